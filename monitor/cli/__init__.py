@@ -1,8 +1,7 @@
-"""Command line of the program: registers the commands, and turns every error into one line and an exit status.
+"""Command line of the program, which turns every error into one line of text and an exit status.
 
-Exit status: 0 for success, 1 for a failure at run time, 2 for a wrong argument or input file, and 3 if the data do not
-support an answer. Each command has a module that defines the arguments and prints the results. Heavy libraries are
-imported only when a command runs.
+The exit status is 0 for success, 1 for a failure at run time, and 2 for a wrong argument or input file. The exit status
+3 means that the data do not support an answer.
 """
 
 import contextlib
@@ -33,10 +32,10 @@ from monitor.cli import (
 )
 from monitor.cli import check as check_config
 from monitor.cli import simulate as simulate_recording
-from monitor.cli.shared.errors import DEBUG, INTERRUPTED, message_and_status
+from monitor.cli.shared.errors import DEBUG, INTERRUPTED, error_message_and_exit_status
 
-# This must precede the import of NumPy. The matrices are small, and the program has its own threads for the work.
-# Additional threads of the linear algebra libraries would only use processor time.
+# The limits must be set before NumPy is imported. Threads of the linear algebra libraries do not pay off here,
+# because the matrices are small.
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_pool, "1")
 # pydantic would otherwise search all installed packages for plug-ins
@@ -50,7 +49,6 @@ app = typer.Typer(
 
 
 def _print_version(wanted: bool) -> None:
-    """Print the version of the program and exit."""
     if wanted:
         from importlib import metadata
 
@@ -99,10 +97,10 @@ app.add_typer(_thermal, name="thermal")
 
 
 def main() -> None:
-    """Run the program with the arguments of the process, and exit with its status.
+    """Run the program with the arguments of the process, and exit with the status of the command.
 
-    Every error is printed as one line on standard error. ``--debug``, before or after the name of the command, prints
-    the traceback of an error before this line.
+    Every error is printed as one line on standard error. The option ``--debug`` may be given before or after the name
+    of the command, and adds the traceback of an error.
     """
     arguments, debug = _split_debug(sys.argv[1:])
     threading.excepthook = partial(report_failed_thread, debug)
@@ -115,7 +113,7 @@ def main() -> None:
     except Exception as error:  # noqa: BLE001 - any other error is printed in one line, with a request to report it
         if debug:
             traceback.print_exc()
-        line, status = message_and_status(error)
+        line, status = error_message_and_exit_status(error)
         if isinstance(error, OSError):
             _discard_output()
         if not isinstance(error, BrokenPipeError):  # the reader of the output has gone, so a message is useless
@@ -126,7 +124,7 @@ def main() -> None:
 
 
 def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
-    """Print one line on standard error with the reason why a thread ended.
+    """Print the reason why a thread ended as one line on standard error.
 
     Parameters
     ----------
@@ -142,7 +140,7 @@ def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
         if debug:
             traceback.print_exception(error)
         thread = "a thread" if failed.thread is None else f'thread "{failed.thread.name}"'
-        print(f"imu-monitor: {thread} ended: {message_and_status(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
+        print(f"imu-monitor: {thread} ended: {error_message_and_exit_status(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:
@@ -153,13 +151,13 @@ def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:
 
 
 def _split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
-    """Return the arguments without ``--debug``, and True if ``--debug`` was given before ``--``."""
+    """Return the arguments without ``--debug``, and True if ``--debug`` was given."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
     return [*(one for one in arguments[:end] if one != DEBUG), *arguments[end:]], DEBUG in arguments[:end]
 
 
 def _discard_output() -> None:
-    """Discard buffered text of standard output. Writing the text at exit would fail again and print a traceback."""
+    """Redirect standard output to the null device, because writing the buffered text at exit would fail again."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # standard output is closed, or is not a file
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -167,7 +165,6 @@ def _discard_output() -> None:
 
 
 def _fail(line: str, status: int) -> NoReturn:
-    """Print an error on standard error and exit."""
     if sys.stderr is not None:
         with contextlib.suppress(OSError, ValueError):  # standard error cannot be written, so only the status remains
             print(f"imu-monitor: {line}", file=sys.stderr, flush=True)  # noqa: T201

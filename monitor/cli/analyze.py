@@ -29,31 +29,33 @@ def analyze(
         typer.Option(metavar="FILE.png|.html", help="Allan deviations as a picture, or the whole result as a page."),
     ] = None,
 ) -> None:
-    """Print the Allan deviation of a recording, Q, N, B, K, R with confidence intervals, motion and changes."""
+    """Print the Allan deviations, noise coefficients Q, N, B, K, R, motion and noise changes of a recording."""
     from monitor.commands import analyze as offline
     from monitor.publishing.messages.analysis_json import AnalysisMessage, FailedAnalysisMessage
 
     output.check_output_file("--plot", plot, ".png", ".html")
     window_s = options.parse_duration("--window", window)
     last_s = options.parse_duration("--last", last)
-    wanted = offline.Request(
+    wanted = offline.AnalysisRequest(
         recording, rate, options.parse_averaging_times(tau), window_s, rest, bool(json or plot), last_s
     )
     try:
-        with output.show_progress() as tell:
+        with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
             results = offline.run_analysis(wanted, tell)
     except offline.TooFewSamples as error:
         if json is not None:
-            output.write_bytes("--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n")
+            output.write_file_or_stdout(
+                "--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n"
+            )
         raise
     if json is not None:
         message = AnalysisMessage.from_analysis(
             results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
         )
-        output.write_bytes("--json", json, message.encode() + b"\n")
+        output.write_file_or_stdout("--json", json, message.encode() + b"\n")
     if plot is not None:
-        offline.draw_plots(results, plot, recording.name)
+        offline.save_plot_or_report(results, plot, recording.name)
     if json != Path("-"):
         output.print_analysis(results.analysis)
     if results.lacking:

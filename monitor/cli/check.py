@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
-from monitor.cli.shared.errors import WRONG, name_option
+from monitor.cli.shared.errors import WRONG, name_option_in_config_errors
 
 
 def check(
@@ -42,7 +42,6 @@ def check(
 
 
 def _defaults(link: str | None, decoder: str | None) -> str:
-    """Return a configuration file with all keys and defaults, or only with the keys of a link and a decoder."""
     from monitor.settings import printed_defaults
 
     texts = []
@@ -51,6 +50,6 @@ def _defaults(link: str | None, decoder: str | None) -> str:
         ("--decoder", decoder, printed_defaults.format_decoder),
     ):
         if name is not None:
-            with name_option(option):
+            with name_option_in_config_errors(option):
                 texts.append(form(name))
     return "\n".join(texts) or printed_defaults.format_defaults()

@@ -30,7 +30,7 @@ def compensate(
         Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
     ] = None,
 ) -> None:
-    """Write a recording without the drift of its gyroscopes, by the method of the service or another method."""
+    """Remove the gyro drift from a recording, and write the compensated recording."""
     from rich.console import Console
 
     from monitor.commands import compensate as compensating
@@ -44,12 +44,12 @@ def compensate(
             raise ConfigError(f"{option}: {place} is also the output file of --out; choose another name")
     service_in_terminal.exit_on_sigterm()
     last_s = options.parse_duration("--last", last)
-    wanted = compensating.Request(recording, out, method, rate, options.parse_arma_order(order), last_s)
-    with output.show_progress() as tell:
+    wanted = compensating.CompensationRequest(recording, out, method, rate, options.parse_arma_order(order), last_s)
+    with output.show_progress_bar() as tell:
         output.compile_analysis_kernels(tell)
         result = compensating.run_compensation(wanted, tell)
     if json is not None:
-        output.write_bytes("--json", json, text.encode_compensation(result) + b"\n")
+        output.write_file_or_stdout("--json", json, text.encode_compensation(result) + b"\n")
     if plot is not None:
         from monitor.publishing.plots.compensate_plot import save_compensation_plot
 

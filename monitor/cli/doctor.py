@@ -1,4 +1,4 @@
-"""Command ``doctor``: prints the findings as a table or writes them as JSON."""
+"""Command ``doctor``: prints the findings about a machine and a configuration as a table or as JSON."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -25,9 +25,11 @@ def doctor(
     from monitor.commands import doctor as checks
 
     output.check_output_file("--json", json)
-    findings = checks.examine(config)
+    findings = checks.examine_machine(config)
     if json is not None:
-        output.write_bytes("--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n")
+        output.write_file_or_stdout(
+            "--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n"
+        )
     if json != Path("-"):
         _print(findings)
     if checks.worst_mark(findings) == "wrong":
@@ -35,7 +37,6 @@ def doctor(
 
 
 def _print(findings: list) -> None:  # type: ignore[type-arg]
-    """Print the findings as a table."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

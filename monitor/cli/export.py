@@ -14,7 +14,7 @@ def export(
         Path,
         typer.Argument(metavar="MODEL.toml|RESULT.json", help="Model, or JSON of analyze; - = standard input."),
     ],
-    form: Annotated[
+    target_format: Annotated[
         str, typer.Option("--format", metavar="kalibr|gyroparams|kalman", help="Tool that reads the parameters.")
     ],
     inflation: options.Inflation = 1.0,
@@ -32,8 +32,8 @@ def export(
     belong = {"dt_s": "kalman", "correlation_time_s": "kalman", "rostopic": "kalibr"}
     given = {name: value for name, value in keys.items() if value is not None}
     for name in given:
-        if form in exports.FORMATS and form != belong[name]:
+        if target_format in exports.FORMATS and target_format != belong[name]:
             option = name.removesuffix("_s").replace("_", "-")
-            raise ConfigError(f"--{option}: belongs to --format {belong[name]}, not {form}")
-    text = exports.export(options.read_noise_coefficients(source), form, inflation, **given)
-    output.write_bytes("--out", out or Path("-"), text.encode())
+            raise ConfigError(f"--{option}: belongs to --format {belong[name]}, not {target_format}")
+    text = exports.export(options.read_noise_coefficients(source), target_format, inflation, **given)
+    output.write_file_or_stdout("--out", out or Path("-"), text.encode())

@@ -1,4 +1,4 @@
-"""Command ``history``: prints past results from the file of a daemon or from a running daemon."""
+"""Command ``history``: prints stored results from the history file or from a running daemon."""
 
 import time
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import typer
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from monitor.cli.shared import options, output
-from monitor.cli.shared.errors import name_option
+from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
     from monitor.history.history_table import HistoryTable
@@ -70,7 +70,7 @@ def history(
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: give either a file or --connect, not both")
-    with name_option("--step"):
+    with name_option_in_config_errors("--step"):
         step_s = None if step is None else max(int(parse_duration_s(step)), 1)
     axes = AXES if axis is None else (axis,)
     asked = HistoryQuery(_span(since, until), step_s, PARTS, axes)
@@ -88,14 +88,13 @@ def history(
 
 
 def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:
-    """Write the results to the requested files."""
     from monitor.publishing.messages.history import HistoryMessage
     from monitor.publishing.reports import history_file
 
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
         message = HistoryMessage.build_reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
-        output.write_bytes("--json", json, message.encode() + b"\n")
+        output.write_file_or_stdout("--json", json, message.encode() + b"\n")
     if out is not None:
         history_file.save_history(past, out)
     if plot is not None:
@@ -105,7 +104,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:
-    """Return a function that reads results from a history file. A daemon may write to the file at the same time."""
+    """Return a function that reads the history file, even while a daemon writes to the file."""
     from monitor.history import history_table as past
     from monitor.history.sqlite_store import open_history
 
@@ -115,28 +114,27 @@ def _from_file(source: Path | None, name: str | None) -> Get:
     with open_history(path) as reader:
         device = _select_device(name, list(reader.list_devices()), str(path))
 
-    def get(asked: "HistoryQuery") -> "HistoryTable":
+    def query_file(query: "HistoryQuery") -> "HistoryTable":
         with open_history(path) as reader:
-            return past.read_history(reader, device, asked.span, asked.selects_column, asked.step_s)
+            return past.read_history(reader, device, query.span, query.selects_column, query.step_s)
 
-    return get
+    return query_file
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
-    """Return a function that queries the history of a running daemon over zenoh."""
     from monitor.publishing.zenoh.history_client import query_histories
 
-    def get(asked: "HistoryQuery") -> "HistoryTable":
+    def query_daemon(query: "HistoryQuery") -> "HistoryTable":
         found = {
-            one.device: one for one in query_histories(endpoint, name or "*", asked.format_parameters(), prefix, file)
+            one.device: one for one in query_histories(endpoint, name or "*", query.format_parameters(), prefix, file)
         }
         return found[_select_device(name, list(found), mask_secrets(endpoint or str(file)))]
 
-    return get
+    return query_daemon
 
 
 def _history_path(source: Path) -> Path:
-    """Return the path of the history file for a configuration, a folder or the file itself."""
+    """Return the path of the history file for a configuration file, a storage folder or a history file."""
     from monitor.history.sqlite_store import FILE_NAME
     from monitor.settings import loading
 
@@ -151,7 +149,7 @@ def _history_path(source: Path) -> Path:
 
 
 def _select_device(name: str | None, there: list[str], where: str) -> str:
-    """Return the name of the requested device, or of the only device.
+    """Return the name of the requested device, or of the only device if no name is given.
 
     Raises
     ------
@@ -175,15 +173,15 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
 
 
 def _span(since: str | None, until: str | None) -> "TimeRange | None":
-    """Return the requested time range; None if neither end is given."""
+    """Return the time range of the options ``--from`` and ``--to``, or None if both options are missing."""
     from monitor.history.time_ranges import TimeRange, parse_time
 
     if since is None and until is None:
         return None
     now_s = time.time()
-    with name_option("--from"):
+    with name_option_in_config_errors("--from"):
         start_s = float("-inf") if since is None else parse_time(since, now_s)
-    with name_option("--to"):
+    with name_option_in_config_errors("--to"):
         end_s = float("inf") if until is None else parse_time(until, now_s)
     if end_s <= start_s:
         raise ConfigError(f"--to: {until} is not after --from {since}")

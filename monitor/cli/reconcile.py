@@ -31,7 +31,7 @@ def reconcile(
     last: options.Last = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
-    """Find where recording and model disagree, which effects are missing, and what remains with these effects."""
+    """Compare recordings with a noise model, and find the effects that are missing in the model."""
     require_extra("reconcile", "reconcile")
     from rich.console import Console
 
@@ -47,7 +47,7 @@ def reconcile(
     several = len(recordings) > 1
     service_in_terminal.exit_on_sigterm()
     try:
-        with output.show_progress() as tell:
+        with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
             if several:
                 every = reconciling.ComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
@@ -55,14 +55,14 @@ def reconcile(
                 data, show = comparison_report.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
                 one = reconciling.run_reconciliation(
-                    reconciling.Request(recordings[0], tested, out, seed, rate, last_s=last_s), tell
+                    reconciling.ReconciliationRequest(recordings[0], tested, out, seed, rate, last_s=last_s), tell
                 )
                 data, show = report.encode_report(one), partial(text.print_reconciliation, one)
     except NotReady:
         if json is not None:
-            output.write_bytes("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
+            output.write_file_or_stdout("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
         raise
     if json is not None:
-        output.write_bytes("--json", json, data + b"\n")
+        output.write_file_or_stdout("--json", json, data + b"\n")
     if json != Path("-"):
         show(Console())

@@ -20,7 +20,7 @@ def run(
     """Run the service for all devices of a configuration file until the process is interrupted."""
     from monitor.settings import loading
 
-    found = service_in_terminal.with_history_span(
+    found = service_in_terminal.with_viewer_history_length(
         loading.load(config, pipe=True), options.parse_duration("--history", history)
     )
     service_in_terminal.run_service(found, seconds, viewer)

@@ -29,7 +29,7 @@ def simulate(
     ] = False,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
-    """Write a recording of a noise model. An incomplete file never appears."""
+    """Simulate a noise model and write the samples to a recording."""
     from monitor.commands import simulate as simulation
     from monitor.noise.model_loading import load_model
 
@@ -39,11 +39,11 @@ def simulate(
         if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{option}: {path} is also the output file of --out; choose another name")
     noise = load_model(model, Path.cwd())
-    request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
+    request = simulation.SimulationRequest(noise, out, length_s, seed, rate, temperature_from, truth, model)
     service_in_terminal.exit_on_sigterm()
-    with output.show_progress() as tell:
+    with output.show_progress_bar() as tell:
         result = simulation.run_simulation(request, tell)
     if json is not None:
-        output.write_bytes("--json", json, result.to_json() + b"\n")
+        output.write_file_or_stdout("--json", json, result.to_json() + b"\n")
     if json != Path("-"):
-        typer.echo(result.text())
+        typer.echo(result.describe_in_one_line())

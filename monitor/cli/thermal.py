@@ -1,4 +1,4 @@
-"""Commands ``thermal fit`` and ``thermal predict``: model the bias as a function of temperature."""
+"""Commands ``thermal fit`` and ``thermal predict``: describe the bias as a function of temperature."""
 
 from pathlib import Path
 from typing import Annotated
@@ -37,13 +37,13 @@ def thermal_fit(
     output.check_output_file("--json", json)
     output.check_output_file("--out", out)
     interval_s, last_s = options.parse_duration("--interval", interval), options.parse_duration("--last", last)
-    study = thermal.fit_recording(recording, interval_s, rate, last_s)
+    study = thermal.fit_thermal_models(recording, interval_s, rate, last_s)
     if json is not None:
-        output.write_bytes("--json", json, text.encode_thermal_fit(study) + b"\n")
+        output.write_file_or_stdout("--json", json, text.encode_thermal_fit(study) + b"\n")
     if not study.fits:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in study.refused.items()))
     if out is not None:
-        output.write_bytes("--out", out, thermal.encode_model_file(study) + b"\n")
+        output.write_file_or_stdout("--out", out, thermal.encode_model_file(study) + b"\n")
     if plot is not None:
         from monitor.publishing.plots.thermal_plot import save_thermal_fit_plot
 
@@ -68,11 +68,11 @@ def thermal_predict(
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--json", json)
-    outlook = thermal.predict_recording(
+    outlook = thermal.predict_bias_of_recording(
         recording, thermal.read_model_file(model), rate, options.parse_duration("--last", last)
     )
     if json is not None:
-        output.write_bytes("--json", json, text.encode_thermal_prediction(outlook) + b"\n")
+        output.write_file_or_stdout("--json", json, text.encode_thermal_prediction(outlook) + b"\n")
     if not outlook.judged:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in outlook.refused.items()))
     if plot is not None:

@@ -18,5 +18,5 @@ def view(
     viewer: options.Viewer = None,
     seconds: options.Seconds = None,
 ) -> None:
-    """Show any number of daemons in one viewer: a table of all devices, and chosen devices in detail."""
+    """Show several daemons in one viewer, with a table of all devices and details of selected devices."""
     service_in_terminal.run_fleet_viewer(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)

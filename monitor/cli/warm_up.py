@@ -1,4 +1,4 @@
-"""Command ``warm-up``: compiles the numerical kernels before they are needed."""
+"""Command ``warm-up``: compiles the numerical kernels in advance."""
 
 import sys
 import time
@@ -11,7 +11,7 @@ from monitor.cli.shared import output
 
 
 def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True)] = False) -> None:
-    """Compile the numerical kernels and keep them on disk, so that the next start is quick."""
+    """Compile the numerical kernels and store the compiled kernels on disk for a quick start."""
     from monitor.common.compiled import cache_folder
     from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
@@ -25,15 +25,15 @@ def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True
         )
     cold = [group for group in kernel_parts.GROUPS if not kernel_compilation.is_warm(group)]
     begun_s = time.monotonic()
-    with output.show_progress() as show:
+    with output.show_progress_bar() as show:
 
-        def tell(progress: kernel_compilation.Progress) -> None:
+        def report_progress(progress: kernel_compilation.Progress) -> None:
             show(str(progress), progress.share)
             if not sys.stderr.isatty():
                 typer.echo(progress, err=True)
 
         for group in cold:
-            for _ in kernel_compilation.prepare_kernels(group, tell):
+            for _ in kernel_compilation.prepare_kernels(group, report_progress):
                 pass
     parts = sum(len(group.parts) for group in cold)
     done = f"compiled {parts} parts in {time.monotonic() - begun_s:.0f} s" if cold else "nothing to compile"

@@ -11,7 +11,7 @@ def watch(
     zenoh: options.ZenohFile = None,
     seconds: options.Seconds = None,
 ) -> None:
-    """Show a live table of any number of daemons, received over zenoh."""
+    """Show a live table of several daemons, whose results are received over zenoh."""
     from rich.console import Console
 
     from monitor.publishing.terminal.watch import watch as show

@@ -1,1 +1,1 @@
-"""Commands on recordings and configurations: ``analyze``, ``simulate``, ``reconcile`` and others."""
+"""Commands that process recordings and configurations, for example ``analyze``, ``simulate`` and ``reconcile``."""

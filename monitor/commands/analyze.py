@@ -1,11 +1,7 @@
-"""Command ``analyze``: reads a recording and computes all requested results, in several threads.
+"""Command ``analyze``: reads a recording and computes Allan deviations, noise coefficients, motion and noise changes.
 
-Allan deviations, noise coefficients, motion and changes of the noise are always determined. Total and Hadamard
-deviations take four times as long as Allan deviations, so they are computed only if they are drawn or written. Allan
-deviations over time are computed if a window is given.
-
-Independent axes and results are computed in parallel threads, because kernels release the GIL. Allan deviations over
-time are computed in the calling thread, so that Ctrl-C ends the computation at once.
+Total and Hadamard deviations take four times as long as Allan deviations, so they are computed only on request.
+Independent axes and results are computed in parallel threads, because the numerical kernels release the GIL.
 """
 
 import os
@@ -20,7 +16,7 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature, temperature_varied
+from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature_effect, temperature_varied
 from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
@@ -49,52 +45,52 @@ class TooFewSamples(NotReady):
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class AnalysisRequest:
     """Recording to analyse and results to compute."""
 
     recording: Path
     rate_hz: float | None = None
     tau: TauGrid = "octave"
-    window_s: float | None = None  # window of dynamic curves; None for no dynamic curves
-    exclude_motion: bool = False  # True if motion is excluded
-    total_and_hadamard: bool = False  # True if total and Hadamard deviations are computed
+    window_s: float | None = None  # window length of dynamic Allan deviations; None = not computed
+    exclude_motion: bool = False  # True if samples in motion are excluded
+    total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
     last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
 @dataclass(frozen=True, slots=True)
-class Results:
+class AnalysisResults:
     """Results of an analysis."""
 
     analysis: RecordingAnalysis
     total: TotalCurve | None = None
     hadamard: HadamardCurve | None = None
     dynamic: DynamicAllan | None = None
-    lacking: str = ""  # reason why requested dynamic curves are missing
+    lacking: str = ""  # reason why dynamic Allan deviations are missing
     without_temperature: TemperatureRemoval | None = (
         None  # coefficients without the effect of temperature, if it explains any axis
     )
 
 
-def run_analysis(request: Request, tell: ProgressCallback = ignore_progress) -> Results:
+def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = ignore_progress) -> AnalysisResults:
     """Read a recording and analyse it.
 
     Parameters
     ----------
-    request : Request
+    request : AnalysisRequest
         Recording to analyse and results to compute.
-    tell : callable, optional
+    report_progress : callable, optional
         Progress callback.
 
     Raises
     ------
     RecordingError, ConfigError
-        If the recording cannot be read, if it is too short for a requested τ or window, or if there is not enough
-        memory.
+        If the recording cannot be read, or is too short for a requested averaging time or window, or if there is not
+        enough memory.
     TooFewSamples
         If the recording has too few samples for any result.
     """
     try:
-        return _make(request, tell)
+        return _make(request, report_progress)
     except MemoryError as error:
         raise ConfigError(
             f"{request.recording}: the analysis needs more memory than is free; use only the end with --last, or "
@@ -102,8 +98,7 @@ def run_analysis(request: Request, tell: ProgressCallback = ignore_progress) -> 
         ) from error
 
 
-def _make(request: Request, tell: ProgressCallback) -> Results:
-    """Read a recording and analyse it, with a pool of threads."""
+def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     blocks = list(iter_blocks(found))
@@ -126,20 +121,20 @@ def _make(request: Request, tell: ProgressCallback) -> Results:
         found_all = replace(
             found_all,
             notes=(*found_all.notes, *said, *([lacking] if lacking else [])),
-            axes_of_temperature=() if without is None else without.axes_of_temperature,
+            axes_of_temperature=() if without is None else without.axes_explained_by_temperature,
         )
-        return Results(found_all, total, hadamard, courses, lacking, without)
+        return AnalysisResults(found_all, total, hadamard, courses, lacking, without)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def draw_plots(results: Results, path: Path, title: str) -> None:
-    """Draw the results as a picture, or write them as a page if the file name ends in .html.
+def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> None:
+    """Save the results as a picture, or as an HTML page if the file name ends in ``.html``.
 
     Parameters
     ----------
-    results : Results
-        Results to draw.
+    results : AnalysisResults
+        Results of the analysis.
     path : Path
         File to write.
     title : str
@@ -166,17 +161,16 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
 def _without_temperature(
     result: RecordingAnalysis, blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> TemperatureRemoval | None:
-    """Return the coefficients without the effect of temperature; None if the temperature is missing or constant."""
+    """Return the coefficients without the effect of temperature, or None if the temperature is missing or constant."""
     if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
         return None
     _, temperature_c, _, _ = resample_with_temperature(blocks, rate_hz)
-    return remove_temperature(result, temperature_c)
+    return remove_temperature_effect(result, temperature_c)
 
 
 def _dynamic_curves(
-    result: RecordingAnalysis, request: Request, tell: ProgressCallback
+    result: RecordingAnalysis, request: AnalysisRequest, tell: ProgressCallback
 ) -> tuple[DynamicAllan | None, str]:
-    """Return the dynamic curves if they are requested, or the reason why they are missing."""
     if request.window_s is None:
         return None, ""
     rate_hz = result.estimate.rate_hz
@@ -190,7 +184,7 @@ def _dynamic_curves(
 
 
 def _total_and_hadamard(result: RecordingAnalysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
-    """Return total and Hadamard deviations at octaves, or at the listed τ if the recording is long enough."""
+    """Return the total and Hadamard deviations at octaves, or at the requested averaging times."""
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors
     short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]

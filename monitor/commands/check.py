@@ -1,9 +1,6 @@
-"""Command ``check``: finds all mistakes in a configuration file and in the model files that it names. No device is
-opened.
+"""Command ``check``: finds all mistakes in a configuration file and in the noise models of the configuration.
 
-``settings.examine`` reads the configuration. Model files are read here, because the modules for models are in a higher
-layer than the settings. The check covers the noise model of each device with the limits that are relative to the model,
-and the model and effects of each simulated sensor.
+No device is opened. The noise models are checked here, because the settings package must not import the noise models.
 """
 
 from collections.abc import Iterator
@@ -14,21 +11,21 @@ from monitor.settings.loading import Config, ModelDependentSettings, examine
 
 
 def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
-    """Read a configuration file and find all mistakes.
+    """Read a configuration file and return all mistakes.
 
     Parameters
     ----------
     path : Path
         Configuration file.
     pipe : bool, optional
-        True if a pipe may be read as well, see ``drivers.file_access.read``.
+        True if ``path`` may be a pipe.
 
     Returns
     -------
     config : Config or None
-        Configuration; None if there is any mistake.
+        Configuration, or None if the file contains a mistake.
     wrong : list of str
-        One line for each mistake, which begins with the file.
+        One line of text for each mistake. The line begins with the path of the file.
     """
     reading = examine(path, pipe=pipe)
     wrong = [*reading.wrong, *(f"{path}: {use.device}: {line}" for use in reading.models for line in _problems(use))]
@@ -36,8 +33,7 @@ def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | Non
 
 
 def _problems(use: ModelDependentSettings) -> Iterator[str]:
-    """Yield the mistakes in the model files of a device."""
-    # imported only if needed, because most configurations have neither a model nor a simulated sensor
+    """Yield the mistakes in the noise model of a device and in the model of a simulated sensor."""
     try:
         if use.model is not None:
             from monitor.daemon.operations.coefficient_limits import make_bounds

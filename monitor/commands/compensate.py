@@ -1,9 +1,8 @@
-"""Command ``compensate``: writes a recording without the drift of its gyroscopes, and measures the improvement.
+"""Command ``compensate``: removes the gyro drift from a recording and measures the improvement.
 
-The method ``adaptive`` processes the samples one by one, as the daemon does. The method ``fixed`` differs from
-``adaptive`` in that the noise of the drift is not adapted. The other methods are published methods for finished
-recordings. All methods are evaluated on the same samples at rest. The first third of the samples at rest is excluded,
-because some methods use it for learning.
+The method ``adaptive`` processes the samples one by one, as the daemon does. The method ``fixed`` does not adapt the
+estimated noise of the drift. All methods are evaluated on the same samples at rest. The first third of the samples at
+rest is not evaluated, because some methods use the first third for learning.
 """
 
 from dataclasses import dataclass
@@ -35,7 +34,7 @@ BLOCK_ROWS: Final = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class CompensationRequest:
     """Recording to compensate and method to use."""
 
     recording: Path
@@ -46,32 +45,34 @@ class Request:
     last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
-def run_compensation(request: Request, tell: ProgressCallback = ignore_progress) -> CompensationResult:
+def run_compensation(
+    request: CompensationRequest, report_progress: ProgressCallback = ignore_progress
+) -> CompensationResult:
     """Compensate a recording and write the result.
 
     Parameters
     ----------
-    request : Request
+    request : CompensationRequest
         Recording to compensate and method to use.
-    tell : callable, optional
+    report_progress : callable, optional
         Progress callback.
 
     Returns
     -------
-    Result
-        Quality of the uncompensated and the compensated rate of each gyroscope axis.
+    CompensationResult
+        Quality of the uncompensated and the compensated rate of each gyro axis.
 
     Raises
     ------
     ConfigError, RecordingError
-        If the method is unknown, if the recording cannot be read or has no gyroscope axis, or if the result cannot be
+        If the method is unknown, if the recording cannot be read or has no gyro axis, or if the result cannot be
         written.
     NotReady
         If the sensor was never at rest for long enough. No file is written.
     """
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
-    tell("reading", None)
+    report_progress("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
@@ -79,8 +80,8 @@ def run_compensation(request: Request, tell: ProgressCallback = ignore_progress)
     values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     orders = ORDERS if request.order is None else (request.order,)
     live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
-    out = _run(live, values, tell)
-    intervals = tuple(live.take_intervals())
+    out = _run(live, values, report_progress)
+    intervals = tuple(live.take_finished_intervals())
     rest = _at_rest(intervals, len(values), live.interval_samples)
     learned, judged = _split_learning(rest)
     if not judged.any():
@@ -89,13 +90,13 @@ def run_compensation(request: Request, tell: ProgressCallback = ignore_progress)
             "so the drift cannot be learned"
         )
     if request.method in REFERENCE_METHODS:
-        out = _compensate_offline(request.method, values, learned, axes, tell)
-    tell("evaluating", None)
+        out = _compensate_offline(request.method, values, learned, axes, report_progress)
+    report_progress("evaluating", None)
     judged_axes: dict[str, AxisCompensation] = {
         str(axis): _evaluate_axis(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
     }
     start_s = 0.0 if found.t_s is None else float(found.t_s[0])
-    _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, tell)
+    _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, report_progress)
     return CompensationResult(
         recording=request.recording.name,
         out=request.out,
@@ -112,7 +113,7 @@ def run_compensation(request: Request, tell: ProgressCallback = ignore_progress)
 
 
 def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
-    """Compensate as the daemon does, except that a model is identified at once when it is due."""
+    """Compensate the drift as the daemon does, but identify each drift model without delay."""
     out = np.empty_like(values)
     size = live.interval_samples
     for start in range(0, len(values), size):
@@ -124,7 +125,7 @@ def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
 
 
 def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray[np.bool_]:
-    """Return a mask [n, 3] that is True for samples of the intervals that updated a known bias."""
+    """Return a mask [n, 3] that is True for samples of intervals at rest with a known bias."""
     mask = np.zeros((n, len(GYROS)), dtype=bool)
     for one in intervals:
         mask[one.end - size : one.end] = (one.outcome == USED) & np.isfinite(one.expected)
@@ -132,7 +133,7 @@ def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray
 
 
 def _split_learning(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return two masks for the samples at rest of each axis: the first third, and the remaining samples."""
+    """Return two masks for the samples at rest: the first third for learning, and the rest for the evaluation."""
     count = np.cumsum(rest, axis=0)
     first = count <= LEARNING_SHARE * count[-1]
     return rest & first, rest & ~first
@@ -141,7 +142,6 @@ def _split_learning(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray
 def _compensate_offline(
     method: str, values: Floats, learned: NDArray[np.bool_], axes: tuple[str, ...], tell: ProgressCallback
 ) -> Floats:
-    """Compensate each axis with a method for finished recordings."""
     out = values.copy()
     for axis in axes:
         at = AXES.index(axis)
@@ -159,7 +159,6 @@ def _evaluate_axis(
     live: Compensator,
     intervals: tuple[DriftInterval, ...],
 ) -> AxisCompensation:
-    """Return the quality of one axis before and after compensation."""
     before = values[:, at] - np.nanmean(values[learned[:, at], at])
     first = int(np.argmax(judged[:, at]))
     model = live.models[at]
@@ -167,7 +166,9 @@ def _evaluate_axis(
     return AxisCompensation(
         model=None
         if model is None
-        else fit_arma(*live.identification_means_and_variance(at), [model.order], intervals=True),
+        else fit_arma(
+            *live.means_and_noise_variance_for_identification(at), [model.order], with_confidence_intervals=True
+        ),
         uncompensated=score_at_rest(np.where(judged[:, at], before, np.nan)[first:], live.rate_hz),
         compensated=score_at_rest(np.where(judged[:, at], out[:, at], np.nan)[first:], live.rate_hz),
         rejected_intervals=int((became == REJECTED).sum()),
@@ -178,7 +179,6 @@ def _evaluate_axis(
 def _write(
     path: Path, axes: tuple[str, ...], t_s: Floats, out: Floats, temperature_c: Floats, tell: ProgressCallback
 ) -> None:
-    """Write all recorded rows at their times on the regular grid."""
     there = np.flatnonzero(np.isfinite(out).any(axis=1))
     warm = bool(np.isfinite(temperature_c).any())
     with open_recording_writer(path, axes, warm) as append:

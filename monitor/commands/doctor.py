@@ -1,13 +1,7 @@
-"""Command ``doctor``: checks a machine and a configuration for unattended operation, and returns findings with advice.
+"""Command ``doctor``: checks a machine and a configuration for unattended operation.
 
-Each check returns findings and raises no error. If a check cannot determine a state, the finding says so. No device is
-opened. The checks have three side effects: a port is bound for a moment, a connection to a router is opened and closed,
-and an empty file is created in the storage folder and removed.
-
-The disk use per day, in bytes, is rate · 86400 · SAMPLE_BYTES for each recorded device. Raw bytes add RAW_BYTES for
-each sample. SAMPLE_BYTES is the size of a sample in a packed segment with six axes, temperature and counter, if the
-noise uses all digits of a 32-bit float. Sensors with a coarser resolution need less. The history of results is
-comparatively small and is not counted.
+Each check returns findings with advice, and raises no error. The checks bind ports for a moment, connect to routers,
+and create and remove an empty file in the storage folder. No device is opened.
 """
 
 import contextlib
@@ -44,12 +38,12 @@ from monitor.settings.loading import Config, Storage
 Mark = Literal["well", "doubt", "wrong"]
 
 SAMPLE_BYTES: Final = 35.0
-"""Size of a sample in a packed segment.
+"""Size of a sample with six axes, temperature and counter in a compressed recording.
 
-Sensors that use all digits of a float need 32.5 to 33.3 bytes, and sensors with a coarse resolution 17 to 23 bytes.
+Sensors with a high resolution need 32.5 to 33.3 bytes per sample. Sensors with a coarse resolution need 17 to 23 bytes.
 """
 RAW_BYTES: Final = 60.0
-"""Approximate size of the received frame of a sample. It depends on the protocol."""
+"""Approximate size of the received bytes of a sample. The size depends on the protocol."""
 CONNECT_TIMEOUT_S: Final = 2.0
 TIME_ERROR: Final = 5
 """Return value of adjtimex(2) if the clock is not synchronised."""
@@ -59,7 +53,7 @@ MAX_PORT: Final = 65535
 UNIT: Final = "imu-monitor.service"
 PACKAGE: Final = "imu-monitor"
 PACKAGES: Final = ("monitor", "drivers")
-"""Import packages of the program. The names are common, so other packages may have the same names."""
+"""Packages of the program. Other packages may have the same names, because the names are common."""
 TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
 """Regular expression for the host and the port of a zenoh endpoint over TCP or TLS."""
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
@@ -74,14 +68,14 @@ class Finding:
     mark: Mark
     about: str
     text: str
-    do: str = ""  # advice; empty if nothing is to be done
+    do: str = ""  # advice; empty if no action is needed
 
 
 _well, _doubt, _wrong = partial(Finding, "well"), partial(Finding, "doubt"), partial(Finding, "wrong")
 
 
-def examine(path: Path | None = None) -> list[Finding]:
-    """Check the machine, and the configuration if a path is given."""
+def examine_machine(config_path: Path | None = None) -> list[Finding]:
+    """Check the machine, and also the configuration file if a path is given."""
     machine = [
         *check_library_versions(),
         *_check_shadowed_packages(sys.path),
@@ -89,22 +83,21 @@ def examine(path: Path | None = None) -> list[Finding]:
         check_clock(),
         *_check_systemd_unit(),
     ]
-    if path is None:
+    if config_path is None:
         return machine
-    config, mistakes = check_configuration(path, pipe=True)
+    config, mistakes = check_configuration(config_path, pipe=True)
     found = [_wrong("configuration", line) for line in mistakes]
     if config is not None:
-        found.append(_well("configuration", f"{path}: {format_count(len(config.devices), 'device')}"))
+        found.append(_well("configuration", f"{config_path}: {format_count(len(config.devices), 'device')}"))
     found += machine
-    if path.is_file():
-        found.append(_check_permissions(path))
+    if config_path.is_file():
+        found.append(_check_permissions(config_path))
     if config is not None:
         found += _check_configured(config)
     return found
 
 
 def _check_configured(config: Config) -> Iterator[Finding]:
-    """Check the devices, the outputs and the hooks of a valid configuration."""
     for one in config.table["device"]:
         yield from _check_device(str(one["name"]), one["driver"])
     yield from _check_zenoh(config)
@@ -119,7 +112,7 @@ def _check_configured(config: Config) -> Iterator[Finding]:
 
 
 def _check_permissions(path: Path, about: str = "permissions", secret: bool = True) -> Finding:
-    """Check who may write a file that controls the service, and who may read a file that may contain a password."""
+    """Check which users may write a file, and which users may read a file that contains a password."""
     try:
         seen = path.stat()
     except OSError as error:
@@ -142,7 +135,6 @@ def _check_permissions(path: Path, about: str = "permissions", secret: bool = Tr
 
 
 def _check_device(name: str, driver: Mapping[str, Any]) -> Iterator[Finding]:
-    """Check the link of a device without opening it."""
     about = f"device {name}"
     match driver.get("link"):
         case "serial":
@@ -158,7 +150,6 @@ def _check_device(name: str, driver: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _check_serial_port(about: str, port: str) -> Finding:
-    """Check that a serial port exists, is accessible and is not used by another program."""
     if "://" in port:
         return _well(about, f"{port}: network port or pattern, not checked")
     path = Path(port)
@@ -180,7 +171,7 @@ def _check_serial_port(about: str, port: str) -> Finding:
 
 
 def _processes_using(port: Path) -> Iterator[str]:
-    """Yield the programs that have a port open, as far as this user can see them."""
+    """Yield the programs that have opened a port, as far as the user may see the programs."""
     wanted = str(port.resolve())
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # the process belongs to another user, or has ended
@@ -188,12 +179,12 @@ def _processes_using(port: Path) -> Iterator[str]:
                 yield f"{(process / 'comm').read_text().strip()} (pid {process.name})"
 
 
-def check_can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> Finding:
-    """Check that the package for a CAN interface is installed, and that a socketcan interface exists and is up.
+def check_can_interface(subject: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> Finding:
+    """Check that the package for a CAN interface is installed and that the SocketCAN interface is up.
 
     Parameters
     ----------
-    about : str
+    subject : str
         Subject of the finding.
     interface : str
         Interface of python-can.
@@ -204,11 +195,11 @@ def check_can_interface(about: str, interface: str, channel: str, sysfs: Path = 
     """
     if missing := describe_missing_package(interface):
         text, _, command = missing.partition(": ")
-        return _wrong(about, text, command)
+        return _wrong(subject, text, command)
     if interface != "socketcan":
-        return _well(about, f"{interface} {channel}: not checked")
+        return _well(subject, f"{interface} {channel}: not checked")
     if not hasattr(socket, "AF_CAN"):
-        return _wrong(about, "this system has no socketcan", "use another interface of python-can")
+        return _wrong(subject, "this system has no socketcan", "use another interface of python-can")
     network = sysfs / channel
     up = f"sudo ip link set {channel} up type can bitrate 500000, with the bit rate of the bus"
     try:
@@ -216,19 +207,18 @@ def check_can_interface(about: str, interface: str, channel: str, sysfs: Path = 
     except OSError:
         types = [one for one in sysfs.glob("*/type") if os.access(one, os.R_OK) and one.read_text().strip() == CAN_TYPE]
         there = ", ".join(sorted(one.parent.name for one in types)) or "none"
-        return _wrong(about, f"{channel}: no such interface; existing CAN interfaces: {there}", up)
+        return _wrong(subject, f"{channel}: no such interface; existing CAN interfaces: {there}", up)
     if kind != CAN_TYPE:
-        return _wrong(about, f"{channel}: not a CAN interface", up)
+        return _wrong(subject, f"{channel}: not a CAN interface", up)
     if not flags & 1:  # IFF_UP
-        return _wrong(about, f"{channel}: is down", up)
-    return _well(about, f"{channel}: is up")
+        return _wrong(subject, f"{channel}: is down", up)
+    return _well(subject, f"{channel}: is up")
 
 
 # --- outputs
 
 
 def _check_zenoh(config: Config) -> Iterator[Finding]:
-    """Check the ports to listen on, the routers to connect to, and the zenoh configuration file."""
     own = config.zenoh
     if own.mode == "none":
         return
@@ -248,7 +238,7 @@ def _check_zenoh(config: Config) -> Iterator[Finding]:
 
 
 def _parse_endpoint(about: str, endpoint: str, failure: str) -> tuple[str, int] | Finding:
-    """Return host and port of an endpoint, or a finding if it has no TCP port or an impossible port."""
+    """Return the host and port of a TCP endpoint, or a finding if the endpoint cannot be checked."""
     match = TCP_ENDPOINT.fullmatch(endpoint)
     if match is None:
         return _well(about, f"{endpoint}: not checked, since only TCP endpoints can be checked")
@@ -257,31 +247,30 @@ def _parse_endpoint(about: str, endpoint: str, failure: str) -> tuple[str, int] 
     return match[1], int(match[2])
 
 
-def check_port_free(about: str, endpoint: str) -> Finding:
-    """Check that a port is free, by listening on the port for a moment.
+def check_port_free(subject: str, endpoint: str) -> Finding:
+    """Check that a port is free by listening on the port for a moment.
 
     Parameters
     ----------
-    about : str
+    subject : str
         Subject of the finding.
     endpoint : str
         Zenoh endpoint.
     """
-    address = _parse_endpoint(about, endpoint, "cannot listen")
+    address = _parse_endpoint(subject, endpoint, "cannot listen")
     if isinstance(address, Finding):
         return address
     try:
         with socket.create_server(address, family=socket.AF_INET6 if ":" in address[0] else socket.AF_INET):
-            return _well(about, f"{endpoint}: free")
+            return _well(subject, f"{endpoint}: free")
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             do = "no problem if it is this service; otherwise end it, or choose another port"
-            return _doubt(about, f"{endpoint}: another program listens there", do)
-        return _wrong(about, f"{endpoint}: cannot listen: {getattr(error, 'strerror', None) or error}")
+            return _doubt(subject, f"{endpoint}: another program listens there", do)
+        return _wrong(subject, f"{endpoint}: cannot listen: {getattr(error, 'strerror', None) or error}")
 
 
 def _check_reachable(about: str, endpoint: str) -> Finding:
-    """Check that a connection to an endpoint can be opened."""
     address = _parse_endpoint(about, endpoint, "no answer")
     if isinstance(address, Finding):
         return address
@@ -295,7 +284,6 @@ def _check_reachable(about: str, endpoint: str) -> Finding:
 
 
 def _check_viewer(config: Config) -> Iterator[Finding]:
-    """Check that the viewer is installed, if the configuration uses it."""
     mode = config.viewer.mode
     if mode == "none":
         return
@@ -307,7 +295,6 @@ def _check_viewer(config: Config) -> Iterator[Finding]:
 
 
 def _check_metrics(config: Config) -> Iterator[Finding]:
-    """Check the library and the port for Prometheus, and who can reach the port."""
     own = config.metrics
     if own is None:
         return
@@ -323,7 +310,8 @@ def _check_metrics(config: Config) -> Iterator[Finding]:
 
 
 def _check_reconcile(config: Config) -> Iterator[Finding]:
-    """Check that ``command/reconcile`` can be answered, if a folder is configured for its reports."""
+    """Check that the packages for the command ``reconcile`` are installed, if a folder for the reports is
+    configured."""
     missing = " and ".join(find_missing_packages("reconcile"))
     if missing and any(one.reconcile_folder for one in config.devices):
         text = f"reconcile_folder is set, but {missing} is not installed: the service refuses command/reconcile"
@@ -331,7 +319,6 @@ def _check_reconcile(config: Config) -> Iterator[Finding]:
 
 
 def _check_storage(config: Config) -> Iterator[Finding]:
-    """Check the library for recordings, the storage folder and the free disk space."""
     own = config.storage
     if own is None:
         yield _doubt("storage", "nothing is stored: after a restart the window is empty", "set folder in [storage]")
@@ -354,7 +341,6 @@ def _check_storage(config: Config) -> Iterator[Finding]:
 
 
 def _check_in_use(own: Storage) -> Iterator[Finding]:
-    """Check whether another process records into the storage folder or writes its history there."""
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
     do = "no problem if it is this service; otherwise end it, or choose another folder: only one program records"
     for holder in sorted({lock_holder(own.folder, name) for name, on in wanted.items() if on} - {""}):
@@ -362,7 +348,7 @@ def _check_in_use(own: Storage) -> Iterator[Finding]:
 
 
 def recorded_bytes_per_day(config: Config) -> float | None:
-    """Return the disk use of all devices per day in bytes; None if the rate of a device is not configured.
+    """Return the number of bytes that all devices record per day, or None if the rate of a device is unknown.
 
     Examples
     --------
@@ -383,26 +369,32 @@ def recorded_bytes_per_day(config: Config) -> float | None:
     return None if len(known) < len(rates) else sum(known) * DAY_S * each
 
 
-def check_disk_space(own: Storage, a_day: float | None, total: int, available: int) -> Finding:
-    """Check that the disk has enough space for the data to be kept.
+def check_disk_space(storage: Storage, bytes_per_day: float | None, total_bytes: int, free_bytes: int) -> Finding:
+    """Check that the disk has enough space for the recordings.
 
     Parameters
     ----------
-    own : Storage
+    storage : Storage
         Settings of the storage.
-    a_day : float or None
-        Disk use per day in bytes; None if unknown.
-    total : int
+    bytes_per_day : float or None
+        Number of bytes that are recorded per day; None if unknown.
+    total_bytes : int
         Size of the disk in bytes.
-    available : int
+    free_bytes : int
         Free space of the disk in bytes.
     """
-    allowed = available - (1.0 - own.disk_share) * total
-    if a_day is None:
-        text = f"{own.folder}: {_gb(available)} free; disk use per day unknown, since a device has no configured rate"
+    allowed = free_bytes - (1.0 - storage.disk_share) * total_bytes
+    if bytes_per_day is None:
+        text = (
+            f"{storage.folder}: {_gb(free_bytes)} free; disk use per day unknown, since a device has no configured rate"
+        )
         return _doubt("storage", text, "add rate to every device")
-    wanted, days = a_day * own.keep_s / DAY_S, max(allowed, 0.0) / a_day if a_day else float("inf")
-    text = f"{own.folder}: {_gb(available)} free, about {_gb(a_day)} per day, {_gb(wanted)} for the whole time of keep"
+    wanted = bytes_per_day * storage.keep_s / DAY_S
+    days = max(allowed, 0.0) / bytes_per_day if bytes_per_day else float("inf")
+    text = (
+        f"{storage.folder}: {_gb(free_bytes)} free, about {_gb(bytes_per_day)} per day, "
+        f"{_gb(wanted)} for the whole time of keep"
+    )
     if allowed <= 0.0 or days < 1.0:
         do = "free disk space, or record on another disk"
         return _wrong("storage", f"{text}: not enough for one day below disk_share", do)
@@ -416,7 +408,7 @@ def check_disk_space(own: Storage, a_day: float | None, total: int, available: i
 
 
 def check_library_versions() -> list[Finding]:
-    """Check the version of each library against the requirements of this program."""
+    """Check the version of each installed library against the requirements of the program."""
     about, wrong, count = "libraries", [], 0
     for name, versions, optional in required_libraries():
         install = f'pip install "{name}{versions}"'
@@ -436,7 +428,7 @@ def check_library_versions() -> list[Finding]:
 
 
 def required_libraries() -> Iterator[tuple[str, str, bool]]:
-    """Yield the name, the versions and True if it is optional, for every library that is not only for tests."""
+    """Yield the name, the required versions and the optional flag of each library, except libraries for tests."""
     try:
         lines = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
@@ -450,14 +442,14 @@ def required_libraries() -> Iterator[tuple[str, str, bool]]:
             yield match[1], match[2].replace(" ", ""), extra is not None
 
 
-def version_satisfies(version: str, wanted: str) -> bool:
-    """Return True if a version is within bounds like ``>=0.41,<0.42``. Bounds of another kind are ignored.
+def version_satisfies(version: str, bounds: str) -> bool:
+    """Return True if a version is within bounds such as ``>=0.41,<0.42``. Other kinds of bounds are ignored.
 
     Parameters
     ----------
     version : str
         Version of the installed library.
-    wanted : str
+    bounds : str
         Bounds, separated by commas.
 
     Examples
@@ -466,12 +458,12 @@ def version_satisfies(version: str, wanted: str) -> bool:
     (True, False)
     """
     compare = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt, "==": operator.eq}
-    bounds = re.findall(r"(>=|<=|==|>|<)\s*([\d.]+)", wanted)
-    return all(compare[sign](_numbers(version), _numbers(bound)) for sign, bound in bounds)
+    pairs = re.findall(r"(>=|<=|==|>|<)\s*([\d.]+)", bounds)
+    return all(compare[sign](_numbers(version), _numbers(bound)) for sign, bound in pairs)
 
 
 def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
-    """Report foreign modules that Python would import in place of the packages of the program."""
+    """Check that no other module has the same name as a package of the program and is found first."""
     own = Path(__file__).resolve().parents[2]
     found = []
     for entry in module_path:
@@ -492,7 +484,6 @@ def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
 
 
 def _check_kernels() -> Finding:
-    """Check that the kernels are compiled and cached on disk."""
     from monitor.common.compiled import cache_folder
     from monitor.daemon.kernels.kernel_compilation import is_warm
     from monitor.daemon.kernels.kernel_parts import SERVICE
@@ -508,7 +499,7 @@ def _check_kernels() -> Finding:
 
 
 def check_clock() -> Finding:
-    """Check that the host clock is synchronised, because the times of results are taken from this clock."""
+    """Check that the system clock is synchronised, because the results contain times of the system clock."""
     state = _adjtimex()
     if state is None:
         return _doubt("clock", "the system does not report whether it is synchronised")
@@ -519,7 +510,6 @@ def check_clock() -> Finding:
 
 
 def _check_systemd_unit() -> list[Finding]:
-    """Check the state of the systemd unit, if it is installed."""
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
         return []
     command = ["systemctl", "show", UNIT, "--property=LoadState,ActiveState,SubState,NRestarts,UnitFileState"]
@@ -527,26 +517,27 @@ def _check_systemd_unit() -> list[Finding]:
         said = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False).stdout
     except (OSError, subprocess.TimeoutExpired) as error:
         return [_doubt("systemd", f"the state is unknown: {error}")]
-    return check_unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
+    return check_systemd_unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
 
 
-def check_unit_state(seen: Mapping[str, str]) -> list[Finding]:
-    """Return the findings for the output of ``systemctl show``; none if there is no such unit.
+def check_systemd_unit_state(unit_properties: Mapping[str, str]) -> list[Finding]:
+    """Return the findings about the properties that ``systemctl show`` printed, or an empty list without a unit.
 
     Examples
     --------
-    >>> check_unit_state({"LoadState": "not-found"})
+    >>> check_systemd_unit_state({"LoadState": "not-found"})
     []
     """
-    if seen.get("LoadState") != "loaded":
+    if unit_properties.get("LoadState") != "loaded":
         return []
-    active, restarts = seen.get("ActiveState", ""), seen.get("NRestarts", "0")
-    text = f"{UNIT}: {active} ({seen.get('SubState', '')}), {restarts} restarts, {seen.get('UnitFileState', '')}"
-    if active == "failed":
+    state, restarts = unit_properties.get("ActiveState", ""), unit_properties.get("NRestarts", "0")
+    enabled = unit_properties.get("UnitFileState", "")
+    text = f"{UNIT}: {state} ({unit_properties.get('SubState', '')}), {restarts} restarts, {enabled}"
+    if state == "failed":
         return [_wrong("systemd", text, f"journalctl -u {UNIT} -e shows the reason")]
-    if active != "active" or restarts != "0":
+    if state != "active" or restarts != "0":
         return [_doubt("systemd", text, f"journalctl -u {UNIT} -e; systemctl enable --now {UNIT}")]
-    if seen.get("UnitFileState") != "enabled":
+    if enabled != "enabled":
         return [_doubt("systemd", text, f"systemctl enable {UNIT}; otherwise it does not start with the machine")]
     return [_well("systemd", text)]
 
@@ -555,7 +546,6 @@ def check_unit_state(seen: Mapping[str, str]) -> list[Finding]:
 
 
 def _adjtimex() -> int | None:
-    """Return the state of the kernel clock; None if it cannot be read."""
     try:
         library = ctypes.CDLL(None, use_errno=True)
         question = ctypes.create_string_buffer(512)  # modes = 0: nothing is set
@@ -566,18 +556,16 @@ def _adjtimex() -> int | None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the first four numbers of a version. Missing numbers are 0."""
+    """Return the first four numbers of a version, filled with zeros."""
     numbers = [int(part) for part in re.split(r"[^\d.]", version)[0].split(".") if part]
     return (*numbers, 0, 0, 0, 0)[:4]
 
 
 def _gb(amount: float) -> str:
-    """Format a number of bytes in gigabytes."""
     return f"{amount / 1e9:.3g} GB"
 
 
 def _user(uid: int) -> str:
-    """Return the name of a user, or its number if it has no name."""
     import pwd
 
     try:
@@ -587,7 +575,6 @@ def _user(uid: int) -> str:
 
 
 def _group(gid: int) -> str:
-    """Return the name of a group, or its number if it has no name."""
     import grp
 
     try:

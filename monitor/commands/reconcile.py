@@ -1,11 +1,8 @@
-"""Command ``reconcile``: compares recordings with a noise model, in several threads, and writes the report.
+"""Command ``reconcile``: compares recordings with a noise model and writes the report.
 
-``DIR/`` receives ``report.html``, ``report.json``, ``model.toml`` and ``reconcile.rrd``. Each file is written
-completely or not at all. If the data do not support an answer, only ``report.json`` is written, and it states the
-reason. Kernels and transforms release the GIL, so that axes and simulated recordings are processed in parallel.
-
-Several recordings are compared with one model, one after the other. The report of each recording is written to a
-subfolder of ``DIR/``. The common results and the differences are written to ``DIR/`` itself.
+The report consists of ``report.html``, ``report.json``, ``model.toml`` and ``reconcile.rrd``. If the data do not
+support an answer, only ``report.json`` is written, with the reason. If several recordings are compared, the report of
+each recording is written to a subfolder.
 """
 
 import os
@@ -38,11 +35,11 @@ REPORT: Final = "report.json"
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
-    """Recording and model to compare."""
+class ReconciliationRequest:
+    """Recording, noise model and options of the command ``reconcile``."""
 
     recording: Path
-    model: NoiseModel | None  # None: the five noise terms are fitted to the recording
+    model: NoiseModel | None  # None fits the five noise terms to the recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None
@@ -52,24 +49,26 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class ComparisonRequest:
-    """Several recordings of one sensor, and the model to compare them with."""
+    """Several recordings of one sensor, the noise model, and the options of the command ``reconcile``."""
 
     recordings: tuple[Path, ...]
-    model: NoiseModel | None  # None: the five noise terms are fitted to the first recording
+    model: NoiseModel | None  # None fits the five noise terms to the first recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None
     last_s: float | None = None  # length of the end of each recording that is used; None for all
 
 
-def run_reconciliation(request: Request, tell: ProgressCallback = ignore_progress) -> Reconciliation:
-    """Compare one recording with a model and write the report.
+def run_reconciliation(
+    request: ReconciliationRequest, report_progress: ProgressCallback = ignore_progress
+) -> Reconciliation:
+    """Compare a recording with a noise model and write the report.
 
     Parameters
     ----------
-    request : Request
-        Recording and model to compare.
-    tell : callable, optional
+    request : ReconciliationRequest
+        Recording, noise model and options.
+    report_progress : callable, optional
         Progress callback.
 
     Raises
@@ -77,32 +76,34 @@ def run_reconciliation(request: Request, tell: ProgressCallback = ignore_progres
     RecordingError, ConfigError
         If the recording cannot be read, or if the folder cannot be written.
     NotReady
-        If the data do not support an answer. The report states the reason.
+        If the data do not support an answer.
     """
-    tell("reading", None)
+    report_progress("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     create_report_folder(request.out)
     try:
         recording, notes = _to_regular_grid(found)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            result = reconcile(recording, request.model, request.seed, pool.map, lambda what: tell(what, None))
+            result = reconcile(
+                recording, request.model, request.seed, pool.map, lambda what: report_progress(what, None)
+            )
     except NotReady as error:
         _write(request.out / REPORT, _encode_failure(str(error), len(found)))
         raise
     result = replace(result, notes=(*request.notes, *found.notes, *notes, *result.notes))
-    tell("writing", None)
+    report_progress("writing", None)
     _write_report(result, request.out, request.recording.name)
     return result
 
 
-def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = ignore_progress) -> Comparison:
-    """Compare several recordings with a model and with each other, and write the reports.
+def compare_recordings(request: ComparisonRequest, report_progress: ProgressCallback = ignore_progress) -> Comparison:
+    """Compare several recordings with a noise model and with each other, and write the reports.
 
     Parameters
     ----------
     request : ComparisonRequest
-        Recordings and model to compare.
-    tell : callable, optional
+        Recordings, noise model and options.
+    report_progress : callable, optional
         Progress callback.
 
     Raises
@@ -110,8 +111,7 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = igno
     RecordingError, ConfigError
         If a recording cannot be read or is given twice, or if the folder cannot be written.
     NotReady
-        If fewer than two recordings can be evaluated, or if no model is given and the first recording cannot be
-        evaluated.
+        If fewer than two recordings can be evaluated.
     """
     named = unique_recording_names(request.recordings)
     _check_recordings(named, request.out)
@@ -122,9 +122,11 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = igno
         notes = (
             (f"The model under test consists of the five noise terms of {fitted_to}.",) if fitted_to and at > 1 else ()
         )
-        one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s)
+        one = ReconciliationRequest(
+            path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s
+        )
         try:
-            result = run_reconciliation(one, _tell_for(tell, f"{name}, {at} of {len(named)}"))
+            result = run_reconciliation(one, _tell_for(report_progress, f"{name}, {at} of {len(named)}"))
         except NotReady as error:
             silent[name] = str(error)
             if model is None:
@@ -137,14 +139,13 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = igno
         why = f"at least two recordings are needed for a comparison, but only {len(runs)} can be evaluated: {why}"
         _write(request.out / REPORT, _encode_failure(why, 0, comparison_report.SCHEMA))
         raise NotReady(why)
-    tell("writing", None)
+    report_progress("writing", None)
     comparison = compare_results(runs, fitted_to, silent)
     _write_comparison(comparison, request.out)
     return comparison
 
 
 def _write_comparison(result: Comparison, folder: Path) -> None:
-    """Write the report on all recordings together."""
     from monitor.publishing.reports.comparison_page import render_page
 
     _write(folder / REPORT, comparison_report.encode_comparison(result))
@@ -153,7 +154,9 @@ def _write_comparison(result: Comparison, folder: Path) -> None:
 
 
 def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:
-    """Return a unique name for each recording: the file name without its suffix, and a number if names are equal.
+    """Return a unique name for each recording.
+
+    The name is the file name without the suffix. A number is added if two file names are equal.
 
     Raises
     ------
@@ -178,7 +181,7 @@ def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:
 
 
 def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
-    """Check before the work begins that all recordings exist and that no report would overwrite a recording."""
+    """Check that all recordings exist and that no report would overwrite a recording."""
     for path in named.values():
         if not path.exists():
             raise RecordingError(f"{path}: cannot be read: there is no such file or folder")
@@ -189,12 +192,11 @@ def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
 
 
 def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
-    """Return a progress callback that adds the name of a recording."""
+    """Return a progress callback that adds the name of a recording to each message."""
     return lambda what, share: tell(f"{which}: {what}", share)
 
 
 def _write_report(result: Reconciliation, folder: Path, title: str) -> None:
-    """Write the four files of a report."""
     from monitor.publishing.reports.reconcile_page import render_page
 
     _write(folder / REPORT, encode_report(result))
@@ -209,7 +211,7 @@ def _write_report(result: Reconciliation, folder: Path, title: str) -> None:
 
 
 def _encode_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
-    """Return the content of ``report.json`` for data that do not support an answer."""
+    """Return the content of ``report.json`` if the data do not support an answer."""
     return msgspec.json.encode({"schema": schema, "verdict": None, "why": why, "samples": samples})
 
 
@@ -228,13 +230,12 @@ def create_report_folder(folder: Path) -> None:
 
 
 def _to_regular_grid(found: Samples) -> tuple[Recording, list[str]]:
-    """Return the axes of the recording on a regular time grid, and notes about the resampling."""
+    """Return the recording on a regular time grid, and notes about the resampling."""
     values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     columns = {axis: np.ascontiguousarray(values[:, AXES.index(axis)], np.float64) for axis in found.axes}
     return Recording(columns, rate_hz, temperature_c), notes
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file completely or not at all."""
     with atomic_write_path(path) as place:
         place.write_bytes(data)

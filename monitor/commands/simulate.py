@@ -1,11 +1,8 @@
 """Command ``simulate``: writes a recording of a noise model.
 
-The time series is drawn and written block by block, so that the memory does not grow with the length. The file has the
-column ``t`` (seconds from 0, at the nominal rate) and the axes that the model names. Other axes are absent, not zero.
-The column ``temperature`` is present if the model or a recording provides it.
-
-Recording and truth file are each written completely or not at all. The truth file contains the model, the seed, and
-random values such as the times of events.
+The samples are simulated and written in blocks, so that the required memory does not depend on the length. The
+recording contains only the axes of the noise model. The truth file contains the noise model, the seed, and random
+values such as the times of events.
 """
 
 import tomllib
@@ -32,22 +29,22 @@ CHUNK_ROWS: Final = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
-    """Recording to simulate."""
+class SimulationRequest:
+    """Noise model, output file and options of the command ``simulate``."""
 
     model: NoiseModel
     out: Path
     seconds: float
     seed: int
     rate_hz: float | None = None  # None for the rate of the model
-    temperature_from: Path | None = None  # recording whose temperature replaces that of the model
-    truth: bool = False  # True if a file with the drawn random values is also written
+    temperature_from: Path | None = None  # recording from which the temperature is taken
+    truth: bool = False  # True to write a file with the drawn random values
     name: str = "the model"  # name of the model in messages
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
-    """Description of the written recording."""
+class SimulationResult:
+    """Description of the simulated recording."""
 
     out: Path
     samples: int
@@ -58,28 +55,28 @@ class Result:
     truth: Path | None
 
     @property
-    def seconds(self) -> float:
-        """Length of the recording in seconds."""
+    def duration_s(self) -> float:
+        """Return the length of the recording in seconds."""
         return self.samples / self.rate_hz
 
-    def text(self) -> str:
-        """Return the description in one line of text."""
+    def describe_in_one_line(self) -> str:
+        """Return a description of the recording in one line."""
         columns = " ".join([*self.axes, *(["temperature"] if self.temperature else [])])
         beside = f"; truth in {self.truth}" if self.truth else ""
         return (
-            f"{self.out}: {self.samples} samples at {self.rate_hz:g} Hz, {self.seconds:.6g} s, "
+            f"{self.out}: {self.samples} samples at {self.rate_hz:g} Hz, {self.duration_s:.6g} s, "
             f"seed {self.seed}: {columns}{beside}"
         )
 
     def to_json(self) -> bytes:
-        """Return the description as JSON."""
+        """Return the description of the recording as JSON."""
         return msgspec.json.encode(
             {
                 "schema": RESULT_SCHEMA,
                 "out": str(self.out),
                 "samples": self.samples,
                 "rate": self.rate_hz,
-                "seconds": self.seconds,
+                "seconds": self.duration_s,
                 "seed": self.seed,
                 "axes": self.axes,
                 "temperature": self.temperature,
@@ -88,25 +85,25 @@ class Result:
         )
 
 
-def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -> Result:
-    """Simulate a recording and write it.
+def run_simulation(request: SimulationRequest, report_progress: ProgressCallback = ignore_progress) -> SimulationResult:
+    """Simulate a recording and write the recording to a file.
 
     Parameters
     ----------
-    request : Request
-        Recording to simulate.
-    tell : callable, optional
+    request : SimulationRequest
+        Noise model, output file and options.
+    report_progress : callable, optional
         Progress callback.
 
     Returns
     -------
-    Result
+    SimulationResult
         Description of the written recording.
 
     Raises
     ------
     ConfigError
-        If there is no rate or no axis, if the model cannot be simulated at this rate, or if the file cannot be written.
+        If the sample rate is unknown, if the noise model cannot be simulated, or if the file cannot be written.
     RecordingError
         If the recording with the temperature cannot be read.
     """
@@ -119,7 +116,7 @@ def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -
     axes = tuple(axis for axis in AXES if axis in request.model.effects)
     if not axes:
         raise ConfigError(f"{request.name}: the model has no axis; possible are {' '.join(AXES)}")
-    tell("preparing", None)
+    report_progress("preparing", None)
     temperature_c = _temperature(request, rate_hz, n)
     try:
         stream = request.model.start_stream(rate_hz, request.seed, temperature_c)
@@ -128,18 +125,17 @@ def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -
     first = stream.draw_samples_with_temperature(min(n, CHUNK_ROWS))
     temperature = not bool(np.isnan(first.temperature_c).all())
     truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
-    result = Result(request.out, n, rate_hz, request.seed, axes, temperature, truth)
+    result = SimulationResult(request.out, n, rate_hz, request.seed, axes, temperature, truth)
     if truth is None:
-        _write(result, stream, first, tell)
+        _write(result, stream, first, report_progress)
     else:
         with atomic_write_path(truth) as part:
-            _write(result, stream, first, tell)
+            _write(result, stream, first, report_progress)
             part.write_bytes(_truth(result, request.model, stream))
     return result
 
 
-def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: ProgressCallback) -> None:
-    """Write the recording block by block."""
+def _write(result: SimulationResult, stream: ModelStream, first: SimulatedSamples, tell: ProgressCallback) -> None:
     with open_recording_writer(result.out, result.axes, result.temperature) as append:
         block, written = first, 0
         while True:
@@ -152,18 +148,17 @@ def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: P
         tell("finishing the file", None)  # some formats are compressed only at the end
 
 
-def _rate_hz(request: Request) -> float:
-    """Return the requested sample rate, or else the rate of the model."""
+def _rate_hz(request: SimulationRequest) -> float:
     rate_hz = request.rate_hz or request.model.sample_rate_hz
     if rate_hz is None:
         raise ConfigError(f"{request.name}: the model has no sample_rate; set the rate with --rate HZ")
     return rate_hz
 
 
-def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
-    """Return the temperature of the recording at the times of the samples, [≤ n] in °C, by linear interpolation.
+def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats | None:
+    """Return the temperature [≤ n] in °C, interpolated to the times of the simulated samples.
 
-    None means that the temperature of the model is used.
+    The result is None if no recording with a temperature is given.
     """
     if request.temperature_from is None:
         return None
@@ -179,7 +174,7 @@ def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
 
 
 def _load_recording(path: Path, rate_hz: float | None) -> Recording:
-    """Load the recording with the temperature. If it has no rate, its rows are assumed to have the requested rate."""
+    """Load the recording of the temperature. The requested sample rate is used if the recording has none."""
     try:
         return load_samples(path)
     except ConfigError:
@@ -188,8 +183,7 @@ def _load_recording(path: Path, rate_hz: float | None) -> Recording:
         return load_samples(path, rate_hz)
 
 
-def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
-    """Return the truth as JSON."""
+def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> bytes:
     return msgspec.json.encode(
         {
             "schema": TRUTH_SCHEMA,
@@ -197,7 +191,7 @@ def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
             "model": tomllib.loads(model.to_toml()),
             "seed": result.seed,
             "rate": result.rate_hz,
-            "seconds": result.seconds,
+            "seconds": result.duration_s,
             "samples": result.samples,
             "axes": result.axes,
             "drawn": stream.drawn_random_values(),
@@ -206,7 +200,6 @@ def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
 
 
 def _version() -> str | None:
-    """Return the version of this program; None if it runs from a folder without installation."""
     try:
         return version("imu-monitor")
     except PackageNotFoundError:

@@ -1,7 +1,6 @@
 """Commands ``thermal fit`` and ``thermal predict``: fit thermal models to a recording, and predict the bias of another.
 
-If an axis cannot be fitted or predicted, the reason is reported, and the remaining axes are processed. The model file
-is JSON. ``predict`` reads the file that ``fit`` writes.
+If a model of an axis cannot be fitted or used, the reason is reported, and the remaining axes are processed.
 """
 
 from collections.abc import Mapping
@@ -25,7 +24,7 @@ from monitor.drift.thermal.thermal_results import (
     ThermalFitReport,
     ThermalPredictionReport,
     choose_interval_s,
-    compare_with_means,
+    compare_model_with_means,
 )
 from monitor.estimation.regular_grid import resample_with_temperature
 
@@ -45,7 +44,7 @@ class _AxisModelRecord(msgspec.Struct):
     covariance: list[list[float]]
     temperature: tuple[float, float]
     equation: dict[str, list[float] | float] | None = None
-    """Model in a form for other programs. ``from_file`` does not read it."""
+    """Difference equation for other programs. ``read_model_file`` ignores the difference equation."""
 
 
 class _ModelFile(msgspec.Struct):
@@ -56,7 +55,7 @@ class _ModelFile(msgspec.Struct):
     axes: dict[str, _AxisModelRecord]
 
 
-def fit_recording(
+def fit_thermal_models(
     recording: Path, interval_s: float | None = None, rate_hz: float | None = None, last_s: float | None = None
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
@@ -66,7 +65,7 @@ def fit_recording(
     recording : Path
         Recording with temperature.
     interval_s : float, optional
-        Length of an interval in seconds. By default, the length is derived from the length of the recording.
+        Length of an interval in seconds. By default, the interval is about 1/72 of the recording.
     rate_hz : float, optional
         Sample rate, if the recording has none.
     last_s : float, optional
@@ -88,10 +87,10 @@ def fit_recording(
     return ThermalFitReport(recording.name, interval, means, fits, refused, notes)
 
 
-def predict_recording(
+def predict_bias_of_recording(
     recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None, last_s: float | None = None
 ) -> ThermalPredictionReport:
-    """Predict the bias of a recording with thermal models of an earlier recording.
+    """Predict the bias of a recording with thermal models that were fitted to an earlier recording.
 
     Parameters
     ----------
@@ -115,21 +114,21 @@ def predict_recording(
     for axis, one in means.items():
         if axis not in models:
             refused[axis] = "the model file has no model of this axis"
-        elif one.known.sum() < 2:
+        elif one.both_known.sum() < 2:
             refused[axis] = f"fewer than two intervals of {interval:g} s"
         else:
-            judged[axis] = compare_with_means(models[axis], one)
+            judged[axis] = compare_model_with_means(models[axis], one)
     return ThermalPredictionReport(recording.name, interval, means, judged, refused, notes)
 
 
-def encode_model_file(study: ThermalFitReport) -> bytes:
-    """Return the content of the model file with all axes that were fitted."""
-    rows = {axis: _row(one.model) for axis, one in study.fits.items()}
-    return msgspec.json.format(msgspec.json.encode(_ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
+def encode_model_file(report: ThermalFitReport) -> bytes:
+    """Return the content of the model file with the thermal models of all fitted axes."""
+    rows = {axis: _row(one.model) for axis, one in report.fits.items()}
+    return msgspec.json.format(msgspec.json.encode(_ModelFile(SCHEMA, report.interval_s, rows)), indent=1)
 
 
 def read_model_file(path: Path) -> dict[str, ThermalModel]:
-    """Read the model of each axis from a file or pipe.
+    """Read the thermal model of each axis from a model file.
 
     Raises
     ------
@@ -154,7 +153,6 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
 
 
 def _row(model: ThermalModel) -> _AxisModelRecord:
-    """Return a model in the form of the model file."""
     return _AxisModelRecord(
         powers=model.shape.powers,
         time_constants=list(model.shape.constants_s),
@@ -170,7 +168,6 @@ def _row(model: ThermalModel) -> _AxisModelRecord:
 
 
 def _model(path: Path, axis: str, row: _AxisModelRecord, interval_s: float) -> ThermalModel:
-    """Check the model of one axis in a model file, and return it."""
     k = len(row.time_constants)
     terms = 1 + row.powers + k
     size = terms + 2 * k
@@ -216,7 +213,7 @@ def _model(path: Path, axis: str, row: _AxisModelRecord, interval_s: float) -> T
 def _read_interval_means(
     recording: Path, interval_s: float | None, rate_hz: float | None, last_s: float | None
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
-    """Return the interval means of each recorded axis, and the notes about the recording."""
+    """Return the interval means of each recorded axis, and notes about the recording."""
     found = load_samples(recording, rate_hz, last_s)
     values, temperature_c, rate, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():

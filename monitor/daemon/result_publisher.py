@@ -146,14 +146,14 @@ class ResultPublisher:
         while at < len(samples):
             piece = samples[at : at + live.compensator.samples_to_interval_end]
             at += len(piece)
-            compensated = live.update(piece)
+            compensated = live.compensate_block(piece)
             self.pipeline.update_drift_models()
             offsets_ns = self.timeline.offsets_ns(compensated)
             for output in self.outputs:
                 output.publish_compensated_samples(
                     self.device.name, self.published - len(samples) + at, compensated, offsets_ns
                 )
-        for drift in live.take_updates():
+        for drift in live.take_drift_updates():
             self._result(drift.t_ns, drift)
 
     def _refit(self) -> None:

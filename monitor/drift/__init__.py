@@ -1,1 +1,1 @@
-"""Drift of the bias: models of bias against temperature, and compensation of gyro drift while the carrier moves."""
+"""Bias drift: models of the bias against temperature, and compensation of the gyro drift."""

@@ -34,7 +34,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.recordings import save_samples
-from monitor.commands.reconcile import Request, run_reconciliation
+from monitor.commands.reconcile import ReconciliationRequest, run_reconciliation
 from monitor.common import shipped_config_paths as shipped_file_paths
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
@@ -442,7 +442,7 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
         assert rate_hz is not None
         n = round(HOUR_S * rate_hz)
         save_samples(source, np.arange(n) / rate_hz, model.simulate(n, rate_hz, 1), None)
-    return run_reconciliation(Request(source, read_model(MODEL), folder / "result")).axes["gz"]
+    return run_reconciliation(ReconciliationRequest(source, read_model(MODEL), folder / "result")).axes["gz"]
 
 
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:

@@ -65,7 +65,7 @@ PROGRAM = """
         while one.step_slow_statistics() is None:
             pass
     gyro.bias_standard_error
-    thermal_response.first_order_lag(values[:, 0].copy(), 0.5)
+    thermal_response.apply_first_order_lag(values[:, 0].copy(), 0.5)
     print(json.dumps([before, compiled(), len(found)]))
 """
 

@@ -8,7 +8,7 @@ import zenoh
 from drivers.data_types import concatenate_blocks
 from drivers.recordings import load_samples, save_samples
 from drivers.zenoh.sample_message import SampleMessage, decode_samples
-from monitor.commands.compensate import Request, run_compensation
+from monitor.commands.compensate import CompensationRequest, run_compensation
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 from tests.support.zenoh_sessions import patient_file, session
@@ -58,7 +58,7 @@ def test_rates_come_out_without_drift_live_as_offline(tmp_path: Path) -> None:
 
         wait_for(last_batch, "the last batch over zenoh")
     rates = concatenate_blocks(caught.rates["bench-1"])
-    run_compensation(Request(recording, tmp_path / "out.npz"))
+    run_compensation(CompensationRequest(recording, tmp_path / "out.npz"))
     offline = load_samples(tmp_path / "out.npz")
     np.testing.assert_allclose(rates.values, offline.values, rtol=0.0, atol=1e-12)
     assert np.sqrt(np.mean((rates.values[turning, 1] - truth) ** 2)) < 1.05 * SIGMA

@@ -1,4 +1,4 @@
-"""Messages and exit statuses for the errors that end a command."""
+"""Error messages and exit statuses of the commands."""
 
 import contextlib
 import os
@@ -21,20 +21,20 @@ NO_ANSWER: Final = 3
 INTERRUPTED: Final = 128 + signal.SIGINT
 DEBUG: Final = "--debug"
 MAX_CAUSE_CHARACTERS: Final = 300
-"""Maximum length of the text of an unexpected error. Libraries may write pages."""
+"""Maximum length of the text of an unexpected error, because libraries may produce very long texts."""
 
 
 @contextlib.contextmanager
-def name_option(option: str) -> Iterator[None]:
-    """Put the name of an option in front of the message of a ConfigError."""
+def name_option_in_config_errors(option: str) -> Iterator[None]:
+    """Add the name of an option at the beginning of the message of a ConfigError."""
     try:
         yield
     except ConfigError as error:
         raise ConfigError(f"{option}: {error}") from None
 
 
-def message_and_status(error: Exception) -> tuple[str, int]:
-    """Return the message and the exit status for an error that ended a command."""
+def error_message_and_exit_status(error: Exception) -> tuple[str, int]:
+    """Return the error message and the exit status for an error that ended a command."""
     match error:
         case TyperException():
             return sanitize_error_text(_usage(error)), WRONG
@@ -59,13 +59,12 @@ def message_and_status(error: Exception) -> tuple[str, int]:
 
 
 def _cause(error: Exception) -> str:
-    """Return the text of an error in one line of limited length."""
     text = " ".join(sanitize_error_text(str(error)).split())
     return text if len(text) <= MAX_CAUSE_CHARACTERS else f"{text[:MAX_CAUSE_CHARACTERS]} …"
 
 
 def _system_error(error: OSError) -> str:
-    """Return the text of a system error. A missing working directory has a special message."""
+    """Return the text of a system error, with a special text if the working directory is missing."""
     if error.filename is None:
         try:
             os.getcwd()
@@ -75,7 +74,7 @@ def _system_error(error: OSError) -> str:
 
 
 def _usage(error: TyperException) -> str:
-    """Return an error message that names the missing arguments, or the possible values of a wrong argument."""
+    """Return an error message with the missing arguments, or with the possible values of a wrong argument."""
     text, context = error.format_message(), getattr(error, "ctx", None)
     if isinstance(error, typer.BadParameter) and error.param is not None and not error.message:
         option: Any = error.param

@@ -1,5 +1,4 @@
-"""Command-line options that several commands share, and parsers for option values such as durations. Error messages
-name the option."""
+"""Command-line options that several commands share, and functions that parse the values of options."""
 
 import sys
 from collections.abc import Callable
@@ -19,7 +18,7 @@ from drivers.number_ranges import (
     Number,
     NumberRange,
 )
-from monitor.cli.shared.errors import name_option
+from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
     from monitor.drift.compensation.arma import Order
@@ -29,22 +28,22 @@ if TYPE_CHECKING:
 MAX_AVERAGING_TIMES: Final = 1000
 
 
-def range_callback(quantity: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
-    """Return a typer callback that checks the value of an option against the range of a quantity.
+def make_range_callback(allowed_range: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
+    """Return a typer callback that checks whether the value of an option is within the allowed range.
 
     Raises
     ------
     ConfigError
-        If the value is outside the supported range. The message begins with the name of the option.
+        If the value of the option is outside the supported range.
     """
 
-    def check(option: typer.CallbackParam, value: Number | None) -> Number | None:
+    def check_option_value(option: typer.CallbackParam, value: Number | None) -> Number | None:
         if value is not None:
-            with name_option(option.opts[0]):
-                quantity.check(value)
+            with name_option_in_config_errors(option.opts[0]):
+                allowed_range.check(value)
         return value
 
-    return check
+    return check_option_value
 
 
 Viewer = Annotated[
@@ -63,35 +62,37 @@ Rate = Annotated[
     typer.Option(
         metavar="HZ",
         help="Sample rate for a recording that has neither times nor a rate.",
-        callback=range_callback(RATE_HZ),
+        callback=make_range_callback(RATE_HZ),
     ),
 ]
 ModelRate = Annotated[
     float | None,
-    typer.Option(metavar="HZ", help="Sample rate; by default that of the model.", callback=range_callback(RATE_HZ)),
+    typer.Option(
+        metavar="HZ", help="Sample rate; by default that of the model.", callback=make_range_callback(RATE_HZ)
+    ),
 ]
 Seconds = Annotated[
-    float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=range_callback(RUN_TIME_S))
+    float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=make_range_callback(RUN_TIME_S))
 ]
 SimulationSeed = Annotated[
     int,
     typer.Option(
-        metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=range_callback(SEED)
+        metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=make_range_callback(SEED)
     ),
 ]
 ReportSeed = Annotated[
     int,
     typer.Option(
-        metavar="N", help="Seed of the random numbers: same seed, same report.", callback=range_callback(SEED)
+        metavar="N", help="Seed of the random numbers: same seed, same report.", callback=make_range_callback(SEED)
     ),
 ]
 Inflation = Annotated[
-    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=range_callback(INFLATION))
+    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=make_range_callback(INFLATION))
 ]
 TimeStep = Annotated[
     float | None,
     typer.Option(
-        metavar="S", help="kalman: time step; by default the sample period.", callback=range_callback(DURATION_S)
+        metavar="S", help="kalman: time step; by default the sample period.", callback=make_range_callback(DURATION_S)
     ),
 ]
 CorrelationTime = Annotated[
@@ -99,7 +100,7 @@ CorrelationTime = Annotated[
     typer.Option(
         metavar="S",
         help="kalman: correlation time of the process that represents B.",
-        callback=range_callback(DURATION_S),
+        callback=make_range_callback(DURATION_S),
     ),
 ]
 Last = Annotated[
@@ -108,7 +109,7 @@ Last = Annotated[
 
 
 def parse_averaging_times(text: str) -> "TauGrid":
-    """Parse averaging times: the name of a grid, or a list of seconds.
+    """Parse the averaging times of the option ``--tau``: the name of a grid, or a list of times in seconds.
 
     Raises
     ------
@@ -125,7 +126,7 @@ def parse_averaging_times(text: str) -> "TauGrid":
         ) from None
     if len(listed) > MAX_AVERAGING_TIMES:
         raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
-    with name_option("--tau"):
+    with name_option_in_config_errors("--tau"):
         for tau_s in listed:
             AVERAGING_TIME_S.check(tau_s)
     return listed
@@ -138,14 +139,14 @@ def parse_duration(option: str, text: None) -> None: ...
 @overload
 def parse_duration(option: str, text: str | None) -> float | None: ...
 def parse_duration(option: str, text: str | None) -> float | None:
-    """Parse a duration such as "90", "30min" or "1h", and return seconds.
+    """Parse a duration such as "90", "30min" or "1h", and return the duration in seconds.
 
     Parameters
     ----------
     option : str
         Name of the option, for the message.
     text : str or None
-        Duration. None is returned as None.
+        Text of the duration. If None, the function returns None.
 
     Raises
     ------
@@ -156,13 +157,13 @@ def parse_duration(option: str, text: str | None) -> float | None:
 
     duration_s = None
     if text is not None:
-        with name_option(option):
+        with name_option_in_config_errors(option):
             duration_s = seconds(text)
     return duration_s
 
 
 def parse_arma_order(text: str | None) -> "Order | None":
-    """Parse the orders p and q of an ARMA model.
+    """Parse the orders p and q of an ARMA model, for example "2,1".
 
     Raises
     ------

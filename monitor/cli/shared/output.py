@@ -1,4 +1,4 @@
-"""Output of commands: results on standard output or in files, and progress on a terminal."""
+"""Output of the commands: results on standard output or in files, and a progress bar in the terminal."""
 
 import contextlib
 import sys
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
-    """Check the name and the folder of an output file, before the work begins.
+    """Check the suffix and the folder of an output file before the results are computed.
 
     Parameters
     ----------
@@ -38,8 +38,8 @@ def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
         raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
 
 
-def write_bytes(option: str, path: Path, data: bytes) -> None:
-    """Write bytes to a file, or to standard output if the path is ``-``.
+def write_file_or_stdout(option: str, path: Path, data: bytes) -> None:
+    """Write data to a file, or to standard output if the path is ``-``.
 
     Parameters
     ----------
@@ -66,8 +66,8 @@ def write_bytes(option: str, path: Path, data: bytes) -> None:
 
 
 @contextlib.contextmanager
-def show_progress() -> Iterator[ProgressCallback]:
-    """Show a progress bar if the output is a terminal, and yield the callback that updates the bar."""
+def show_progress_bar() -> Iterator[ProgressCallback]:
+    """Show a progress bar if the output is a terminal, and yield the callback that updates the progress bar."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -80,15 +80,16 @@ def show_progress() -> Iterator[ProgressCallback]:
         yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
 
 
-def compile_analysis_kernels(tell: ProgressCallback) -> None:
-    """Compile the kernels for the analysis of recordings in parallel, if they are not in the cache on disk."""
+def compile_analysis_kernels(report_progress: ProgressCallback) -> None:
+    """Compile the numerical kernels for the analysis of recordings, if the cache on disk does not contain the
+    kernels."""
     from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
     for group in kernel_parts.GROUPS:
         if not kernel_compilation.is_warm(group):
-            with contextlib.suppress(OSError):  # without a cache on disk, each kernel is compiled at its first call
+            with contextlib.suppress(OSError):  # without a cache, kernels are compiled at the first call
                 for _ in kernel_compilation.prepare_kernels(
-                    group, lambda progress: tell(str(progress), progress.share)
+                    group, lambda progress: report_progress(str(progress), progress.share)
                 ):
                     pass
 

@@ -1,7 +1,6 @@
-"""Service in a terminal: live table, log lines, and the signals that stop the service.
+"""Run the service in a terminal, with a live table, log lines and signal handlers.
 
-Table and log are written by threads (``QueuedWriter``). A blocked terminal or pipe therefore delays neither samples nor
-the end of the process.
+A separate thread writes to the terminal, so that a blocked terminal or pipe does not delay the processing of samples.
 """
 
 import contextlib
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
 
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
-from monitor.cli.shared.errors import name_option
+from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
     from collections.abc import MutableMapping
@@ -28,16 +27,18 @@ STDOUT: Final = "standard output"
 STDERR: Final = "standard error"
 
 
-def run_service(config: "Config", seconds: float | None, viewer: str | None) -> None:
-    """Run the service, with a live table in a terminal, or else with log lines and the final table at the end.
+def run_service(config: "Config", seconds: float | None, viewer_mode: str | None) -> None:
+    """Run the service with a live table in a terminal, or with log lines if standard output is not a terminal.
+
+    Without a terminal, the final table is printed when the service ends.
 
     Parameters
     ----------
     config : Config
         Configuration to run.
     seconds : float or None
-        Duration in seconds. If None, the service runs until a signal or the end of all replays.
-    viewer : str or None
+        Duration in seconds. If None, the service runs until a signal is received or all replays have ended.
+    viewer_mode : str or None
         Viewer mode that replaces the mode of the configuration.
 
     Raises
@@ -45,7 +46,7 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
     ConfigError
         If the viewer mode or a device cannot be used.
     OSError
-        If the run ended without a signal, and the final table could not be written to a file or pipe.
+        If the final table could not be written to a file or pipe, and no signal ended the service.
     """
     import threading
 
@@ -60,7 +61,7 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
     unit = SystemdNotifier.from_environment(os.environ)
-    config = _with_viewer(config, viewer)
+    config = _with_viewer(config, viewer_mode)
     console, board, asked = Console(file=sys.stdout), DeviceStates(), threading.Event()
     table, terminal = LiveTable(console), console.is_terminal
     screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
@@ -96,7 +97,7 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
 
 
 def _table_error(screen: "QueuedWriter", unread: bool) -> Exception | None:
-    """Return the reason why the final table has not been written to standard output, or None if it has."""
+    """Return the error that prevented the output of the final table, or None."""
     from monitor.publishing.terminal.queued_writer import CLOSE_S
 
     if unread:
@@ -110,9 +111,14 @@ def _table_error(screen: "QueuedWriter", unread: bool) -> Exception | None:
 
 
 def run_fleet_viewer(
-    keyexpr: str, connect: Sequence[str], file: Path | None, detail: Sequence[str], mode: str, seconds: float | None
+    keyexpr: str,
+    connect: Sequence[str],
+    zenoh_file: Path | None,
+    detailed_devices: Sequence[str],
+    viewer_mode: str,
+    seconds: float | None,
 ) -> None:
-    """Run the viewer of a fleet until a signal, and print its address and its errors on standard error.
+    """Show several daemons in the viewer until a signal is received.
 
     Parameters
     ----------
@@ -120,14 +126,14 @@ def run_fleet_viewer(
         Zenoh key expression of the daemons.
     connect : sequence of str
         Zenoh endpoints to connect to.
-    file : Path or None
+    zenoh_file : Path or None
         Zenoh configuration file.
-    detail : sequence of str
+    detailed_devices : sequence of str
         Devices that are shown with samples and Allan deviations.
-    mode : str
+    viewer_mode : str
         Viewer mode.
     seconds : float or None
-        Duration in seconds. If None, the viewer runs until a signal.
+        Duration in seconds. If None, the viewer runs until a signal is received.
 
     Raises
     ------
@@ -143,11 +149,11 @@ def run_fleet_viewer(
     from monitor.publishing.zenoh.subscriber import ZenohSubscriber
     from monitor.settings import loading
 
-    with name_option("--viewer"):
-        loading.check_viewer_mode(mode)
-    keys = tuple(dict.fromkeys(full_device_key(device, keyexpr) for device in detail))
-    arriving = ZenohSubscriber(keyexpr, connect, file, keys)
-    rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
+    with name_option_in_config_errors("--viewer"):
+        loading.check_viewer_mode(viewer_mode)
+    keys = tuple(dict.fromkeys(full_device_key(device, keyexpr) for device in detailed_devices))
+    arriving = ZenohSubscriber(keyexpr, connect, zenoh_file, keys)
+    rerun = RerunView(ViewerSettings(mode=viewer_mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
     stop = threading.Event()
     install_signal_handlers(stop.set)
 
@@ -161,15 +167,15 @@ def run_fleet_viewer(
         FleetView(arriving, rerun, keys).run(stop, say, seconds)
 
 
-def with_history_span(config: "Config", history_s: float | None) -> "Config":
-    """Return the configuration with another length of the history in the viewer.
+def with_viewer_history_length(config: "Config", history_s: float | None) -> "Config":
+    """Return a copy of the configuration with another length of the history in the viewer.
 
     Parameters
     ----------
     config : Config
         Configuration.
     history_s : float or None
-        Length of the history in seconds. None keeps the value of the configuration.
+        Length of the history in seconds. None keeps the configured length.
 
     Raises
     ------
@@ -186,23 +192,23 @@ def with_history_span(config: "Config", history_s: float | None) -> "Config":
 
 
 def _with_viewer(config: "Config", viewer: str | None) -> "Config":
-    """Return the configuration with another viewer mode; None keeps the mode."""
+    """Return a copy of the configuration with another viewer mode. None keeps the configured mode."""
     import dataclasses
 
     from monitor.settings import loading
 
     if viewer is None:
         return config
-    with name_option("--viewer"):
+    with name_option_in_config_errors("--viewer"):
         loading.check_viewer_mode(viewer)
     return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"mode": viewer}))
 
 
 @contextlib.contextmanager
 def _stderr_through(writer: "QueuedWriter") -> Iterator[None]:
-    """Start a writer and redirect standard error to it, for log lines, warnings and tracebacks of threads.
+    """Redirect standard error to a writer thread.
 
-    If the writer is still blocked at the end, standard error is detached, so that the process can end.
+    If the writer thread is still blocked at the end, standard error is redirected to the null device.
     """
     from monitor.publishing.terminal.queued_writer import (
         QueuedLines,
@@ -230,29 +236,26 @@ def _same_file(one: TextIO | None, other: TextIO | None) -> bool:
 
 
 def _warn(text: str) -> None:
-    """Log a message of a writer as a warning."""
     import structlog
 
     structlog.get_logger("imu-monitor").warning("log", text=text)
 
 
 class _ErrorStream(io.TextIOBase):
-    """Text stream for the log that forwards to standard error and drops lines that cannot be written."""
+    """Text stream that writes to the current standard error and ignores write errors."""
 
     def write(self, text: str) -> int:
-        """Write text, or drop it if the disk is full or the reader has gone."""
+        """Write text to standard error. Errors such as a full disk are ignored."""
         with contextlib.suppress(OSError):
             sys.stderr.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush standard error, if it can be written."""
         with contextlib.suppress(OSError):
             sys.stderr.flush()
 
 
 def _configure_logging(config: "Config") -> None:
-    """Configure structlog to write structured lines to standard error."""
     import structlog
 
     from monitor.daemon.operations.log_level import set_log_level
@@ -272,38 +275,38 @@ def _configure_logging(config: "Config") -> None:
 
 
 def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]") -> "MutableMapping[str, Any]":
-    """Mask credentials in every text of a log line."""
     return {key: mask_secrets(value) if isinstance(value, str) else value for key, value in line.items()}
 
 
-def install_signal_handlers(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:
-    """Install the signal handlers of a session.
+def install_signal_handlers(stop: Callable[[], None], on_hangup: Callable[[], None] | None = None) -> None:
+    """Install the handlers of SIGINT, SIGTERM and SIGHUP.
 
-    The first SIGINT or SIGTERM calls ``stop``. A second SIGINT ends the process at once. SIGHUP calls ``hung_up``.
+    The first SIGINT or SIGTERM calls ``stop``. A second SIGINT ends the process immediately. SIGHUP calls
+    ``on_hangup``.
 
     Parameters
     ----------
     stop : callable
-        Starts an orderly stop.
-    hung_up : callable, optional
-        Handles SIGHUP. By default SIGHUP keeps its present handler.
+        Function that starts an orderly shutdown.
+    on_hangup : callable, optional
+        Function that handles SIGHUP. By default, the handler of SIGHUP is not changed.
     """
     import threading
 
-    def first(number: int, _frame: Any) -> None:
+    def handle_first_signal(number: int, _frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # a separate thread is needed, because the main thread may hold the lock of the event that stop sets
+        # Another thread calls ``stop``, because the main thread may hold the lock of the event that ``stop`` sets.
         threading.Thread(target=stop, name="stop", daemon=True).start()
 
-    signal.signal(signal.SIGINT, first)
-    signal.signal(signal.SIGTERM, first)
-    if hung_up is not None:
-        call = hung_up  # runs in a thread for the same reason
+    signal.signal(signal.SIGINT, handle_first_signal)
+    signal.signal(signal.SIGTERM, handle_first_signal)
+    if on_hangup is not None:
+        call = on_hangup
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=call, name="hung up", daemon=True).start())
 
 
 def exit_on_sigterm() -> None:
-    """Let SIGTERM end a command as Ctrl-C does, so that incomplete files are removed."""
+    """Exit on SIGTERM in the same way as on Ctrl-C, so that incomplete files are removed."""
 
     def ended(_number: int, _frame: Any) -> NoReturn:
         sys.exit(128 + signal.SIGTERM)

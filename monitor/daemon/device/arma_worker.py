@@ -34,16 +34,16 @@ class ArmaWorker:
             if self._work.thread.is_alive():
                 return
             if self._work.of is live.compensator:  # the compensator may have been replaced since the thread started
-                live.set_model(self._work.axis, self._work.found)
+                live.apply_identification_result(self._work.axis, self._work.found)
             self._work = None
-        for axis in live.compensator.axes_due:
+        for axis in live.compensator.axes_due_for_identification:
             work = _Identification(live.compensator, axis, self._name)
             if not self._at_once:
                 self._work = work
                 work.thread.start()
                 return
             work.identify_model()
-            live.set_model(axis, work.found)
+            live.apply_identification_result(axis, work.found)
 
 
 class _Identification:
@@ -52,7 +52,7 @@ class _Identification:
     def __init__(self, of: Compensator, axis: int, name: str) -> None:
         self.of, self.axis = of, axis
         self.found: ArmaModel | None = None
-        self._window: tuple[Floats, float] = of.identification_means_and_variance(axis)
+        self._window: tuple[Floats, float] = of.means_and_noise_variance_for_identification(axis)
         self.thread = threading.Thread(target=self.identify_model, name=name, daemon=True)
 
     def identify_model(self) -> None:

@@ -215,11 +215,11 @@ class DeviceWorker:
     def _select_thermal_model(self) -> None:
         """Continue the selection of a thermal model for a short time."""
         thermal, schedule = self.pipeline.thermal, self.publisher.schedule
-        if thermal is None or not thermal.choosing or not schedule.is_due("thermal"):
+        if thermal is None or not thermal.is_selecting_model or not schedule.is_due("thermal"):
             return
         begun_s = time.perf_counter()
         until_s = begun_s + (MODEL_SELECTION_REPLAY_S if self._replayed else MODEL_SELECTION_S)
-        while thermal.step() and time.perf_counter() < until_s:
+        while thermal.run_selection_step() and time.perf_counter() < until_s:
             pass
         if self._replayed:
             self._wake.set()  # waiting samples of the recording can be processed

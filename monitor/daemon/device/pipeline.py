@@ -20,7 +20,7 @@ from monitor.common.compiled import interpreted
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.drift.thermal.live_thermal import LiveThermal, ThermalIntervalResult
+from monitor.drift.thermal.live_thermal import LiveThermalModels, ThermalIntervalResult
 from monitor.estimation.detection.model_comparison import PreparedModel
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
@@ -62,7 +62,7 @@ class DevicePipeline:
     ) -> None:
         self.estimator: Estimator | None = None
         self.signal_monitor: SignalMonitor | None = None
-        self.thermal: LiveThermal | None = None
+        self.thermal: LiveThermalModels | None = None
         self.compensation: LiveCompensation | None = None
         self.model_in_force: PreparedModel | None = None
         self.refusal_reason = ""
@@ -142,7 +142,9 @@ class DevicePipeline:
             for samples in blocks
             for at in range(0, len(samples), MAX_PIECE_SAMPLES)
         ]
-        while self._pieces and (drain or not self._replayed or self.thermal is None or not self.thermal.choosing):
+        while self._pieces and (
+            drain or not self._replayed or self.thermal is None or not self.thermal.is_selecting_model
+        ):
             piece = self._pieces.popleft()
             self._update_estimator(
                 self.signal_monitor.process_samples(piece) if self.signal_monitor is not None else [piece]
@@ -183,9 +185,9 @@ class DevicePipeline:
         live = self.compensation
         if live is not None and np.isfinite(samples.values[:, :3]).any():
             for at in range(0, len(samples), MAX_PIECE_SAMPLES):
-                live.update(samples[at : at + MAX_PIECE_SAMPLES])
+                live.compensate_block(samples[at : at + MAX_PIECE_SAMPLES])
             self.arma_worker.adopt_and_start_models(live)
-            live.take_updates()
+            live.take_drift_updates()
         self.take_events()
         self.take_thermal_intervals()
 
@@ -252,7 +254,7 @@ class DevicePipeline:
         self.signal_monitor = SignalMonitor(
             rate_hz, device.leave_out_motion, device.alarms_per_day, keep_samples_at_rest=wanted
         )
-        self.thermal = None if device.thermal_s is None else LiveThermal(rate_hz, device.thermal_s)
+        self.thermal = None if device.thermal_s is None else LiveThermalModels(rate_hz, device.thermal_s)
         self.compensation = LiveCompensation(rate_hz) if device.compensate else None
 
     def _update_estimator(self, blocks: Sequence[SampleBlock]) -> None:
@@ -282,4 +284,4 @@ class DevicePipeline:
             self._handled = self.signal_monitor.orientation_changes
             self.thermal.learn_new_offset()
         for samples in self.signal_monitor.take_samples_at_rest():
-            self._thermal_intervals += self.thermal.update(samples)
+            self._thermal_intervals += self.thermal.process_block(samples)

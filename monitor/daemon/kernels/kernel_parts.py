@@ -62,7 +62,9 @@ def _call_change_detection() -> None:
 def _call_compensation() -> None:
     compensator = Compensator(100.0)
     compensator.compensate(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
-    compensator.set_model(0, fit_arma(*compensator.identification_means_and_variance(0), [(2, 1)]))
+    compensator.apply_identification_result(
+        0, fit_arma(*compensator.means_and_noise_variance_for_identification(0), [(2, 1)])
+    )
     compensator.compensate(np.zeros((1, 6)), lost=1)
     _ = compensator.bias_standard_error
 
@@ -80,7 +82,7 @@ def _call_refit() -> None:
 
 
 def _call_temperature_lag() -> None:
-    thermal_response.first_order_lag(np.zeros(2), 0.5)
+    thermal_response.apply_first_order_lag(np.zeros(2), 0.5)
 
 
 def _call_analysis() -> None:

@@ -1,1 +1,1 @@
-"""Compensation of gyro drift while the carrier may move."""
+"""Compensation of the gyro drift while the carrier may move."""

@@ -1,17 +1,17 @@
-"""ARMA(p, q) models of a drift at rest, p ≤ 2 and q ≤ 1: exact likelihood, choice of the order, confidence intervals.
+"""Identification of ARMA(p, q) models for the gyro drift at rest, with p ≤ 2 and q ≤ 1.
+
+The model of the process x and of the interval means z is
 
     x_k = φ1 x_{k−1} + φ2 x_{k−2} + a_k + θ1 a_{k−1},    z_k = μ + x_k + v_k
 
-The values z are means over intervals, and v is the white noise of a mean. The variance of v is known from the scatter
-within the intervals. A variance of zero means that the process x is measured directly, as in Yuan et al. (2010). The
-state-space form uses Green's function (Pandit & Wu 1983). The state consists of the process and its one-step
-prediction:
+where a is the innovation and v is the white noise of an interval mean. The variance of v is estimated from the scatter
+within the intervals. If the variance of v is zero, the model equals the model of Yuan et al. (2010). The state-space
+form of the ARMA model uses Green's function (Pandit & Wu 1983):
 
     X_k = [x_k, x̂_{k+1|k}],  X_k = A X_{k−1} + B a_k,  A = [[0, 1], [φ2, φ1]],  B = [G0, G1]ᵀ,  G0 = 1, G1 = φ1 + θ1
 
-The likelihood is computed by a Kalman filter, so intervals may be missing. μ is the generalised least-squares estimate.
-The coefficients are written as functions of partial autocorrelations, which keeps the model stable and invertible
-(Monahan 1984).
+A Kalman filter computes the exact likelihood, even if interval means are missing. The coefficients are functions of
+partial autocorrelations, which keeps the ARMA model stable and invertible (Monahan 1984).
 """
 
 from collections.abc import Sequence
@@ -32,16 +32,16 @@ Order = tuple[int, int]
 _Triple = tuple[float, float, float]
 
 ORDERS: Final[tuple[Order, ...]] = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1))
-"""Orders (p, q) to choose from. The paper uses (2, 1). The order (0, 0) means that only white noise is visible."""
+"""Orders (p, q) to choose from. Yuan et al. (2010) use (2, 1). The order (0, 0) is white noise."""
 MIN_VALUES: Final = 30
-"""Smallest number of known values for an identification."""
+"""Smallest number of interval means for the identification of an ARMA model."""
 MAX_PARTIAL_AUTOCORRELATION: Final = 0.99999
 MAX_COEFFICIENTS: Final = 3
-"""Number of coefficients of the highest order. Only this order can have several maxima of the likelihood."""
+"""Number of coefficients of the highest order, which is the only order with several likelihood maxima."""
 MIN_MAXIMA_DISTANCE: Final = 0.1
-"""Smallest difference of the partial autocorrelations between two maxima that are treated as distinct."""
+"""Smallest difference of the partial autocorrelations of two distinct likelihood maxima."""
 BISECTION_STEPS: Final = 6
-"""Bisections of the last step of a search for the end of a confidence interval."""
+"""Number of bisection steps in the search for the end of a confidence interval."""
 START_PARTIAL_AUTOCORRELATIONS: Final = {
     0: ((),),
     1: ((0.3,), (0.9,), (0.99,)),
@@ -51,14 +51,14 @@ START_PARTIAL_AUTOCORRELATIONS: Final = {
 START_THETAS: Final = (-0.9, -0.5, 0.0, 0.5)
 """Start values of the partial autocorrelation of the moving-average part."""
 START_VARIANCE_SHARES: Final = (1e-3, 0.03, 0.5)
-"""Start values of the innovation variance, as shares of the variance of z, if z contains white noise."""
+"""Start values of the innovation variance, relative to the variance of z."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArmaModel:
-    """Parameters of one identified ARMA process.
+    """Parameters of an identified ARMA model.
 
-    >>> ArmaModel((0.5, 0.3), -0.2, 1.0).green
+    >>> ArmaModel((0.5, 0.3), -0.2, 1.0).green_function_values
     (1.0, 0.3)
     """
 
@@ -76,46 +76,51 @@ class ArmaModel:
     count: int = 0  # number of values used for the identification
 
     @property
-    def green(self) -> tuple[float, float]:
+    def green_function_values(self) -> tuple[float, float]:
         """Return the first two values G0 and G1 of Green's function."""
         return 1.0, self.phi[0] + self.theta
 
     @property
     def name(self) -> str:
-        """Return the name of the model for display."""
+        """Return the name of the ARMA model for display, for example "ARMA(2, 1)"."""
         return f"ARMA({self.order[0]}, {self.order[1]})" if self.order != (0, 0) else "constant"
 
 
-def fit_arma(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, intervals: bool = False) -> ArmaModel:
-    """Return the model of the order with the least BIC (Schwarz 1978).
+def fit_arma(
+    interval_means: Floats,
+    white_variance: float = 0.0,
+    orders: Sequence[Order] = ORDERS,
+    with_confidence_intervals: bool = False,
+) -> ArmaModel:
+    """Fit ARMA models of all given orders, and return the model with the least BIC (Schwarz 1978).
 
     Parameters
     ----------
-    z : ndarray, shape (n,)
+    interval_means : ndarray, shape (n,)
         Interval means in rad/s; NaN = missing.
-    white : float
+    white_variance : float
         Variance of the white noise v of a mean, (rad/s)².
     orders : sequence of (p, q)
         Orders to choose from.
-    intervals : bool
-        True if the confidence intervals of the coefficients are computed too. This takes ten times as long.
+    with_confidence_intervals : bool
+        True to compute the confidence intervals of the coefficients, which takes ten times as long.
 
     Raises
     ------
     NotReady
-        If fewer than MIN_VALUES values are known, or if all values are equal.
+        If fewer than MIN_VALUES interval means are known, or if all interval means are equal.
     """
-    known = z[np.isfinite(z)]
+    known = interval_means[np.isfinite(interval_means)]
     if known.size < MIN_VALUES:
         raise NotReady(f"{known.size} values; at least {MIN_VALUES} are needed to identify a drift")
     origin, scale = float(np.median(known)), float(known.std())
     if not scale > 0.0:
         raise NotReady("all values are equal")
-    unit = (z - origin) / scale
-    share = white / scale**2
+    unit = (interval_means - origin) / scale
+    share = white_variance / scale**2
     best = min((_fit_order(unit, share, order) for order in orders), key=lambda one: one[0])
     found = _to_model(unit, share, origin, scale, best)
-    if not intervals:
+    if not with_confidence_intervals:
         return found
     lo, hi = _confidence_intervals(unit, share, *best[1:])
     return replace(found, lo=lo, hi=hi)
@@ -125,7 +130,7 @@ def fit_arma(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, in
 def _propagate_covariance(
     p11: float, p12: float, p22: float, phi1: float, phi2: float, g1: float, variance: float
 ) -> _Triple:
-    """Return A P Aᵀ + variance B Bᵀ as its elements p11, p12, p22."""
+    """Return the elements p11, p12 and p22 of the predicted covariance A P Aᵀ + variance · B Bᵀ."""
     return (
         p22 + variance,
         phi2 * p12 + phi1 * p22 + g1 * variance,
@@ -135,7 +140,7 @@ def _propagate_covariance(
 
 @compiled
 def stationary_covariance(phi1: float, phi2: float, theta: float) -> _Triple:
-    """Return the elements p11, p12, p22 of the stationary covariance of the state, for innovations of variance 1.
+    """Return the elements p11, p12 and p22 of the stationary state covariance for innovations of unit variance.
 
     Parameters
     ----------
@@ -151,20 +156,20 @@ def stationary_covariance(phi1: float, phi2: float, theta: float) -> _Triple:
 
 
 @compiled
-def run_kalman_filter(
-    z: Floats, phi1: float, phi2: float, theta: float, variance: float, white: float
+def compute_likelihood_sums(
+    values: Floats, phi1: float, phi2: float, theta: float, innovation_variance: float, white_variance: float
 ) -> tuple[int, float, float, float]:
-    """Run the exact Kalman filter, and return the sums from which the likelihood follows.
+    """Compute the sums of the log-likelihood of an ARMA model with an exact Kalman filter.
 
     Parameters
     ----------
-    z : ndarray, shape (n,)
+    values : ndarray, shape (n,)
         Values; NaN = missing.
     phi1, phi2, theta : float
         Coefficients φ1, φ2 and θ1.
-    variance : float
+    innovation_variance : float
         Variance of a, in the squared unit of z.
-    white : float
+    white_variance : float
         Variance of v, in the squared unit of z.
 
     Returns
@@ -180,22 +185,22 @@ def run_kalman_filter(
     """
     g1 = phi1 + theta
     p11, p12, p22 = stationary_covariance(phi1, phi2, theta)
-    p11, p12, p22 = p11 * variance, p12 * variance, p22 * variance
-    x1 = x2 = o1 = o2 = 0.0  # The filter runs on z and on a series of ones. Both together give the mean.
+    p11, p12, p22 = p11 * innovation_variance, p12 * innovation_variance, p22 * innovation_variance
+    x1 = x2 = o1 = o2 = 0.0  # The filter also processes a series of ones, from which the mean is estimated.
     count, logs, zz, zo, oo = 0, 0.0, 0.0, 0.0, 0.0
-    for k in range(z.size):
-        if z[k] == z[k]:
-            s = p11 + white
+    for k in range(values.size):
+        if values[k] == values[k]:
+            s = p11 + white_variance
             gain1, gain2 = p11 / s, p12 / s
-            e, o = z[k] - x1, 1.0 - o1
+            e, o = values[k] - x1, 1.0 - o1
             logs += np.log(s)
             zz, zo, oo, count = zz + e * e / s, zo + e * o / s, oo + o * o / s, count + 1
             x1, x2, o1, o2 = x1 + gain1 * e, x2 + gain2 * e, o1 + gain1 * o, o2 + gain2 * o
             p22 = p22 - gain2 * p12
-            p11, p12 = white * gain1, white * gain2
+            p11, p12 = white_variance * gain1, white_variance * gain2
         x1, x2 = x2, phi2 * x1 + phi1 * x2
         o1, o2 = o2, phi2 * o1 + phi1 * o2
-        p11, p12, p22 = _propagate_covariance(p11, p12, p22, phi1, phi2, g1, variance)
+        p11, p12, p22 = _propagate_covariance(p11, p12, p22, phi1, phi2, g1, innovation_variance)
     mean = zo / oo if oo > 0.0 else 0.0
     return count, logs, zz - mean * zo, mean
 
@@ -204,10 +209,10 @@ _OrderFit = tuple[float, Order, Floats]  # BIC, order, search parameters
 
 
 def _fit_order(z: Floats, white: float, order: Order) -> _OrderFit:
-    """Return the most likely parameters of one order.
+    """Return the maximum-likelihood estimate of an ARMA model of the given order.
 
-    The search parameters are atanh of the partial autocorrelations and of θ. If the variance of v is positive, the
-    logarithm of the innovation variance is one more parameter.
+    The search parameters are atanh of the partial autocorrelations and of θ. If the white noise v has a positive
+    variance, the logarithm of the innovation variance is another search parameter.
     """
     count = int(np.isfinite(z).sum())
     free = sum(order) + (white > 0.0 and order != (0, 0))
@@ -227,7 +232,6 @@ def _fit_order(z: Floats, white: float, order: Order) -> _OrderFit:
 
 
 def _start_parameters(white: float, order: Order) -> list[Floats]:
-    """Return the start points of the search."""
     return [
         np.array([*map(atanh, partial), *((atanh(theta),) if order[1] else ()), *((log(share),) if share else ())])
         for partial in START_PARTIAL_AUTOCORRELATIONS[order[0]]
@@ -237,9 +241,9 @@ def _start_parameters(white: float, order: Order) -> list[Floats]:
 
 
 def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
-    """Return the log-likelihood, maximised over the mean and, without white noise, over the innovation variance."""
+    """Return the log-likelihood, maximised over the mean, and without white noise also over the innovation variance."""
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
-    count, logs, square, _ = run_kalman_filter(z, phi1, phi2, theta, variance, white)
+    count, logs, square, _ = compute_likelihood_sums(z, phi1, phi2, theta, variance, white)
     if white > 0.0 and order != (0, 0):
         return float(-0.5 * (count * log(2.0 * pi) + logs + square))
     size = max(square / count, 1e-300)
@@ -247,7 +251,7 @@ def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
 
 
 def _model_coefficients(order: Order, u: Floats, white: float) -> tuple[float, float, float, float]:
-    """Return φ1, φ2, θ1 and the innovation variance. The variance is 1 if it is not a search parameter."""
+    """Return φ1, φ2, θ1 and the innovation variance for a vector of search parameters."""
     partial = [
         max(min(tanh(one), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION)
         for one in u[: order[0] + order[1]].tolist()
@@ -263,11 +267,10 @@ def _model_coefficients(order: Order, u: Floats, white: float) -> tuple[float, f
 
 
 def _to_model(z: Floats, white: float, origin: float, scale: float, best: _OrderFit) -> ArmaModel:
-    """Return the fitted model in the units of the measurement."""
     bic, order, u = best
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     seen = white if order != (0, 0) else 0.0
-    count, _, square, mean = run_kalman_filter(z, phi1, phi2, theta, variance, seen)
+    count, _, square, mean = compute_likelihood_sums(z, phi1, phi2, theta, variance, seen)
     if seen == 0.0:
         variance = square / count
     nothing = order == (0, 0) and white > 0.0
@@ -285,11 +288,10 @@ def _to_model(z: Floats, white: float, origin: float, scale: float, best: _Order
 
 
 def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> tuple[_Triple, _Triple]:
-    """Return the 95 % intervals of φ1, φ2 and θ1 by the profile likelihood.
+    """Return the 95 % confidence intervals of φ1, φ2 and θ1 by the profile likelihood.
 
-    At the ends of an interval, the log-likelihood, maximised over all other parameters, is lower than its maximum by
-    half of the 95 % quantile of χ²(1). If a root of φ nearly cancels θ, the likelihood has a long ridge or two maxima.
-    The curvature of the likelihood then underestimates the uncertainty. The interval covers both maxima.
+    If a root of φ nearly cancels θ, the likelihood has a long ridge or two maxima. The curvature of the likelihood then
+    underestimates the uncertainty. The confidence intervals therefore cover all maxima within the 95 % limit.
     """
     there = (order[0] > 0, order[0] > 1, order[1] > 0)
     tops = _likelihood_maxima(z, white, order, u)
@@ -301,8 +303,7 @@ def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> t
 
 
 def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list[Floats]:
-    """Return the positions of all maxima that lie within the 95 % limit of the likelihood. The fitted maximum is the
-    first."""
+    """Return the search parameters of all likelihood maxima within the 95 % limit, starting with the fitted maximum."""
     found = [u]
     if sum(order) == MAX_COEFFICIENTS:
         for start in _start_parameters(white, order):
@@ -317,8 +318,7 @@ def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list
 
 
 def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: float) -> tuple[float, float]:
-    """Return the ends of the confidence interval of one coefficient around one maximum. ``top`` is the highest
-    log-likelihood."""
+    """Return the ends of the confidence interval of a coefficient around a likelihood maximum."""
     value = _model_coefficients(order, u, white)[which]
     limits = (
         (-MAX_PARTIAL_AUTOCORRELATION, MAX_PARTIAL_AUTOCORRELATION)
@@ -351,10 +351,7 @@ def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int,
 
 
 def _free_parameters(order: Order, u: Floats, which: int) -> Floats:
-    """Return ``u`` without the parameter that is fixed with one coefficient.
-
-    φ1 is replaced by a parameter that describes φ2 by its position in the region of stable models.
-    """
+    """Return the search parameters without the parameter that corresponds to a fixed coefficient."""
     held = order[0] if which == 2 else which
     return np.delete(u, held)
 
@@ -362,9 +359,10 @@ def _free_parameters(order: Order, u: Floats, which: int) -> Floats:
 def _profile_likelihood(
     z: Floats, white: float, order: Order, which: int, value: float, near: Floats
 ) -> tuple[float, Floats]:
-    """Return the log likelihood with one coefficient fixed, maximised over the others, and the place of the maximum."""
+    """Return the log-likelihood for a fixed coefficient, maximised over the other parameters, and the position of
+    the maximum."""
 
-    def full(free: Floats) -> Floats:
+    def insert_fixed_coefficient(free: Floats) -> Floats:
         u = np.insert(free, order[0] if which == 2 else which, 0.0)
         if which == 2:
             u[order[0]] = atanh(value)
@@ -384,6 +382,8 @@ def _profile_likelihood(
         return u
 
     if not near.size:
-        return _log_likelihood(z, white, order, full(near)), near
-    least, place = minimize_bfgs(lambda free: -_log_likelihood(z, white, order, full(free)), near, 1e-2)
+        return _log_likelihood(z, white, order, insert_fixed_coefficient(near)), near
+    least, place = minimize_bfgs(
+        lambda free: -_log_likelihood(z, white, order, insert_fixed_coefficient(free)), near, 1e-2
+    )
     return -least, place

@@ -11,18 +11,18 @@ from monitor.drift.compensation.compensator import DriftInterval
 
 @dataclass(frozen=True, slots=True)
 class AxisCompensation:
-    """Compensation of one gyro axis, evaluated on samples at rest that had not been used for learning."""
+    """Quality of the drift compensation of a gyro axis at rest."""
 
     model: ArmaModel | None  # last identified model of the drift; None if there was too little rest
     uncompensated: RestScore  # without compensation, minus the mean of the first third
     compensated: RestScore  # with compensation
-    rejected_intervals: int  # number of rejected intervals, which no drift explains
+    rejected_intervals: int  # number of intervals that were rejected as outliers
     steps: int  # number of steps of the bias
 
 
 @dataclass(frozen=True, slots=True)
 class CompensationResult:
-    """Compensation of one recording."""
+    """Result of the drift compensation of a recording."""
 
     recording: str
     out: Path  # compensated recording

@@ -1,9 +1,7 @@
-"""Quality of a compensated rate at rest. All methods are evaluated in the same way.
+"""Quality of a compensated gyro rate at rest.
 
-Samples that a method has used for learning are not evaluated. A method that learns from a whole recording therefore
-learns from one part and is evaluated on another part. A filter that uses only past samples needs no separate part. The
-mean of the learning part is subtracted from the uncompensated rate. Otherwise, the removal of a constant bias would
-count as an improvement.
+Samples that were used for learning are not evaluated. The mean of the learning samples is subtracted from the
+uncompensated rate, so that the removal of a constant bias does not count as an improvement.
 """
 
 from dataclasses import dataclass
@@ -16,12 +14,15 @@ from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 
 MINUTE_S: Final = 60.0
 SPANS_S: Final = (60.0, 600.0, 3600.0)
-"""Averaging periods in seconds for the mean rate, which is the mean error of the heading rate."""
+"""Averaging periods of the mean rate in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class RestScore:
-    """Quality of one axis at rest, in rad/s. A value is NaN if the record is too short."""
+    """Quality of the rate of a gyro axis at rest, in rad/s.
+
+    A value is NaN if the recording is too short.
+    """
 
     rms: float  # rms about zero
     worst_minute: float  # largest rms of a minute
@@ -30,23 +31,23 @@ class RestScore:
     allan: Floats  # [k] overlapping Allan deviation
 
 
-def score_at_rest(rate: Floats, rate_hz: float) -> RestScore:
-    """Return the quality of a rate whose true value is zero.
+def score_at_rest(angular_rate: Floats, rate_hz: float) -> RestScore:
+    """Return the quality of an angular rate whose true value is zero.
 
     Parameters
     ----------
-    rate : ndarray, shape (n,)
+    angular_rate : ndarray, shape (n,)
         Rate in rad/s; NaN = missing, or not at rest.
     rate_hz : float
         Sample rate in Hz.
     """
-    sizes: Ints = cluster_sizes(rate.size, rate_hz)
-    allan, _ = overlapping_avar_axis(rate, sizes)
-    minutes = _span_means(rate**2, round(MINUTE_S * rate_hz))
+    sizes: Ints = cluster_sizes(angular_rate.size, rate_hz)
+    allan, _ = overlapping_avar_axis(angular_rate, sizes)
+    minutes = _span_means(angular_rate**2, round(MINUTE_S * rate_hz))
     return RestScore(
-        rms=_rms(rate),
+        rms=_rms(angular_rate),
         worst_minute=float(np.sqrt(minutes.max())) if minutes.size else np.nan,
-        drift=tuple(_rms(_span_means(rate, round(span * rate_hz))) for span in SPANS_S),
+        drift=tuple(_rms(_span_means(angular_rate, round(span * rate_hz))) for span in SPANS_S),
         tau_s=sizes / rate_hz,
         allan=np.sqrt(allan),
     )
@@ -64,6 +65,5 @@ def _span_means(x: Floats, samples: int) -> Floats:
 
 
 def _rms(x: Floats) -> float:
-    """Return the rms of the known values."""
     known = x[np.isfinite(x)]
     return float(np.sqrt(np.mean(known**2))) if known.size else np.nan

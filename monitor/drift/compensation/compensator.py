@@ -1,14 +1,12 @@
-"""Removal of the drift of three gyro axes from the measured rate, sample by sample, while the carrier may move.
+"""Compensation of the gyro drift of a carrier that may move, sample by sample.
 
-The measured rate is z = ω + drift + noise. At rest the true rate ω is zero, so the drift is estimated from means over
-intervals at rest. ``sage_husa`` estimates the drift with a model of ``arma``. In motion the drift is predicted, and the
-filters of ``carrier_rate_filter_bank`` smooth the remaining rate. A single filter for drift and motion would have to
-attribute every slow change to one of them. Rest detection is more reliable than such a decision.
+The measured rate is z = ω + drift + noise. At rest, the rate ω is zero, and the drift is estimated from interval means
+with the Kalman filter of ``sage_husa``. In motion, the drift is predicted, and the filters of
+``carrier_rate_filter_bank`` smooth the remaining rate.
 
-The motion detector decides about a block only some blocks later (``motion_kernel``). The result of an interval is
-therefore used from the second block after the interval, which is a delay of 0.5 s at most sample rates. The compensated
-rate is not delayed, because output sample k depends on the input samples up to k. The output does not depend on how the
-stream is divided into blocks. Accelerometer values are not changed. They are used to detect rest.
+The motion detector decides some blocks later whether a block was at rest. At most sample rates, the bias estimate is
+therefore delayed by 0.5 s. The compensated rate is not delayed. The results do not depend on the sizes of the input
+blocks.
 """
 
 from collections.abc import Sequence
@@ -24,11 +22,11 @@ from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import ORDERS, ArmaModel, Order, fit_arma
 from monitor.drift.compensation.carrier_rate_filter_bank import (
     MIN_REST_INTERVALS,
-    filter_memories,
-    filter_sample,
-    gain_table,
+    apply_bias_change,
+    choose_memory_lengths,
+    compute_gain_table,
+    filter_rate_sample,
     predict_over_gap,
-    shift_bias,
     update_rest_noise,
 )
 from monitor.estimation.detection import motion_kernel
@@ -37,26 +35,27 @@ from monitor.estimation.detection.motion_detection import samples_per_block
 GYROS: Final = 3
 """Number of gyro axes. They are the first columns of the samples."""
 BLOCKS_PER_INTERVAL: Final = 4
-"""Blocks of the motion detector in an interval. An interval lasts 1 s, and longer at rates below 32 Hz."""
+"""Number of blocks per interval. An interval lasts 1 s, or longer at sample rates below 32 Hz."""
 MIN_REST_BLOCKS: Final = 2
-"""Smallest number of blocks at rest in an interval at rest."""
+"""Smallest number of blocks at rest in an interval that counts as at rest."""
 MAX_PENDING_BLOCKS: Final = 4
-"""Blocks that can wait for a rest decision."""
+"""Largest number of blocks that wait for a decision of the motion detector."""
 HISTORY_INTERVALS: Final = 2048
-"""Intervals that are kept to identify a model."""
+"""Number of intervals that are stored for the identification of a drift model."""
 MIN_IDENTIFICATION_INTERVALS: Final = 60
-"""Number of intervals at rest before the first identification. The next identification follows when the number has
-grown by half, but after at most HISTORY_INTERVALS more."""
-MAX_REST_RMS: Final = (0.02,) * 3 + (0.3,) * 3
-"""Largest rms of a block at rest about its mean, in rad/s and m/s².
+"""Number of intervals at rest before the first identification.
 
-The limit applies even if the motion detector has adapted to permanent motion, for example in a car that drives all day.
-A block above the limit is not used to learn the drift.
+The identification is repeated each time the number of intervals has grown by half.
+"""
+MAX_REST_RMS: Final = (0.02,) * 3 + (0.3,) * 3
+"""Largest standard deviation of the samples of a block at rest, in rad/s and m/s².
+
+The limit is needed because the motion detector can adapt to permanent motion, for example in a car.
 """
 MAX_BIAS_RAD_S: Final = 0.35
 """Largest mean rate of a gyro at rest: 0.35 rad/s is 20 °/s."""
 MAX_GAP_INTERVALS: Final = 100_000
-"""Largest number of intervals predicted across a gap. After a longer gap, the prediction contains no information."""
+"""Largest number of missing intervals over which the drift is predicted."""
 
 BLOCK_NUMBER, COUNT, ORIGIN, SUM, SQUARES = range(5)
 """Columns of ``CompensatorState.waiting``: number of the block, number of samples, origin of the sums, sum, and sum of
@@ -71,7 +70,7 @@ standard error of the prediction. SCATTER is the variance of the mean, estimated
 
 
 class CompensatorState(NamedTuple):
-    """Complete state of the compensator, in arrays that compiled code can use."""
+    """State of the compensator in arrays for compiled code."""
 
     rest: motion_kernel.MotionState
     current: Ints  # [1] number of the current interval; -1 = none yet
@@ -82,9 +81,9 @@ class CompensatorState(NamedTuple):
     ages: Ints  # [3, filters, 2] columns as in ``carrier_rate_filter_bank``
     feedback: Floats  # [3, 1] difference of input and output that is still to be fed back
     waiting: Floats  # [MAX_PENDING_BLOCKS, 6, 5] sums of the blocks that wait for a rest decision
-    sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] sums of ``filter_sample`` for each of these blocks
+    sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] sums of ``filter_rate_sample`` for each of these blocks
     means: Floats  # [3, BLOCKS_PER_INTERVAL] rad/s, means of the blocks of the interval; NaN = not at rest
-    followed: Floats  # [3, filters + 1, 2] sums of ``filter_sample`` over the blocks at rest
+    followed: Floats  # [3, filters + 1, 2] sums of ``filter_rate_sample`` over the blocks at rest
     samples: Floats  # [3] number of samples in these blocks
     table: Floats  # [rows, 2] gains of all filters
     first: Ints  # [filters + 1] first row of each filter in the table
@@ -94,7 +93,7 @@ class CompensatorState(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DriftInterval:
-    """Result of one interval for three gyro axes, in rad/s."""
+    """Measured and predicted drift of three gyro axes in one interval, in rad/s."""
 
     end: int  # index of the first sample after the interval; missing samples count
     mean: Floats  # [3] measured at rest; NaN = in motion
@@ -105,19 +104,20 @@ class DriftInterval:
 
     @property
     def innovation(self) -> Floats:
-        """Return the normalised innovation [3]: measured minus expected mean, in predicted standard deviations."""
+        """Return the normalised innovations [3], which are ``mean - expected`` divided by the predicted standard
+        deviations."""
         return (self.mean - self.expected) / self.error
 
 
 class Compensator:
-    """Drift compensator of the three gyro axes of one sensor.
+    """Drift compensator for the three gyro axes of a sensor.
 
     Parameters
     ----------
     rate_hz : float
         Sample rate in Hz.
     adapts : bool
-        True if the noise of the drift is estimated continuously. False if the identified noise is kept.
+        True to estimate the noise of the drift continuously. False to keep the identified noise.
     orders : sequence of (p, q)
         ARMA orders to choose from.
 
@@ -156,19 +156,19 @@ class Compensator:
 
     @property
     def bias(self) -> Floats:
-        """Return the bias [3] in rad/s that is subtracted; NaN = not known yet."""
+        """Return the subtracted bias [3] in rad/s. The value NaN means that the bias is not known yet."""
         return self._state.bias.copy()
 
     @property
     def bias_standard_error(self) -> Floats:
-        """Return the standard error [3] of the bias in rad/s; NaN = not known yet."""
-        known = [sage_husa.expected_bias(drift)[1] ** 0.5 for drift in self._state.drift]
+        """Return the standard errors [3] of the bias in rad/s. The value NaN means that the bias is not known yet."""
+        known = [sage_husa.expected_bias_and_variance(drift)[1] ** 0.5 for drift in self._state.drift]
         return np.where(np.isnan(self._state.bias), np.nan, known)
 
     def compensate(self, values: Floats, lost: int = 0) -> Floats:
-        """Return consecutive samples with the drift of the gyros removed.
+        """Return the samples with the gyro drift removed.
 
-        The rate of a gyroscope is returned unchanged until its bias is known. Missing samples remain missing.
+        The rate of a gyro axis is returned unchanged until the bias of the axis is known.
 
         Parameters
         ----------
@@ -190,7 +190,7 @@ class Compensator:
         # Numba compiles one version per memory layout and access flag, so the array is always contiguous and read-only.
         values = np.ascontiguousarray(values, np.float64).view()
         values.flags.writeable = False
-        # After a gap, the motion detector decides about all waiting blocks at once, and each block may end an interval.
+        # After missing samples, the motion detector decides about all waiting blocks at once. Each may end an interval.
         outcomes = np.empty((len(values) // self.interval_samples + 2 + MAX_PENDING_BLOCKS, 1 + 6 * GYROS))
         filled = _advance(values, self.sample_count, self.block_samples, self._state, out, outcomes)
         self.sample_count += len(values)
@@ -198,7 +198,7 @@ class Compensator:
             self._record_interval(outcomes[k])
         return out
 
-    def take_intervals(self) -> list[DriftInterval]:
+    def take_finished_intervals(self) -> list[DriftInterval]:
         """Return the results of the intervals that have ended since the last call."""
         outcomes, self._finished_intervals = self._finished_intervals, []
         return outcomes
@@ -207,20 +207,19 @@ class Compensator:
 
     @property
     def samples_to_interval_end(self) -> int:
-        """Return the number of samples to the end of the interval.
+        """Return the number of samples until the end of the interval.
 
-        A caller that changes models only at the end of an interval gets results that do not depend on the division into
-        blocks.
+        Results do not depend on the sizes of the input blocks if models are changed only at the end of an interval.
         """
         return self.interval_samples - self.sample_count % self.interval_samples
 
     @property
-    def axes_due(self) -> tuple[int, ...]:
-        """Return the indices of the axes that have enough new intervals to identify a model."""
+    def axes_due_for_identification(self) -> tuple[int, ...]:
+        """Return the indices of the axes whose drift models are due for identification."""
         return tuple(np.flatnonzero(self._at_rest >= self._next_identification).tolist())
 
-    def identification_means_and_variance(self, axis: int) -> tuple[Floats, float]:
-        """Return the interval means from which the model of an axis is to be identified.
+    def means_and_noise_variance_for_identification(self, axis: int) -> tuple[Floats, float]:
+        """Return the interval means and the noise variance for the identification of a drift model.
 
         Parameters
         ----------
@@ -238,47 +237,48 @@ class Compensator:
         white = float(np.nanmean(scatter)) if np.isfinite(scatter).any() else 0.0
         return z, white
 
-    def set_model(self, axis: int, model: ArmaModel | None) -> None:
-        """Use a new model for an axis, and run the filter with the new model over all stored intervals.
+    def apply_identification_result(self, axis: int, identified_model: ArmaModel | None) -> None:
+        """Replace the drift model of an axis, and process all stored intervals again with the new model.
 
         Parameters
         ----------
         axis : int
             Index of the gyro axis, 0 to 2.
-        model : ArmaModel or None
-            The identified model. None means that no model was found, so the identification is repeated later.
+        identified_model : ArmaModel or None
+            The identified model. None means that the identification failed and is repeated later.
         """
         self._next_identification[axis] = self._at_rest[axis] + min(
             max(self._at_rest[axis], MIN_IDENTIFICATION_INTERVALS) // 2, HISTORY_INTERVALS
         )
-        if model is None:
+        if identified_model is None:
             return
-        self.models[axis] = model
+        self.models[axis] = identified_model
         drift = self._state.drift[axis]
         count = drift["rest_count"]
-        sage_husa.set_model(drift, model)
+        sage_husa.restart_with_model(drift, identified_model)
         sage_husa.refilter_history(drift, *self._history(axis), _min_variance(self._state.rest.open, axis))
-        drift["rest_count"] = count  # The repeated intervals are not counted a second time.
+        drift["rest_count"] = count  # The stored intervals must not be counted twice.
         _update_bias(axis, self._state.drift, self._state.bias, self._state.bank)
 
     def identify_due_models(self) -> None:
-        """Identify the models of all axes that are due."""
-        for axis in self.axes_due:
+        """Identify the drift models of all axes that are due."""
+        for axis in self.axes_due_for_identification:
             try:
-                self.set_model(axis, fit_arma(*self.identification_means_and_variance(axis), self._orders))
-            except NotReady:  # There are too few means, or all means are equal. The identification is repeated later.
-                self.set_model(axis, None)
+                self.apply_identification_result(
+                    axis, fit_arma(*self.means_and_noise_variance_for_identification(axis), self._orders)
+                )
+            except NotReady:  # too few means, or all means are equal
+                self.apply_identification_result(axis, None)
 
     # --- results of intervals
 
     def _history(self, axis: int) -> tuple[Floats, Floats]:
-        """Return the stored means and their scatter, oldest first."""
+        """Return the stored interval means and their variances, oldest first."""
         count = min(self._interval_count, HISTORY_INTERVALS)
         order = np.arange(self._interval_count - count, self._interval_count) % HISTORY_INTERVALS
         return self._means[axis][order], self._scatter[axis][order]
 
     def _record_interval(self, outcomes: Floats) -> None:
-        """Record the result of one interval in the history."""
         columns = outcomes[1:].reshape(GYROS, 6).T.copy()
         at = self._interval_count % HISTORY_INTERVALS
         became = columns[OUTCOME].astype(np.int64)
@@ -294,9 +294,8 @@ class Compensator:
 
 
 def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
-    """Return the state before the first sample."""
-    each = filter_memories(rate_hz)
-    table, first = gain_table(each)
+    each = choose_memory_lengths(rate_hz)
+    table, first = compute_gain_table(each)
     filters = each.size
     drift = np.zeros(GYROS, sage_husa.DRIFT_FILTER)
     drift["adaptive"] = adapts
@@ -323,7 +322,8 @@ def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
 
 @compiled
 def _advance(values: Floats, index: int, size: int, s: CompensatorState, out: Floats, outcomes: Floats) -> int:
-    """Process consecutive rows, write the results of finished intervals, and return their number."""
+    """Process successive samples, write the results of finished intervals, and return the number of finished
+    intervals."""
     keep = 0.5 / (2 << (s.ages.shape[1] - 1))
     filled, i, n = 0, 0, values.shape[0]
     while i < n:
@@ -347,7 +347,6 @@ def _advance(values: Floats, index: int, size: int, s: CompensatorState, out: Fl
 
 @compiled
 def _begin_block(number: int, waiting: Floats, sums: Floats) -> None:
-    """Assign a slot to a new block and clear its sums."""
     for a in range(len(AXES)):
         waiting[a, BLOCK_NUMBER] = number
         for column in range(COUNT, SQUARES + 1):
@@ -359,7 +358,6 @@ def _begin_block(number: int, waiting: Floats, sums: Floats) -> None:
 
 @compiled
 def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorState, keep: float, out: Floats) -> None:
-    """Remove the drift from samples of one gyro axis; NaN = missing."""
     bank, ages, feedback = s.bank[axis], s.ages[axis], s.feedback[axis]
     bias = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
     trusted = s.learned[axis] >= MIN_REST_INTERVALS
@@ -368,7 +366,7 @@ def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorState, kee
             predict_over_gap(bank, ages, 1)
             out[k] = z[k]
             continue
-        rate = filter_sample(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
+        rate = filter_rate_sample(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
         if not trusted:
             rate, feedback[0] = z[k] - bias, 0.0
         out[k] = rate
@@ -376,7 +374,7 @@ def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorState, kee
 
 @compiled
 def _accumulate(values: Floats, sums: Floats) -> None:
-    """Add values to the sums of a block; NaN values are skipped."""
+    """Add values to the sums of a block, except NaN."""
     for k in range(values.size):
         if values[k] != values[k]:
             continue
@@ -390,7 +388,7 @@ def _accumulate(values: Floats, sums: Floats) -> None:
 
 @compiled
 def _apply_rest_decision(number: int, moves: bool, s: CompensatorState, outcomes: Floats) -> bool:
-    """Apply the final decision about a block, and return True if the block ended the previous interval."""
+    """Process the decision of the motion detector about a block, and return True if the previous interval has ended."""
     interval = number // BLOCKS_PER_INTERVAL
     over = bool(s.current[0] >= 0 and interval > s.current[0])
     if over:
@@ -415,7 +413,7 @@ def _apply_rest_decision(number: int, moves: bool, s: CompensatorState, outcomes
 
 @compiled
 def _exceeds_rest_limits(waiting: Floats) -> bool:
-    """Return True if a block exceeds the fixed limits of rest."""
+    """Return True if the rms or the mean rate of a block exceeds the limits for a sensor at rest."""
     for a in range(len(AXES)):
         n = waiting[a, COUNT]
         if n == 0.0:
@@ -430,7 +428,7 @@ def _exceeds_rest_limits(waiting: Floats) -> bool:
 
 @compiled
 def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
-    """End the interval: update drift and filters, and predict the drift of the next interval."""
+    """Finish the interval, update the drift filters, and predict the drift of the next interval."""
     outcomes[0] = s.current[0]
     for a in range(GYROS):
         outcome = outcomes[1 + 6 * a : 7 + 6 * a]
@@ -439,7 +437,7 @@ def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
             outcome[column] = np.nan
         outcome[EXPECTED], outcome[OUTCOME] = s.bias[a], sage_husa.NOT_AT_REST
         if known:
-            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.expected_bias(s.drift[a])[1])
+            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.expected_bias_and_variance(s.drift[a])[1])
         count, mean, scatter = _interval_mean(s.means[a])
         if count >= MIN_REST_BLOCKS:
             variance, became = sage_husa.update_with_interval(s.drift[a], mean, scatter, _min_variance(s.rest.open, a))
@@ -453,7 +451,7 @@ def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
                 s.learned[a] += 1
                 update_rest_noise(s.bank[a], s.followed[a], s.samples[a], s.learned[a])
         else:
-            sage_husa.skip_interval(s.drift[a])
+            sage_husa.process_interval_in_motion(s.drift[a])
         _predict_next_interval(a, s)
         for b in range(BLOCKS_PER_INTERVAL):
             s.means[a, b] = np.nan
@@ -464,9 +462,9 @@ def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
 
 @compiled
 def _interval_mean(means: Floats) -> tuple[int, float, float]:
-    """Return the number of blocks at rest in an interval, their mean, and the variance of the mean.
+    """Return the number of blocks at rest in an interval, the mean of the blocks, and the variance of the mean.
 
-    The variance comes from half the differences of neighbouring blocks.
+    The variance is estimated from the differences of neighbouring blocks.
     """
     count, total, apart, pairs = 0, 0.0, 0.0, 0
     for b in range(BLOCKS_PER_INTERVAL):
@@ -479,14 +477,12 @@ def _interval_mean(means: Floats) -> tuple[int, float, float]:
 
 @compiled
 def _min_variance(blocks: Floats, axis: int) -> float:
-    """Return the smallest variance of an interval mean, which follows from the quantization step in
-    ``MotionState.open``."""
+    """Return the smallest variance of an interval mean, which follows from the quantization step."""
     return float(blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.MIN_VARIANCE)
 
 
 @compiled
 def _predict_next_interval(axis: int, s: CompensatorState) -> None:
-    """Predict the drift of the next interval, if a level is confirmed."""
     if s.drift[axis]["rest_count"] >= sage_husa.MIN_CONFIRMED_INTERVALS:
         sage_husa.predict_next_interval(s.drift[axis])
         _update_bias(axis, s.drift, s.bias, s.bank)
@@ -494,8 +490,7 @@ def _predict_next_interval(axis: int, s: CompensatorState) -> None:
 
 @compiled
 def _update_bias(axis: int, drifts: np.ndarray, biases: Floats, banks: Floats) -> None:
-    """Use the predicted drift as the bias, and shift the filters by the change of the bias."""
-    now = sage_husa.expected_bias(drifts[axis])[0]
+    now = sage_husa.expected_bias_and_variance(drifts[axis])[0]
     before = biases[axis] if biases[axis] == biases[axis] else 0.0
-    shift_bias(banks[axis], now - before)
+    apply_bias_change(banks[axis], now - before)
     biases[axis] = now

@@ -1,8 +1,7 @@
-"""Live drift compensation of one device: removes the gyro drift from a stream of samples.
+"""Live compensation of the gyro drift of a device.
 
-Each interval produces a ``DriftUpdate``. An event reports a model that no longer fits, or a step of the bias. An
-identification takes about 50 ms, so the caller runs it in another thread. ``Compensator.axes_due`` lists the axes to
-identify, and ``set_model`` receives an identified model.
+The identification of a drift model takes about 50 ms, so the caller runs the identification in another thread. Events
+report steps of the bias and drift models that no longer fit.
 """
 
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ EVENT_KIND: Final = "drift_unexplained"
 
 @dataclass(frozen=True, slots=True)
 class DriftUpdate:
-    """Result of one interval for three gyro axes, in rad/s."""
+    """Measured and subtracted drift of three gyro axes in one interval, in rad/s."""
 
     t_ns: int  # time of the last sample
     interval_s: float
@@ -35,7 +34,7 @@ class DriftUpdate:
 
 
 class LiveCompensation:
-    """Drift compensation of the gyros of one device.
+    """Drift compensation for the gyro axes of a device.
 
     Parameters
     ----------
@@ -49,56 +48,53 @@ class LiveCompensation:
         self._updates: list[DriftUpdate] = []
         self._reset()
 
-    def update(self, samples: SampleBlock) -> SampleBlock:
-        """Return the block with the drift of its gyros removed; times, temperature and accelerations stay the same."""
+    def compensate_block(self, samples: SampleBlock) -> SampleBlock:
+        """Return a block of samples with the gyro drift removed."""
         values = self.compensator.compensate(samples.values, samples.lost)
         newest_ns = int(samples.t_ns[-1])
-        for interval in self.compensator.take_intervals():
+        for interval in self.compensator.take_finished_intervals():
             t_ns = newest_ns - round((self.compensator.sample_count - interval.end) / self._rate_hz * 1e9)
             self._publish(interval, t_ns)
         return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
-    def take_updates(self) -> list[DriftUpdate]:
+    def take_drift_updates(self) -> list[DriftUpdate]:
         """Return the results of the intervals that have ended since the last call."""
         updates, self._updates = self._updates, []
         return updates
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call: steps of the bias, and models that no longer fit."""
+        """Return the events since the last call: steps of the bias, and drift models that no longer fit."""
         events, self._events = self._events, []
         return events
 
-    def set_model(self, axis: int, model: ArmaModel | None) -> None:
-        """Use a newly identified model for an axis.
+    def apply_identification_result(self, axis: int, identified_model: ArmaModel | None) -> None:
+        """Replace the drift model of an axis with an identified model.
 
         Parameters
         ----------
         axis : int
             Index of the gyro axis, 0 to 2.
-        model : ArmaModel or None
-            The identified model. None means that no model was found.
+        identified_model : ArmaModel or None
+            The identified model. None means that the identification failed.
         """
-        self.compensator.set_model(axis, model)
-        if model is not None:
+        self.compensator.apply_identification_result(axis, identified_model)
+        if identified_model is not None:
             self._innovations[axis].forget_innovations()
 
     def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
 
-        If the rate differs by more than MAX_RATE_CHANGE, the compensation is restarted, because the length of an
-        interval has changed.
+        If the sample rate changes by more than MAX_RATE_CHANGE, the compensation is restarted.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz
             self._reset()
 
     def _reset(self) -> None:
-        """Restart the compensation at the current sample rate."""
         self.compensator = Compensator(self._rate_hz)
         self._innovations = [InnovationTest() for _ in range(GYROS)]
 
     def _publish(self, interval: DriftInterval, t_ns: int) -> None:
-        """Append the result of an interval and its events."""
         used = interval.outcome == USED
         self._updates.append(
             DriftUpdate(
@@ -117,19 +113,19 @@ class LiveCompensation:
                 self._events.append(_step_event(AXES[at], float(interval.mean[at] - interval.expected[at]), t_ns))
                 continue
             known = used[at] and np.isfinite(interval.expected[at])
-            if known and self._innovations[at].update(float(interval.innovation[at])):
+            if known and self._innovations[at].detect_new_misfit(float(interval.innovation[at])):
                 since_ns = t_ns - round(INTERVALS * self.compensator.interval_s * 1e9)
-                self._events.append(_misfit_event(AXES[at], self._innovations[at].mean_square, t_ns, since_ns))
+                self._events.append(
+                    _misfit_event(AXES[at], self._innovations[at].mean_square_innovation, t_ns, since_ns)
+                )
 
 
 def _step_event(axis: str, size: float, t_ns: int) -> Event:
-    """Return the event of a step of the bias by ``size`` rad/s."""
     text = f"{axis}: lasting step of the bias by {format_rate(axis, size, sign=True)}; the new bias is now compensated"
     return Event(EVENT_KIND, t_ns, text, axis, {"bias": {"size": size}})
 
 
 def _misfit_event(axis: str, mean_square: float, t_ns: int, since_ns: int) -> Event:
-    """Return the event of innovations whose mean square is too large."""
     text = (
         f"{axis}: the drift does not follow its model: squared innovations are {mean_square:.1f} times as large as "
         f"expected"

@@ -1,8 +1,7 @@
 """Published methods that remove drift and noise from a finished recording, for comparison.
 
-All three methods learn from samples at rest and then treat the recording as one signal. None of them detects motion.
-The methods ``emd`` and ``wavelet`` need future samples. The method ``ar`` assumes that the whole
-signal has the spectrum of the noise at rest.
+All methods use samples at rest for learning and do not detect motion. The methods ``emd`` and ``wavelet`` need future
+samples. The method ``ar`` assumes that the recording has the spectrum of the noise at rest.
 """
 
 from collections.abc import Callable
@@ -19,8 +18,10 @@ MAX_ORDER: Final = 8
 """Highest order of an autoregression."""
 MIN_REST_SAMPLES: Final = 100
 PIECE, OVERLAP = 16_384, 4_096
-"""Samples of one empirical mode decomposition, and of the cross-fade to the next one. A long signal is decomposed in
-pieces, because the required memory grows with the length."""
+"""Number of samples in a piece, and in the overlap of two pieces.
+
+An empirical mode decomposition of a long signal would need too much memory.
+"""
 MAX_NOISE_LAG: Final = 2
 """Lag in samples by which the autocorrelation of a noise mode has fallen below 1/e."""
 WAVELET: Final = "db4"
@@ -29,20 +30,19 @@ MAX_LEVELS: Final = 8
 MISSING_PACKAGES: Final = 'EMD-signal and PyWavelets are not installed: pip install "imu-monitor[denoise]"'
 
 ReferenceMethod = Callable[[Floats, Floats], Floats]
-"""Function that returns a rate [n] without noise. The arguments are the rate [n] and samples at rest [m], minus the
-mean at rest."""
+"""Function that returns a filtered rate [n] for a rate [n] and samples at rest [m], minus the mean at rest."""
 
 
-def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod) -> Floats:
-    """Return the rate of one axis without drift and noise.
+def apply_reference_method(rate: Floats, rest_samples: Floats, method: ReferenceMethod) -> Floats:
+    """Return the rate of a gyro axis with drift and noise removed by a reference method.
 
     Parameters
     ----------
-    x : ndarray, shape (n,)
+    rate : ndarray, shape (n,)
         Rate in rad/s; NaN = missing. Missing samples stay missing.
-    learned : ndarray, shape (m,)
+    rest_samples : ndarray, shape (m,)
         Rate at rest in rad/s, in the order of time.
-    variant : callable
+    method : callable
         One of the REFERENCE_METHODS.
 
     Returns
@@ -55,28 +55,28 @@ def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod)
     NotReady
         If there are too few samples at rest.
     """
-    rest = learned[np.isfinite(learned)]
+    rest = rest_samples[np.isfinite(rest_samples)]
     if rest.size < MIN_REST_SAMPLES:
         raise NotReady(f"{rest.size} samples at rest; at least {MIN_REST_SAMPLES} are needed for learning")
     mean = float(rest.mean())
-    there = np.isfinite(x)
-    whole = np.interp(np.arange(x.size), np.flatnonzero(there), x[there]) - mean
-    out = variant(whole, rest - mean)
+    there = np.isfinite(rate)
+    whole = np.interp(np.arange(rate.size), np.flatnonzero(there), rate[there]) - mean
+    out = method(whole, rest - mean)
     return np.where(there, out, np.nan)
 
 
 def _autoregressive_filter(x: Floats, learned: Floats) -> Floats:
-    """Filter with an autoregressive model: Yule–Walker equations, order by BIC, Kalman filter."""
+    """Apply a Kalman filter with an autoregressive model, whose order is selected by the BIC."""
     return _kalman_filtered(x, *_autoregression(learned), float(learned.var()))
 
 
 def _filter_emd_modes(x: Floats, _learned: Floats) -> Floats:
-    """Filter the modes of an empirical mode decomposition (Huang et al. 1998) that are noise, see ``_is_noise``."""
+    """Filter the noise modes of an empirical mode decomposition (Huang et al. 1998)."""
     return _process_pieces(x, _filter_noise_modes)
 
 
 def _shrink_wavelets(x: Floats, learned: Floats) -> Floats:
-    """Shrink wavelet coefficients softly by the universal threshold (Donoho & Johnstone 1994)."""
+    """Apply soft thresholding to the wavelet coefficients with the universal threshold (Donoho & Johnstone 1994)."""
     try:
         import pywt
     except ImportError as error:
@@ -91,7 +91,7 @@ def _shrink_wavelets(x: Floats, learned: Floats) -> Floats:
 
 
 def _autoregression(x: Floats) -> tuple[Floats, float]:
-    """Return the coefficients [p ≥ 1] of an autoregression and the variance of its innovations."""
+    """Return the coefficients of an autoregressive model and the variance of the innovations."""
     n = x.size
     most = min(MAX_ORDER, n // 10)
     covariance = np.array([float(x[: n - k] @ x[k:]) / n for k in range(most + 1)])
@@ -105,7 +105,7 @@ def _autoregression(x: Floats) -> tuple[Floats, float]:
 
 
 def _kalman_filtered(x: Floats, phi: Floats, new: float, measuring: float) -> Floats:
-    """Return the steady-state Kalman estimate of an autoregression measured in white noise."""
+    """Return the steady-state Kalman estimate of an autoregressive process with white measurement noise."""
     p = phi.size
     step = np.zeros((p, p))
     step[0], step[1:, :-1] = phi, np.eye(p - 1)
@@ -115,11 +115,11 @@ def _kalman_filtered(x: Floats, phi: Floats, new: float, measuring: float) -> Fl
 
 
 def _steady_covariance(step: Floats, new: float) -> Floats:
-    """Return the steady-state covariance of a Kalman filter's prediction.
+    """Return the steady-state covariance of a Kalman prediction.
 
-    ``step`` is the transition matrix [p, p], and ``new`` is the variance added to the first element in each step. The
-    first element is measured with a variance of one. The function uses the structure-preserving doubling algorithm,
-    which converges quadratically (Chu, Fan, Lin & Wang, Int. J. Control 77, 2004).
+    The structure-preserving doubling algorithm converges quadratically (Chu, Fan, Lin & Wang, Int. J. Control 77,
+    2004). The transition matrix ``step`` has the shape [p, p]. The variance ``new`` is added to the first state in each
+    step. The first state is measured with unit variance.
     """
     p = step.shape[0]
     a, g, h = step.T.copy(), np.zeros((p, p)), np.zeros((p, p))
@@ -137,7 +137,7 @@ def _steady_covariance(step: Floats, new: float) -> Floats:
 
 @compiled
 def _run_filter(x: Floats, phi: Floats, gain: Floats) -> Floats:
-    """Run the filter with a constant gain [p] over x [n], and return its estimates [n]."""
+    """Apply a Kalman filter with a constant gain [p] to the values x [n]."""
     p = phi.size
     state, out = np.zeros(p), np.empty(x.size)
     for k in range(x.size):
@@ -155,7 +155,7 @@ def _run_filter(x: Floats, phi: Floats, gain: Floats) -> Floats:
 
 
 def _filter_noise_modes(x: Floats) -> Floats:
-    """Return the sum of the modes of x [n], with the noise modes filtered."""
+    """Return the sum of the modes of x [n] after filtering the noise modes."""
     try:
         from PyEMD import EMD
     except ImportError as error:
@@ -180,7 +180,7 @@ def _is_noise(mode: Floats) -> bool:
 
 
 def _process_pieces(x: Floats, work: Callable[[Floats], Floats]) -> Floats:
-    """Process overlapping pieces of x [n] one by one, and cross-fade them."""
+    """Process overlapping pieces of x [n], and cross-fade the results."""
     out = np.zeros(x.size)
     rise = (np.arange(OVERLAP) + 0.5) / OVERLAP
     start, end = 0, 0

@@ -1,1 +1,1 @@
-"""Models of bias against temperature: fit, online update and prediction."""
+"""Models of the bias against temperature: fit, online update and prediction."""

@@ -1,24 +1,19 @@
-"""Test whether the slow part of a bias depends on temperature, and whether heating and cooling differ.
+"""Significance tests for the dependence of a bias on temperature, and for hysteresis between heating and cooling.
 
-A random walk correlates with a temperature ramp by chance, so ordinary regression would name axes that do not depend on
-temperature. The tests are therefore generalised least squares with correlated noise as the null hypothesis. The noise
-is the sum of white noise and a random walk whose increments may be correlated (a smooth drift). The ratio of random
-walk to white noise and the correlation of the increments are unknown. An F test is made for each pair of these two
-parameters on a grid. Pairs are plausible if their log restricted likelihood (Harville, J. Am. Stat. Assoc. 72, 1977) is
-within MAX_LIKELIHOOD_LOSS of the best. The result is the largest p-value of all plausible pairs. The measured false
-positive rates are in
-docs/thermal-measurements.md.
+A random walk can correlate with temperature by chance. The tests are therefore F tests of generalised least squares, in
+which the noise is the sum of white noise and a random walk with correlated increments. The noise parameters are
+unknown, so an F test is made for each pair of parameters on a grid. A pair is plausible if its log restricted
+likelihood (Harville, J. Am. Stat. Assoc. 72, 1977) is within MAX_LIKELIHOOD_LOSS of the best. The p-value is the
+largest p-value of all plausible pairs. The measured false positive rates are in docs/thermal-measurements.md.
 
-``find_dependence`` tests a cubic polynomial in temperature, alone and with each description of hysteresis.
-``find_hysteresis`` tests the descriptions of hysteresis in addition to a polynomial of order 5. The descriptions are:
+Hysteresis is described in three ways:
 
 - differences between heating and cooling that vanish at the ends of the temperature range;
 - first-order lags, for heat that reaches the sensor with a delay;
-- play operators, whose sum is the Prandtl-Ishlinskii model of rate-independent hysteresis (Visintin, Differential
-  Models of Hysteresis, 1994, chapter III).
+- play operators of the Prandtl-Ishlinskii model (Visintin, Differential Models of Hysteresis, 1994, chapter III).
 
-If temperature rose and fell, a constant drift with time belongs to the null hypothesis. If temperature moved in one
-direction only, such a drift cannot be distinguished from a dependence on temperature, and ``one_way`` is True.
+If the temperature rose and fell, a constant drift with time is part of the null hypothesis. If the temperature only
+rose or only fell, a drift with time cannot be distinguished from a dependence on temperature.
 """
 
 from collections.abc import Mapping
@@ -31,28 +26,27 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.common.distributions import incomplete_beta
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.thermal_model import interpolate_gaps
-from monitor.drift.thermal.thermal_response import first_order_lag
+from monitor.drift.thermal.thermal_model import interpolate_missing_temperatures
+from monitor.drift.thermal.thermal_response import apply_first_order_lag
 
 SIGNIFICANCE: Final = 0.01
 """Largest p-value of a dependence or a hysteresis that is reported, after Bonferroni's correction."""
 MAIN_SHARE: Final = 0.5
-"""Share of the variance of the means above which temperature is said to explain most of the variance."""
+"""Share of the variance of the interval means from which temperature explains most of the variance."""
 MAX_MEANS: Final = 150
-"""Largest number of means. If there are more, groups of means are averaged, because the cost grows with the cube of the
-number."""
+"""Largest number of interval means, because the computing time grows with the cube of the number."""
 MIN_FREE: Final = 4
 """Smallest number of degrees of freedom that a regression must leave."""
 MAX_LIKELIHOOD_LOSS: Final = 2.0
-"""Largest difference of the log restricted likelihood to the best noise model, for a plausible noise model."""
+"""Largest difference of the log restricted likelihood between the best and a plausible noise model."""
 WALK_RATIOS: Final = (0.0, *np.geomspace(1e-3, 1e3, 9).tolist())
-"""Variance that the random walk gains in an interval, divided by the white variance of a mean."""
+"""Variance of the random walk increments, divided by the variance of the white noise."""
 INCREMENT_CORRELATIONS: Final = (0.0, 0.5, 0.8, 0.95)
 """Correlations of successive increments of the random walk."""
 MIN_REVERSAL_SHARE: Final = 0.05
-"""Share of the temperature range by which temperature must return to have changed its direction."""
+"""Smallest change of temperature for a reversal, as a share of the temperature range."""
 MIN_REVERSAL_SIGMAS: Final = 3.0
-"""Standard errors of a mean of temperature by which temperature must return to have changed its direction."""
+"""Smallest change of temperature for a reversal, in standard errors of a mean temperature."""
 LAG_INTERVALS: Final = (1.0, 2.5, 6.0, 15.0)
 """Time constants of the lags, in intervals."""
 PLAY_WIDTHS: Final = (0.05, 0.1, 0.2, 0.35)
@@ -60,9 +54,9 @@ PLAY_WIDTHS: Final = (0.05, 0.1, 0.2, 0.35)
 LOOP_POWERS: Final = 4
 """Number of terms of the difference between heating and cooling."""
 FOLDS: Final = 6
-"""Parts of the means for cross-validation. Successive means belong to different parts."""
+"""Number of parts for the cross-validation. Successive interval means belong to different parts."""
 MIN_NEW_SHARE: Final = 1e-4
-"""Smallest part of a regressor that the previous regressors must leave unexplained. Other regressors are dropped."""
+"""Smallest part of a regressor that must be linearly independent of the previous regressors."""
 CURVE_ORDER: Final = 3
 """Order of the polynomial in temperature for the test of dependence."""
 HYSTERESIS_CURVE_ORDER: Final = 5
@@ -71,36 +65,36 @@ HYSTERESIS_CURVE_ORDER: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class TemperatureDependence:
-    """Significant dependence of the slow variation of an axis on temperature."""
+    """Significant dependence of a bias on temperature."""
 
     share: float  # explained share of the variance of the interval means, cross-validated
     p_value: float  # p-value of the hypothesis of no dependence
     form: str  # "cubic", or "cubic with hysteresis"
-    one_way: bool  # True if temperature only rose or only fell
+    one_way: bool  # True if the temperature only rose or only fell
     interval_s: float
 
     @property
-    def explains_most(self) -> bool:
-        """True if temperature explains the greater part of the slow variance."""
+    def explains_most_variance(self) -> bool:
+        """Return True if temperature explains at least half of the variance of the interval means."""
         return self.share >= MAIN_SHARE
 
 
 @dataclass(frozen=True, slots=True)
 class Hysteresis:
-    """Difference of the bias between heating and cooling."""
+    """Difference of a bias between heating and cooling."""
 
     size: float  # largest difference of the bias at one temperature, including a drift in between; rad/s or m/s²
     p_value: float  # p-value of the hypothesis of no difference
 
     @property
     def hysteresis_is_significant(self) -> bool:
-        """True if noise alone does not explain the difference."""
+        """Return True if the hysteresis is statistically significant."""
         return self.p_value < SIGNIFICANCE
 
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    """F test of one set of regressors."""
+    """Result of the F test of additional regressors."""
 
     p_value: float  # largest p-value among the plausible noise models
     likelihood: float  # logarithm, for the most likely noise model; comparable between regressions of the same means
@@ -109,16 +103,17 @@ class _Regression:
 
 
 def temperature_noise_c(temperature_c: Floats) -> float:
-    """Return the standard deviation of the noise of temperatures [n] in °C, from their second differences."""
+    """Return the standard deviation of the temperature noise in °C, estimated from second differences."""
     second = np.diff(temperature_c, 2)
     return float(np.median(np.abs(second))) / 6.0**0.5 / 0.6745 if second.size else 0.0
 
 
 def heating_direction(temperature_c: Floats) -> Floats:
-    """Return +1 where temperature was last rising and -1 where it was last falling. All values are 0 without any
-    change.
+    """Return +1 for each temperature after a rise and -1 for each temperature after a fall. A constant temperature
+    gives zeros.
 
-    A reversal counts if it exceeds MIN_REVERSAL_SHARE of the range and MIN_REVERSAL_SIGMAS standard errors of a mean.
+    A change of direction counts if the change exceeds MIN_REVERSAL_SHARE of the temperature range and
+    MIN_REVERSAL_SIGMAS standard errors.
 
     Parameters
     ----------
@@ -153,21 +148,21 @@ def heating_direction(temperature_c: Floats) -> Floats:
     return direction
 
 
-def find_dependence(means: IntervalMeans) -> TemperatureDependence | None:
-    """Test whether the bias depends on temperature.
+def find_temperature_dependence(means: IntervalMeans) -> TemperatureDependence | None:
+    """Test whether a bias depends on temperature.
 
     Parameters
     ----------
     means : IntervalMeans
-        Interval means of bias (rad/s or m/s²) and temperature (°C). Temperature must vary.
+        Interval means of bias (rad/s or m/s²) and temperature (°C). The temperature must vary.
 
     Returns
     -------
     TemperatureDependence or None
-        The dependence with the largest share among the significant ones, or None if noise explains the bias.
+        The significant dependence with the largest explained share, or None if no dependence is significant.
     """
     pooled = _pooled(means)
-    known, y = pooled.known, pooled.bias
+    known, y = pooled.both_known, pooled.bias
     x, direction = _scaled(pooled)
     one_way = not _rose_and_fell(direction)
     curve = _polynomial(x, CURVE_ORDER)
@@ -189,53 +184,54 @@ def find_dependence(means: IntervalMeans) -> TemperatureDependence | None:
 
 
 def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
-    """Test whether the bias differs between heating and cooling at the same temperature.
+    """Test whether a bias differs between heating and cooling at the same temperature.
 
     Parameters
     ----------
     means : IntervalMeans
-        Interval means of bias (rad/s or m/s²) and temperature (°C). Temperature must vary.
+        Interval means of bias (rad/s or m/s²) and temperature (°C). The temperature must vary.
 
     Returns
     -------
     Hysteresis or None
-        The difference and its p-value. None if temperature moved in one direction only, or if there are too few means.
+        The hysteresis and its p-value. None if the temperature only rose or only fell, or if there are too few means.
     """
     pooled = _pooled(means)
     x, direction = _scaled(pooled)
     if not _rose_and_fell(direction):
         return None
     curve, loops = _polynomial(x, HYSTERESIS_CURVE_ORDER), _hysteresis_regressors(x, direction)
-    # A single lag or play operator is also tested, because it leaves more degrees of freedom than all four together.
+    # A single lag or play operator leaves more degrees of freedom than all four together.
     candidates = [*loops.values(), *loops["lag"].T[:, :, None], *loops["play"].T[:, :, None]]
 
-    def regress(nuisance: Floats) -> list[_Regression]:
-        tested = (_regression(pooled.bias, nuisance, each, pooled.known) for each in candidates)
+    def test_candidates(nuisance: Floats) -> list[_Regression]:
+        tested = (_regression(pooled.bias, nuisance, each, pooled.both_known) for each in candidates)
         return [one for one in tested if one is not None]
 
-    tests = regress(np.hstack([_linear_drift(x.size), curve]))
-    # Within one temperature cycle, a drift and hysteresis are nearly collinear, so the size comes from a fit without a
-    # drift.
-    fits = regress(curve)
+    tests = test_candidates(np.hstack([_linear_drift(x.size), curve]))
+    # Within one temperature cycle, drift and hysteresis are nearly collinear, so the size is fitted without drift.
+    fits = test_candidates(curve)
     if not tests or not fits:
         return None
     best = max(fits, key=lambda one: one.likelihood)
-    size = _loop_width(best.smooth, x[pooled.known], direction[pooled.known])
+    size = _loop_width(best.smooth, x[pooled.both_known], direction[pooled.both_known])
     return Hysteresis(size, min(len(tests) * min(one.p_value for one in tests), 1.0))
 
 
 def _pooled(means: IntervalMeans) -> IntervalMeans:
-    """Return the means, averaged in groups if there are more than MAX_MEANS."""
+    """Return the interval means, averaged in groups if there are more than MAX_MEANS."""
     group = -(-means.bias.size // MAX_MEANS)
     if group == 1:
         return means
     count = means.bias.size // group
-    known = means.known[: count * group].reshape(count, group)
+    known = means.both_known[: count * group].reshape(count, group)
     rows = (np.where(known, part[: count * group].reshape(count, group), 0.0) for part in (means.bias, means.error))
     bias, error = (part.sum(axis=1) for part in rows)
     there = np.maximum(known.sum(axis=1), 1)
     enough = 2 * known.sum(axis=1) >= group
-    temperature_c = interpolate_gaps(means.temperature_c)[: count * group].reshape(count, group).mean(axis=1)
+    temperature_c = (
+        interpolate_missing_temperatures(means.temperature_c)[: count * group].reshape(count, group).mean(axis=1)
+    )
     return IntervalMeans(
         group * means.interval_s,
         np.where(enough, bias / there, np.nan),
@@ -245,14 +241,14 @@ def _pooled(means: IntervalMeans) -> IntervalMeans:
 
 
 def _scaled(means: IntervalMeans) -> tuple[Floats, Floats]:
-    """Return temperature scaled to -1 … 1, and the direction of its change."""
-    temperature_c = interpolate_gaps(means.temperature_c)
+    """Return the temperature scaled to the range -1 to 1, and the heating direction."""
+    temperature_c = interpolate_missing_temperatures(means.temperature_c)
     lowest, swing = float(temperature_c.min()), float(np.ptp(temperature_c))
     return 2.0 * (temperature_c - lowest) / swing - 1.0, heating_direction(temperature_c)
 
 
 def _rose_and_fell(direction: Floats) -> bool:
-    """Return True if temperature was rising in at least three means and falling in at least three means."""
+    """Return True if the temperature rose in at least three intervals and fell in at least three intervals."""
     return min(int((direction > 0.0).sum()), int((direction < 0.0).sum())) >= 3
 
 
@@ -262,21 +258,23 @@ def _polynomial(x: Floats, order: int) -> Floats:
 
 
 def _linear_drift(n: int) -> Floats:
-    """Return a linear drift with time [n, 1] from -1 to 1."""
+    """Return a linear drift with time as a column [n, 1], from -1 to 1."""
     return np.linspace(-1.0, 1.0, n)[:, None]
 
 
 def _hysteresis_regressors(x: Floats, direction: Floats) -> Mapping[str, Floats]:
-    """Return the regressors [n, k] of each description of hysteresis."""
+    """Return the regressors [n, k] for each description of hysteresis."""
     return {
         "direction": np.stack([direction * (1.0 - x**2) * x**power for power in range(LOOP_POWERS)], axis=1),
-        "lag": np.stack([first_order_lag(x, float(np.exp(-1.0 / constant))) - x for constant in LAG_INTERVALS], axis=1),
+        "lag": np.stack(
+            [apply_first_order_lag(x, float(np.exp(-1.0 / constant))) - x for constant in LAG_INTERVALS], axis=1
+        ),
         "play": np.stack([_play(x, 2.0 * width) - x for width in PLAY_WIDTHS], axis=1),
     }
 
 
 def _play(x: Floats, half_width: float) -> Floats:
-    """Return the play operator of x: an output that follows x at a distance of at most half_width.
+    """Return the output of a play operator, which follows x at a distance of at most ``half_width``.
 
     >>> _play(np.array([0.0, 1.0, 0.0, -1.0]), 0.25).tolist()
     [0.0, 0.75, 0.25, -0.75]
@@ -290,7 +288,7 @@ def _play(x: Floats, half_width: float) -> Floats:
 
 
 def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) -> _Regression | None:
-    """Return the F test of regressors that are added to the nuisance regressors, or None if there are too few means."""
+    """Return the F test of additional regressors, or None if there are too few interval means."""
     if int(known.sum()) <= MIN_FREE + 1:
         return None
     whiteners, log_determinants = _whiteners(known.tobytes())
@@ -327,7 +325,7 @@ def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) 
 def _validated_share(
     y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray, noise: tuple[float, float]
 ) -> float:
-    """Return the share of the variance of the means that a fit to the other means predicts."""
+    """Return the cross-validated share of the variance of the interval means that the regressors explain."""
     columns = np.hstack([nuisance, tested])[known]
     columns = columns - columns.mean(axis=0)
     columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -347,23 +345,24 @@ def _validated_share(
 
 
 def _noise_models() -> list[tuple[float, float]]:
-    """Return ratio and correlation of each noise model; without a random walk there is no correlation."""
+    """Return the ratio and the correlation of each noise model on the grid."""
     return [(ratio, one) for ratio in WALK_RATIOS for one in (INCREMENT_CORRELATIONS if ratio else (0.0,))]
 
 
 @lru_cache(maxsize=4)
 def _whiteners(known: bytes) -> tuple[Floats, Floats]:
-    """Return a whitening matrix [g, m - 1, m] of the m known means and its log determinant [g], by noise model."""
+    """Return the whitening matrices [g, m - 1, m] and the log determinants [g] of all noise models."""
     there = np.frombuffer(known, np.bool_)
     made = [_whitener(there, *one) for one in _noise_models()]
     return np.stack([each for each, _ in made]), np.array([each for _, each in made])
 
 
 def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floats, float]:
-    """Return the matrix [m - 1, m] that makes differences of the m known means white, and the log determinant.
+    """Return the matrix [m - 1, m] that whitens the differences of m interval means, and the log determinant.
 
-    The covariance of the differences of successive means is that of white noise, tridiagonal (-1, 2, -1), plus that of
-    the walk. A random walk averaged over intervals has increments of variance 2/3 and covariance 1/6.
+    The covariance matrix is the sum of the covariances of white noise and of the random walk. White noise gives a
+    tridiagonal matrix (-1, 2, -1). The increments of an averaged random walk have the variance 2/3 and the covariance
+    1/6.
     """
     n, at = known.size, np.flatnonzero(known)
     if correlation:
@@ -383,13 +382,13 @@ def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floa
 
 
 def _toeplitz(row: Floats) -> Floats:
-    """Return the symmetric Toeplitz matrix [n, n] with the given first row [n]."""
+    """Return the symmetric Toeplitz matrix [n, n] with the first row ``row``."""
     at = np.arange(row.size)
     return np.asarray(row[np.abs(at[:, None] - at)])
 
 
 def _loop_width(bias: Floats, x: Floats, direction: Floats) -> float:
-    """Return the largest difference between heating and cooling at one temperature."""
+    """Return the largest difference of the bias between heating and cooling at the same temperature."""
     grid = np.linspace(-0.95, 0.95, 39)
     legs: dict[float, list[Floats]] = {1.0: [], -1.0: []}
     for leg in np.split(np.arange(x.size), np.flatnonzero(np.diff(direction)) + 1):
@@ -403,7 +402,8 @@ def _loop_width(bias: Floats, x: Floats, direction: Floats) -> float:
 
 
 def _mean_of_legs(legs: list[Floats], n: int) -> Floats:
-    """Return the mean [n] over all temperature sweeps at each temperature; NaN where no sweep passed."""
+    """Return the mean bias of all temperature sweeps on the temperature grid. The value is NaN outside of all
+    sweeps."""
     rows = np.array(legs).reshape(len(legs), n)
     there = np.isfinite(rows)
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Interval means of bias and temperature, with their standard errors."""
+"""Interval means of the bias and the temperature, with standard errors."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -14,7 +14,7 @@ MIN_KNOWN_SHARE: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class IntervalMeans:
-    """Means of the bias of one axis and of temperature over successive intervals without gaps in time."""
+    """Means of the bias of an axis and of the temperature over successive intervals."""
 
     interval_s: float
     bias: Floats  # [n] rad/s or m/s²; NaN if too few samples are known
@@ -22,18 +22,18 @@ class IntervalMeans:
     temperature_c: Floats  # [n] °C; NaN if too few samples are known
 
     @property
-    def known(self) -> np.ndarray:
-        """True [n] where bias and temperature are both known."""
+    def both_known(self) -> np.ndarray:
+        """Return a mask [n] that is True for intervals with a known bias and a known temperature."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
 
 
 def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> IntervalMeans:
-    """Return the means over whole intervals; a shorter remainder at the end is dropped.
+    """Return the means of the bias and the temperature over successive intervals.
 
-    An interval is divided into PARTS_PER_INTERVAL parts. Half of the mean square difference between the means of
-    neighbouring parts estimates the variance of a part. The standard error of the interval is the root of this variance
-    divided by the number of parts. For white noise, the standard error equals σ/√n. A drift across the interval has
-    little effect.
+    An interval is divided into PARTS_PER_INTERVAL parts. The variance of a part is half the mean square difference
+    between the means of neighbouring parts. The standard error is the square root of the variance divided by the number
+    of parts. A drift within the interval has little effect on the standard error. Samples after the last complete
+    interval are not used.
 
     Parameters
     ----------
@@ -60,11 +60,11 @@ def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float
 
 
 def _row_means(rows: Floats) -> tuple[Floats, Floats]:
-    """Return mean and standard error [n] of each row [n, length]; NaN if fewer than MIN_KNOWN_SHARE are known."""
+    """Return the mean and the standard error of each row [n, length]. NaN means that too few values are known."""
     known_samples = np.isfinite(rows)
     count = known_samples.sum(axis=1)
     too_few = count < max(MIN_KNOWN_SHARE * rows.shape[1], 1.0)
-    # Subtracting the origin avoids rounding errors, for example with gravity of 9.81 m/s² and noise of 1e-4 m/s².
+    # Subtracting the origin reduces rounding errors, for example if gravity is 9.81 m/s² and the noise 1e-4 m/s².
     origin = np.nanmedian(rows) if known_samples.any() else 0.0
     mean = origin + np.where(known_samples, rows - origin, 0.0).sum(axis=1) / np.maximum(count, 1)
     size = rows.shape[1] // PARTS_PER_INTERVAL
@@ -73,23 +73,23 @@ def _row_means(rows: Floats) -> tuple[Floats, Floats]:
         shape = (count.size, PARTS_PER_INTERVAL, size)
         inside = known_samples[:, : PARTS_PER_INTERVAL * size].reshape(shape).sum(axis=2)
         differences = np.where(known_samples, rows - mean[:, None], 0.0)[:, : PARTS_PER_INTERVAL * size]
-        error = standard_error(differences.reshape(shape).sum(axis=2).T, inside.T)
+        error = standard_error_from_parts(differences.reshape(shape).sum(axis=2).T, inside.T)
     mean[too_few], error[too_few] = np.nan, np.nan
     return mean, error
 
 
-def standard_error(sums: Floats, counts: Ints) -> Floats:
-    """Return the standard errors [n] of interval means, as described in ``compute_interval_means``.
+def standard_error_from_parts(part_sums: Floats, part_counts: Ints) -> Floats:
+    """Return the standard errors [n] of interval means from the sums over parts of the intervals.
 
     Parameters
     ----------
-    sums : ndarray, shape (PARTS_PER_INTERVAL, n)
+    part_sums : ndarray, shape (PARTS_PER_INTERVAL, n)
         Sum of the known samples of each part.
-    counts : ndarray, shape (PARTS_PER_INTERVAL, n)
+    part_counts : ndarray, shape (PARTS_PER_INTERVAL, n)
         Number of known samples of each part.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        differences = np.diff(sums / counts, axis=0)
+        differences = np.diff(part_sums / part_counts, axis=0)
         known = np.isfinite(differences)
         square = np.where(known, differences, 0.0) ** 2
         return np.asarray(np.sqrt(0.5 * square.sum(axis=0) / known.sum(axis=0) / PARTS_PER_INTERVAL))

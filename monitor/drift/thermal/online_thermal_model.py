@@ -1,19 +1,15 @@
-"""Online model of bias against temperature for one axis: each interval is predicted before it is used for the fit.
+"""Online model of the bias against temperature for one axis.
 
-The model that was fitted to the earlier intervals predicts each new interval. A multi-step prediction uses the
-temperature only, and a one-step prediction also uses the previous bias. After the prediction, ``RecursiveThermalFit``
-updates the coefficients with the interval. The terms and time constants of the model are selected again when the number
-of known intervals has grown by the factor REFIT_GROWTH. A selection takes up to a second. ``step`` therefore runs one
-short step at a time, on the intervals that were known at the start of the selection.
+The model predicts each interval before the interval is used for the fit. A multi-step prediction uses only the
+temperature. A one-step prediction also uses the previous bias. After the prediction, ``RecursiveThermalFit`` updates
+the coefficients. The model is selected again when the number of intervals has grown by the factor REFIT_GROWTH. A model
+selection takes up to a second, so ``run_selection_step`` runs one short step at a time.
 
-If several intervals lie outside their prediction intervals, ``residual_alarm`` suspects a change of the bias. During a
-suspicion, no regular model selection starts, because a new model could fit the change and hide it. Intervals far
-outside their prediction are not used for the fit. The suspicion is tested by two fits: one with a step of the offset at
-the start of the suspicion, and one without a step. Both fits include lags, because delayed heat looks like a change
-when the temperature reverses for the first time. If temperature explains the intervals without a step, the new model is
-used and no change is reported. Otherwise, the change is reported, and the earlier intervals are shifted to the new
-offset. The known dependence on temperature is thus kept. After the sensor has been moved or restarted, the new offset
-is learned in the same way, but not reported.
+If several intervals lie outside of the prediction intervals, ``residual_alarm`` suspects a change of the bias.
+Intervals far outside of the prediction are not used for the fit. Two fits test the suspicion, one with a step of the
+bias and one without a step. If the fit with a step is clearly better, the change is reported, and the earlier intervals
+are shifted to the new offset. Otherwise, the fit without a step becomes the new model. After the sensor has been moved
+or restarted, the new offset is learned but not reported.
 """
 
 from collections import deque
@@ -28,30 +24,32 @@ from drivers.errors import NotReady
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval, RecursiveThermalFit
 from monitor.drift.thermal.residual_alarm import ResidualAlarm, UnexplainedChange
-from monitor.drift.thermal.thermal_fit import StepwiseWork, fit_in_steps
+from monitor.drift.thermal.thermal_fit import StepwiseWork, fit_thermal_model_stepwise
 from monitor.drift.thermal.thermal_model import ThermalModel
 
 MAX_INTERVALS: Final = 1000
-"""Largest number of stored intervals, which is a week with intervals of ten minutes."""
+"""Largest number of stored intervals. A thousand intervals of ten minutes correspond to a week."""
 REFIT_GROWTH: Final = 1.25
 """Growth of the number of known intervals after which the model is selected again."""
 OFFSET_INTERVALS: Final = 3
-"""Intervals that determine a new offset."""
+"""Number of intervals from which a new offset is determined."""
 STEP_AICC_MARGIN: Final = 10.0
-"""Gain in AICc above which a step is accepted. The margin is needed because the position of the step was chosen with
-the same intervals."""
+"""Improvement of the AICc above which a step of the bias is accepted.
+
+A margin is needed because the same intervals determine the position of the step.
+"""
 NEW_OFFSET: Final = "the sensor was moved or restarted: the new offset is being learned"
-"""Text for intervals without a prediction after a change of the offset."""
+"""Reason for a missing prediction after a change of the offset."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedAxisInterval:
-    """One interval of one axis, with its prediction."""
+    """Measured and predicted mean of an axis in one interval."""
 
     bias: float  # rad/s or m/s²; NaN if too few samples are known
     error: float  # standard error of ``bias``
     multi_step: PredictionInterval | None  # prediction from temperature only; None if there is no model yet
-    one_step: PredictionInterval | None  # prediction from temperature and from the bias before
+    one_step: PredictionInterval | None  # prediction from temperature and previous bias
     model: str  # name of the form of the model
     slope: float  # bias per °C after all lags have settled; NaN without a model
     text: str  # reason why there is no prediction
@@ -59,20 +57,18 @@ class PredictedAxisInterval:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """Bias, standard error and temperature of one interval."""
-
     bias: float
     error: float
     temperature_c: float
 
     @property
     def has_bias_and_temperature(self) -> bool:
-        """True if bias and temperature are both known."""
+        """Return True if the bias and the temperature are both known."""
         return bool(np.isfinite(self.bias) and np.isfinite(self.temperature_c))
 
 
 class OnlineThermalModel:
-    """Online model of one axis and the intervals from which it is fitted.
+    """Online thermal model of an axis, with the intervals of the fit.
 
     Parameters
     ----------
@@ -89,55 +85,66 @@ class OnlineThermalModel:
         self._interval_count = 0  # intervals since the start
         self._known_count = 0  # intervals with a known bias and temperature
         self._next_choice = 0  # number of known intervals at the next choice
-        self._offset_differences: list[float] | None = None  # residuals since the offset changed; None if it did not
+        self._offset_differences: list[float] | None = None  # residuals since a change of the offset, or None
         self._new_offset_at = 0  # number of intervals at the change of the offset
         self._settled: list[UnexplainedChange] = []
         self._missing_reason = ""  # reason why there is no model
 
-    def update(self, bias: float, error: float, temperature_c: float) -> PredictedAxisInterval:
-        """Add an interval, and return it with its prediction.
+    def predict_and_add_interval(
+        self, bias: float, standard_error: float, temperature_c: float
+    ) -> PredictedAxisInterval:
+        """Predict the bias of a new interval, and then update the model with the interval.
 
         Parameters
         ----------
         bias : float
             Mean of the interval in rad/s or m/s²; NaN = not measured.
-        error : float
+        standard_error : float
             Standard error of ``bias``.
         temperature_c : float
             Mean temperature of the interval in °C; NaN = not measured.
         """
-        row = _Row(bias, error, temperature_c)
+        row = _Row(bias, standard_error, temperature_c)
         self._interval_count += 1
         self._known_count += row.has_bias_and_temperature
         self._rows.append(row)
         if self._recursion is None:
             if self._work is None:
                 self._start_work(self._choose_model())
-            return PredictedAxisInterval(bias, error, None, None, "", np.nan, self._missing_reason)
+            return PredictedAxisInterval(bias, standard_error, None, None, "", np.nan, self._missing_reason)
         multi_step, one_step = self._recursion.predict_multi_and_one_step(temperature_c)
         model = self._recursion.model
         if self._offset_differences is not None:
-            self._recursion.update(temperature_c, np.nan)
+            self._recursion.add_interval(temperature_c, np.nan)
             if row.has_bias_and_temperature:
                 self._add_offset_difference(self._offset_differences, bias - multi_step.bias)
-            return PredictedAxisInterval(bias, error, None, None, model.shape.name, model.mean_slope, NEW_OFFSET)
-        found = self._suspicion.update(bias if row.has_bias_and_temperature else np.nan, multi_step, one_step)
-        self._recursion.update(
-            temperature_c, np.nan if row.has_bias_and_temperature and self._suspicion.is_unfit_for_update else bias
+            return PredictedAxisInterval(
+                bias, standard_error, None, None, model.shape.name, model.mean_bias_slope, NEW_OFFSET
+            )
+        found = self._suspicion.check_interval(bias if row.has_bias_and_temperature else np.nan, multi_step, one_step)
+        self._recursion.add_interval(
+            temperature_c,
+            np.nan if row.has_bias_and_temperature and self._suspicion.last_interval_is_far_outside else bias,
         )
         if found is not None:
             self._start_work(self._test_for_step(found))
-        elif self._known_count >= self._next_choice and self._work is None and self._suspicion.is_within_prediction:
+        elif (
+            self._known_count >= self._next_choice
+            and self._work is None
+            and self._suspicion.recent_intervals_fit_prediction
+        ):
             self._start_work(self._choose_model())
-        return PredictedAxisInterval(bias, error, multi_step, one_step, model.shape.name, model.mean_slope, "")
+        return PredictedAxisInterval(
+            bias, standard_error, multi_step, one_step, model.shape.name, model.mean_bias_slope, ""
+        )
 
     @property
-    def choosing(self) -> bool:
-        """True if a model selection is active, so that ``step`` has work to do."""
+    def is_selecting_model(self) -> bool:
+        """Return True if a model selection is active."""
         return self._work is not None
 
-    def step(self) -> bool:
-        """Run one step of the model selection, which takes about 1 ms. Return False if no selection is active."""
+    def run_selection_step(self) -> bool:
+        """Run one step of an active model selection, which takes about 1 ms. Return False if no selection is active."""
         if self._work is None:
             return False
         try:
@@ -147,7 +154,7 @@ class OnlineThermalModel:
         return True
 
     def take_unexplained_changes(self) -> list[UnexplainedChange]:
-        """Return the unexplained changes of the bias that were confirmed since the last call."""
+        """Return the bias changes that were confirmed since the last call and that temperature does not explain."""
         told, self._settled = self._settled, []
         return told
 
@@ -161,31 +168,31 @@ class OnlineThermalModel:
             self._offset_differences, self._new_offset_at = [], self._interval_count
 
     def _start_work(self, work: StepwiseWork[None]) -> None:
-        """Start new work. Unfinished earlier work is discarded, because it used fewer intervals."""
+        """Start a model selection, and discard any unfinished model selection."""
         self._work = work
-        self.step()
+        self.run_selection_step()
 
     def _choose_model(self) -> StepwiseWork[None]:
-        """Select the model again. The present model is kept if there are too few intervals."""
+        """Select a new model, or keep the present model if there are too few intervals."""
         self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         self._missing_reason = "the model is being selected"
         try:
-            chosen = yield from fit_in_steps(self._means())
+            chosen = yield from fit_thermal_model_stepwise(self._means())
         except NotReady as error:
             self._missing_reason = str(error)
         else:
             self._recursion = RecursiveThermalFit(chosen.model, self._means())
 
     def _test_for_step(self, doubt: UnexplainedChange) -> StepwiseWork[None]:
-        """Decide whether another model of temperature or a step of the offset explains a suspected change."""
+        """Decide whether a suspected change is explained by another thermal model or by a step of the bias."""
         means, came, since = self._means(), self._interval_count, len(self._rows) - doubt.since
         self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         size, model = doubt.size, None
         try:
-            without = yield from fit_in_steps(means, lags=True)
-            stepped = yield from fit_in_steps(means, since, lags=True)
+            without = yield from fit_thermal_model_stepwise(means, always_try_lags=True)
+            stepped = yield from fit_thermal_model_stepwise(means, since, always_try_lags=True)
         except NotReady:
-            pass  # There are too few intervals to select a model. The present model is kept.
+            pass  # With too few intervals, the present model is kept.
         else:
             if without.aicc - stepped.aicc < STEP_AICC_MARGIN:
                 self._recursion = RecursiveThermalFit(without.model, self._means())
@@ -196,16 +203,17 @@ class OnlineThermalModel:
         self._settled.append(replace(doubt, size=size, since=since))
 
     def _add_offset_difference(self, apart: list[float], by: float) -> None:
-        """Add a residual. Determine the new offset when OFFSET_INTERVALS residuals are known."""
+        """Add a residual, and determine the new offset after OFFSET_INTERVALS residuals."""
         apart.append(by)
         if len(apart) == OFFSET_INTERVALS:
             self._start_work(self._settle_offset(float(np.mean(apart))))
 
     def _settle_offset(self, size: float) -> StepwiseWork[None]:
-        """Determine the new offset by a fit to all intervals, or by the mean residual if a fit is not possible."""
+        """Determine the new offset from a fit to all intervals, or from the mean residual if the fit is not
+        possible."""
         model = None
         try:
-            stepped = yield from fit_in_steps(
+            stepped = yield from fit_thermal_model_stepwise(
                 self._means(), len(self._rows) - (self._interval_count - self._new_offset_at)
             )
         except NotReady:
@@ -216,7 +224,7 @@ class OnlineThermalModel:
         self._shift_history(size, self._interval_count - self._new_offset_at, model)
 
     def _shift_history(self, by: float, last: int, model: ThermalModel | None) -> None:
-        """Add the step of the offset to the bias of all intervals except the last ones, and fit the model again."""
+        """Add a step to the bias of all intervals except the last ``last`` intervals, and fit the model again."""
         before = max(len(self._rows) - last, 0)
         moved = [_Row(row.bias + by, row.error, row.temperature_c) for row in islice(self._rows, before)]
         self._rows = deque([*moved, *islice(self._rows, before, None)], maxlen=MAX_INTERVALS)
@@ -224,6 +232,5 @@ class OnlineThermalModel:
             self._recursion = RecursiveThermalFit(model or self._recursion.model, self._means())
 
     def _means(self) -> IntervalMeans:
-        """Return the kept intervals as arrays."""
         bias, error, temperature_c = np.array([(r.bias, r.error, r.temperature_c) for r in self._rows]).T
         return IntervalMeans(self._interval_s, bias, error, temperature_c)

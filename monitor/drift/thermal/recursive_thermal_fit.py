@@ -1,14 +1,10 @@
-"""Recursive least squares: update of the coefficients of a thermal model with each interval.
+"""Recursive least squares, which updates the coefficients of a thermal model with each interval.
 
-The terms of the model, the time constants and φ are not changed. The whitened regressors and values of all intervals
-are stored as the triangular factor R of their QR decomposition. A new interval adds one row, and R is made triangular
-again (Golub & Van Loan, Matrix Computations, 6.5). Except for rounding, the coefficients agree with least squares over
-the whole record, and the cost does not grow with the record. R has further columns for the derivatives with respect to
-the time constants. These columns do not affect the coefficients, but they add the uncertainty of the time constants to
-the prediction intervals.
-
-If the temperature of an interval is missing, the previous temperature is used. A fit to the whole record interpolates
-missing temperatures.
+The regressors and values of all intervals are stored as the triangular factor R of a QR decomposition, which is updated
+with each interval (Golub & Van Loan, Matrix Computations, 6.5). The coefficients equal those of a least-squares fit to
+all intervals, except for rounding errors. Additional columns of R contain the derivatives with respect to the time
+constants. The derivatives add the uncertainty of the time constants to the prediction intervals. The time constants and
+φ are not updated.
 """
 
 from dataclasses import dataclass, replace
@@ -18,41 +14,41 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.common.distributions import student_quantile
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.thermal_fit import whiten
+from monitor.drift.thermal.thermal_fit import whiten_regression
 from monitor.drift.thermal.thermal_model import (
     LOG_TIME_CONSTANT_STEP,
     ThermalModel,
-    bias_derivatives_by_time_constant,
     coefficient_covariance,
-    interpolate_gaps,
-    predict_with_variance,
+    combine_regressor_derivatives,
+    interpolate_missing_temperatures,
+    predict_bias_and_variance,
     regressor_derivatives,
 )
-from monitor.drift.thermal.thermal_response import ThermalModelForm, regressors
+from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors
 
 
 @dataclass(frozen=True, slots=True)
 class PredictionInterval:
-    """Predicted mean of one interval and its 95 % prediction interval, rad/s or m/s²."""
+    """Predicted mean of one interval, with a 95 % prediction interval, in rad/s or m/s²."""
 
     bias: float
     lo: float
     hi: float
 
-    def side_of(self, bias: float) -> int:
-        """Return 1 if the bias lies above the interval, −1 if below, and 0 if inside or not measured."""
+    def side_of_interval(self, bias: float) -> int:
+        """Return 1 if the bias lies above the prediction interval, -1 if the bias lies below, and 0 otherwise."""
         return int(bias > self.hi) - int(bias < self.lo)
 
 
 class RecursiveThermalFit:
-    """Thermal model with coefficients that are updated recursively.
+    """Thermal model with recursively updated coefficients.
 
     Parameters
     ----------
     model : ThermalModel
-        Model whose terms, time constants, φ and reference temperature are used. The coefficients are computed again.
+        Thermal model whose terms, time constants, φ and reference temperature are used.
     means : IntervalMeans
-        Intervals so far.
+        Interval means so far.
     """
 
     def __init__(self, model: ThermalModel, means: IntervalMeans) -> None:
@@ -60,8 +56,8 @@ class RecursiveThermalFit:
         shape = model.shape
         k = self._k = shape.difference_equation_order
         self._terms = 1 + shape.powers + k
-        excess = interpolate_gaps(means.temperature_c) - model.reference_c
-        columns = regressors(shape, excess, model.interval_s, began=True)
+        excess = interpolate_missing_temperatures(means.temperature_c) - model.reference_c
+        columns = build_regressors(shape, excess, model.interval_s, with_initial_state=True)
         rows = np.hstack([columns, regressor_derivatives(shape, excess, model.interval_s)])
         near = np.multiply.outer(
             np.exp([-LOG_TIME_CONSTANT_STEP, 0.0, LOG_TIME_CONSTANT_STEP]), np.asarray(shape.constants_s)
@@ -69,30 +65,30 @@ class RecursiveThermalFit:
         # [3, k] for slightly shorter, exact and slightly longer time constants
         self._decays = np.exp(-model.interval_s / near)
         moved = [
-            regressors(ThermalModelForm(0, tuple(one)), excess, model.interval_s, began=True)[-1, 1:] for one in near
+            build_regressors(ThermalModelForm(0, tuple(one)), excess, model.interval_s, with_initial_state=True)[-1, 1:]
+            for one in near
         ]
         # each [3, k], after the last interval
         self._lags, self._initial_responses = np.hsplit(np.array(moved).reshape(3, 2 * k), 2)
         self._excess = float(excess[-1])
-        self._row, self._bias = rows[-1], float(means.bias[-1]) if means.known[-1] else np.nan
-        white, z, _ = whiten(rows, np.where(means.known, means.bias, 0.0), means.known, model.phi)
+        self._row, self._bias = rows[-1], float(means.bias[-1]) if means.both_known[-1] else np.nan
+        white, z, _ = whiten_regression(rows, np.where(means.both_known, means.bias, 0.0), means.both_known, model.phi)
         self._triangle = _upper_triangle(np.hstack([white, z[:, None]]))
-        self._count = int(means.known.sum())
+        self._count = int(means.both_known.sum())
         self.model = self._with_current_coefficients(
             float(np.nanmin(means.temperature_c)), float(np.nanmax(means.temperature_c))
         )
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Return the degrees of freedom of the residuals."""
+        """Return the number of degrees of freedom of the residuals."""
         taken = self._terms + 2 * self._k + (self._model.phi > 0.0)
         return max(self._count - taken, 1)
 
     def predict_multi_and_one_step(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
-        """Return the multi-step and the one-step prediction of the next interval from its temperature in °C.
+        """Return the multi-step and the one-step prediction of the next interval for a temperature in °C.
 
-        The prediction intervals use Student's t distribution, because the scatter is at first estimated from few
-        intervals.
+        The prediction intervals use Student's t distribution, because few intervals may be known.
         """
         model = self.model
         excess = np.array([self._excess, temperature_c - model.reference_c if np.isfinite(temperature_c) else np.nan])
@@ -101,17 +97,17 @@ class RecursiveThermalFit:
         rows = np.stack([self._row, row])
         sizes = np.concatenate([model.coefficients, model.initial_state])
         own = sizes.size
-        bends = bias_derivatives_by_time_constant(model.shape, rows[:, own:], sizes)
+        bends = combine_regressor_derivatives(model.shape, rows[:, own:], sizes)
         wide = student_quantile(self.degrees_of_freedom, 0.975)
         both = []
         for measured in (None, np.array([self._bias, np.nan])):
-            bias, variance = predict_with_variance(model, excess, rows[:, :own], sizes, bends, measured)
+            bias, variance = predict_bias_and_variance(model, excess, rows[:, :own], sizes, bends, measured)
             at, half = float(bias[1]), wide * float(variance[1]) ** 0.5
             both.append(PredictionInterval(at, at - half, at + half))
         return both[0], both[1]
 
-    def update(self, temperature_c: float, bias: float) -> None:
-        """Add an interval.
+    def add_interval(self, temperature_c: float, bias: float) -> None:
+        """Update the coefficients with the temperature and the bias of an interval.
 
         Parameters
         ----------
@@ -138,24 +134,23 @@ class RecursiveThermalFit:
             self.model = self._with_current_coefficients(lowest, highest)
 
     def _next_row(self, excess: float, ends: tuple[float, float] | None) -> tuple[Floats, Floats, Floats]:
-        """Return the regressors of the next interval with their derivatives, the updated lags, and the updated
-        initial-state responses."""
+        """Return the regressors of the next interval, the updated lags, and the updated initial-state responses."""
         lags = self._decays * self._lags + (1.0 - self._decays) * excess
         left = self._initial_responses * self._decays
         shape = replace(self._model.shape, constants_s=())
-        first = regressors(shape, np.array([excess]), self._model.interval_s, ends=ends)[0]
+        first = build_regressors(shape, np.array([excess]), self._model.interval_s, range_c=ends)[0]
         by = [(one[2] - one[0]) / (2.0 * LOG_TIME_CONSTANT_STEP) for one in (lags, left)]
         return np.concatenate([first, lags[1], left[1], *by]), lags, left
 
     def _with_current_coefficients(self, lowest_c: float, highest_c: float) -> ThermalModel:
-        """Return the model with coefficients from all intervals so far."""
+        """Return the thermal model with coefficients from all intervals so far."""
         own = self._terms + self._k
         x, z = self._triangle[:, :own], self._triangle[:, -1]
         scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
         sizes = np.linalg.lstsq(x / scale, z, rcond=1e-10)[0] / scale
         square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
         sigma = (square / self.degrees_of_freedom) ** 0.5
-        bends = bias_derivatives_by_time_constant(self._model.shape, self._triangle[:, own:-1], sizes)
+        bends = combine_regressor_derivatives(self._model.shape, self._triangle[:, own:-1], sizes)
         return replace(
             self._model,
             coefficients=sizes[: self._terms],
@@ -168,5 +163,4 @@ class RecursiveThermalFit:
 
 
 def _upper_triangle(rows: Floats) -> Floats:
-    """Return the factor R of the QR decomposition of the rows."""
     return np.asarray(np.linalg.qr(rows, mode="r"))

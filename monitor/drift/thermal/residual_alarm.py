@@ -1,9 +1,8 @@
-"""Alarm for one axis whose bias lies outside its prediction from temperature more often than by chance.
+"""Alarm for a bias that lies outside of the prediction from temperature more often than by chance.
 
-Every interval is predicted one step ahead before it is used for the fit. If the model is true, one in forty intervals
-lies above its 95 % prediction interval and one in forty below, independently. If MIN_OUTSIDE of the last
-WINDOW_INTERVALS known intervals lie outside on the same side, a change is suspected. ``online_thermal_model`` tests the
-suspicion. The measured rate of false alarms is in docs/thermal-measurements.md.
+For a correct model, one in forty intervals lies above the 95 % prediction interval, and one in forty lies below. A
+change is suspected if MIN_OUTSIDE of the last WINDOW_INTERVALS known intervals lie on the same side. The measured rate
+of false alarms is in docs/thermal-measurements.md.
 """
 
 from collections import deque
@@ -17,12 +16,11 @@ from monitor.common.distributions import Z95
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 
 MIN_OUTSIDE: Final = 4
-"""Number of intervals above, or below, their prediction intervals that causes a suspicion."""
+"""Number of intervals on the same side of the prediction intervals that raises a suspicion."""
 WINDOW_INTERVALS: Final = 6
-"""Number of known intervals that are considered."""
+"""Number of recent intervals with a known bias in which outliers are counted."""
 FAR_HALF_WIDTHS: Final = 2.0
-"""Distance from the prediction, in half widths of its interval, above which an interval is not used for the fit until
-others confirm it."""
+"""Largest distance from the prediction for an update of the fit, in half widths of the prediction interval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,34 +45,32 @@ class _Residual:
 
 
 class ResidualAlarm:
-    """Detector of unexplained changes in the last intervals of one axis."""
+    """Detector of bias changes that temperature does not explain, for one axis."""
 
     def __init__(self) -> None:
         self._recent: deque[_Residual] = deque(maxlen=WINDOW_INTERVALS)  # only intervals with a known bias
         self._interval_count = 0
 
     @property
-    def is_within_prediction(self) -> bool:
-        """True if the last interval was inside its prediction, and at most one recent interval was above and one below.
-
-        The intervals may then be used to select a model.
-        """
+    def recent_intervals_fit_prediction(self) -> bool:
+        """Return True if the last interval agrees with the prediction, and at most one recent interval lies on each
+        side."""
         return not (self._recent and self._recent[-1].side) and all(self._count_outside(side) < 2 for side in (-1, 1))
 
     @property
-    def is_unfit_for_update(self) -> bool:
-        """True if the last interval was so far outside its prediction that it must not be used for the fit yet."""
+    def last_interval_is_far_outside(self) -> bool:
+        """Return True if the last interval is too far outside of the prediction interval to be used for the fit."""
         return bool(self._recent) and abs(self._recent[-1].z) > FAR_HALF_WIDTHS * Z95
 
-    def update(
+    def check_interval(
         self, bias: float, multi_step: PredictionInterval, one_step: PredictionInterval
     ) -> UnexplainedChange | None:
-        """Add an interval with its predictions, and return the change if one is now suspected.
+        """Add an interval with its predictions, and return a suspected change of the bias or None.
 
         Parameters
         ----------
         bias : float
-            Measured mean in rad/s or m/s²; NaN = not measured.
+            Measured interval mean in rad/s or m/s²; NaN = not measured.
         multi_step, one_step : PredictionInterval
             Predictions of the interval.
         """
@@ -83,7 +79,7 @@ class ResidualAlarm:
             return None
         half = max(0.5 * (one_step.hi - one_step.lo), 1e-300)
         z = Z95 * (bias - one_step.bias) / half
-        self._recent.append(_Residual(self._interval_count, one_step.side_of(bias), bias - multi_step.bias, z))
+        self._recent.append(_Residual(self._interval_count, one_step.side_of_interval(bias), bias - multi_step.bias, z))
         side = self._recent[-1].side
         if not side or self._count_outside(side) < MIN_OUTSIDE:
             return None
@@ -96,9 +92,9 @@ class ResidualAlarm:
         return found
 
     def forget_residuals(self) -> None:
-        """Discard the residual history."""
+        """Discard all stored residuals."""
         self._recent.clear()
 
     def _count_outside(self, side: int) -> int:
-        """Return the number of recent intervals above (1) or below (-1) their prediction intervals."""
+        """Return the number of recent intervals above (1) or below (-1) the prediction intervals."""
         return sum(one.side == side for one in self._recent)

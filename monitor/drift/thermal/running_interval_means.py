@@ -1,9 +1,6 @@
-"""Interval means of live samples. The means equal those of ``compute_interval_means`` for a whole recording.
+"""Interval means of a stream of samples. The means equal the means of ``compute_interval_means``.
 
-Only sums are stored. Blocks of samples must arrive in order, with the number of missing samples before each block.
-Every interval is returned when it ends. An interval has a fixed number of samples, including missing ones. Rows are
-buffered up to the end of a part of an interval before they are summed, so the means do not depend on how the stream is
-divided into blocks.
+The means do not depend on how the stream is divided into blocks.
 """
 
 from dataclasses import dataclass
@@ -12,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL, standard_error
+from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL, standard_error_from_parts
 
 BUFFER_ROWS: Final = 1024
 TEMPERATURE_COLUMN: Final = len(AXES)
@@ -20,7 +17,7 @@ TEMPERATURE_COLUMN: Final = len(AXES)
 
 @dataclass(frozen=True, slots=True)
 class IntervalMean:
-    """Means of one interval."""
+    """Means of one interval, with standard errors."""
 
     bias: Floats  # [6] rad/s and m/s²; NaN if too few samples are known
     error: Floats  # [6] standard error of each mean
@@ -29,20 +26,20 @@ class IntervalMean:
 
 
 class RunningIntervalMeans:
-    """Means of successive intervals.
+    """Interval means of a stream of samples.
 
     Parameters
     ----------
     length : int
-        Samples per interval, at least PARTS_PER_INTERVAL.
+        Number of samples in an interval, at least PARTS_PER_INTERVAL.
     longest : int
-        Largest number of empty intervals that are returned for one gap.
+        Largest number of empty intervals that are returned for a series of missing samples.
 
     Examples
     --------
     >>> means = RunningIntervalMeans(50)
     >>> ramp = np.repeat(np.arange(100.0)[:, None], 6, axis=1)
-    >>> [(one.bias[0].item(), one.temperature_c) for one in means.update(ramp, np.full(100, 25.0), 0)]
+    >>> [(one.bias[0].item(), one.temperature_c) for one in means.add_samples(ramp, np.full(100, 25.0), 0)]
     [(24.5, 25.0), (74.5, 25.0)]
     """
 
@@ -50,17 +47,17 @@ class RunningIntervalMeans:
         size = length // PARTS_PER_INTERVAL
         self._length = length
         self._max_empty = longest
-        # Samples after the last part count for the mean of the interval, but not for the standard error.
+        # Samples after the last part contribute to the mean, but not to the standard error.
         self._edges = [*(size * k for k in range(1, PARTS_PER_INTERVAL)), size * PARTS_PER_INTERVAL, length]
         self._rows = np.empty((BUFFER_ROWS, TEMPERATURE_COLUMN + 1))
         self._buffered = 0
-        # Subtracting the origin avoids rounding errors, for example with gravity of 9.81 m/s² and noise of 1e-4 m/s².
+        # Subtracting the origin reduces rounding errors, for example if gravity is 9.81 m/s² and the noise 1e-4 m/s².
         self._origin = np.full(TEMPERATURE_COLUMN + 1, np.nan)
         self._end = 0  # end of the last finished interval, in samples
         self._begin()
 
-    def update(self, values: Floats, temperature_c: Floats, lost: int) -> list[IntervalMean]:
-        """Add samples and return the intervals that have ended.
+    def add_samples(self, values: Floats, temperature_c: Floats, lost: int) -> list[IntervalMean]:
+        """Add samples, and return the means of the intervals that have ended.
 
         Parameters
         ----------
@@ -83,20 +80,18 @@ class RunningIntervalMeans:
             finished += self._advance(count)
         return finished
 
-    def forget_sensor_values(self) -> None:
-        """Discard the sensor values of the current interval, and keep the temperatures of the interval."""
+    def forget_current_sensor_values(self) -> None:
+        """Discard the sensor values of the current interval. The temperatures are kept."""
         self._rows[: self._buffered, :TEMPERATURE_COLUMN] = np.nan
         self._sum[:, :TEMPERATURE_COLUMN], self._count[:, :TEMPERATURE_COLUMN] = 0.0, 0
 
     def _begin(self) -> None:
-        """Clear the sums for a new interval."""
         self._position = self._part = 0
         self._sum = np.zeros((PARTS_PER_INTERVAL + 1, TEMPERATURE_COLUMN + 1))
         self._count = np.zeros((PARTS_PER_INTERVAL + 1, TEMPERATURE_COLUMN + 1), np.int64)
 
     def _advance(self, count: int) -> list[IntervalMean]:
-        """Advance by ``count`` samples, and return the interval if it has ended. At the end of a part, the buffer is
-        summed."""
+        """Advance by ``count`` samples, and return the means of the interval if the interval has ended."""
         self._position += count
         if self._buffered == BUFFER_ROWS or self._position == self._edges[self._part]:
             self._sum_buffer()
@@ -110,7 +105,6 @@ class RunningIntervalMeans:
         return [closed]
 
     def _sum_buffer(self) -> None:
-        """Add the buffered rows to the sums of the current part."""
         rows, self._buffered = self._rows[: self._buffered], 0
         there = np.isfinite(rows)
         new = there.any(axis=0) & np.isnan(self._origin)
@@ -120,7 +114,7 @@ class RunningIntervalMeans:
         self._count[self._part] += there.sum(axis=0)
 
     def _skip_missing(self, lost: int) -> list[IntervalMean]:
-        """Advance over missing samples, and return the intervals that have ended."""
+        """Advance over missing samples, and return the means of the intervals that have ended."""
         finished: list[IntervalMean] = []
         while lost and self._position:
             count = min(lost, self._edges[self._part] - self._position)
@@ -140,12 +134,11 @@ class RunningIntervalMeans:
         return finished
 
     def _interval(self) -> IntervalMean:
-        """Return the means and standard errors of the interval that has just ended."""
         count = self._count.sum(axis=0)
         too_few = count < max(MIN_KNOWN_SHARE * self._length, 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = self._origin + self._sum.sum(axis=0) / count
         parts = np.s_[:PARTS_PER_INTERVAL, :TEMPERATURE_COLUMN]
-        error = standard_error(self._sum[parts], self._count[parts])
+        error = standard_error_from_parts(self._sum[parts], self._count[parts])
         mean[too_few], error[too_few[:TEMPERATURE_COLUMN]] = np.nan, np.nan
         return IntervalMean(mean[:TEMPERATURE_COLUMN], error, float(mean[TEMPERATURE_COLUMN]), self._end)

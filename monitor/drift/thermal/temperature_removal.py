@@ -1,12 +1,8 @@
-"""Test for a dependence of the bias on temperature, and noise coefficients after removal of this dependence.
+"""Noise coefficients of a recording after the temperature dependence of the bias has been removed.
 
-The input is the analysis of a recording and the temperature of each sample. ``temperature_dependence`` tests the bias
-of each axis for a dependence on temperature against a null hypothesis of correlated noise. If the dependence is
-significant, a model of ``thermal_fit`` is subtracted from the samples. The model is interpolated smoothly between the
-middles of the intervals, because steps and corners would add noise. The Allan deviation and the coefficients are then
-computed again. Axes without a significant dependence are not changed and not reported.
-
-A model can follow a part of a random walk by chance. A share of a few percent of K or R is therefore not significant.
+The bias of each axis is tested for a dependence on temperature. A significant dependence is modelled and subtracted
+from the samples, and the noise coefficients are computed again. A model can follow a part of a random walk by chance,
+so a change of K or R by a few percent is not significant.
 """
 
 from collections.abc import Mapping
@@ -17,10 +13,10 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
-from monitor.drift.thermal.bias_temperature_tests import TemperatureDependence, find_dependence
+from monitor.drift.thermal.bias_temperature_tests import TemperatureDependence, find_temperature_dependence
 from monitor.drift.thermal.interval_means import compute_interval_means
-from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means_suffice, fit_thermal_model
-from monitor.drift.thermal.thermal_model import predict
+from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means_suffice_for_fit, fit_thermal_model
+from monitor.drift.thermal.thermal_model import predict_interval_means
 from monitor.drift.thermal.thermal_results import choose_interval_s
 from monitor.estimation.allan.batch import EachAxis
 from monitor.estimation.analysis import RecordingAnalysis, fit_other_samples
@@ -31,7 +27,7 @@ SLOW_LETTERS: Final = ("K", "R")
 
 @dataclass(frozen=True, slots=True)
 class TemperatureRemoval:
-    """Dependence of each axis on temperature, and the coefficients after its removal from the bias."""
+    """Temperature dependence of each axis, and the noise coefficients before and after removing the dependence."""
 
     models: Mapping[str, str]  # axis -> form of its model, for the axes with a fitted model
     before: Coefficients
@@ -40,14 +36,14 @@ class TemperatureRemoval:
     dependences: Mapping[str, TemperatureDependence] = field(default_factory=dict)  # significant dependences by axis
 
     @property
-    def axes_of_temperature(self) -> tuple[str, ...]:
-        """Return the axes on which temperature explains most of the slow variance."""
-        return tuple(axis for axis, one in self.dependences.items() if one.explains_most)
+    def axes_explained_by_temperature(self) -> tuple[str, ...]:
+        """Return the axes on which temperature explains most of the bias variation."""
+        return tuple(axis for axis, one in self.dependences.items() if one.explains_most_variance)
 
-    def variance_share(self, letter: str, axis: str) -> float | None:
-        """Return the share of a coefficient's variance that temperature explains: 1 − after²/before².
+    def variance_share_of_temperature(self, letter: str, axis: str) -> float | None:
+        """Return the share of the variance of a noise coefficient that temperature explains, 1 − after²/before².
 
-        If only an upper bound is known after the removal, the result is a lower bound of the share.
+        If only an upper bound of the coefficient is known after the removal, the result is a lower bound.
 
         Parameters
         ----------
@@ -59,7 +55,7 @@ class TemperatureRemoval:
         Returns
         -------
         float or None
-            The share, at least 0. None if the coefficient was not estimated before the removal, or is unknown after it.
+            The share, at least 0. None if the coefficient is not known before or after the removal.
         """
         at = SYMBOLS.index(letter), AXES.index(axis)
         if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
@@ -68,9 +64,11 @@ class TemperatureRemoval:
         after = float((self.coefficients.hi if bounded else self.coefficients.value)[at])
         return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
 
-    def has_decreased_significantly(self, letter: str, axis: str) -> bool:
-        """Return True if the upper limit of the new coefficient lies below the confidence interval of the old
-        coefficient.
+    def coefficient_decreased_significantly(self, letter: str, axis: str) -> bool:
+        """Return True if the removal of the temperature dependence has reduced a noise coefficient significantly.
+
+        The reduction is significant if the confidence intervals of the coefficient before and after the removal do not
+        overlap.
 
         Parameters
         ----------
@@ -80,101 +78,103 @@ class TemperatureRemoval:
             Name of the axis.
         """
         at = SYMBOLS.index(letter), AXES.index(axis)
-        return self.variance_share(letter, axis) is not None and bool(self.coefficients.hi[at] < self.before.lo[at])
+        return self.variance_share_of_temperature(letter, axis) is not None and bool(
+            self.coefficients.hi[at] < self.before.lo[at]
+        )
 
 
 def temperature_varied(temperatures_c: Floats) -> bool:
-    """Return True if temperature [n] in °C is known and varied by more than MIN_SWING_C."""
+    """Return True if the temperature [n] in °C is known and has a range of more than MIN_SWING_C."""
     return (
         bool(np.isfinite(temperatures_c).any())
         and float(np.ptp(temperatures_c[np.isfinite(temperatures_c)])) > MIN_SWING_C
     )
 
 
-def remove_temperature(
-    result: RecordingAnalysis, temperature_c: Floats, each: EachAxis = map
+def remove_temperature_effect(
+    analysis: RecordingAnalysis, temperature_c: Floats, parallel_map: EachAxis = map
 ) -> TemperatureRemoval | None:
-    """Return the coefficients of an analysis without the temperature part of the bias.
+    """Return the noise coefficients of an analysis after removing the temperature dependence of the bias.
 
     Parameters
     ----------
-    result : RecordingAnalysis
+    analysis : RecordingAnalysis
         Analysis of a recording.
     temperature_c : ndarray, shape (n,)
         Temperature of each sample, °C.
-    each : callable
+    parallel_map : callable
         Replacement for ``map``, which may run in parallel.
 
     Returns
     -------
     TemperatureRemoval or None
-        None if no axis depends on temperature.
+        The new coefficients, or None if no axis depends on temperature.
     """
-    rate_hz = result.estimate.rate_hz
-    interval_s = choose_interval_s(len(result.values) / rate_hz, rate_hz)
-    values, models, dependences = result.values, dict[str, str](), dict[str, TemperatureDependence]()
+    rate_hz = analysis.estimate.rate_hz
+    interval_s = choose_interval_s(len(analysis.values) / rate_hz, rate_hz)
+    values, models, dependences = analysis.values, dict[str, str](), dict[str, TemperatureDependence]()
     for at, axis in enumerate(AXES):
-        means = compute_interval_means(result.values[:, at], temperature_c, rate_hz, interval_s)
+        means = compute_interval_means(analysis.values[:, at], temperature_c, rate_hz, interval_s)
         try:
-            check_means_suffice(means)
+            check_means_suffice_for_fit(means)
         except NotReady:
             continue
-        dependence = find_dependence(means)
+        dependence = find_temperature_dependence(means)
         if dependence is None:
             continue
         dependences[axis] = dependence
         model = fit_thermal_model(means).model
         if model.shape.difference_equation_order or model.shape.powers:
-            values = values.copy() if values is result.values else values
-            course = predict(model, means.temperature_c, began=True).bias
-            values[:, at] -= interpolate_smoothly(course, round(means.interval_s * rate_hz), len(values))
+            values = values.copy() if values is analysis.values else values
+            course = predict_interval_means(model, means.temperature_c, starts_with_fit=True).bias
+            values[:, at] -= interpolate_with_zero_mean(course, round(means.interval_s * rate_hz), len(values))
             models[axis] = model.shape.name
     if not dependences:
         return None
-    before, k_or_r = result.estimate.coefficients, result.estimate.k_or_r
+    before, k_or_r = analysis.estimate.coefficients, analysis.estimate.k_or_r
     after = before
     if models:
-        fit = fit_other_samples(result, values, each)
+        fit = fit_other_samples(analysis, values, parallel_map)
         after, k_or_r = fit.coefficients, fit.k_or_r
     return TemperatureRemoval(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
 
 
-def interpolate_smoothly(course: Floats, length: int, n: int) -> Floats:
-    """Interpolate interval values by a smooth curve of n samples with zero mean.
+def interpolate_with_zero_mean(interval_values: Floats, interval_samples: int, n_samples: int) -> Floats:
+    """Interpolate interval values to samples with a natural cubic spline, and subtract the mean.
 
-    The curve is a natural cubic spline through the middles of the intervals, and linear beyond them.
+    The spline passes through the middles of the intervals, and continues linearly beyond the first and the last middle.
 
     Parameters
     ----------
-    course : ndarray, shape (intervals,)
+    interval_values : ndarray, shape (intervals,)
         Value of each interval, at least two.
-    length : int
+    interval_samples : int
         Samples per interval.
-    n : int
+    n_samples : int
         Number of samples.
 
     Examples
     --------
-    >>> interpolate_smoothly(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
+    >>> interpolate_with_zero_mean(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     """
-    bend = _natural_spline(course)
-    at = (np.arange(n) + 0.5) / length - 0.5  # in intervals, 0 = middle of the first interval
-    left = np.clip(at.astype(np.int64), 0, course.size - 2)
+    bend = _natural_spline(interval_values)
+    at = (np.arange(n_samples) + 0.5) / interval_samples - 0.5  # in intervals, 0 = middle of the first interval
+    left = np.clip(at.astype(np.int64), 0, interval_values.size - 2)
     right = left + 1
-    t = np.clip(at, 0.0, course.size - 1.0) - left
-    made = (1.0 - t) * course[left] + t * course[right]
+    t = np.clip(at, 0.0, interval_values.size - 1.0) - left
+    made = (1.0 - t) * interval_values[left] + t * interval_values[right]
     made += ((1.0 - t) ** 3 - (1.0 - t)) / 6.0 * bend[left] + (t**3 - t) / 6.0 * bend[right]
-    first = course[1] - course[0] - bend[1] / 6.0
-    last = course[-1] - course[-2] + bend[-2] / 6.0
-    made += first * np.minimum(at, 0.0) + last * np.maximum(at - (course.size - 1.0), 0.0)
+    first = interval_values[1] - interval_values[0] - bend[1] / 6.0
+    last = interval_values[-1] - interval_values[-2] + bend[-2] / 6.0
+    made += first * np.minimum(at, 0.0) + last * np.maximum(at - (interval_values.size - 1.0), 0.0)
     return np.asarray(made - made.mean())
 
 
 def _natural_spline(y: Floats) -> Floats:
-    """Return the second derivatives of the natural cubic spline through y [n ≥ 2] at steps of one.
+    """Return the second derivatives of the natural cubic spline through the values y [n ≥ 2] at unit steps.
 
-    de Boor, A Practical Guide to Splines, 1978, chapter IV: the system of M is tridiagonal, (1, 4, 1) / 6.
+    The tridiagonal system (1, 4, 1) / 6 is described by de Boor, A Practical Guide to Splines, 1978, chapter IV.
 
     >>> _natural_spline(np.array([0.0, 1.0, 0.0])).tolist()
     [0.0, -3.0, 0.0]

@@ -1,18 +1,16 @@
-"""Fit of the bias as a function of temperature: selection of the terms, coefficients and their uncertainty.
+"""Selection and fit of a model of the bias as a function of temperature.
 
-Polynomials and difference equations (``thermal_response``) are fitted to interval means by least squares over the whole
-record. A difference equation is evaluated with its own outputs and not with the measured values, because noise in the
-measured values would bias the roots towards zero. The residuals may be correlated: r_n = φ r_{n−1} + e_n. The model
-with the least AICc is selected (Hurvich & Tsai, Biometrika 76, 1989). AICc asymptotically agrees with leave-one-out
-cross-validation (Stone, J. R. Stat. Soc. B, 1977), and no separate samples are needed. In addition, FOLDS parts of the
-record are each predicted from the other parts. A model that predicts the parts worse than a constant is rejected,
-because slow heating leaves one end of a polynomial unconstrained. A model with lags, or with powers above the third, is
-selected only if its AICc is better by a margin.
+Polynomials and difference equations are fitted to interval means by least squares. A difference equation is evaluated
+with predicted values, because noise in the measured values would bias the roots towards zero. The residuals may be
+correlated: r_n = φ r_{n−1} + e_n.
 
-The search takes between 50 ms and 1 s. ``fit_in_steps`` divides the search into steps of less than a millisecond.
+The model with the least AICc is selected (Hurvich & Tsai, Biometrika 76, 1989). The AICc asymptotically agrees with
+cross-validation (Stone, J. R. Stat. Soc. B, 1977). Lags and powers above the third must improve the AICc by a margin. A
+model is rejected if the cross-validated error exceeds the error of a constant, because slow heating leaves one end of a
+polynomial unconstrained. The selection takes 50 ms to 1 s.
 
-The method follows Wang et al., who modelled the bias of MEMS gyroscopes under small temperature changes, with 72 means
-of 1 h. The constant term and the evaluation with own outputs are not part of their paper.
+The method follows Wang et al., who modelled the bias of MEMS gyroscopes with 72 hourly means under small temperature
+changes. The constant term and the use of predicted values are additions to the method.
 """
 
 from collections.abc import Generator, Iterator
@@ -30,52 +28,51 @@ from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, temper
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import (
     ThermalModel,
+    bias_derivatives_by_time_constant,
     coefficient_covariance,
-    interpolate_gaps,
-    time_constant_derivatives,
+    interpolate_missing_temperatures,
 )
-from monitor.drift.thermal.thermal_response import ThermalModelForm, least_squares, regressors
+from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors, solve_least_squares
 
 MIN_INTERVALS: Final = 12
 MAX_POWER: Final = 5
 CUBIC: Final = 3
-"""Highest order of a polynomial that needs no margin in AICc."""
+"""Highest order of a polynomial that requires no margin in the AICc."""
 MAX_LAGS: Final = 3
 INTERVALS_PER_SQUARED_LAGS: Final = 8
-"""Number of intervals, divided by k², that a model with k lags needs. With fewer intervals, the lags would follow a
-random walk of the bias."""
+"""Number of intervals that a model with k lags needs, divided by k².
+
+With fewer intervals, the lags would follow a random walk of the bias.
+"""
 MAX_TIME_CONSTANT_SHARE: Final = 0.25
-"""Longest time constant as a share of the record. A longer time constant cannot be distinguished from a drift."""
+"""Longest time constant as a share of the record, because longer time constants resemble a drift."""
 MIN_TIME_CONSTANT_INTERVALS: Final = 0.5
-"""Shortest time constant in intervals. A shorter time constant has no effect."""
+"""Shortest time constant in intervals, because shorter time constants have no effect."""
 MIN_TIME_CONSTANT_RATIO: Final = 2.0
-"""Smallest ratio of two time constants. Closer time constants have large coefficients that cancel."""
+"""Smallest ratio of two time constants, because closer time constants have large coefficients that cancel."""
 GRID_POINTS: Final = 20
 PHI_VALUES: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
 FOLDS: Final = 6
-"""Parts of the record that are each predicted from the others."""
+"""Number of parts of the record for the cross-validation."""
 MAX_ERROR_RATIO: Final = 1.05
-"""Largest cross-validated error of an accepted model, relative to the error of a constant. The margin above one allows
-for chance."""
+"""Largest cross-validated error of an accepted model, relative to the error of a constant."""
 LAG_AICC_MARGIN: Final = 6.0
-"""Margin in AICc that a lag must gain. With few means, noise sometimes looks like a lag, and a wrong choice causes
-large errors."""
+"""Smallest AICc improvement of a model with lags, because noise can resemble a lag if there are few intervals."""
 CURVE_AICC_MARGIN: Final = 10.0
-"""Margin in AICc that a power above the third must gain, because noise sometimes looks like a higher power."""
+"""Smallest AICc improvement of a power above the third, because noise can resemble a higher power."""
 MIN_SWING_C: Final = 0.1
 """Smallest range of temperature for a fit, °C."""
 MIN_SWING_SIGMAS: Final = 5.0
 """Smallest range of temperature, in standard errors of a mean of temperature."""
 MIN_REVERSE_SHARE: Final = 0.1
-"""Smallest share of the smaller direction in the total change of temperature, if temperature is said to rise and
-fall."""
+"""Smallest share of the rise or fall in the total temperature change, if the temperature rose and fell."""
 GOLDEN_STEPS: Final = 10
 GOLDEN_RATIO: Final = 0.6180339887498949
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
-    """Fitted model that was a candidate for the selection."""
+class CandidateModel:
+    """Fitted thermal model that was considered in the model selection."""
 
     shape: ThermalModelForm
     aicc: float  # difference to the chosen form; negative if a margin was not reached
@@ -85,11 +82,11 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class ThermalFit:
-    """Model of one axis, and the candidates from which it was chosen."""
+    """Selected thermal model of an axis, and all candidate models."""
 
     model: ThermalModel
-    candidates: tuple[Candidate, ...]  # the chosen form first, then the others by AICc
-    temperature_rose_and_fell: bool  # True if temperature rose and fell
+    candidates: tuple[CandidateModel, ...]  # the chosen form first, then the others by AICc
+    temperature_rose_and_fell: bool
     explained: float  # explained share of the variance of the means
     aicc: float  # only differences between fits of the same means are meaningful
     step: float = 0.0  # step of the offset (after minus before), if one was fitted; rad/s or m/s²
@@ -100,18 +97,18 @@ class ThermalFit:
 
 T = TypeVar("T")
 StepwiseWork = Generator[None, None, T]
-"""Generator that runs one step at each ``next``, and returns the result at the end."""
+"""Generator that runs one computation step at each ``next``, and returns the result at the end."""
 
 
 def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
-    """Select and fit a model, and test whether heating and cooling differ.
+    """Select and fit a thermal model, and test for hysteresis between heating and cooling.
 
     Raises
     ------
     NotReady
-        If there are too few intervals, or if temperature hardly changed.
+        If there are too few intervals, or if the temperature hardly changed.
     """
-    found = _run_all_steps(fit_in_steps(means))
+    found = _run_all_steps(fit_thermal_model_stepwise(means))
     loop = find_hysteresis(means) if found.temperature_rose_and_fell else None
     if loop is None:
         return found
@@ -119,7 +116,6 @@ def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
 
 
 def _run_all_steps(pieces: StepwiseWork[T]) -> T:
-    """Run all steps and return the result."""
     try:
         while True:
             next(pieces)
@@ -128,43 +124,47 @@ def _run_all_steps(pieces: StepwiseWork[T]) -> T:
         return made
 
 
-def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = False) -> StepwiseWork[ThermalFit]:
-    """Select and fit a model. Each ``next`` runs one least-squares fit.
+def fit_thermal_model_stepwise(
+    means: IntervalMeans, first_after_step: int | None = None, always_try_lags: bool = False
+) -> StepwiseWork[ThermalFit]:
+    """Select and fit a thermal model in steps of less than a millisecond.
+
+    Each ``next`` of the generator runs one least-squares fit.
 
     Parameters
     ----------
     means : IntervalMeans
         Interval means of bias (rad/s or m/s²) and temperature (°C).
-    since : int or None
+    first_after_step : int or None
         Index of the first interval after a possible step of the bias. The step is one more coefficient.
-    lags : bool
-        True if lags are fitted even if temperature moved in one direction only.
+    always_try_lags : bool
+        True to fit lags even if the temperature only rose or only fell.
 
     Raises
     ------
     NotReady
-        If there are too few intervals, or if temperature hardly changed. The first step raises the error.
+        If there are too few intervals, or if the temperature hardly changed.
     """
-    check_means_suffice(means)
+    check_means_suffice_for_fit(means)
     excess, reference_c = _temperature_difference(means)
     temperature_rose_and_fell = _both_ways(means.temperature_c)
     tried = []
-    for shape in _shapes(means, temperature_rose_and_fell or lags):
-        tried.append((yield from _fit_shape(means, excess, shape, since)))
+    for shape in _shapes(means, temperature_rose_and_fell or always_try_lags):
+        tried.append((yield from _fit_shape(means, excess, shape, first_after_step)))
     tried.sort(key=lambda one: one.aicc + _aicc_margin(one.shape))
     errors = []
     for one in tried:
         yield
-        errors.append(_cross_validated_error(_without_step(means, since, one.step), excess, one))
+        errors.append(_cross_validated_error(_without_step(means, first_after_step, one.step), excess, one))
     alone = next(error for one, error in zip(tried, errors, strict=True) if one.shape == ThermalModelForm(0, ()))
     at = next(i for i, error in enumerate(errors) if error <= MAX_ERROR_RATIO * alone)
     best = tried.pop(at)
     kept = [(best, errors.pop(at)), *zip(tried, errors, strict=True)]
-    candidates = tuple(Candidate(one.shape, one.aicc - best.aicc, one.rms, error) for one, error in kept)
+    candidates = tuple(CandidateModel(one.shape, one.aicc - best.aicc, one.rms, error) for one, error in kept)
     yield
-    means = _without_step(means, since, best.step)
+    means = _without_step(means, first_after_step, best.step)
     model = _to_model(means, excess, reference_c, best)
-    known = means.known
+    known = means.both_known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
     return ThermalFit(model, candidates, temperature_rose_and_fell, explained, best.aicc, best.step)
@@ -172,7 +172,7 @@ def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = Fa
 
 @dataclass(frozen=True, slots=True)
 class _ShapeFit:
-    """Least-squares fit of one form of the model."""
+    """Least-squares fit of a model form."""
 
     shape: ThermalModelForm
     columns: Floats  # [n, terms + k] regressors
@@ -184,21 +184,21 @@ class _ShapeFit:
     step: float
 
 
-def check_means_suffice(means: IntervalMeans) -> None:
-    """Check that the means suffice for a fit.
+def check_means_suffice_for_fit(means: IntervalMeans) -> None:
+    """Check that the interval means suffice to fit a thermal model.
 
     Raises
     ------
     NotReady
-        If there are too few means, if temperature hardly changed, or if the bias is constant.
+        If there are too few interval means, if the temperature hardly changed, or if the bias is constant.
     """
-    count = int(means.known.sum())
+    count = int(means.both_known.sum())
     if count < MIN_INTERVALS:
         raise NotReady(
             f"{count} intervals of {means.interval_s:g} s with bias and temperature; at least {MIN_INTERVALS} are "
             f"needed: record longer, or use a shorter interval"
         )
-    known_temperature_c = means.temperature_c[means.known]
+    known_temperature_c = means.temperature_c[means.both_known]
     swing = float(np.ptp(known_temperature_c))
     least = max(MIN_SWING_C, MIN_SWING_SIGMAS * temperature_noise_c(known_temperature_c))
     if swing < least:
@@ -206,27 +206,29 @@ def check_means_suffice(means: IntervalMeans) -> None:
             f"temperature hardly changed: by {swing:.2g} °C in {count * means.interval_s / HOUR_S:.3g} h; "
             f"at least {least:.2g} °C are needed"
         )
-    if not np.ptp(means.bias[means.known]) > 0.0:
+    if not np.ptp(means.bias[means.both_known]) > 0.0:
         raise NotReady("the bias is the same in all intervals")
 
 
 def _aicc_margin(shape: ThermalModelForm) -> float:
-    """Return the margin in AICc that a model must gain."""
+    """Return the AICc improvement that a model form requires."""
     if shape.difference_equation_order:
         return LAG_AICC_MARGIN
     return CURVE_AICC_MARGIN if shape.powers > CUBIC else 0.0
 
 
 def _temperature_difference(means: IntervalMeans) -> tuple[Floats, float]:
-    """Return temperature minus the reference [n] and the reference, in °C."""
-    known = interpolate_gaps(means.temperature_c)
+    """Return the temperature minus the reference temperature [n], and the reference temperature, in °C."""
+    known = interpolate_missing_temperatures(means.temperature_c)
     reference_c = round(float(known.mean()), 2)
     return known - reference_c, reference_c
 
 
 def _both_ways(temperature_c: Floats) -> bool:
-    """Return True if temperature, smoothed over three intervals, rose and fell by more than MIN_REVERSE_SHARE."""
-    smooth = np.convolve(np.pad(interpolate_gaps(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid")
+    """Return True if the temperature rose and fell by more than MIN_REVERSE_SHARE of the total change."""
+    smooth = np.convolve(
+        np.pad(interpolate_missing_temperatures(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid"
+    )
     moved = np.diff(smooth)
     up, down = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
     return min(up, down) > MIN_REVERSE_SHARE * (up + down)
@@ -234,7 +236,7 @@ def _both_ways(temperature_c: Floats) -> bool:
 
 def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
     """Yield the model forms that the number of intervals allows."""
-    count = int(means.known.sum())
+    count = int(means.both_known.sum())
     for powers in range(MAX_POWER + 1):
         if powers + 3 < count / 2:
             yield ThermalModelForm(powers, ())
@@ -247,18 +249,18 @@ def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
 def _fit_shape(
     means: IntervalMeans, excess: Floats, shape: ThermalModelForm, since: int | None
 ) -> StepwiseWork[_ShapeFit]:
-    """Fit a model with the best time constants and the best correlation φ of the residuals."""
-    best = yield from _TimeConstantSearch(means, excess, shape, PHI_VALUES[0], since).run()
+    """Fit a model form with the best time constants and the best residual correlation φ."""
+    best = yield from _TimeConstantSearch(means, excess, shape, PHI_VALUES[0], since).find_best_time_constants()
     for phi in PHI_VALUES[1:]:
-        other = yield from _TimeConstantSearch(means, excess, shape, phi, since).run()
+        other = yield from _TimeConstantSearch(means, excess, shape, phi, since).find_best_time_constants()
         best = min(best, other, key=lambda one: one.aicc)
     return best
 
 
 class _TimeConstantSearch:
-    """Search for the time constants of a model with a given φ.
+    """Search for the time constants of a model form with a given φ.
 
-    The time constants are chosen one after the other from a grid, then refined by golden-section search.
+    The time constants are selected one by one from a grid, and then refined by golden-section search.
     """
 
     def __init__(
@@ -270,8 +272,8 @@ class _TimeConstantSearch:
         self._grid = np.geomspace(self._fastest, self._slowest, GRID_POINTS)
         self._constants: tuple[float, ...] = ()
 
-    def run(self) -> StepwiseWork[_ShapeFit]:
-        """Fit the model with the best time constants."""
+    def find_best_time_constants(self) -> StepwiseWork[_ShapeFit]:
+        """Return the fit with the best time constants."""
         k = self._shape.difference_equation_order
         for _ in range(k):
             yield from self._add_from_grid()
@@ -286,7 +288,8 @@ class _TimeConstantSearch:
         return _fit_sizes(self._means, self._excess, shape, self._phi, self._since)
 
     def _add_from_grid(self) -> StepwiseWork[None]:
-        """Add the best time constant of the grid that differs enough from the others."""
+        """Add the best time constant of the grid. The ratio to the other time constants is at least
+        MIN_TIME_CONSTANT_RATIO."""
         free = [
             one
             for one in self._grid.tolist()
@@ -298,7 +301,6 @@ class _TimeConstantSearch:
         self._constants = (*self._constants, free[int(np.argmin(scores))])
 
     def _refine(self, at: int) -> StepwiseWork[None]:
-        """Refine one time constant by golden-section search."""
         lo, hi = self._bounds(at)
         for _ in range(GOLDEN_STEPS):
             a, b = hi * (lo / hi) ** GOLDEN_RATIO, lo * (hi / lo) ** GOLDEN_RATIO
@@ -311,8 +313,7 @@ class _TimeConstantSearch:
         return (*self._constants[:at], constant, *self._constants[at + 1 :])
 
     def _bounds(self, at: int) -> tuple[float, float]:
-        """Return the limits for the refinement of a time constant. The limits are one grid step away, and keep
-        MIN_TIME_CONSTANT_RATIO to the other constants."""
+        """Return the limits for the refinement of a time constant, which are at most one grid step away."""
         one, others = self._constants[at], (*self._constants[:at], *self._constants[at + 1 :])
         ratio = float(self._grid[1] / self._grid[0])
         below = max((MIN_TIME_CONSTANT_RATIO * other for other in others if other < one), default=self._fastest)
@@ -323,15 +324,15 @@ class _TimeConstantSearch:
 def _fit_sizes(
     means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None = None
 ) -> _ShapeFit:
-    """Fit the coefficients by least squares on the whitened rows."""
-    known = means.known
-    columns = regressors(shape, excess, means.interval_s, began=True)
+    """Fit the coefficients of a model form by least squares on whitened regressors."""
+    known = means.both_known
+    columns = build_regressors(shape, excess, means.interval_s, with_initial_state=True)
     own = columns.shape[1]
     if since is not None:
         columns = np.hstack([columns, (np.arange(excess.size) >= since)[:, None]])
     y = np.where(known, means.bias, 0.0)
-    x, z, fresh = whiten(columns, y, known, phi)
-    sizes = least_squares(x, z)
+    x, z, fresh = whiten_regression(columns, y, known, phi)
+    sizes = solve_least_squares(x, z)
     count = x.shape[0]
     square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
     free = sizes.size + shape.difference_equation_order + (phi > 0.0) + 1
@@ -344,23 +345,22 @@ def _fit_sizes(
 
 
 def _without_step(means: IntervalMeans, since: int | None, step: float) -> IntervalMeans:
-    """Return the means with the step of the offset removed."""
     if since is None:
         return means
     return replace(means, bias=means.bias - step * (np.arange(means.bias.size) >= since))
 
 
-def whiten(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
-    """Return rows and values with the correlation φ of the residuals removed.
+def whiten_regression(regressors: Floats, values: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
+    """Remove the residual correlation φ from regressors and values.
 
-    Each row is reduced by φ times the row before, if that row is known. The first row after a gap is scaled to the same
-    variance.
+    Each row is reduced by φ times the previous row, if the previous row is known. Otherwise, the row is scaled to the
+    same variance.
 
     Parameters
     ----------
-    columns : ndarray, shape (n, m)
+    regressors : ndarray, shape (n, m)
         Regressors.
-    y : ndarray, shape (n,)
+    values : ndarray, shape (n,)
         Values in rad/s or m/s².
     known : ndarray, shape (n,), bool
         True where the value is known.
@@ -369,17 +369,17 @@ def whiten(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[F
 
     Returns
     -------
-    columns : ndarray, shape (known, m)
+    regressors : ndarray, shape (known, m)
         Whitened regressors of the known rows.
-    y : ndarray, shape (known,)
+    values : ndarray, shape (known,)
         Whitened values.
     fresh : int
-        Number of rows without a known row before.
+        Number of known rows without a known previous row.
     """
     follows = known[1:] & known[:-1]
-    x, z = columns.copy(), y.copy()
-    x[1:] -= phi * follows[:, None] * columns[:-1]
-    z[1:] -= phi * follows * y[:-1]
+    x, z = regressors.copy(), values.copy()
+    x[1:] -= phi * follows[:, None] * regressors[:-1]
+    z[1:] -= phi * follows * values[:-1]
     first = known.copy()
     first[1:] &= ~follows
     weight = np.where(first, (1.0 - phi**2) ** 0.5, 1.0)
@@ -387,25 +387,25 @@ def whiten(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[F
 
 
 def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit) -> float:
-    """Return the rms error of parts of the record, each predicted from the other parts with the same time constants.
+    """Return the rms error of a cross-validation in which each part of the record is predicted from the other parts.
 
-    The initial state of the lags is known only from the first part. When this part is predicted, the temperature before
-    the record is assumed to be constant.
+    If the first part is predicted, the temperature before the record is assumed to be constant, because the initial
+    state of the lags is unknown.
     """
     edges = np.linspace(0, excess.size, FOLDS + 1).astype(np.int64)
     square = 0.0
     for lo, hi in pairwise(edges.tolist()):
-        used = means.known.copy()
+        used = means.both_known.copy()
         used[lo:hi] = False
-        columns = one.columns if lo else regressors(one.shape, excess, means.interval_s)
-        x, z, _ = whiten(columns, np.where(used, means.bias, 0.0), used, one.phi)
-        differences = (means.bias - columns @ least_squares(x, z))[lo:hi]
-        square += float((differences[means.known[lo:hi]] ** 2).sum())
-    return float((square / means.known.sum()) ** 0.5)
+        columns = one.columns if lo else build_regressors(one.shape, excess, means.interval_s)
+        x, z, _ = whiten_regression(columns, np.where(used, means.bias, 0.0), used, one.phi)
+        differences = (means.bias - columns @ solve_least_squares(x, z))[lo:hi]
+        square += float((differences[means.both_known[lo:hi]] ** 2).sum())
+    return float((square / means.both_known.sum()) ** 0.5)
 
 
 def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
-    """Return the model of a fitted form, with the covariance of its coefficients."""
+    """Return the thermal model of a fit, with the covariance of the coefficients."""
     k = one.shape.difference_equation_order
     terms = one.sizes.size - k
     model = ThermalModel(
@@ -420,6 +420,6 @@ def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _Sh
         lowest_c=float(np.nanmin(means.temperature_c)),
         highest_c=float(np.nanmax(means.temperature_c)),
     )
-    rows = np.hstack([one.columns, time_constant_derivatives(model, excess, one.sizes)])
-    x, _, _ = whiten(rows, np.zeros(excess.size), means.known, one.phi)
+    rows = np.hstack([one.columns, bias_derivatives_by_time_constant(model, excess, one.sizes)])
+    x, _, _ = whiten_regression(rows, np.zeros(excess.size), means.both_known, one.phi)
     return replace(model, covariance=coefficient_covariance(x, one.sigma))

@@ -1,9 +1,8 @@
-"""Model of bias against temperature: its coefficients, their uncertainty, and predictions of interval means.
+"""Model of the bias against temperature, with coefficients, uncertainty and predictions of interval means.
 
-A multi-step prediction uses temperature only. A one-step prediction also uses the bias measured one interval before.
-The prediction intervals apply to the measured mean. They include the uncertainty of coefficients and time constants,
-and the scatter of the means. ``thermal_fit`` chooses and fits models, and ``recursive_least_squares`` updates their
-coefficients with new intervals.
+A multi-step prediction uses only the temperature. A one-step prediction also uses the bias of the previous interval.
+The prediction intervals include the scatter of the interval means, and the uncertainty of coefficients and time
+constants.
 """
 
 from dataclasses import dataclass
@@ -15,9 +14,9 @@ from drivers.data_types import Floats
 from monitor.common.distributions import Z95
 from monitor.drift.thermal.thermal_response import (
     ThermalModelForm,
-    difference_equation,
-    excess_beyond_range,
-    regressors,
+    build_regressors,
+    difference_equation_coefficients,
+    temperature_beyond_range,
 )
 
 LOG_TIME_CONSTANT_STEP: Final = 1e-3
@@ -26,7 +25,7 @@ LOG_TIME_CONSTANT_STEP: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class ThermalModel:
-    """Bias of one axis as a function of temperature and its history."""
+    """Model of the bias of an axis as a function of the temperature and its history."""
 
     shape: ThermalModelForm
     interval_s: float
@@ -41,13 +40,12 @@ class ThermalModel:
 
     @property
     def residual_std(self) -> float:
-        """Return the standard deviation of the multi-step residuals, rad/s or m/s²."""
+        """Return the standard deviation of the multi-step residuals in rad/s or m/s²."""
         return float(self.sigma / (1.0 - self.phi**2) ** 0.5)
 
     @property
-    def mean_slope(self) -> float:
-        """Return the mean slope of the bias over the temperatures of the fit after all lags have settled, in rad/s or
-        m/s² per °C."""
+    def mean_bias_slope(self) -> float:
+        """Return the mean change of the bias per °C, in rad/s or m/s², after all lags have settled."""
         (lo, hi), powers = self.temperature_range_from_reference_c, np.arange(1, self.shape.powers + 1)
         chords = (hi**powers - lo**powers) / (hi - lo)
         return float(
@@ -56,35 +54,35 @@ class ThermalModel:
 
     @property
     def equation(self) -> dict[str, list[float] | float] | None:
-        """Return the coefficients a, b and c of the difference equation in T − reference; None for a polynomial of
-        order 2 or more."""
+        """Return the coefficients a, b and c of the difference equation, or None for a polynomial of order 2 or
+        more."""
         if self.shape.powers > 1:
             return None
-        a, b, c = difference_equation(self.shape, self.coefficients, self.interval_s)
+        a, b, c = difference_equation_coefficients(self.shape, self.coefficients, self.interval_s)
         return {"a": a.tolist(), "b": b.tolist(), "c": c}
 
     @property
     def temperature_range_from_reference_c(self) -> tuple[float, float]:
-        """Return the lowest and the highest temperature of the fit minus the reference, °C."""
+        """Return the lowest and the highest temperature of the fit, minus the reference temperature, in °C."""
         return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
-    """Predicted mean of each interval."""
+class ThermalPrediction:
+    """Predicted interval means, with 95 % prediction intervals."""
 
     bias: Floats  # [n] rad/s or m/s²
     lo: Floats  # [n] 95 % prediction interval of the measured mean
     hi: Floats  # [n]
 
 
-def predict(
-    model: ThermalModel, temperature_c: Floats, measured: Floats | None = None, began: bool = False
-) -> Prediction:
-    """Predict the interval means, multi-step or one-step.
+def predict_interval_means(
+    model: ThermalModel, temperature_c: Floats, measured_bias: Floats | None = None, starts_with_fit: bool = False
+) -> ThermalPrediction:
+    """Predict interval means of the bias, either multi-step or one-step.
 
-    Outside the temperatures of the fit, each power continues with its mean slope between the lowest and the highest
-    temperature. The extrapolated change is added to the uncertainty.
+    Outside the temperature range of the fit, each power continues as a straight line, and the extrapolated change is
+    added to the uncertainty.
 
     Parameters
     ----------
@@ -92,148 +90,155 @@ def predict(
         Fitted model.
     temperature_c : ndarray, shape (n,)
         Mean temperature of each interval, °C; NaN = missing.
-    measured : ndarray, shape (n,), or None
-        Measured bias of each interval, rad/s or m/s². Each value is used for the prediction of the next interval. None
-        selects the multi-step prediction from temperature only.
-    began : bool
+    measured_bias : ndarray, shape (n,), or None
+        Measured bias of each interval in rad/s or m/s², for one-step predictions. None selects multi-step predictions.
+    starts_with_fit : bool
         True if the first interval is also the first interval of the fit, so that the initial state is known. If False,
-        temperature is assumed to have been constant before the first interval, and the prediction intervals include the
-        uncertainty of this assumption.
+        the temperature before the first interval is assumed to be constant, which increases the uncertainty.
     """
-    excess = interpolate_gaps(temperature_c) - model.reference_c
-    columns = regressors(
-        model.shape, excess, model.interval_s, began=True, ends=model.temperature_range_from_reference_c
+    excess = interpolate_missing_temperatures(temperature_c) - model.reference_c
+    columns = build_regressors(
+        model.shape, excess, model.interval_s, with_initial_state=True, range_c=model.temperature_range_from_reference_c
     )
     k = model.shape.difference_equation_order
-    if not began:
+    if not starts_with_fit:
         columns[:, columns.shape[1] - k :] = 0.0
-    sizes = np.concatenate([model.coefficients, model.initial_state if began else np.zeros(k)])
-    bias, variance = predict_with_variance(
-        model, excess, columns, sizes, time_constant_derivatives(model, excess, sizes), measured
+    sizes = np.concatenate([model.coefficients, model.initial_state if starts_with_fit else np.zeros(k)])
+    bias, variance = predict_bias_and_variance(
+        model, excess, columns, sizes, bias_derivatives_by_time_constant(model, excess, sizes), measured_bias
     )
-    if not began and k:
+    if not starts_with_fit and k:
         swing = (model.highest_c - model.lowest_c) / 12.0**0.5
         lags = model.coefficients[1 + model.shape.powers :]
         p = np.exp(-model.interval_s / np.asarray(model.shape.constants_s))
         variance += ((lags * swing) ** 2 * p ** (2.0 * np.arange(excess.size)[:, None])).sum(axis=1)
     half = Z95 * np.sqrt(variance)
-    return Prediction(bias, bias - half, bias + half)
+    return ThermalPrediction(bias, bias - half, bias + half)
 
 
-def predict_with_variance(
-    model: ThermalModel, excess: Floats, columns: Floats, sizes: Floats, bends: Floats, measured: Floats | None
+def predict_bias_and_variance(
+    model: ThermalModel,
+    excess_c: Floats,
+    regressors: Floats,
+    coefficients: Floats,
+    derivatives: Floats,
+    measured_bias: Floats | None,
 ) -> tuple[Floats, Floats]:
-    """Return the expected bias of successive intervals, and the variance of a measured mean about it.
+    """Return the predicted bias of successive intervals, and the variance of the prediction errors.
 
     Parameters
     ----------
     model : ThermalModel
         Fitted model.
-    excess : ndarray, shape (n,)
+    excess_c : ndarray, shape (n,)
         T − reference, °C.
-    columns : ndarray, shape (n, terms + k)
-        Regressors of ``regressors``.
-    sizes : ndarray, shape (terms + k,)
+    regressors : ndarray, shape (n, terms + k)
+        Regressors of ``build_regressors``.
+    coefficients : ndarray, shape (terms + k,)
         Coefficients of the columns.
-    bends : ndarray, shape (n, k)
-        Derivatives of ``time_constant_derivatives``.
-    measured : ndarray, shape (n,), or None
-        Measured bias, rad/s or m/s². Each value except the last is known to the next interval. None selects multi-step.
+    derivatives : ndarray, shape (n, k)
+        Derivatives of ``bias_derivatives_by_time_constant``.
+    measured_bias : ndarray, shape (n,), or None
+        Measured bias in rad/s or m/s², for one-step predictions. None selects multi-step predictions.
 
     Returns
     -------
     bias : ndarray, shape (n,)
-        Expected bias, rad/s or m/s².
+        Predicted bias in rad/s or m/s².
     variance : ndarray, shape (n,)
-        Variance of the measured mean, in the squared unit.
+        Variance of the prediction errors, in the squared unit.
     """
-    bias = columns @ sizes
-    rows = np.hstack([columns, bends])
-    sigma = np.full(excess.size, model.residual_std)
-    if measured is not None:
-        known = np.isfinite(measured[:-1])
-        last = np.where(known, measured[:-1] - bias[:-1], 0.0)
+    bias = regressors @ coefficients
+    rows = np.hstack([regressors, derivatives])
+    sigma = np.full(excess_c.size, model.residual_std)
+    if measured_bias is not None:
+        known = np.isfinite(measured_bias[:-1])
+        last = np.where(known, measured_bias[:-1] - bias[:-1], 0.0)
         rows[1:] -= model.phi * known[:, None] * rows[:-1]
         bias[1:] += model.phi * last
         sigma[1:][known] = model.sigma
     variance = np.einsum("ij,jk,ik->i", rows, model.covariance, rows) + sigma**2
-    variance += (model.mean_slope * excess_beyond_range(excess, model.temperature_range_from_reference_c)) ** 2
+    variance += (
+        model.mean_bias_slope * temperature_beyond_range(excess_c, model.temperature_range_from_reference_c)
+    ) ** 2
     return bias, variance
 
 
-def interpolate_gaps(temperature_c: Floats) -> Floats:
-    """Return the temperature [n] with interpolated gaps. The lags need the temperature within the gaps."""
+def interpolate_missing_temperatures(temperature_c: Floats) -> Floats:
+    """Return the temperatures [n] with interpolated values for missing temperatures."""
     there = np.flatnonzero(np.isfinite(temperature_c))
     return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
 
 
-def coefficient_covariance(rows: Floats, sigma: float) -> Floats:
-    """Return the covariance [m, m] of least-squares coefficients.
+def coefficient_covariance(whitened_regressors: Floats, residual_std: float) -> Floats:
+    """Return the covariance matrix [m, m] of least-squares coefficients.
 
     Parameters
     ----------
-    rows : ndarray, shape (n, m)
+    whitened_regressors : ndarray, shape (n, m)
         Whitened regressors.
-    sigma : float
+    residual_std : float
         Standard deviation of the whitened residuals.
     """
-    scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-    scaled = rows / scale
-    return np.asarray(sigma**2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-10) / np.outer(scale, scale))
+    scale = np.maximum(np.linalg.norm(whitened_regressors, axis=0), 1e-300)
+    scaled = whitened_regressors / scale
+    return np.asarray(residual_std**2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-10) / np.outer(scale, scale))
 
 
-def time_constant_derivatives(model: ThermalModel, excess: Floats, sizes: Floats) -> Floats:
-    """Return the derivatives [n, k] of the bias with respect to the logarithm of each time constant.
+def bias_derivatives_by_time_constant(model: ThermalModel, excess_c: Floats, coefficients: Floats) -> Floats:
+    """Return the derivatives [n, k] of the bias with respect to the logarithms of the time constants.
 
     Parameters
     ----------
     model : ThermalModel
         Fitted model.
-    excess : ndarray, shape (n,)
+    excess_c : ndarray, shape (n,)
         T − reference, °C.
-    sizes : ndarray, shape (terms + k,)
+    coefficients : ndarray, shape (terms + k,)
         Coefficients of the columns.
     """
-    return bias_derivatives_by_time_constant(
-        model.shape, regressor_derivatives(model.shape, excess, model.interval_s), sizes
+    return combine_regressor_derivatives(
+        model.shape, regressor_derivatives(model.shape, excess_c, model.interval_s), coefficients
     )
 
 
-def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: float) -> Floats:
-    """Return the derivatives [n, 2 k] of the lags and their initial-state responses with respect to the logarithm of
-    each time constant.
+def regressor_derivatives(shape: ThermalModelForm, excess_c: Floats, interval_s: float) -> Floats:
+    """Return the derivatives of lags and initial-state responses with respect to the logarithms of the time constants.
 
     Parameters
     ----------
     shape : ThermalModelForm
         Form of the model.
-    excess : ndarray, shape (n,)
+    excess_c : ndarray, shape (n,)
         T − reference, °C.
     interval_s : float
         Length of an interval, s.
     """
     less, more = (
-        regressors(
-            ThermalModelForm(0, tuple(one * np.exp(by) for one in shape.constants_s)), excess, interval_s, began=True
+        build_regressors(
+            ThermalModelForm(0, tuple(one * np.exp(by) for one in shape.constants_s)),
+            excess_c,
+            interval_s,
+            with_initial_state=True,
         )
         for by in (-LOG_TIME_CONSTANT_STEP, LOG_TIME_CONSTANT_STEP)
     )
     return np.asarray((more - less)[:, 1:] / (2.0 * LOG_TIME_CONSTANT_STEP))
 
 
-def bias_derivatives_by_time_constant(shape: ThermalModelForm, column_derivatives: Floats, sizes: Floats) -> Floats:
-    """Return the derivatives [n, k] of the bias with respect to the logarithm of each time constant.
+def combine_regressor_derivatives(shape: ThermalModelForm, derivatives: Floats, coefficients: Floats) -> Floats:
+    """Return the derivatives of the bias by combining the derivatives of the regressors with the coefficients.
 
     Parameters
     ----------
     shape : ThermalModelForm
         Form of the model.
-    column_derivatives : ndarray, shape (n, 2 k)
+    derivatives : ndarray, shape (n, 2 k)
         Derivatives of the columns, from ``regressor_derivatives``.
-    sizes : ndarray, shape (terms + k,)
+    coefficients : ndarray, shape (terms + k,)
         Coefficients of the columns.
     """
     k, first = shape.difference_equation_order, 1 + shape.powers
     return np.asarray(
-        column_derivatives[:, :k] * sizes[first : first + k] + column_derivatives[:, k:] * sizes[first + k :]
+        derivatives[:, :k] * coefficients[first : first + k] + derivatives[:, k:] * coefficients[first + k :]
     )

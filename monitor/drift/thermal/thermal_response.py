@@ -1,16 +1,16 @@
-"""Response of a bias to temperature, as a sum of terms that are linear in their coefficients.
+"""Response of a bias to temperature, as a sum of terms with linear coefficients.
 
-A **lag** describes heat that reaches the sensor with a delay: L_n = p L_{n−1} + (1 − p) T_n, p = exp(−Δt/τ). Thermal
-resistances and capacitances have only real, positive time constants. A difference equation
+A lag describes heat that reaches the sensor with a delay: L_n = p L_{n−1} + (1 − p) T_n, with p = exp(−Δt/τ). Networks
+of thermal resistances and capacitances have only real, positive time constants. A difference equation
 
     Y_n + a_1 Y_{n−1} + … + a_k Y_{n−k} = b_0 T_n + … + b_m T_{n−m} + c
 
-with roots p_1 … p_k is therefore a sum of k lags, each with its own coefficient. m = k − 1, or m = k if a part of the
-bias follows without delay. The equation is stable by construction. Each root also has an initial-state response p^n,
-which is the effect of temperatures before the first interval.
+with the roots p_1 … p_k is therefore a stable sum of k lags. The order m is k − 1, or k if a part of the bias follows
+the temperature without delay. Each root also has an initial-state response p^n, which describes the effect of
+temperatures before the first interval.
 
-A **polynomial** in T is the established alternative without memory. Outside the temperatures of the fit, each power
-continues as the straight line through its end points, because powers diverge.
+A polynomial describes a bias that follows the temperature without delay. Outside the temperature range of the fit, each
+power continues as a straight line.
 """
 
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ from monitor.common.compiled import compiled
 
 @dataclass(frozen=True, slots=True)
 class ThermalModelForm:
-    """Form of the model: its nonlinear parameters."""
+    """Form of a thermal model: the order of the polynomial, and the time constants of the lags."""
 
     powers: int  # order of the polynomial in T − reference, which acts without delay
     constants_s: tuple[float, ...]  # time constants of the lags, s
 
     @property
     def difference_equation_order(self) -> int:
-        """Return the order k of the difference equation; 0 for a polynomial."""
+        """Return the order k of the difference equation, which is 0 for a polynomial."""
         return len(self.constants_s)
 
     @property
     def name(self) -> str:
-        """Return the name of the form for display.
+        """Return the name of the model form for display.
 
         >>> ThermalModelForm(0, ()).name, ThermalModelForm(3, ()).name
         ('constant', 'polynomial 3')
@@ -60,14 +60,14 @@ def compute_lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
     return np.exp(-interval_s / np.asarray(shape.constants_s, dtype=np.float64))
 
 
-def regressors(
+def build_regressors(
     shape: ThermalModelForm,
     excess_c: Floats,
     interval_s: float,
-    began: bool = False,
-    ends: tuple[float, float] | None = None,
+    with_initial_state: bool = False,
+    range_c: tuple[float, float] | None = None,
 ) -> Floats:
-    """Return the regressors [n, terms]: one, powers of T − reference, lags, and initial-state responses.
+    """Return the regressors [n, terms]: a constant, powers of T − reference, lags, and initial-state responses.
 
     Parameters
     ----------
@@ -77,109 +77,109 @@ def regressors(
         T − reference, °C, without gaps.
     interval_s : float
         Length of an interval, s.
-    began : bool
-        True if each lag has a regressor for its initial state, because the earlier temperature is unknown. False if
-        temperature is assumed to have been constant before the first interval.
-    ends : (float, float) or None
-        Lowest and highest T − reference of the fit, °C. Outside this range, powers continue as straight lines.
+    with_initial_state : bool
+        True to add the initial-state response of each lag. False to assume a constant temperature before the first
+        interval.
+    range_c : (float, float) or None
+        Lowest and highest T − reference of the fit, °C. Outside of the range, powers continue as straight lines.
 
     Examples
     --------
-    >>> regressors(ThermalModelForm(1, ()), np.array([0.0, 2.0]), 60.0).tolist()
+    >>> build_regressors(ThermalModelForm(1, ()), np.array([0.0, 2.0]), 60.0).tolist()
     [[1.0, 0.0], [1.0, 2.0]]
     """
     n = excess_c.size
     columns = [np.ones(n)]
-    columns += [_power(excess_c, power, ends) for power in range(1, shape.powers + 1)]
+    columns += [_power(excess_c, power, range_c) for power in range(1, shape.powers + 1)]
     p = compute_lag_roots(shape, interval_s)
-    columns += [first_order_lag(excess_c, one) for one in p]
-    if began:
+    columns += [apply_first_order_lag(excess_c, one) for one in p]
+    if with_initial_state:
         columns += [one ** np.arange(n, dtype=np.float64) for one in p]
     return np.stack(columns, axis=1)
 
 
-def excess_beyond_range(excess_c: Floats, ends: tuple[float, float]) -> Floats:
-    """Return the signed distance of each temperature from the range of the fit in °C; 0 inside.
+def temperature_beyond_range(excess_c: Floats, range_c: tuple[float, float]) -> Floats:
+    """Return the signed distance of each temperature from the temperature range of the fit in °C. Inside, the distance
+    is 0.
 
     Parameters
     ----------
     excess_c : ndarray, shape (n,)
         T − reference, °C.
-    ends : (float, float)
+    range_c : (float, float)
         Lowest and highest T − reference of the fit, °C.
     """
-    return excess_c - np.clip(excess_c, *ends)
+    return excess_c - np.clip(excess_c, *range_c)
 
 
 def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
-    """Return a power of x, continued outside the range as the straight line through its end points."""
+    """Return a power of x, which continues outside the range as a straight line through the end points."""
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])
-    return np.asarray(np.clip(x, *ends) ** power + chord * excess_beyond_range(x, ends))
+    return np.asarray(np.clip(x, *ends) ** power + chord * temperature_beyond_range(x, ends))
 
 
 @compiled
-def first_order_lag(x: Floats, p: float) -> Floats:
-    """Return a first-order lag of x, L_n = p L_{n−1} + (1 − p) x_n, settled at the first value.
+def apply_first_order_lag(values: Floats, root: float) -> Floats:
+    """Apply a first-order lag, L_n = p L_{n−1} + (1 − p) x_n, which starts at the first value.
 
     Parameters
     ----------
-    x : ndarray, shape (n,)
+    values : ndarray, shape (n,)
         Input.
-    p : float
+    root : float
         Root of the lag, 0 < p < 1.
     """
-    out = np.empty(x.size)
-    level = x[0]
-    for k in range(x.size):
-        level = p * level + (1.0 - p) * x[k]
+    out = np.empty(values.size)
+    level = values[0]
+    for k in range(values.size):
+        level = root * level + (1.0 - root) * values[k]
         out[k] = level
     return out
 
 
-def least_squares(columns: Floats, y: Floats) -> Floats:
-    """Return the least-squares coefficients [terms].
-
-    The columns are scaled, so that their units have no effect.
+def solve_least_squares(regressors: Floats, values: Floats) -> Floats:
+    """Return the least-squares coefficients [terms], computed with scaled columns.
 
     Parameters
     ----------
-    columns : ndarray, shape (n, terms)
+    regressors : ndarray, shape (n, terms)
         Regressors.
-    y : ndarray, shape (n,)
+    values : ndarray, shape (n,)
         Values.
     """
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    found = np.linalg.lstsq(columns / scale, y, rcond=1e-10)[0]
+    scale = np.maximum(np.linalg.norm(regressors, axis=0), 1e-300)
+    found = np.linalg.lstsq(regressors / scale, values, rcond=1e-10)[0]
     return np.asarray(found / scale)
 
 
-def difference_equation(shape: ThermalModelForm, sizes: Floats, interval_s: float) -> tuple[Floats, Floats, float]:
+def difference_equation_coefficients(
+    shape: ThermalModelForm, coefficients: Floats, interval_s: float
+) -> tuple[Floats, Floats, float]:
     """Return the coefficients a [k], b [m + 1] and c of the difference equation in T − reference.
 
     Parameters
     ----------
     shape : ThermalModelForm
         Form of the model.
-    sizes : ndarray, shape (terms,)
+    coefficients : ndarray, shape (terms,)
         Coefficients of constant, powers and lags.
     interval_s : float
         Length of an interval, s.
 
     Examples
     --------
-    >>> a, b, c = difference_equation(ThermalModelForm(0, (1.0 / np.log(2.0),)), np.array([3.0, 10.0]), 1.0)
-    >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12)
-    ([-0.5], [5.0], 1.5)
+    >>> a, b, c = difference_equation_coefficients(ThermalModelForm(0, (1.0 / np.log(2.0),)), np.array([3.0, 10.0]),
+    1.0) >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12) ([-0.5], [5.0], 1.5)
     """
     p = compute_lag_roots(shape, interval_s)
     whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] 1, followed by a
     b = np.zeros(whole.size)
     if shape.powers:
-        b += sizes[1] * whole
+        b += coefficients[1] * whole
     for i, one in enumerate(p):
         rest = np.poly(np.delete(p, i)) if p.size > 1 else np.ones(1)
-        b[: rest.size] += sizes[1 + shape.powers + i] * (1.0 - one) * rest
+        b[: rest.size] += coefficients[1 + shape.powers + i] * (1.0 - one) * rest
     last = b.size if shape.powers else b.size - 1
-    return np.asarray(whole[1:], dtype=np.float64), b[: max(last, 1)], float(sizes[0] * whole.sum())
+    return np.asarray(whole[1:], dtype=np.float64), b[: max(last, 1)], float(coefficients[0] * whole.sum())

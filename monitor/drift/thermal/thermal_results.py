@@ -1,4 +1,4 @@
-"""Thermal models fitted in one recording, and their predictions for another recording."""
+"""Reports of thermal fits to a recording, and of thermal predictions for another recording."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_fit import ThermalFit
-from monitor.drift.thermal.thermal_model import Prediction, ThermalModel, predict
+from monitor.drift.thermal.thermal_model import ThermalModel, ThermalPrediction, predict_interval_means
 
 DEFAULT_INTERVALS: Final = 72
-"""Number of intervals in a recording, if no interval is given. The paper uses 72 h in intervals of 1 h."""
+"""Default number of intervals in a recording. Wang et al. use 72 intervals of 1 h."""
 ROUND_INTERVALS_S: Final = (
     0.1,
     0.2,
@@ -39,7 +39,7 @@ ROUND_INTERVALS_S: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ThermalFitReport:
-    """Thermal models fitted in one recording."""
+    """Thermal models that were fitted to a recording."""
 
     recording: str
     interval_s: float
@@ -50,12 +50,12 @@ class ThermalFitReport:
 
 
 @dataclass(frozen=True, slots=True)
-class ComparisonWithMeans:
-    """Comparison of a thermal model with the interval means of a recording."""
+class ThermalModelComparison:
+    """Prediction errors of a thermal model for the interval means of a recording."""
 
-    multi_step: Prediction
-    one_step: Prediction
-    offset: float  # mean of measured minus multi-step; a bias changes from one start to the next
+    multi_step: ThermalPrediction
+    one_step: ThermalPrediction
+    offset: float  # mean difference of measured and multi-step bias, because the bias differs after each start
     rms: float  # rms of measured minus multi-step, rad/s or m/s²
     rms_without_offset: float  # rms of measured minus multi-step minus offset
     rms_one_step: float  # rms of measured minus one-step
@@ -65,18 +65,18 @@ class ComparisonWithMeans:
 
 @dataclass(frozen=True, slots=True)
 class ThermalPredictionReport:
-    """Predictions of models for a recording."""
+    """Prediction errors of the thermal models of all axes for a recording."""
 
     recording: str
     interval_s: float
     means: Mapping[str, IntervalMeans]
-    judged: Mapping[str, ComparisonWithMeans]
+    judged: Mapping[str, ThermalModelComparison]
     refused: Mapping[str, str]
     notes: tuple[str, ...] = ()
 
 
-def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ComparisonWithMeans:
-    """Compare a model with interval means that were not used for the fit.
+def compare_model_with_means(model: ThermalModel, means: IntervalMeans) -> ThermalModelComparison:
+    """Compare the predictions of a thermal model with interval means that were not used for the fit.
 
     Parameters
     ----------
@@ -85,14 +85,14 @@ def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ComparisonW
     means : IntervalMeans
         Interval means of bias (rad/s or m/s²) and temperature (°C).
     """
-    multi, known = predict(model, means.temperature_c), means.known
+    multi, known = predict_interval_means(model, means.temperature_c), means.both_known
     residual = means.bias - multi.bias
     offset = float(residual[known].mean())
-    one = predict(model, means.temperature_c, means.bias - offset)
+    one = predict_interval_means(model, means.temperature_c, means.bias - offset)
     inside = (means.bias >= multi.lo) & (means.bias <= multi.hi)
-    return ComparisonWithMeans(
+    return ThermalModelComparison(
         multi,
-        Prediction(one.bias + offset, one.lo + offset, one.hi + offset),
+        ThermalPrediction(one.bias + offset, one.lo + offset, one.hi + offset),
         offset,
         _rms(residual[known]),
         _rms(residual[known] - offset),
@@ -102,12 +102,12 @@ def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ComparisonW
     )
 
 
-def choose_interval_s(seconds: float, rate_hz: float) -> float:
-    """Return a round interval length in seconds, such that a recording has about DEFAULT_INTERVALS intervals.
+def choose_interval_s(recording_s: float, rate_hz: float) -> float:
+    """Return a round interval length in seconds that divides a recording into about DEFAULT_INTERVALS intervals.
 
     Parameters
     ----------
-    seconds : float
+    recording_s : float
         Length of the recording in seconds.
     rate_hz : float
         Sample rate in Hz.
@@ -117,10 +117,9 @@ def choose_interval_s(seconds: float, rate_hz: float) -> float:
     >>> choose_interval_s(72 * 3600.0, 100.0), choose_interval_s(8784.0, 4.16), choose_interval_s(60.0, 100.0)
     (3600, 120, 0.5)
     """
-    most = max(seconds / DEFAULT_INTERVALS, 1.0 / rate_hz) * 1.01
+    most = max(recording_s / DEFAULT_INTERVALS, 1.0 / rate_hz) * 1.01
     return max((one for one in ROUND_INTERVALS_S if 1.0 / rate_hz <= one <= most), default=1.0 / rate_hz)
 
 
 def _rms(x: Floats) -> float:
-    """Return the rms of x."""
     return float(np.sqrt(np.mean(x**2)))

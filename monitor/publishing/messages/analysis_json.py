@@ -66,7 +66,7 @@ class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
         return cls(
             removal.models[axis],
             {symbol: values[symbol] for symbol in SLOW_LETTERS},
-            {symbol: removal.variance_share(symbol, axis) for symbol in SLOW_LETTERS},
+            {symbol: removal.variance_share_of_temperature(symbol, axis) for symbol in SLOW_LETTERS},
         )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from monitor.common.units import DEVIATION_UNITS, format_duration, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.thermal_model import Prediction, predict
+from monitor.drift.thermal.thermal_model import ThermalPrediction, predict_interval_means
 from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.plots import style
 
@@ -33,7 +33,7 @@ def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
         (
             axis,
             report.means[axis],
-            predict(one.model, report.means[axis].temperature_c, began=True),
+            predict_interval_means(one.model, report.means[axis].temperature_c, starts_with_fit=True),
             one.model.shape.name,
         )
         for axis, one in report.fits.items()
@@ -59,12 +59,12 @@ def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) ->
     rows = []
     for axis, one in report.judged.items():
         predicted = (bound + one.offset for bound in (one.multi_step.bias, one.multi_step.lo, one.multi_step.hi))
-        rows.append((axis, report.means[axis], Prediction(*predicted), "multi-step prediction, offset removed"))
+        rows.append((axis, report.means[axis], ThermalPrediction(*predicted), "multi-step prediction, offset removed"))
     duration = format_duration(report.interval_s)
     _save_plot(rows, f"{report.recording}: bias predicted from temperature, means of {duration}", path)
 
 
-def _save_plot(rows: list[tuple[str, IntervalMeans, Prediction, str]], title: str, path: Path) -> None:
+def _save_plot(rows: list[tuple[str, IntervalMeans, ThermalPrediction, str]], title: str, path: Path) -> None:
     with style.figure_style():
         figure = style.create_figure(ROW_INCHES[0], 0.6 + ROW_INCHES[1] * len(rows))
         panels = figure.subplots(len(rows), 2, squeeze=False, sharex="col", sharey="row", width_ratios=[2.4, 1.0])

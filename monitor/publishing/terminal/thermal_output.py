@@ -12,7 +12,7 @@ from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
 from monitor.drift.thermal.thermal_fit import ThermalFit
 from monitor.drift.thermal.thermal_response import ThermalModelForm
-from monitor.drift.thermal.thermal_results import ComparisonWithMeans, ThermalFitReport, ThermalPredictionReport
+from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalModelComparison, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import encode_json
 from monitor.publishing.terminal.tables import plain_table, print_notes
@@ -81,8 +81,8 @@ def temperature_notes(removal: TemperatureRemoval) -> list[str]:
         fallen = [
             f"{letter} falls from {before.value} to {after.value} {after.unit} ({100.0 * share:.0f} % of its variance)"
             for letter in SLOW_LETTERS
-            if removal.has_decreased_significantly(letter, axis)
-            and (share := removal.variance_share(letter, axis)) is not None
+            if removal.coefficient_decreased_significantly(letter, axis)
+            and (share := removal.variance_share_of_temperature(letter, axis)) is not None
             for before, after in [
                 (
                     format_coefficient(removal.before, letter, axis),
@@ -91,7 +91,7 @@ def temperature_notes(removal: TemperatureRemoval) -> list[str]:
             ]
         ]
         without = f"without temperature ({removal.models.get(axis, '')}), {' and '.join(fallen)}" if fallen else ""
-        if one.explains_most:
+        if one.explains_most_variance:
             share_text = f"{math.floor(100.0 * one.share):d} %"
             notes.append(
                 f"{axis} follows its temperature: a {one.form} explains {share_text} of the variance of means of "
@@ -125,7 +125,7 @@ def encode_thermal_fit(report: ThermalFitReport) -> bytes:
             "sizes": model.coefficients.tolist(),
             "time_constants": list(model.shape.constants_s),
             "equation": model.equation,
-            "slope": model.mean_slope,
+            "slope": model.mean_bias_slope,
             "hysteresis": one.hysteresis,
             "hysteresis_p": one.hysteresis_p,
             "both_directions": one.temperature_rose_and_fell,
@@ -148,7 +148,7 @@ def encode_thermal_prediction(report: ThermalPredictionReport) -> bytes:
     return _json(PREDICT_SCHEMA, report.recording, report.interval_s, axes, report.refused, report.notes)
 
 
-def _prediction_of_axis(means: IntervalMeans, one: ComparisonWithMeans) -> dict[str, Any]:
+def _prediction_of_axis(means: IntervalMeans, one: ThermalModelComparison) -> dict[str, Any]:
     return {
         "rms": one.rms,
         "rms_offset_out": one.rms_without_offset,
@@ -190,7 +190,7 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
     cubic = next((each.validated for each in one.candidates if each.shape == ThermalModelForm(3, ())), None)
     return (
         model.shape.name,
-        _format_deviation(axis, model.mean_slope) if model.shape != ThermalModelForm(0, ()) else "—",
+        _format_deviation(axis, model.mean_bias_slope) if model.shape != ThermalModelForm(0, ()) else "—",
         ", ".join(format_duration(each) for each in model.shape.constants_s) or "—",
         "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis),
         _format_deviation(axis, best.rms),

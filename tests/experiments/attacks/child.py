@@ -88,7 +88,7 @@ def replace_endless_commands() -> None:
         setattr(place, name, _accepted(name))
     write: Callable[..., None] = simulate_recording._write
 
-    def write_short(result: simulate_recording.Result, *rest: Any) -> None:
+    def write_short(result: simulate_recording.SimulationResult, *rest: Any) -> None:
         if result.samples > LONGEST_SIMULATION:
             raise SystemExit(0)
         write(result, *rest)

@@ -28,7 +28,7 @@ from drivers.number_ranges import NumberRange
 from drivers.recordings import load_samples
 from drivers.settings_model import KeywordOrType, SettingsModel, fields_by_key
 from monitor import cli
-from monitor.commands.analyze import Request, run_analysis
+from monitor.commands.analyze import AnalysisRequest, run_analysis
 from monitor.common import shipped_config_paths as shipped_file_paths
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
@@ -396,14 +396,14 @@ def columns(n: int = 400) -> dict[str, Any]:
 def test_stated_rate_of_a_recording(fs: Any, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     np.savez(path, fs=fs, **columns())
-    answer_or_refuse(Request(path, total_and_hadamard=True))
+    answer_or_refuse(AnalysisRequest(path, total_and_hadamard=True))
 
 
 @pytest.mark.parametrize("step_s", [1e-300, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 15.0, 900.0, 1e4, 1e7])
 def test_time_stamps_of_a_recording(step_s: float, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     np.savez(path, t=np.arange(400) * step_s, **columns())
-    answered = answer_or_refuse(Request(path, total_and_hadamard=True))
+    answered = answer_or_refuse(AnalysisRequest(path, total_and_hadamard=True))
     assert answered == (1e-6 <= step_s <= 900.0), step_s
 
 
@@ -423,8 +423,8 @@ def try_outlier(t0: float, row: int, far: float, tmp_path: Path) -> None:
     path, t = tmp_path / "r.npz", t0 + np.arange(400) / 100.0
     t[row] = far
     np.savez(path, t=t, **columns())
-    answer_or_refuse(Request(path))
-    answer_or_refuse(Request(path, last_s=2.0))
+    answer_or_refuse(AnalysisRequest(path))
+    answer_or_refuse(AnalysisRequest(path, last_s=2.0))
 
 
 @pytest.mark.parametrize("value", [np.longdouble("1e4000"), np.longdouble("-1e4000"), np.longdouble("nan")])
@@ -436,7 +436,7 @@ def test_a_column_of_long_doubles(value: Any, tmp_path: Path) -> None:
     found = load_samples(path)
     assert np.isnan(found.values[7, 0])
     assert np.isfinite(found.values[8, 0])
-    assert answer_or_refuse(Request(path))
+    assert answer_or_refuse(AnalysisRequest(path))
 
 
 @pytest.mark.parametrize("value", [1e30, 1e155, 1e300, 1e-300, 5e-324, -1e307])
@@ -446,7 +446,7 @@ def test_absurd_samples(value: float, tmp_path: Path) -> None:
     data["gx"][100:110] = value
     data["gz"] = data["gz"] * value
     np.savez(path, fs=100.0, **data)
-    answer_or_refuse(Request(path, total_and_hadamard=True))
+    answer_or_refuse(AnalysisRequest(path, total_and_hadamard=True))
 
 
 @pytest.mark.parametrize("last_s", [1e-6, 1e-3, 1e9])
@@ -461,11 +461,11 @@ def test_every_supported_rate_is_answered(rate_hz: float, tmp_path: Path) -> Non
     """Both ends of the range, and a sensor of vibration; slow sensors are above, by their time stamps."""
     path = tmp_path / "r.npz"
     np.savez(path, t=np.arange(2000) / rate_hz, **columns(2000))
-    found = run_analysis(Request(path, total_and_hadamard=True, window_s=500.0 / rate_hz))
+    found = run_analysis(AnalysisRequest(path, total_and_hadamard=True, window_s=500.0 / rate_hz))
     assert found.analysis.estimate.rate_hz == pytest.approx(rate_hz, rel=1e-3)
 
 
-def answer_or_refuse(request: Request) -> bool:
+def answer_or_refuse(request: AnalysisRequest) -> bool:
     """Return True if there is an answer; a warning is an error here."""
     try:
         run_analysis(request)

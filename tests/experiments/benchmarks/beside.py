@@ -82,15 +82,17 @@ class Side:
 
 def sides(recording: Path, model: str, seed: int) -> tuple[Side, Side]:
     """The recording, and the model for as long."""
-    recorded = analyze.run_analysis(analyze.Request(recording)).analysis
+    recorded = analyze.run_analysis(analyze.AnalysisRequest(recording)).analysis
     estimate = recorded.estimate
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "simulated.npz"
         seconds = estimate.curve.n / estimate.rate_hz
         simulate_recording.run_simulation(
-            simulate_recording.Request(load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model)
+            simulate_recording.SimulationRequest(
+                load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model
+            )
         )
-        simulated = analyze.run_analysis(analyze.Request(out)).analysis
+        simulated = analyze.run_analysis(analyze.AnalysisRequest(out)).analysis
     return Side("recorded", recorded), Side("simulated", simulated)
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.data_types import AXES, Floats, make_block
 from drivers.recordings import load_samples
-from monitor.commands.compensate import METHODS, Request, run_compensation
+from monitor.commands.compensate import METHODS, CompensationRequest, run_compensation
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import fit_arma, stationary_covariance
@@ -162,7 +162,7 @@ def _judged(recording: Path, method: str) -> Floats:
 def _axes(recording: Path, method: str) -> list[AxisCompensation]:
     """What compensation made of each axis; the recording that comes out is not kept."""
     with tempfile.TemporaryDirectory() as folder:
-        return list(run_compensation(Request(recording, Path(folder) / "out.npz", method)).axes.values())
+        return list(run_compensation(CompensationRequest(recording, Path(folder) / "out.npz", method)).axes.values())
 
 
 def _row(rows: Floats) -> list[str]:
@@ -290,10 +290,10 @@ def _followed(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) ->
     """rms error before and after the change, and of ε/√S after it."""
     row = np.zeros(1, sage_husa.DRIFT_FILTER)[0]
     row["adaptive"] = adapts
-    sage_husa.set_model(row, model)
+    sage_husa.restart_with_model(row, model)
     off, new = np.empty(z.size), np.empty(z.size)
     for k in range(z.size):
-        expected = sage_husa.expected_bias(row)[0]
+        expected = sage_husa.expected_bias_and_variance(row)[0]
         off[k] = expected - drift[k]
         total, _ = sage_husa.update_with_interval(row, z[k], scatter[k], 1e-12)
         new[k] = (z[k] - expected) / total**0.5
@@ -336,7 +336,7 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
         one.compensate(values[start : start + size])
         one.identify_due_models()
         kept.append((one._state.drift.copy(), len(taught)))
-        taught += [interval.mean for interval in one.take_intervals()]
+        taught += [interval.mean for interval in one.take_finished_intervals()]
     means, per_min = np.array(taught), round(60.0 / one.interval_s)
     squares = np.zeros((3, len(spans)))
     for at, span in enumerate(spans):
@@ -350,7 +350,7 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
             for row in rows:
                 for _ in range(ahead + per_min // 2):
                     sage_husa.predict_next_interval(row)
-            now = np.array([sage_husa.expected_bias(row) for row in rows])
+            now = np.array([sage_husa.expected_bias_and_variance(row) for row in rows])
             spread = now[:, 1] + np.array([row["white_variance"] for row in rows]) / per_min
             squares[:, at] += np.mean([(truth - minute) ** 2, (truth - now[:, 0]) ** 2, spread], axis=1)
             count += 1
@@ -374,7 +374,7 @@ def alarms(seeds: int) -> None:
             one, by_hand = LiveCompensation(rate_hz), ArmaWorker("", synchronous=True)
             t_ns = np.round(np.arange(len(values)) / rate_hz * 1e9).astype(np.int64)
             for start in range(0, len(values), 100):
-                one.update(make_block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))
+                one.compensate_block(make_block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))
                 by_hand.adopt_and_start_models(one)
             told += [event.text for event in one.take_events()]
         hours = sum(len(values) for values in records) / rate_hz / 3600.0
@@ -467,7 +467,7 @@ def arma(seeds: int) -> None:
             for seed in range(count):
                 a = np.random.default_rng(seed).standard_normal(n + 500)
                 z = lfilter([1.0, theta], [1.0, -phi[0], -phi[1]], a)[500:]
-                found = fit_arma(z, orders=[(2, 1)], intervals=True)
+                found = fit_arma(z, orders=[(2, 1)], with_confidence_intervals=True)
                 inside += (np.array(found.lo) <= [*phi, theta]) & (np.array(found.hi) >= [*phi, theta])
             made.add_row(f"{phi[0]:g}, {phi[1]:g}, {theta:g}", str(n), *(f"{100 * x / count:.0f}" for x in inside))
     console.print(made)
@@ -497,7 +497,7 @@ def robust(_seeds: int) -> None:
             values[size // 2 :] += 0.05
         out = one.compensate(values, lost=int(rng.integers(2)) * int(rng.integers(10**6)))
         one.identify_due_models()
-        one.take_intervals()
+        one.take_finished_intervals()
         assert np.array_equal(np.isfinite(out), np.isfinite(values))
         for row in one._state.drift:
             covariance = row["covariance"]

@@ -11,7 +11,7 @@ import argparse
 
 import numpy as np
 
-from monitor.drift.thermal.bias_temperature_tests import find_dependence, find_hysteresis
+from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, find_temperature_dependence
 from tests.experiments.benchmarks.machine import console, table
 from tests.monitor.drift.cycles import NOISES, SHAPES, chamber_means, drift
 
@@ -25,10 +25,10 @@ def false_statements(noise: str, shape: str, seeds: int) -> tuple[int, int, int]
     found = np.zeros(3, int)
     for seed in range(seeds):
         means = chamber_means(shape, drift(noise, COUNT, np.random.default_rng(seed)))
-        one, loop = find_dependence(means), find_hysteresis(means)
+        one, loop = find_temperature_dependence(means), find_hysteresis(means)
         found += (
             one is not None,
-            one is not None and one.explains_most,
+            one is not None and one.explains_most_variance,
             loop is not None and loop.hysteresis_is_significant,
         )
     return int(found[0]), int(found[1]), int(found[2])
@@ -40,8 +40,8 @@ def power(law: str, shape: str, share: float, seeds: int) -> int:
     for seed in range(seeds):
         noise = drift("random walk", COUNT, np.random.default_rng(seed))
         size = noise.std() * (share / (1.0 - share)) ** 0.5
-        one = find_dependence(chamber_means(shape, noise, law, size))
-        found += one is not None and one.explains_most
+        one = find_temperature_dependence(chamber_means(shape, noise, law, size))
+        found += one is not None and one.explains_most_variance
     return found
 
 

@@ -13,7 +13,7 @@ from collections import Counter
 import numpy as np
 
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
-from monitor.drift.thermal.thermal_model import predict
+from monitor.drift.thermal.thermal_model import predict_interval_means
 from tests.experiments.benchmarks.machine import console, table
 from tests.monitor.drift.made import first_intervals, hourly
 
@@ -28,8 +28,8 @@ def cell(lag_h: float, noise: float, seeds: int) -> tuple[str, ...]:
     for seed in range(seeds):
         means = hourly(seed, lag_h, noise)
         model = fit_thermal_model(first_intervals(means, DAY)).model
-        multi = predict(model, means.temperature_c, began=True)
-        one = predict(model, means.temperature_c, means.bias, began=True)
+        multi = predict_interval_means(model, means.temperature_c, starts_with_fit=True)
+        one = predict_interval_means(model, means.temperature_c, means.bias, starts_with_fit=True)
         cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)
         of_cubic = np.sqrt(np.mean((means.bias - cubic)[DAY:] ** 2))
         ratios.append([np.sqrt(np.mean((means.bias - each.bias)[DAY:] ** 2)) / of_cubic for each in (multi, one)])

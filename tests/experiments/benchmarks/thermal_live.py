@@ -60,8 +60,8 @@ def followed(
     biases, warmth, size = record(kind, seed, step)
     axis, looks, told = OnlineThermalModel(60.0 * MINUTES), [], []
     for k, (bias, temperature_c) in enumerate(zip(biases.tolist(), warmth.tolist(), strict=True)):
-        looks.append(axis.update(bias, size, temperature_c))
-        while axis.step():
+        looks.append(axis.predict_and_add_interval(bias, size, temperature_c))
+        while axis.run_selection_step():
             pass
         told += [(k, found) for found in axis.take_unexplained_changes()]
     return looks, told, size
@@ -76,7 +76,7 @@ def held(kind: str, seeds: int) -> tuple[str, ...]:
         told, records = told + len(found), records + bool(found)
         for k, one in enumerate(looks):
             if one.one_step is not None:
-                inside[k < FIRST].append(one.one_step.side_of(one.bias) == 0)
+                inside[k < FIRST].append(one.one_step.side_of_interval(one.bias) == 0)
     count = sum(map(len, inside.values()))
     shares = [f"{100 * np.mean(inside[early]):.1f} %" for early in (True, False)]
     return kind, f"{count}", *shares, f"{told}", f"{records} of {seeds}"

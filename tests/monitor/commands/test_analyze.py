@@ -9,7 +9,7 @@ import pytest
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import save_samples
 from monitor.commands import analyze, thermal
-from monitor.commands.analyze import Request, TooFewSamples, run_analysis
+from monitor.commands.analyze import AnalysisRequest, TooFewSamples, run_analysis
 from monitor.common.units import MILLI_G
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing import exporters
@@ -31,7 +31,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def test_only_what_is_wanted_is_made(recording: Path) -> None:
-    results = run_analysis(Request(recording))
+    results = run_analysis(AnalysisRequest(recording))
     assert results.total is results.hadamard is results.dynamic is results.without_temperature is None
     assert results.lacking == ""
     [change] = results.analysis.changes  # told in the notes, so always looked for
@@ -42,7 +42,8 @@ def test_only_what_is_wanted_is_made(recording: Path) -> None:
 def test_all_of_it(recording: Path) -> None:
     told: list[tuple[str, float | None]] = []
     results = run_analysis(
-        Request(recording, window_s=30.0, total_and_hadamard=True), lambda what, share: told.append((what, share))
+        AnalysisRequest(recording, window_s=30.0, total_and_hadamard=True),
+        lambda what, share: told.append((what, share)),
     )
     assert results.total is not None
     assert results.hadamard is not None
@@ -67,7 +68,7 @@ def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
     values = 1e-4 * rng.standard_normal((t.size, 6))
     values[:, 2] += 3e-5 * (warmth - 25.0)
     save_samples(tmp_path / "warm.npz", t, values, warmth)
-    results = run_analysis(Request(tmp_path / "warm.npz"))
+    results = run_analysis(AnalysisRequest(tmp_path / "warm.npz"))
     (note,) = (one for one in results.analysis.notes if "follows its temperature" in one)
     assert note.startswith("gz follows its temperature")
     written = json.loads(
@@ -101,7 +102,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
         values[:, 5] += 12.0 * MILLI_G * loop("loop", x) / opening(loop("loop", x), x)
     path = tmp_path / "chamber.npz"
     save_samples(path, np.arange(n) / rate_hz, values, temperature_c)
-    results = run_analysis(Request(path))
+    results = run_analysis(AnalysisRequest(path))
     assert results.analysis.axes_of_temperature == ("gy", "gz", "az")
     named = [one.split()[0] for one in results.analysis.notes if "follows its temperature" in one]
     assert named == ["gy", "gz", "az"]
@@ -115,7 +116,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
     assert marks["gy"]["one_way"] == (shape == "heating")
     warnings = exporters.from_analysis_json(written).warnings
     assert [one.split()[0] for one in warnings] == ["gy", "gz", "az"]
-    study = thermal.fit_recording(path)
+    study = thermal.fit_thermal_models(path)
     if shape != "heating":
         assert study.fits["az"].hysteresis == pytest.approx(12.0 * MILLI_G, rel=0.15)
         assert [study.fits[axis].hysteresis for axis in ("gx", "gy", "gz", "ax", "ay")] == [0.0] * 5
@@ -127,7 +128,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
     if shape == "ramp":
         pytest.importorskip("matplotlib")
         pytest.importorskip("jinja2")
-        analyze.draw_plots(results, tmp_path / "x.html", "chamber")
+        analyze.save_plot_or_report(results, tmp_path / "x.html", "chamber")
         page = (tmp_path / "x.html").read_text("utf-8")
         assert "gy †" in page
         assert "gx †" not in page
@@ -137,16 +138,16 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
 @pytest.mark.long
 def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recording: Path) -> None:
     listed = (0.1, 0.2, 0.5, 1.0, 2.0, 100.0)
-    results = run_analysis(Request(recording, tau=listed, total_and_hadamard=True))
+    results = run_analysis(AnalysisRequest(recording, tau=listed, total_and_hadamard=True))
     assert results.total is not None
     assert results.hadamard is not None
     assert results.total.tau_s.tolist() == list(listed)
     assert results.hadamard.tau_s.tolist() == list(listed[:-1])
-    assert run_analysis(Request(recording, tau=(100.0,), total_and_hadamard=True)).hadamard is None
+    assert run_analysis(AnalysisRequest(recording, tau=(100.0,), total_and_hadamard=True)).hadamard is None
 
 
 def test_a_window_longer_than_the_recording_leaves_the_rest(recording: Path) -> None:
-    results = run_analysis(Request(recording, window_s=1000.0))
+    results = run_analysis(AnalysisRequest(recording, window_s=1000.0))
     assert results.dynamic is None
     assert results.lacking == "no dynamic curves: 240 s are recorded, less than the window of 1000 s"
     assert results.analysis.notes[-1] == results.lacking
@@ -155,15 +156,15 @@ def test_a_window_longer_than_the_recording_leaves_the_rest(recording: Path) -> 
 def test_too_short_says_how_short(tmp_path: Path) -> None:
     save_samples(tmp_path / "x.npz", np.arange(20) / RATE_HZ, np.zeros((20, 6)))
     with pytest.raises(TooFewSamples, match="20 samples; at least 50") as raised:
-        run_analysis(Request(tmp_path / "x.npz"))
+        run_analysis(AnalysisRequest(tmp_path / "x.npz"))
     assert raised.value.samples == 20
 
 
 def test_what_is_wrong_is_said(tmp_path: Path, recording: Path) -> None:
     with pytest.raises(RecordingError):
-        run_analysis(Request(tmp_path / "nowhere.csv"))
+        run_analysis(AnalysisRequest(tmp_path / "nowhere.csv"))
     with pytest.raises(ConfigError, match="window of 0"):
-        run_analysis(Request(recording, window_s=0.1))
+        run_analysis(AnalysisRequest(recording, window_s=0.1))
 
 
 @pytest.mark.long
@@ -171,9 +172,9 @@ def test_what_is_wrong_is_said(tmp_path: Path, recording: Path) -> None:
 def test_a_drawing_has_the_changes_marked(recording: Path, name: str, start: bytes) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
-    results = run_analysis(Request(recording, window_s=30.0, total_and_hadamard=True))
+    results = run_analysis(AnalysisRequest(recording, window_s=30.0, total_and_hadamard=True))
     path = recording.with_name(name)
-    analyze.draw_plots(results, path, "bench")
+    analyze.save_plot_or_report(results, path, "bench")
     assert path.read_bytes().startswith(start)
     if name == "x.html":
         page = path.read_text("utf-8")
@@ -187,4 +188,4 @@ def test_an_analysis_beyond_the_memory_is_one_line(recording: Path, monkeypatch:
 
     monkeypatch.setattr(analyze, "analyze", fail)
     with pytest.raises(ConfigError, match=r"x\.npz: the analysis needs more memory than is free; use only the end"):
-        run_analysis(Request(recording))
+        run_analysis(AnalysisRequest(recording))

@@ -23,7 +23,7 @@ from monitor.commands.doctor import (
     SAMPLE_BYTES,
     Finding,
     check_disk_space,
-    examine,
+    examine_machine,
     recorded_bytes_per_day,
     version_satisfies,
     worst_mark,
@@ -46,7 +46,7 @@ def examined(folder: Path, text: str, mode: int = 0o600) -> list[Finding]:
     path = folder / "c.toml"
     path.write_text(text)
     path.chmod(mode)
-    return examine(path)
+    return examine_machine(path)
 
 
 def of(findings: list[Finding], about: str) -> list[Finding]:
@@ -77,7 +77,7 @@ def test_a_limit_that_its_model_cannot_bear_is_found(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there_is_wrong_and_the_machine_is_looked_at_still(tmp_path: Path) -> None:
-    found = examine(tmp_path / "none.toml")
+    found = examine_machine(tmp_path / "none.toml")
     assert "no such file" in one_of(found, "configuration").text
     assert of(found, "clock")
     assert worst_mark(found) == "wrong"
@@ -346,7 +346,7 @@ def test_the_clock_is_asked_and_an_answer_given() -> None:
     ],
 )
 def test_the_unit_is_judged_by_what_systemd_says(seen: dict[str, str], mark: str) -> None:
-    assert [one.mark for one in doctor.check_unit_state({"LoadState": "loaded", **seen})] == [mark]
+    assert [one.mark for one in doctor.check_systemd_unit_state({"LoadState": "loaded", **seen})] == [mark]
 
 
 # --- the command

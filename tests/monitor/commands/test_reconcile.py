@@ -27,7 +27,7 @@ FILES = ["report.html", "report.json", "model.toml"]
 
 
 def recorded(path: Path, model: NoiseModel, seed: int, seconds: float = 600.0) -> Path:
-    simulate.run_simulation(simulate.Request(model, path, seconds, seed))
+    simulate.run_simulation(simulate.SimulationRequest(model, path, seconds, seed))
     return path
 
 

@@ -12,7 +12,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.recordings import FORMATS, load_samples, save_samples
 from monitor.commands import analyze
-from monitor.commands.simulate import CHUNK_ROWS, Request, run_simulation
+from monitor.commands.simulate import CHUNK_ROWS, SimulationRequest, run_simulation
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 
@@ -56,9 +56,9 @@ def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 def test_the_five_terms_come_back_from_every_format(path: Path) -> None:
     """At 95 % about one interval in twenty misses: this seed's do not, and are the same in each format."""
-    made = run_simulation(Request(MODEL, path, 1200.0, seed=2))
+    made = run_simulation(SimulationRequest(MODEL, path, 1200.0, seed=2))
     assert (made.samples, made.rate_hz, made.axes, made.temperature, made.truth) == (60_000, 50.0, ("gz",), False, None)
-    found = analyze.run_analysis(analyze.Request(path)).analysis.estimate.coefficients
+    found = analyze.run_analysis(analyze.AnalysisRequest(path)).analysis.estimate.coefficients
     assert found.value.shape == (5, 6)
     assert found.status[1, 2] == Status.ESTIMATED
     for row, letter in enumerate(SYMBOLS):
@@ -67,7 +67,7 @@ def test_the_five_terms_come_back_from_every_format(path: Path) -> None:
 
 def test_it_is_the_models_own_series_to_the_last_bit(path: Path) -> None:
     n = CHUNK_ROWS + 1000  # more than one block
-    run_simulation(Request(WARM, path, n / 50.0, seed=4))
+    run_simulation(SimulationRequest(WARM, path, n / 50.0, seed=4))
     recording = load_samples(path)
     drawn = WARM.start_stream(50.0, 4).draw_samples_with_temperature(n)
     assert recording.axes == ("gy", "ax", "az")  # what the model does not name is absent, not zero
@@ -81,9 +81,9 @@ def test_it_is_the_models_own_series_to_the_last_bit(path: Path) -> None:
 
 
 def test_the_rate_goes_before_the_models_and_one_must_be_known(tmp_path: Path) -> None:
-    assert run_simulation(Request(MODEL, tmp_path / "a.npz", 2.0, seed=1, rate_hz=200.0)).samples == 400
+    assert run_simulation(SimulationRequest(MODEL, tmp_path / "a.npz", 2.0, seed=1, rate_hz=200.0)).samples == 400
     with pytest.raises(ConfigError, match="no sample_rate; set the rate with --rate HZ"):
-        run_simulation(Request(NoiseModel(MODEL.effects), tmp_path / "b.npz", 2.0, seed=1))
+        run_simulation(SimulationRequest(NoiseModel(MODEL.effects), tmp_path / "b.npz", 2.0, seed=1))
     assert not (tmp_path / "b.npz").exists()
 
 
@@ -92,7 +92,9 @@ def test_the_temperature_of_a_recording_is_taken(tmp_path: Path) -> None:
     warmth = 20.0 + (t_s - t_s[0])
     warmth[7] = np.nan
     save_samples(tmp_path / "oven.csv", t_s, np.zeros((t_s.size, 6)), warmth)
-    made = run_simulation(Request(WARM, tmp_path / "x.npz", 30.0, seed=1, temperature_from=tmp_path / "oven.csv"))
+    made = run_simulation(
+        SimulationRequest(WARM, tmp_path / "x.npz", 30.0, seed=1, temperature_from=tmp_path / "oven.csv")
+    )
     recording = load_samples(tmp_path / "x.npz")
     assert made.temperature
     since_s = np.arange(1500) / 50.0
@@ -102,13 +104,15 @@ def test_the_temperature_of_a_recording_is_taken(tmp_path: Path) -> None:
 
 def test_the_recording_keeps_its_own_rate(tmp_path: Path) -> None:
     np.savez(tmp_path / "oven.npz", fs=1.0, gx=np.zeros(11), temperature=np.arange(11.0))
-    run_simulation(Request(WARM, tmp_path / "x.npz", 8.0, seed=1, rate_hz=20.0, temperature_from=tmp_path / "oven.npz"))
+    run_simulation(
+        SimulationRequest(WARM, tmp_path / "x.npz", 8.0, seed=1, rate_hz=20.0, temperature_from=tmp_path / "oven.npz")
+    )
     assert load_samples(tmp_path / "x.npz").temperature_c == pytest.approx(np.arange(160) / 20.0)
 
 
 def test_a_recording_without_times_has_the_rate_asked_for(tmp_path: Path) -> None:
     (tmp_path / "oven.csv").write_text("gx,temperature\n" + "".join(f"0,{i}\n" for i in range(200)))
-    wanted = Request(WARM, tmp_path / "x.npz", 8.0, seed=1, temperature_from=tmp_path / "oven.csv")
+    wanted = SimulationRequest(WARM, tmp_path / "x.npz", 8.0, seed=1, temperature_from=tmp_path / "oven.csv")
     with pytest.raises(ConfigError, match="give it with --rate HZ"):
         run_simulation(wanted)
     run_simulation(replace(wanted, rate_hz=20.0))
@@ -118,12 +122,14 @@ def test_a_recording_without_times_has_the_rate_asked_for(tmp_path: Path) -> Non
 def test_a_recording_without_temperature_is_said(tmp_path: Path) -> None:
     save_samples(tmp_path / "cold.csv", np.arange(10.0), np.zeros((10, 6)))
     with pytest.raises(ConfigError, match=r"cold\.csv: has no temperature"):
-        run_simulation(Request(WARM, tmp_path / "x.npz", 30.0, seed=1, temperature_from=tmp_path / "cold.csv"))
+        run_simulation(
+            SimulationRequest(WARM, tmp_path / "x.npz", 30.0, seed=1, temperature_from=tmp_path / "cold.csv")
+        )
     assert not (tmp_path / "x.npz").exists()
 
 
 def test_the_truth_says_what_the_file_does_not(tmp_path: Path) -> None:
-    made = run_simulation(Request(WARM, tmp_path / "x.csv", 60.0, seed=9, truth=True))
+    made = run_simulation(SimulationRequest(WARM, tmp_path / "x.csv", 60.0, seed=9, truth=True))
     assert made.truth == tmp_path / "x.csv.truth.json"
     truth = json.loads(made.truth.read_bytes())
     assert truth["schema"] == "imu-monitor/truth/1"
@@ -153,14 +159,15 @@ def test_a_run_that_is_broken_off_leaves_nothing(path: Path, truth: bool) -> Non
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        run_simulation(Request(MODEL, path, 2.0 * CHUNK_ROWS / 50.0, seed=1, truth=truth), tell)
+        run_simulation(SimulationRequest(MODEL, path, 2.0 * CHUNK_ROWS / 50.0, seed=1, truth=truth), tell)
     assert list(path.parent.iterdir()) == []
 
 
 def test_progress_rises_to_the_whole(tmp_path: Path) -> None:
     told: list[float | None] = []
     run_simulation(
-        Request(MODEL, tmp_path / "x.npz", 2.5 * CHUNK_ROWS / 50.0, seed=1), lambda _what, share: told.append(share)
+        SimulationRequest(MODEL, tmp_path / "x.npz", 2.5 * CHUNK_ROWS / 50.0, seed=1),
+        lambda _what, share: told.append(share),
     )
     assert told[0] is None
     assert told[1:4] == pytest.approx([0.4, 0.8, 1.0])
@@ -183,5 +190,7 @@ def test_what_cannot_be_is_said_and_nothing_written(
     model: NoiseModel, seconds: float, words: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ConfigError, match=words):
-        run_simulation(Request(model, tmp_path / "x.npz", seconds, seed=1, rate_hz=50.0, truth=True, name="m"))
+        run_simulation(
+            SimulationRequest(model, tmp_path / "x.npz", seconds, seed=1, rate_hz=50.0, truth=True, name="m")
+        )
     assert list(tmp_path.iterdir()) == []

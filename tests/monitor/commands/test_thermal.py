@@ -45,7 +45,7 @@ def test_fit_then_predict_another_start(tmp_path, capsys):
 
 
 def test_the_model_file_comes_back_as_it_went(tmp_path):
-    study = thermal.fit_recording(write(tmp_path / "a.npz", 3), 3600.0)
+    study = thermal.fit_thermal_models(write(tmp_path / "a.npz", 3), 3600.0)
     path = tmp_path / "m.json"
     path.write_bytes(thermal.encode_model_file(study))
     one, other = study.fits["gz"].model, thermal.read_model_file(path)["gz"]
@@ -77,7 +77,7 @@ def test_no_temperature_is_said(tmp_path, capsys):
 
 
 def good(tmp_path):
-    return json.loads(thermal.encode_model_file(thermal.fit_recording(write(tmp_path / "a.npz", 3), 3600.0)))
+    return json.loads(thermal.encode_model_file(thermal.fit_thermal_models(write(tmp_path / "a.npz", 3), 3600.0)))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import numpy as np
 from drivers.data_types import Floats, make_block
 from monitor.common.compiled import Kernel
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.drift.thermal.thermal_response import first_order_lag
+from monitor.drift.thermal.thermal_response import apply_first_order_lag
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import MIN_SAMPLES, Estimator
 from tests.support.waiting import PATIENCE_S
@@ -87,7 +87,7 @@ def results(seed: int) -> list[Any]:
             estimator.add_samples(part)
         for restart in watch.take_restart_requests():
             estimator.restart_axis(restart.axis, restart.samples)
-        found += [compensation.update(samples).values, compensation.take_updates()]
+        found += [compensation.compensate_block(samples).values, compensation.take_drift_updates()]
         if rng.random() < 0.2 and estimator.samples_in_window >= MIN_SAMPLES:
             found.append(estimator.get_estimate())
     found += [estimator.step_slow_statistics() for _ in range(3)]
@@ -95,7 +95,7 @@ def results(seed: int) -> list[Any]:
         watch.take_events(),
         watch.take_samples_at_rest(),
         compensation.take_events(),
-        first_order_lag(values[:, 0], 0.5),
+        apply_first_order_lag(values[:, 0], 0.5),
     ]
     return [plain(one) for one in found]
 

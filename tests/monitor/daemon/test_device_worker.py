@@ -589,7 +589,7 @@ def follow_temperature(rig, seconds, begin_s=0.0):
 def test_bias_is_held_against_temperature():
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 30.0)
-    while rig.station.pipeline.thermal.step():  # until the models are chosen
+    while rig.station.pipeline.thermal.run_selection_step():  # until the models are chosen
         pass
     follow_temperature(rig, 3.0, 100.0)
     assert len(rig.caught.thermals) >= 31
@@ -605,7 +605,7 @@ def test_choosing_a_model_holds_no_round_up(monkeypatch):
     monkeypatch.setattr(device_worker, "MODEL_SELECTION_S", 0.0)  # a step each time, however fast the machine is
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 14.0)
-    assert rig.station.pipeline.thermal.choosing
+    assert rig.station.pipeline.thermal.is_selecting_model
     for i in range(50):
         rig.work(100.0 + i)
     assert rig.station._can_take()  # a sensor never waits
@@ -621,7 +621,7 @@ def test_a_recording_waits_for_its_model(monkeypatch):
     with monkeypatch.context() as slow:
         slow.setattr(device_worker, "MODEL_SELECTION_REPLAY_S", 0.0)  # a step each time, however fast the machine is
         rig.work(1000.0)
-    assert rig.station.pipeline.thermal.choosing
+    assert rig.station.pipeline.thermal.is_selecting_model
     assert 12 <= len(rig.caught.thermals) <= 20
     assert not rig.station._can_take()
     for i in range(2000):
@@ -735,7 +735,11 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
             rig.station._push(make_block(at * 10_000_000, values, np.full(1000, 20.0), at))
         rig.work(1000.0 + i, drain=i == 59)
         rig.finish_models()
-    told = [event for _, event in rig.caught.events if event.kind == "drift_unexplained" and "step of the bias" in event.text]
+    told = [
+        event
+        for _, event in rig.caught.events
+        if event.kind == "drift_unexplained" and "step of the bias" in event.text
+    ]
     assert [event.axis for event in told] == ["gy"]
     assert told[0].values["bias"]["size"] == pytest.approx(0.02, rel=0.05)
     assert 390 < told[0].t_ns / 1e9 < 510  # as long as the level before had been confirmed, 5 min at most

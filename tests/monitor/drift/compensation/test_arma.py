@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 from drivers.errors import NotReady
 from monitor.drift.compensation import arma
-from monitor.drift.compensation.arma import ArmaModel, fit_arma, run_kalman_filter
+from monitor.drift.compensation.arma import ArmaModel, compute_likelihood_sums, fit_arma
 
 TRUE = ((1.2, -0.5), -0.4)
 
@@ -36,7 +36,7 @@ def test_the_likelihood_is_that_of_the_dense_covariance_also_with_holes(white):
     one = np.ones(there.sum())
     mean = one @ inverse @ z[there] / (one @ inverse @ one)
     left = z[there] - mean
-    count, logs, square, found = run_kalman_filter(z, *TRUE[0], TRUE[1], variance, white)
+    count, logs, square, found = compute_likelihood_sums(z, *TRUE[0], TRUE[1], variance, white)
     assert count == there.sum()
     assert logs == pytest.approx(np.linalg.slogdet(c)[1], rel=1e-9)
     assert square == pytest.approx(left @ inverse @ left, rel=1e-9)
@@ -79,7 +79,7 @@ def test_intervals_hold_the_truth():
     """60 drifts, 3 coefficients: fewer than 51 inside would come by chance once in 2000 at 95 %."""
     inside = np.zeros(3)
     for seed in range(60):
-        found = fit_arma(drawn(400, seed), orders=[(2, 1)], intervals=True)
+        found = fit_arma(drawn(400, seed), orders=[(2, 1)], with_confidence_intervals=True)
         true = np.array([*TRUE[0], TRUE[1]])
         inside += (np.array(found.lo) <= true) & (true <= np.array(found.hi))
         assert np.all(np.array(found.lo) <= [*found.phi, found.theta])
@@ -87,7 +87,7 @@ def test_intervals_hold_the_truth():
 
 
 def test_a_constant_has_no_coefficients():
-    found = fit_arma(np.random.default_rng(4).standard_normal(500), 1.0, intervals=True)
+    found = fit_arma(np.random.default_rng(4).standard_normal(500), 1.0, with_confidence_intervals=True)
     assert found.name == "constant"
     assert np.isnan(found.lo).all()
     assert found.variance == 0.0
@@ -101,20 +101,20 @@ def test_too_few_and_all_the_same_are_refused():
 
 
 def test_green():
-    assert ArmaModel((0.5, 0.3), -0.2, 1.0).green == (1.0, pytest.approx(0.3))
+    assert ArmaModel((0.5, 0.3), -0.2, 1.0).green_function_values == (1.0, pytest.approx(0.3))
 
 
 @pytest.mark.parametrize("white", [0.0, 0.5])
 def test_parameters_and_intervals_are_those_that_scipy_finds(monkeypatch, white):
     z = drawn(600, 4) + white**0.5 * np.random.default_rng(5).standard_normal(600)
-    found = fit_arma(z, white, intervals=True)
+    found = fit_arma(z, white, with_confidence_intervals=True)
 
     def by_scipy(function, start, gradient_tolerance):
         result = minimize(function, start, method="BFGS", options={"gtol": gradient_tolerance})
         return float(result.fun), result.x
 
     monkeypatch.setattr(arma, "minimize_bfgs", by_scipy)
-    expected = fit_arma(z, white, intervals=True)
+    expected = fit_arma(z, white, with_confidence_intervals=True)
     assert found.order == expected.order
     assert found.bic == pytest.approx(expected.bic, abs=1e-5)
     assert (*found.phi, found.theta) == pytest.approx((*expected.phi, expected.theta), abs=1e-4)

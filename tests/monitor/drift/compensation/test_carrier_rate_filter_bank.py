@@ -5,12 +5,12 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from monitor.drift.compensation.carrier_rate_filter_bank import (
-    filter_memories,
-    filter_sample,
-    gain_table,
+    apply_bias_change,
+    choose_memory_lengths,
+    compute_gain_table,
+    filter_rate_sample,
     predict_over_gap,
     process_noise_intensity,
-    shift_bias,
     update_rest_noise,
 )
 
@@ -21,8 +21,8 @@ class Bank:
     """One axis."""
 
     def __init__(self, rate_hz: float = 100.0) -> None:
-        each = filter_memories(rate_hz)
-        self.table, self.first = gain_table(each)
+        each = choose_memory_lengths(rate_hz)
+        self.table, self.first = compute_gain_table(each)
         self.bank, self.ages = np.zeros((each.size + 1, 5)), np.zeros((each.size, 2), np.int64)
         self.feedback, self.sums = np.zeros(1), np.zeros((each.size + 1, 2))
         self.intervals = 0
@@ -30,7 +30,9 @@ class Bank:
     def run(self, z: np.ndarray, rest: bool) -> np.ndarray:
         out = np.empty_like(z)
         for k, one in enumerate(z):
-            out[k] = filter_sample(one, self.bank, self.ages, self.table, self.first, self.sums, self.feedback, 5e-4)
+            out[k] = filter_rate_sample(
+                one, self.bank, self.ages, self.table, self.first, self.sums, self.feedback, 5e-4
+            )
             if rest and k % 100 == 99:
                 self.intervals += 1
                 update_rest_noise(self.bank, self.sums, 100.0, self.intervals)
@@ -47,8 +49,8 @@ def learned() -> Bank:
 
 
 def test_the_steady_gains_solve_the_riccati_equation():
-    each = filter_memories(100.0)
-    table, first = gain_table(each)
+    each = choose_memory_lengths(100.0)
+    table, first = compute_gain_table(each)
     step, look = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0], [0.0]])
     for j, memory in enumerate(each):
         q = process_noise_intensity(int(memory))
@@ -57,7 +59,7 @@ def test_the_steady_gains_solve_the_riccati_equation():
 
 
 def test_the_first_gains_are_those_of_a_straight_line():
-    table, first = gain_table(filter_memories(100.0))
+    table, first = compute_gain_table(choose_memory_lengths(100.0))
     k = np.arange(2, 20)
     np.testing.assert_allclose(table[first[-2] + k - 1, 0], 2 * (2 * k - 1) / (k * (k + 1)), rtol=1e-3)
 
@@ -65,7 +67,7 @@ def test_the_first_gains_are_those_of_a_straight_line():
 def test_noise_at_rest_falls_by_the_memory(learned):
     noise = learned.bank[:, 3] / SIGMA**2
     assert noise[0] == pytest.approx(1.0, rel=0.1)
-    np.testing.assert_allclose(noise[1:7] * filter_memories(100.0)[:6], 1.0, rtol=0.35)
+    np.testing.assert_allclose(noise[1:7] * choose_memory_lengths(100.0)[:6], 1.0, rtol=0.35)
 
 
 def test_at_rest_the_slowest_is_taken(learned):
@@ -101,7 +103,7 @@ def test_no_angle_is_lost(learned):
 def test_a_hole_makes_short_memories_begin_anew_and_a_shift_moves_all():
     bank = Bank()
     bank.run(np.full(500, 0.1), rest=False)
-    shift_bias(bank.bank, 0.1)
+    apply_bias_change(bank.bank, 0.1)
     np.testing.assert_allclose(bank.bank[1:, 0], 0.0, atol=1e-9)
     predict_over_gap(bank.bank, bank.ages, 16)
     assert bank.ages[:4, 0].tolist() == [0, 0, 0, 0]

@@ -40,7 +40,9 @@ def test_any_cut_gives_the_same(cuts, seed):
             parts.append(one.compensate(values[at : at + cut]))
             at += cut
     np.testing.assert_array_equal(np.concatenate(parts), expected)
-    np.testing.assert_array_equal([i.mean for i in one.take_intervals()], [i.mean for i in whole.take_intervals()])
+    np.testing.assert_array_equal(
+        [i.mean for i in one.take_finished_intervals()], [i.mean for i in whole.take_finished_intervals()]
+    )
 
 
 def test_rest_is_stilled_and_the_rest_left_alone():
@@ -60,7 +62,7 @@ def test_a_known_rate_is_passed_on_and_not_learned():
     out = fed(one, values)
     assert np.sqrt(np.mean((out[24_000:, 2] - truth) ** 2)) < 1.02 * SIGMA
     np.testing.assert_allclose(one.bias, 0.02, atol=2e-4)
-    assert [i.outcome[2] for i in one.take_intervals()[245:297]] == [NOT_AT_REST] * 52
+    assert [i.outcome[2] for i in one.take_finished_intervals()[245:297]] == [NOT_AT_REST] * 52
 
 
 @pytest.mark.long
@@ -72,7 +74,7 @@ def test_a_slow_turn_is_no_drift(rate):
     out = fed(one, values)
     assert out[20_100:26_000, 2].mean() == pytest.approx(rate * DEGREE, rel=0.01)
     assert abs(out[26_100:, 2].mean()) < 1e-4
-    assert {int(i.outcome[2]) for i in one.take_intervals()[203:258]} <= {REJECTED, NOT_AT_REST}
+    assert {int(i.outcome[2]) for i in one.take_finished_intervals()[203:258]} <= {REJECTED, NOT_AT_REST}
 
 
 @pytest.mark.long
@@ -83,12 +85,12 @@ def test_a_step_of_the_bias_is_taken_in_the_end_and_forgets_what_was_before():
     out = fed(one, values)
     assert out[39_000:40_000, 0].mean() == pytest.approx(1.0 * DEGREE, rel=0.02)
     np.testing.assert_allclose(one.bias, [0.02 + DEGREE, 0.02, 0.02], atol=2e-4)
-    became = [int(i.outcome[0]) for i in one.take_intervals()]
+    became = [int(i.outcome[0]) for i in one.take_finished_intervals()]
     assert became.count(STEPPED) == 1
     assert (
-        np.isfinite(one.identification_means_and_variance(0)[0]).sum()
+        np.isfinite(one.means_and_noise_variance_for_identification(0)[0]).sum()
         < 400
-        < np.isfinite(one.identification_means_and_variance(1)[0]).sum()
+        < np.isfinite(one.means_and_noise_variance_for_identification(1)[0]).sum()
     )
 
 
@@ -137,7 +139,7 @@ def test_all_intervals_that_a_hole_ends_at_once_find_room():
         for lost in rng.integers(0, 20_000, 200):
             n = int(rng.integers(1, 600))
             one.compensate(1e-3 * rng.standard_normal((n, 6)), int(lost))
-            most = max(most, len(one.take_intervals()) - n // one.interval_samples)
+            most = max(most, len(one.take_finished_intervals()) - n // one.interval_samples)
     assert 2 < most <= 2 + MAX_PENDING_BLOCKS
 
 
@@ -146,12 +148,12 @@ def test_models_are_identified_as_rest_goes_on_and_memory_stays():
     asked = []
     for k in range(30):
         one.compensate(still(10.0, k))
-        asked.append(bool(one.axes_due))
+        asked.append(bool(one.axes_due_for_identification))
         one.identify_due_models()
-        assert not one.axes_due
+        assert not one.axes_due_for_identification
     assert asked.count(True) == 4  # 60, 90, 135, 203 intervals, as far as they end
     assert all(isinstance(model, ArmaModel) for model in one.models)
-    assert one.identification_means_and_variance(0)[0].size <= HISTORY_INTERVALS
+    assert one.means_and_noise_variance_for_identification(0)[0].size <= HISTORY_INTERVALS
     assert one.bias_standard_error == pytest.approx(SIGMA / np.sqrt(100.0 * 60.0), rel=0.9)
 
 
@@ -163,7 +165,7 @@ def test_the_drift_that_it_expects_is_as_near_as_it_says():
     drift = np.cumsum(rng.standard_normal((len(values), 3)), axis=0) * 2e-6
     values[:, :3] += drift
     fed(one, values)
-    taught = one.take_intervals()
+    taught = one.take_finished_intervals()
     innovations = np.array([i.innovation for i in taught])[120:]
     assert np.nanmean(innovations**2) == pytest.approx(1.0, abs=0.15)
     off = np.array([(i.expected - 0.02 - drift[i.end - 50]) / i.known for i in taught[540:]])

@@ -10,7 +10,7 @@ from monitor.drift.compensation.innovation_test import FALSE_ALARM_PROBABILITY, 
 def test_chance_passes_next_to_never():
     """150 000 looks, 1.7 days of an axis."""
     one = InnovationTest()
-    assert not any(one.update(x) for x in np.random.default_rng(0).standard_normal(150_000).tolist())
+    assert not any(one.detect_new_misfit(x) for x in np.random.default_rng(0).standard_normal(150_000).tolist())
 
 
 def test_twice_the_noise_is_told_once_and_again_when_it_comes_back():
@@ -18,12 +18,12 @@ def test_twice_the_noise_is_told_once_and_again_when_it_comes_back():
     rng = np.random.default_rng(1)
 
     def alarms(scale: float, n: int) -> int:
-        return sum(one.update(x) for x in (scale * rng.standard_normal(n)).tolist())
+        return sum(one.detect_new_misfit(x) for x in (scale * rng.standard_normal(n)).tolist())
 
-    assert np.isnan(one.mean_square)
+    assert np.isnan(one.mean_square_innovation)
     assert alarms(1.0, 200) == 0
     assert alarms(2.0, 400) == 1
-    assert one.mean_square > LIMIT
+    assert one.mean_square_innovation > LIMIT
     assert alarms(1.0, 400) == 0
     assert alarms(2.0, 400) == 1
     one.forget_innovations()

@@ -15,7 +15,7 @@ def fed(live: LiveCompensation, seconds: float, start_s: float = 0.0, scale: flo
     n = round(seconds * RATE_HZ)
     t_ns = np.round((start_s + np.arange(n) / RATE_HZ) * 1e9).astype(np.int64)
     values = 0.01 + scale * SIGMA * np.random.default_rng(seed).standard_normal((n, 6))
-    return live.update(make_block(t_ns, values, np.full(n, 21.0), np.arange(n), lost))
+    return live.compensate_block(make_block(t_ns, values, np.full(n, 21.0), np.arange(n), lost))
 
 
 def test_blocks_keep_what_is_not_a_rate():
@@ -24,10 +24,10 @@ def test_blocks_keep_what_is_not_a_rate():
     assert (second.lost, len(second)) == (100, 1000)
     assert (first.temperature_c == 21.0).all()
     np.testing.assert_array_equal(first.ticks, np.arange(3000))
-    looks = live.take_updates()
+    looks = live.take_drift_updates()
     assert [look.t_ns for look in looks[:3]] == [990_000_000, 1_990_000_000, 2_990_000_000]
     assert looks[-1].t_ns == 39_990_000_000
-    assert not live.take_updates()
+    assert not live.take_drift_updates()
     np.testing.assert_allclose(looks[-1].expected, 0.01, atol=3e-4)
 
 
@@ -35,7 +35,7 @@ def test_noise_that_grows_is_an_event_with_its_times():
     live = LiveCompensation(RATE_HZ)
     fed(live, 100.0)
     for axis in range(3):
-        live.set_model(
+        live.apply_identification_result(
             axis, ArmaModel((0.0, 0.0), 0.0, 0.0, mean=0.01, white_variance=SIGMA**2 / 100.0, order=(0, 0), count=100)
         )
     fed(live, 100.0, 100.0)

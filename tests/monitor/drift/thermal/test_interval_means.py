@@ -26,7 +26,7 @@ def test_intervals_with_too_little_are_missing_and_others_are_not():
     means = compute_interval_means(y, np.full(100, 20.0), 1.0, 10.0)
     assert np.isnan(means.bias[0])
     assert means.bias[1:].tolist() == [1.0] * 9
-    assert means.known.tolist() == [False] + [True] * 9
+    assert means.both_known.tolist() == [False] + [True] * 9
 
 
 def test_what_is_left_at_the_end_is_no_interval():
@@ -34,4 +34,4 @@ def test_what_is_left_at_the_end_is_no_interval():
 
 
 def test_nothing_at_all():
-    assert compute_interval_means(np.full(20, np.nan), np.ones(20), 1.0, 10.0).known.tolist() == [False, False]
+    assert compute_interval_means(np.full(20, np.nan), np.ones(20), 1.0, 10.0).both_known.tolist() == [False, False]

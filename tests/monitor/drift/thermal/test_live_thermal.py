@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import make_block
-from monitor.drift.thermal.live_thermal import KIND, LiveThermal
+from monitor.drift.thermal.live_thermal import KIND, LiveThermalModels
 from tests.monitor.drift.made import COEFFICIENT, late, weather
 
 RATE_HZ = 0.1
@@ -37,15 +37,15 @@ def fed(live, values, warmth, edges=None, lost=0, choose=True):
     for lo, hi in pairwise(edges):
         missing = lost if hi == edges[-1] else 0
         t_ns = PERIOD_NS * (np.arange(lo, hi) + missing)
-        looks += live.update(make_block(t_ns, values[lo:hi], warmth[lo:hi], None, missing))
-        while choose and live.step():
+        looks += live.process_block(make_block(t_ns, values[lo:hi], warmth[lo:hi], None, missing))
+        while choose and live.run_selection_step():
             pass
     return looks
 
 
 @pytest.mark.long
 def test_bias_is_expected_from_temperature():
-    looks = fed(live := LiveThermal(RATE_HZ, INTERVAL_S), *day(24, 1))
+    looks = fed(live := LiveThermalModels(RATE_HZ, INTERVAL_S), *day(24, 1))
     assert len(looks) == 144
     assert [list(look.axes) for look in looks] == [["gz", "az"]] * 144
     assert [look.t_ns for look in looks] == [PERIOD_NS * (LENGTH * (k + 1) - 1) for k in range(144)]
@@ -53,7 +53,7 @@ def test_bias_is_expected_from_temperature():
     assert last.interval_s == INTERVAL_S
     assert last.axes["gz"].slope == pytest.approx(COEFFICIENT, rel=0.2)
     assert abs(last.axes["az"].slope) < 1e-5
-    inside = [look.axes["gz"].one_step.side_of(look.axes["gz"].bias) == 0 for look in looks[20:]]
+    inside = [look.axes["gz"].one_step.side_of_interval(look.axes["gz"].bias) == 0 for look in looks[20:]]
     assert np.mean(inside) > 0.85
     assert live.take_events() == []
 
@@ -64,7 +64,7 @@ STEP, AT_H = 2e-4, 12.0
 @cache
 def stepped():
     """Looks and events of a record whose bias steps, interval by interval."""
-    live = LiveThermal(RATE_HZ, INTERVAL_S)
+    live = LiveThermalModels(RATE_HZ, INTERVAL_S)
     return fed(live, *day(14, 2, STEP, AT_H)), live.take_events()
 
 
@@ -72,7 +72,7 @@ def stepped():
 @pytest.mark.parametrize("edges", [[1, 2, 59, 61, 1000, 3001], range(0, 5040, 7)], ids=["few", "many"])
 def test_how_samples_are_cut_makes_no_difference(edges):
     values, warmth = day(14, 2, STEP, AT_H)
-    live = LiveThermal(RATE_HZ, INTERVAL_S)
+    live = LiveThermalModels(RATE_HZ, INTERVAL_S)
     # choices are made at the end of each interval, as in the other
     looks = fed(live, values, warmth, sorted({*edges, *range(0, 5041, LENGTH)}))
     others, events = stepped()
@@ -93,9 +93,9 @@ def test_a_step_of_the_bias_is_an_event():
 
 def test_without_temperature_nothing_is_kept():
     values, _ = day(2, 4)
-    live = LiveThermal(RATE_HZ, INTERVAL_S)
+    live = LiveThermalModels(RATE_HZ, INTERVAL_S)
     assert fed(live, values, np.full(len(values), np.nan)) == []
-    assert not live.choosing
+    assert not live.is_selecting_model
     looks = fed(live, *day(1, 5), lost=0)  # it begins with the first temperature
     assert len(looks) == 6
     assert looks[0].axes["gz"].text.startswith("1 intervals")
@@ -103,13 +103,13 @@ def test_without_temperature_nothing_is_kept():
 
 def test_intervals_keep_their_places_across_a_hole():
     values, warmth = day(2, 6)
-    looks = fed(LiveThermal(RATE_HZ, INTERVAL_S), values, warmth, [0, 300, 720], lost=LENGTH * 4 + 30)
+    looks = fed(LiveThermalModels(RATE_HZ, INTERVAL_S), values, warmth, [0, 300, 720], lost=LENGTH * 4 + 30)
     ends = np.array([look.t_ns for look in looks]) / PERIOD_NS + 1
     assert ends.tolist() == [60, 120, 180, 240, 300, *range(600, 961, 60)]  # half an interval is enough
 
 
 def test_another_rate_begins_anew():
-    live = LiveThermal(RATE_HZ, INTERVAL_S)
+    live = LiveThermalModels(RATE_HZ, INTERVAL_S)
     assert len(fed(live, *day(3, 7))) == 18
     live.set_rate(RATE_HZ * 1.001)
     assert fed(live, *day(1, 8))[-1].axes["gz"].one_step is not None
@@ -122,7 +122,7 @@ def test_another_rate_begins_anew():
 @pytest.mark.long
 def test_a_new_offset_leaves_nothing_of_the_interval_in_which_it_came():
     values, warmth = day(12, 9)
-    live = LiveThermal(RATE_HZ, INTERVAL_S)
+    live = LiveThermalModels(RATE_HZ, INTERVAL_S)
     fed(live, values[:4000], warmth[:4000])  # 40 samples into an interval
     live.learn_new_offset()
     looks = fed(live, values[4000:] + 1e-3, warmth[4000:])

@@ -26,8 +26,8 @@ class Run:
 
     def give(self, biases, temperatures):
         for bias, temperature_c in zip(biases, temperatures, strict=True):
-            self.looks.append(self.following.update(float(bias), 1e-7, float(temperature_c)))
-            while not self.slow and self.following.step():
+            self.looks.append(self.following.predict_and_add_interval(float(bias), 1e-7, float(temperature_c)))
+            while not self.slow and self.following.run_selection_step():
                 pass
             self.found += [*self.following.take_unexplained_changes(), None][:1]
         return self
@@ -35,7 +35,7 @@ class Run:
 
 def shares(looks, biases):
     """Inside their one-step intervals."""
-    return np.mean([one.one_step.side_of(bias) == 0 for one, bias in zip(looks, biases, strict=True)])
+    return np.mean([one.one_step.side_of_interval(bias) == 0 for one, bias in zip(looks, biases, strict=True)])
 
 
 @pytest.mark.long
@@ -61,7 +61,7 @@ def test_an_interval_is_expected_before_it_is_known():
     other[-1] += 1.0
     one, two = (Run().give(biases, means.temperature_c).looks[-1] for biases in (means.bias, other))
     assert (one.one_step, one.multi_step) == (two.one_step, two.multi_step)
-    assert two.one_step.side_of(other[-1]) == 1
+    assert two.one_step.side_of_interval(other[-1]) == 1
 
 
 @pytest.mark.long
@@ -112,10 +112,10 @@ def test_before_there_is_a_model_a_new_offset_begins_the_record_anew():
 def test_a_choice_is_made_in_pieces_and_holds_nothing_up():
     means = hourly(7, 2, 0.05)
     run = Run(slow=True).give(means.bias[:40], means.temperature_c[:40])
-    assert run.following.choosing
+    assert run.following.is_selecting_model
     assert run.looks[-1].text == "the model is being selected"
     pieces = 0
-    while run.following.step():
+    while run.following.run_selection_step():
         pieces += 1
     assert pieces > 10
     run.give(means.bias[40:41], means.temperature_c[40:41])
@@ -128,9 +128,9 @@ def test_choices_follow_at_growing_spacings():
     run, at = Run(slow=True), []
     for k in range(72):
         run.give(means.bias[k : k + 1], means.temperature_c[k : k + 1])
-        if run.following.choosing:
+        if run.following.is_selecting_model:
             at.append(k + 1)
-        while run.following.step():
+        while run.following.run_selection_step():
             pass
     assert at[0] == 12
     assert all(later >= REFIT_GROWTH * one for one, later in pairwise(at))
@@ -159,5 +159,5 @@ def test_temperature_that_hardly_moves_says_so():
 def test_memory_is_bounded():
     following = OnlineThermalModel(HOUR_S)
     for _ in range(MAX_INTERVALS + 100):
-        following.update(0.0, 1e-7, 25.0)
+        following.predict_and_add_interval(0.0, 1e-7, 25.0)
     assert len(following._rows) == MAX_INTERVALS

@@ -10,7 +10,7 @@ from monitor.common.distributions import Z95
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.recursive_thermal_fit import RecursiveThermalFit
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
-from monitor.drift.thermal.thermal_model import ThermalModel, predict
+from monitor.drift.thermal.thermal_model import ThermalModel, predict_interval_means
 from monitor.drift.thermal.thermal_response import ThermalModelForm
 from tests.monitor.drift.made import first_intervals, hourly
 
@@ -35,7 +35,7 @@ def test_interval_by_interval_is_the_whole_at_once(shape, phi):
     model = of(means, shape, phi)
     one, whole = RecursiveThermalFit(model, first_intervals(means, 20)), RecursiveThermalFit(model, means)
     for k in range(20, 72):
-        one.update(float(means.temperature_c[k]), float(means.bias[k]))
+        one.add_interval(float(means.temperature_c[k]), float(means.bias[k]))
     for name in ("coefficients", "initial_state", "sigma", "lowest_c", "highest_c"):
         np.testing.assert_allclose(getattr(one.model, name), getattr(whole.model, name), rtol=1e-7, err_msg=name)
     np.testing.assert_allclose(one.model.covariance, whole.model.covariance, rtol=1e-4, atol=1e-25)
@@ -63,7 +63,7 @@ def test_what_it_expects_is_what_the_model_predicts(to_c):
     measured = np.append(means.bias[:71], np.nan)
     wide = student.ppf(0.975, recursion.degrees_of_freedom) / Z95
     for found, known in zip(recursion.predict_multi_and_one_step(to_c), (None, measured), strict=True):
-        want = predict(recursion.model, warmth, known, began=True)
+        want = predict_interval_means(recursion.model, warmth, known, starts_with_fit=True)
         assert found.bias == pytest.approx(want.bias[-1], rel=1e-9)
         assert found.hi - found.bias == pytest.approx(wide * (want.hi[-1] - want.bias[-1]), rel=1e-6)
         assert found.bias - found.lo == pytest.approx(wide * (want.bias[-1] - want.lo[-1]), rel=1e-6)
@@ -74,8 +74,8 @@ def test_without_temperature_it_goes_on_as_if_that_had_stayed():
     model = fit_thermal_model(means).model
     held, told = RecursiveThermalFit(model, means), RecursiveThermalFit(model, means)
     last = float(means.temperature_c[-1])
-    held.update(np.nan, 1.0)
-    told.update(last, np.nan)
+    held.add_interval(np.nan, 1.0)
+    told.add_interval(last, np.nan)
     assert held.predict_multi_and_one_step(np.nan)[0].bias == pytest.approx(
         told.predict_multi_and_one_step(last)[0].bias
     )

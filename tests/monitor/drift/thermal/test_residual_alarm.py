@@ -11,7 +11,7 @@ MULTI, ONE = PredictionInterval(0.0, -3.0, 3.0), PredictionInterval(1.0, -1.0, 3
 
 def told(biases):
     suspicion = ResidualAlarm()
-    return [suspicion.update(bias, MULTI, ONE) for bias in biases]
+    return [suspicion.check_interval(bias, MULTI, ONE) for bias in biases]
 
 
 def test_enough_on_one_side_are_told_once():
@@ -39,15 +39,15 @@ def test_what_was_not_measured_is_no_witness_and_keeps_its_place():
 def test_outside_now_or_twice_before_is_not_clear():
     suspicion = ResidualAlarm()
     for bias, clear in [(5.0, False), (0.0, True), (-5.0, False), (0.0, True), (5.0, False), (0.0, False)]:
-        suspicion.update(bias, MULTI, ONE)
-        assert suspicion.is_within_prediction is clear
+        suspicion.check_interval(bias, MULTI, ONE)
+        assert suspicion.recent_intervals_fit_prediction is clear
     suspicion.forget_residuals()
-    assert suspicion.is_within_prediction
+    assert suspicion.recent_intervals_fit_prediction
 
 
 def test_far_outside_is_no_chance():
     suspicion = ResidualAlarm()
-    assert not suspicion.is_unfit_for_update
+    assert not suspicion.last_interval_is_far_outside
     for bias, far in [(4.9, False), (5.1, True), (-3.1, True), (1.0, False)]:
-        suspicion.update(bias, MULTI, ONE)  # half a width of 2 about 1
-        assert suspicion.is_unfit_for_update is far
+        suspicion.check_interval(bias, MULTI, ONE)  # half a width of 2 about 1
+        assert suspicion.last_interval_is_far_outside is far

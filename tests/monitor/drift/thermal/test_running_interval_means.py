@@ -40,10 +40,10 @@ def test_equal_to_those_of_the_whole(length, seed, holes, cuts, hole):
         if lost and lo == first:
             behind = lost
         else:
-            found += means.update(values[lo:hi], warmth[lo:hi], behind)
+            found += means.add_samples(values[lo:hi], warmth[lo:hi], behind)
             behind = 0
     if behind:  # missing samples travel with the block that follows them
-        found += means.update(values[:0], warmth[:0], behind)
+        found += means.add_samples(values[:0], warmth[:0], behind)
     assert [one.end for one in found] == [length * (k + 1) for k in range(1500 // length)]
     for axis in range(6):
         want = compute_interval_means(values[:, axis], warmth, 1.0, float(length))
@@ -54,9 +54,9 @@ def test_equal_to_those_of_the_whole(length, seed, holes, cuts, hole):
 
 def test_cuts_make_no_difference_at_all():
     values, warmth = recording(1, 5 * BUFFER_ROWS, 0.2)
-    whole = RunningIntervalMeans(3 * BUFFER_ROWS).update(values, warmth, 0)
+    whole = RunningIntervalMeans(3 * BUFFER_ROWS).add_samples(values, warmth, 0)
     means = RunningIntervalMeans(3 * BUFFER_ROWS)
-    single = [one for k in range(len(values)) for one in means.update(values[k : k + 1], warmth[k : k + 1], 0)]
+    single = [one for k in range(len(values)) for one in means.add_samples(values[k : k + 1], warmth[k : k + 1], 0)]
     assert len(whole) == len(single) == 1
     assert whole[0].bias.tolist() == single[0].bias.tolist()
     assert whole[0].error.tolist() == single[0].error.tolist()
@@ -64,10 +64,10 @@ def test_cuts_make_no_difference_at_all():
 
 def test_a_hole_of_years_is_passed_over_at_once():
     means = RunningIntervalMeans(100, longest=5)
-    found = means.update(np.ones((30, 6)), np.full(30, 20.0), 10**12)
+    found = means.add_samples(np.ones((30, 6)), np.full(30, 20.0), 10**12)
     assert len(found) == 5
     assert found[-1].end == 10**12
     assert np.isnan(found[-1].bias).all()
-    (after,) = means.update(np.ones((70, 6)), np.full(70, 20.0), 0)
+    (after,) = means.add_samples(np.ones((70, 6)), np.full(70, 20.0), 0)
     assert (after.end, after.temperature_c) == (10**12 + 100, 20.0)
     assert after.bias.tolist() == pytest.approx([1.0] * 6)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monitor.drift.thermal.bias_temperature_tests import find_dependence, find_hysteresis, heating_direction
+from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, find_temperature_dependence, heating_direction
 from monitor.drift.thermal.interval_means import IntervalMeans
 from tests.monitor.drift.cycles import NOISES, SHAPES, chamber_means, drift
 
@@ -16,9 +16,9 @@ COUNT = 75
 @pytest.mark.parametrize("law", ["linear", "cubic"])
 def test_a_bias_of_temperature_is_named_in_every_cycle(shape: str, law: str) -> None:
     noise = drift("random walk", COUNT, np.random.default_rng(1))
-    found = find_dependence(chamber_means(shape, noise, law, 50.0 * noise.std()))
+    found = find_temperature_dependence(chamber_means(shape, noise, law, 50.0 * noise.std()))
     assert found is not None
-    assert found.explains_most
+    assert found.explains_most_variance
     assert found.share > 0.99
     assert found.form == "cubic"
     assert found.one_way == (shape == "heating")
@@ -29,7 +29,7 @@ def test_a_bias_of_temperature_is_named_in_every_cycle(shape: str, law: str) -> 
 def test_noise_is_not_said_to_depend_on_temperature(shape: str, noise: str) -> None:
     for seed in range(3):
         means = chamber_means(shape, drift(noise, COUNT, np.random.default_rng(seed)))
-        assert find_dependence(means) is None
+        assert find_temperature_dependence(means) is None
         loop = find_hysteresis(means)
         assert (loop is None) == (shape == "heating")
         assert loop is None or not loop.hysteresis_is_significant
@@ -48,14 +48,16 @@ def test_hysteresis_has_its_size(shape: str, law: str) -> None:
 
 def test_a_steady_drift_is_neither_temperature_nor_hysteresis() -> None:
     means = chamber_means("ramp", drift("white", COUNT, np.random.default_rng(5)) + np.linspace(0.0, 100.0, COUNT))
-    assert find_dependence(means) is None
+    assert find_temperature_dependence(means) is None
     loop = find_hysteresis(means)
     assert loop is not None
     assert not loop.hysteresis_is_significant
 
 
 def test_a_loop_alone_is_temperature_too() -> None:
-    found = find_dependence(chamber_means("ramp", drift("white", COUNT, np.random.default_rng(6)), "loop", 100.0))
+    found = find_temperature_dependence(
+        chamber_means("ramp", drift("white", COUNT, np.random.default_rng(6)), "loop", 100.0)
+    )
     assert found is not None
     assert found.form == "cubic with hysteresis"
     assert found.share > 0.95
@@ -66,8 +68,8 @@ def test_missing_means_and_units_do_not_matter() -> None:
     means = chamber_means("sine", noise, "cubic", 100.0)
     bias, warmth = 1e-6 * means.bias, means.temperature_c.copy()
     bias[20:26], warmth[40] = np.nan, np.nan
-    found = find_dependence(replace(means, bias=bias, temperature_c=warmth))
-    whole = find_dependence(means)
+    found = find_temperature_dependence(replace(means, bias=bias, temperature_c=warmth))
+    whole = find_temperature_dependence(means)
     assert found is not None
     assert whole is not None
     assert found.share == pytest.approx(whole.share, abs=0.01)
@@ -84,7 +86,7 @@ def test_many_means_are_averaged_and_few_are_no_answer() -> None:
     assert found.size == pytest.approx(20.0, rel=0.15)
     short = IntervalMeans(1.0, np.arange(8.0), np.ones(8), np.array([0.0, 1.0, 2.0, 3.0, 3.0, 2.0, 1.0, 0.0]))
     assert find_hysteresis(short) is None
-    assert find_dependence(short) is None
+    assert find_temperature_dependence(short) is None
 
 
 def test_a_dwell_keeps_the_direction_and_noise_is_no_reversal() -> None:

@@ -7,7 +7,11 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from drivers.data_types import make_block
-from monitor.drift.thermal.temperature_removal import interpolate_smoothly, remove_temperature, temperature_varied
+from monitor.drift.thermal.temperature_removal import (
+    interpolate_with_zero_mean,
+    remove_temperature_effect,
+    temperature_varied,
+)
 from monitor.estimation.analysis import analyze
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.terminal.thermal_output import temperature_notes
@@ -35,17 +39,17 @@ def warm():
 @pytest.mark.long
 def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     result, warmth = warm
-    found = remove_temperature(result, warmth)
+    found = remove_temperature_effect(result, warmth)
     assert found.models["gx"] == "polynomial 1"
     k = SYMBOLS.index("K")
     assert found.before.status[k, 0] == found.before.status[k, 1] == Status.ESTIMATED
-    assert found.variance_share("K", "gx") > 0.9
-    assert found.has_decreased_significantly("K", "gx")
+    assert found.variance_share_of_temperature("K", "gx") > 0.9
+    assert found.coefficient_decreased_significantly("K", "gx")
     assert found.coefficients.value[k, 1] == pytest.approx(3e-6, rel=0.4)
-    assert not found.has_decreased_significantly("K", "gy")
+    assert not found.coefficient_decreased_significantly("K", "gy")
     assert found.coefficients.value[1, 0] == pytest.approx(N, rel=0.03)  # N is as it was
     assert "gy" not in found.dependences
-    assert found.axes_of_temperature == ("gx",)
+    assert found.axes_explained_by_temperature == ("gx",)
     (note,) = temperature_notes(found)
     assert note.startswith("gx follows its temperature: a cubic explains ")
     assert "without temperature (polynomial 1), K falls from " in note
@@ -57,7 +61,7 @@ def test_temperature_that_explains_nothing_takes_nothing(warm):
     still = result.values.copy()
     still[:, 0] = np.random.default_rng(4).standard_normal(len(still))
     still[:, 1] = np.nan
-    assert remove_temperature(replace(result, values=still), warmth) is None
+    assert remove_temperature_effect(replace(result, values=still), warmth) is None
 
 
 def test_temperature_that_stayed_is_no_question():
@@ -68,7 +72,7 @@ def test_temperature_that_stayed_is_no_question():
 
 def test_the_course_has_neither_steps_nor_corners():
     means = np.sin(2.0 * np.pi * (np.arange(20) + 0.5) / 20.0)
-    course = interpolate_smoothly(means, 50, 1020)
+    course = interpolate_with_zero_mean(means, 50, 1020)
     want = np.sin(2.0 * np.pi * (np.arange(1000) + 0.5) / 1000.0)
     np.testing.assert_allclose(course[:1000] - course[:1000].mean(), want, atol=0.03)
     assert np.abs(np.diff(course, 2)).max() < 3.0 * np.abs(np.diff(want, 2)).max()
@@ -83,4 +87,4 @@ def test_the_course_is_a_natural_spline(count: int, length: int, n: int) -> None
     at = np.arange(n, dtype=np.float64)
     inside = np.clip(at, middle[0], middle[-1])
     expected = spline(inside) + np.where(at < middle[0], spline(middle[0], 1), spline(middle[-1], 1)) * (at - inside)
-    assert interpolate_smoothly(course, length, n) == pytest.approx(expected - expected.mean(), abs=1e-12)
+    assert interpolate_with_zero_mean(course, length, n) == pytest.approx(expected - expected.mean(), abs=1e-12)

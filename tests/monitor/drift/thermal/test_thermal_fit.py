@@ -8,9 +8,9 @@ import pytest
 from drivers.errors import NotReady
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
-from monitor.drift.thermal.thermal_model import predict
+from monitor.drift.thermal.thermal_model import predict_interval_means
 from monitor.drift.thermal.thermal_response import ThermalModelForm
-from monitor.drift.thermal.thermal_results import compare_with_means
+from monitor.drift.thermal.thermal_results import compare_model_with_means
 from tests.monitor.drift.made import COEFFICIENT, first_intervals, hourly
 
 DAY = 24  # h, to fit; two more to judge
@@ -20,7 +20,7 @@ def errors(seed, lag_h, noise):
     """Multi-step error over that of a cubic on the two days that chose nothing; the share of means in the interval."""
     means = hourly(seed, lag_h, noise)
     found = fit_thermal_model(first_intervals(means, DAY))
-    model = predict(found.model, means.temperature_c, began=True)
+    model = predict_interval_means(found.model, means.temperature_c, starts_with_fit=True)
     cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)
     apart, of_cubic = ((means.bias - one)[DAY:] for one in (model.bias, cubic))
     inside = (model.lo < means.bias) & (means.bias < model.hi)
@@ -39,7 +39,7 @@ def test_late_heat_is_followed(lag_h, noise, most):
     for one in found:
         assert one.model.shape.difference_equation_order >= 1
         assert max(one.model.shape.constants_s) == pytest.approx(3600.0 * lag_h, rel=0.7)
-        assert one.model.mean_slope == pytest.approx(COEFFICIENT, rel=0.3)
+        assert one.model.mean_bias_slope == pytest.approx(COEFFICIENT, rel=0.3)
     for seed in range(6):
         # one day is one cycle of the temperature, in which correlated noise explains the loop as well
         two_days, three_days = (
@@ -65,7 +65,7 @@ def test_one_step_estimates_know_the_bias_before():
         step = 0.04 * np.ptp(means.bias)
         moved = replace(means, bias=means.bias + step * np.random.default_rng(seed).standard_normal(72).cumsum())
         model = fit_thermal_model(first_intervals(moved, 48)).model
-        one = predict(model, moved.temperature_c, moved.bias, began=True)
+        one = predict_interval_means(model, moved.temperature_c, moved.bias, starts_with_fit=True)
         ratios.append(np.std((moved.bias - one.bias)[48:]) / step)
         inside.append(np.mean(((one.lo < moved.bias) & (moved.bias < one.hi))[48:]))
     assert np.median(ratios) < 1.2  # one is what nobody can foresee
@@ -80,8 +80,8 @@ def test_missing_intervals_leave_their_place():
     holes = replace(means, bias=bias, temperature_c=warmth)
     whole, found = fit_thermal_model(means).model, fit_thermal_model(holes).model
     assert found.shape.name == whole.shape.name
-    np.testing.assert_allclose(found.mean_slope, whole.mean_slope, rtol=0.1)
-    assert np.isfinite(predict(found, warmth).bias).all()
+    np.testing.assert_allclose(found.mean_bias_slope, whole.mean_bias_slope, rtol=0.1)
+    assert np.isfinite(predict_interval_means(found, warmth).bias).all()
 
 
 def test_units_do_not_matter():
@@ -89,14 +89,14 @@ def test_units_do_not_matter():
     large = replace(means, bias=1e6 * means.bias)
     one, other = fit_thermal_model(means).model, fit_thermal_model(large).model
     assert one.shape == other.shape
-    assert other.mean_slope == pytest.approx(1e6 * one.mean_slope, rel=1e-6)
+    assert other.mean_bias_slope == pytest.approx(1e6 * one.mean_bias_slope, rel=1e-6)
 
 
 def test_another_start_of_the_sensor_is_an_offset():
     """Another run: settled at first, 0.3 mrad/s aside; the offset is told, and what is left is its noise."""
     model = fit_thermal_model(hourly(4, 1, 0.02)).model
     other = hourly(14, 1, 0.02)
-    judged = compare_with_means(model, replace(other, bias=other.bias + 3e-4))
+    judged = compare_model_with_means(model, replace(other, bias=other.bias + 3e-4))
     assert judged.offset == pytest.approx(3e-4, rel=0.02)
     assert judged.rms_without_offset < 0.15 * judged.rms_about_mean
     assert judged.rms > 10.0 * judged.rms_without_offset
@@ -109,9 +109,9 @@ def test_beyond_the_temperatures_of_the_fit_nothing_runs_away():
     bias = 1e-5 * (t - 25.0) + 4e-7 * (t - 25.0) ** 3 + 1e-6 * rng.standard_normal(60)
     model = fit_thermal_model(IntervalMeans(60.0, bias, np.full(60, 1e-6), t)).model
     assert model.shape.powers >= 3
-    beyond = predict(model, np.array([30.0, 35.0, 40.0]))
-    np.testing.assert_allclose(np.diff(beyond.bias), 5.0 * model.mean_slope, rtol=1e-9)
-    assert np.all(np.diff(beyond.hi - beyond.lo) > 5.0 * model.mean_slope)
+    beyond = predict_interval_means(model, np.array([30.0, 35.0, 40.0]))
+    np.testing.assert_allclose(np.diff(beyond.bias), 5.0 * model.mean_bias_slope, rtol=1e-9)
+    assert np.all(np.diff(beyond.hi - beyond.lo) > 5.0 * model.mean_bias_slope)
 
 
 def test_one_way_says_nothing_of_lateness():

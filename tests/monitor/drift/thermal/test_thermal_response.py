@@ -8,11 +8,11 @@ from scipy.signal import lfilter
 
 from monitor.drift.thermal.thermal_response import (
     ThermalModelForm,
+    apply_first_order_lag,
+    build_regressors,
     compute_lag_roots,
-    difference_equation,
-    first_order_lag,
-    least_squares,
-    regressors,
+    difference_equation_coefficients,
+    solve_least_squares,
 )
 
 T = np.random.default_rng(3).standard_normal(200).cumsum()
@@ -21,7 +21,7 @@ T = np.random.default_rng(3).standard_normal(200).cumsum()
 def test_a_lag_is_scipys_filter():
     p = 0.8
     want, _ = lfilter([1.0 - p], [1.0, -p], T, zi=[p * T[0]])
-    np.testing.assert_allclose(first_order_lag(T, p), want, rtol=1e-12)
+    np.testing.assert_allclose(apply_first_order_lag(T, p), want, rtol=1e-12)
 
 
 @given(
@@ -33,8 +33,8 @@ def test_the_equation_makes_the_same_as_the_lags(powers, constants, seed):
     """Y_n + a_1 Y_{n−1} + … = b_0 x_n + … + c, run forward from where the lags stand, gives what the lags give."""
     shape = ThermalModelForm(powers, tuple(constants))
     sizes = np.random.default_rng(seed).standard_normal(1 + powers + len(constants))
-    y = regressors(shape, T, 1.0) @ sizes
-    a, b, c = difference_equation(shape, sizes, 1.0)
+    y = build_regressors(shape, T, 1.0) @ sizes
+    a, b, c = difference_equation_coefficients(shape, sizes, 1.0)
     assert (a.size, b.size) == (len(constants), len(constants) + powers)
     assert np.all(np.abs(np.roots(np.concatenate([[1.0], a]))) < 1.0)
     k = len(constants)
@@ -45,12 +45,12 @@ def test_the_equation_makes_the_same_as_the_lags(powers, constants, seed):
 
 def test_what_was_left_behind_dies_away_with_the_roots():
     shape = ThermalModelForm(0, (2.0, 9.0))
-    columns = regressors(shape, T, 1.0, began=True)
+    columns = build_regressors(shape, T, 1.0, with_initial_state=True)
     assert columns.shape == (200, 5)
     np.testing.assert_allclose(columns[1, -2:], compute_lag_roots(shape, 1.0))
 
 
 def test_sizes_do_not_depend_on_units():
-    columns = regressors(ThermalModelForm(3, (4.0,)), T, 1.0)
+    columns = build_regressors(ThermalModelForm(3, (4.0,)), T, 1.0)
     want = np.array([1e-3, 2e-5, -3e-6, 1e-9, 4e-5])
-    np.testing.assert_allclose(least_squares(columns, columns @ want), want, rtol=1e-6)
+    np.testing.assert_allclose(solve_least_squares(columns, columns @ want), want, rtol=1e-6)
