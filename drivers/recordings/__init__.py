@@ -272,7 +272,7 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
             continue
         parts.append(part)
         rows, size_bytes = rows + len(part), size_bytes + segment.stat().st_size
-        memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
+        memory_check.ReadLimit(path, size_bytes, free).check_row_count(rows)
         notes += [f"{segment.name}: {note}" for note in reversed(part.notes)]
         if last_s is not None and _duration_s(parts) > last_s:
             break
@@ -291,7 +291,7 @@ def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> Non
         except (RecordingError, OSError):
             continue  # the note about the segment is added when the segment is read
         size_bytes += segment.stat().st_size
-        memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
+        memory_check.ReadLimit(path, size_bytes, free).check_row_count(rows)
 
 
 def _duration_s(parts: Sequence[Recording]) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular
 from drivers.recordings import memory_check, table
-from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
+from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
 
 METADATA_KEY: Final = b"imu-monitor"
 """Key in the schema metadata of a segment that the daemon has recorded."""
@@ -74,11 +74,11 @@ def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, s
     """Check the limits, and return the columns to read and the number of rows."""
     metadata = file.metadata
     table.check_column_count(path, metadata.num_columns)
-    chosen = table.choose_columns(path, file.schema_arrow.names, notes)
+    chosen = table.select_known_columns(path, file.schema_arrow.names, notes)
     _check_types(path, file.schema_arrow, chosen)
     rows = int(metadata.num_rows)
     stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
-    memory_check.measure_read_limit(path).check_rows(max(rows, stated))
+    memory_check.measure_read_limit(path).check_row_count(max(rows, stated))
     return chosen, rows
 
 
@@ -103,8 +103,8 @@ def _open_parquet(path: Path) -> Iterator[Any]:
                 yield opened
         except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             raise RecordingError(
-                f"{path}: is no complete Parquet file ({first_line(error)}); its index is at the end, "
-                f"so a file that is cut off cannot be read{table.describe_content(path)}"
+                f"{path}: is no complete Parquet file ({first_message_line(error)}); its index is at the end, "
+                f"so a file that is cut off cannot be read{table.describe_suffix_mismatch(path)}"
             ) from error
 
 
@@ -126,7 +126,7 @@ def read_ipc(path: Path) -> table.Table:
     with open_regular(path) as file:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
-        chosen = table.choose_columns(
+        chosen = table.select_known_columns(
             path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes
         )
         count, _ = _check_ipc(path, start, schema, chosen)
@@ -144,7 +144,7 @@ def read_ipc(path: Path) -> table.Table:
         except StopIteration:
             pass  # the stream has ended
         except (pa.ArrowException, OSError) as error:
-            notes.append(f"Only {len(batches)} complete batches could be read: {first_line(error)}.")
+            notes.append(f"Only {len(batches)} complete batches could be read: {first_message_line(error)}.")
     schema = batches[0].schema if batches else schema
     return _float_table(path, pa.Table.from_batches(batches, schema), chosen, notes)
 
@@ -179,7 +179,8 @@ def _ipc_schema(path: Path, file: Any) -> Any:
         schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
-            f"{path}: is no Arrow IPC file or stream ({first_line(error)}){table.describe_content(path)}"
+            f"{path}: is no Arrow IPC file or stream ({first_message_line(error)})"
+            f"{table.describe_suffix_mismatch(path)}"
         ) from error
     return schema
 
@@ -191,7 +192,7 @@ def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -
     counts = [
         count if count is None or field.name in chosen.values() else -count
         for field in schema
-        for count in (count_buffers(pa, field.type),)
+        for count in (count_column_buffers(pa, field.type),)
     ]
     limit = memory_check.measure_read_limit(path)
     batches = rows = dictionaries = 0
@@ -206,8 +207,8 @@ def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -
                     )
                 continue
             batches, rows = batches + 1, rows + size.rows
-            limit.check_rows(rows)
-            if wrong := check_buffer_sizes(size, counts, SLACK_BYTES):
+            limit.check_row_count(rows)
+            if wrong := check_batch_buffer_sizes(size, counts, SLACK_BYTES):
                 raise RecordingError(f"{path}: batch {batches} is damaged: {wrong}")
     return batches, rows
 
@@ -230,7 +231,7 @@ def _float_table(path: Path, data: Any, chosen: Mapping[str, str], notes: list[s
     return table.Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
 
 
-def first_line(error: Exception) -> str:
+def first_message_line(error: Exception) -> str:
     """Return the first line of the text of an exception, without a final full stop."""
     return str(error).strip().partition("\n")[0].rstrip(".")
 

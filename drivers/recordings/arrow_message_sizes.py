@@ -65,14 +65,14 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSiz
         metadata = file.read(size)
         body = at + size
         try:
-            message = _Table.root(metadata)
+            message = _FlatbufferTable.parse_root(metadata)
             kind = message.read_number(MESSAGE_HEADER_TYPE, "B")
             body_bytes = message.read_number(MESSAGE_BODY_LENGTH, "q")
             if body_bytes < 0:
                 return
             if kind in (RECORD_BATCH, DICTIONARY_BATCH):
-                batch = message.read_table(MESSAGE_HEADER)
-                batch = batch.read_table(DICTIONARY_DATA) if kind == DICTIONARY_BATCH else batch
+                batch = message.read_subtable(MESSAGE_HEADER)
+                batch = batch.read_subtable(DICTIONARY_DATA) if kind == DICTIONARY_BATCH else batch
                 yield _read_batch_size(file, batch, body, body_bytes, kind == DICTIONARY_BATCH)
             elif kind != SCHEMA:
                 return
@@ -81,14 +81,14 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSiz
         at = body + body_bytes
 
 
-def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
+def check_batch_buffer_sizes(size: StatedBatchSize, buffer_counts: Sequence[int | None], slack_bytes: int) -> str:
     """Check that the unpacked buffers of numeric columns are not larger than the number of rows requires.
 
     Parameters
     ----------
     size
         Stated size of the batch.
-    counts
+    buffer_counts
         Number of buffers of each column in the order of the schema. The number is negative if the column is not read,
         and None if the number of buffers is unknown. If a number is unknown, all buffers from this column on are
         checked.
@@ -102,7 +102,7 @@ def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slac
     """
     most = 8 * size.rows + slack_bytes
     at = 0
-    for count in counts:
+    for count in buffer_counts:
         n = len(size.buffers) - at if count is None else abs(count)
         used = count is None or count > 0
         large = max(size.buffers[at : at + n], default=0) if used else 0
@@ -114,7 +114,7 @@ def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slac
     return ""
 
 
-def count_buffers(pa: Any, type_: Any) -> int | None:
+def count_column_buffers(pa: Any, type_: Any) -> int | None:
     """Return the number of buffers of a column.
 
     Parameters
@@ -140,12 +140,14 @@ def count_buffers(pa: Any, type_: Any) -> int | None:
     return 3 if any(is_type(type_) for is_type in variable) else 2
 
 
-def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> StatedBatchSize:
+def _read_batch_size(
+    file: IO[bytes], batch: "_FlatbufferTable", body: int, body_bytes: int, dictionary: bool
+) -> StatedBatchSize:
     """Return the stated size of the batch whose body begins at the offset ``body`` in the file."""
     rows = batch.read_number(BATCH_LENGTH, "q")
     packed = batch.has_field(BATCH_COMPRESSION)
     sizes = []
-    for offset, length in batch.read_structs(BATCH_BUFFERS, BUFFER):
+    for offset, length in batch.read_struct_vector(BATCH_BUFFERS, BUFFER):
         unpacked = length
         if packed and length >= 8 and 0 <= offset <= body_bytes - 8:
             file.seek(body + offset)
@@ -156,14 +158,14 @@ def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: in
 
 
 @dataclass(frozen=True, slots=True)
-class _Table:
+class _FlatbufferTable:
     """Table of a flatbuffer. The methods raise struct.error or LookupError if an offset is outside the buffer."""
 
     data: bytes
     at: int
 
     @classmethod
-    def root(cls, data: bytes) -> "_Table":
+    def parse_root(cls, data: bytes) -> "_FlatbufferTable":
         """Return the root table of a flatbuffer."""
         return cls(data, struct.unpack_from("<I", data)[0])
 
@@ -176,14 +178,14 @@ class _Table:
         at = self._field(field)
         return int(_unpack_number(f"<{number_format}", self.data, at)) if at else 0
 
-    def read_table(self, field: int) -> "_Table":
+    def read_subtable(self, field: int) -> "_FlatbufferTable":
         """Return the table to which a field refers."""
         at = self._field(field)
         if not at:
             raise LookupError(field)
-        return _Table(self.data, at + _unpack_number("<I", self.data, at))
+        return _FlatbufferTable(self.data, at + _unpack_number("<I", self.data, at))
 
-    def read_structs(self, field: int, layout: struct.Struct) -> Iterator[tuple[Any, ...]]:
+    def read_struct_vector(self, field: int, layout: struct.Struct) -> Iterator[tuple[Any, ...]]:
         """Yield the structs in a vector; nothing if the field is absent."""
         at = self._field(field)
         if not at:

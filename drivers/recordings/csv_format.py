@@ -53,9 +53,9 @@ class _BadLines:
     count: int = 0
     first: str = ""
 
-    def count_line(self, number: int, reason: str) -> None:
+    def record_bad_line(self, line_number: int, reason: str) -> None:
         """Count a bad line, and store the description of the first bad line."""
-        self.first = self.first or f"line {number}: {reason}"
+        self.first = self.first or f"line {line_number}: {reason}"
         self.count += 1
 
 
@@ -79,7 +79,7 @@ def read_csv(path: Path) -> table.Table:
             what = notes[-1] if notes else "It has no line at all."
             raise RecordingError(f"{path}: has not one complete line, expected {table.EXAMPLE_HEADER}. {what}")
         names = _column_names(path, head)
-        chosen = table.choose_columns(path, names, notes, f" in line {head.number}")
+        chosen = table.select_known_columns(path, names, notes, f" in line {head.number}")
         use = [names.index(name) for name in chosen.values()]
         parts = list(_parse_pieces(path, head, texts, names, use, bad))
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
@@ -101,9 +101,9 @@ def count_csv_rows(path: Path) -> int:
         for text in _whole_lines(_decompressed(file, []), []):
             lines += text.count(b"\n")
             unpacked += len(text)
-            limit.check_rows(lines)
+            limit.check_row_count(lines)
             if unpacked > limit.size_bytes:
-                limit.check_unpacked(unpacked)
+                limit.check_unpacked_size(unpacked)
     return lines
 
 
@@ -221,7 +221,7 @@ def _column_names(path: Path, head: _Header) -> list[str]:
     if b"\0" in head.line or not head.line:
         raise RecordingError(
             f"{path}: is no CSV text, expected a first line such as {table.EXAMPLE_HEADER}"
-            f"{table.describe_content(path)}"
+            f"{table.describe_suffix_mismatch(path)}"
         )
     text = head.line.decode("utf-8", errors="replace")
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
@@ -281,7 +281,7 @@ def _parse_line_by_line(
         try:
             rows.append(_parse_sample(line, names, use))
         except ValueError as error:
-            bad.count_line(number + offset, str(error))
+            bad.record_bad_line(number + offset, str(error))
             rows.append(missing)
     return np.array(rows).reshape(len(rows), len(use))
 
@@ -321,23 +321,23 @@ def _parse_number(field: str) -> float | None:
 
 
 @contextmanager
-def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> Iterator[table.AppendColumns]:
+def open_csv_writer(path: Path, names: Sequence[str], use_gzip: bool = False) -> Iterator[table.AppendColumns]:
     """Write a CSV file with one header line and one line per sample. A missing value is written as ``nan``.
 
-    If ``packed`` is True, the file is compressed with gzip. The gzip header has no time stamp, so that equal data give
-    equal files.
+    If ``use_gzip`` is True, the file is compressed with gzip. The gzip header contains no time stamp, so equal data
+    give equal files.
     """
     with ExitStack() as stack:
         raw: IO[bytes] = stack.enter_context(path.open("wb"))
-        if packed:
+        if use_gzip:
             raw = cast("IO[bytes]", stack.enter_context(gzip.GzipFile("", "wb", GZIP_LEVEL, raw, mtime=0)))
         file = stack.enter_context(io.TextIOWrapper(raw, "ascii", newline=""))
         file.write(",".join(names) + "\n")
 
-        def append(columns: table.Columns) -> None:
+        def append_rows(columns: table.Columns) -> None:
             """Append rows. ``repr`` gives the shortest text from which the same float64 can be read."""
             for start in range(0, columns[names[0]].size, table.BATCH_ROWS):
                 fields = [map(repr, columns[name][start : start + table.BATCH_ROWS].tolist()) for name in names]
                 file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
 
-        yield append
+        yield append_rows

@@ -8,7 +8,7 @@ from typing import Final
 
 from drivers.errors import ConfigError
 from drivers.recordings import arrow_format, csv_format, npz_format
-from drivers.recordings.table import OpenWriter, Table, describe_content
+from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,9 @@ class Format:
 
 FORMATS: Final[Mapping[str, Format]] = {
     ".csv": Format(csv_format.read_csv, csv_format.open_csv_writer, csv_format.count_csv_rows),
-    ".csv.gz": Format(csv_format.read_csv, partial(csv_format.open_csv_writer, packed=True), csv_format.count_csv_rows),
+    ".csv.gz": Format(
+        csv_format.read_csv, partial(csv_format.open_csv_writer, use_gzip=True), csv_format.count_csv_rows
+    ),
     ".npz": Format(npz_format.read_npz, npz_format.open_npz_writer, npz_format.count_npz_rows),
     ".parquet": Format(arrow_format.read_parquet, arrow_format.open_parquet_writer, arrow_format.count_parquet_rows),
     ".arrow": Format(arrow_format.read_ipc, arrow_format.open_ipc_writer, arrow_format.count_ipc_rows),
@@ -40,7 +42,8 @@ def find_format(path: Path) -> Format:
     suffix = _suffix(path)
     if not suffix:
         raise ConfigError(
-            f"{path}: the suffix is not that of a recording; known are {' '.join(FORMATS)}{describe_content(path)}"
+            f"{path}: the suffix is not that of a recording; known are {' '.join(FORMATS)}"
+            f"{describe_suffix_mismatch(path)}"
         )
     return FORMATS[suffix]
 

@@ -47,7 +47,7 @@ class ReadLimit:
     size_bytes: int  # size on disk
     free: int | None  # available memory in bytes; None if unknown
 
-    def check_rows(self, rows: int) -> None:
+    def check_row_count(self, rows: int) -> None:
         """Check the number of samples before the samples are read.
 
         Raises
@@ -69,7 +69,7 @@ class ReadLimit:
                 f"{self.free / 1e9:.1f} GB are free; read the end of a folder with --last 1d, or split the file"
             )
 
-    def check_unpacked(self, unpacked_bytes: int) -> None:
+    def check_unpacked_size(self, unpacked_bytes: int) -> None:
         """Raise RecordingError if the unpacked size so far exceeds the limit."""
         if unpacked_bytes > max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKING_RATIO * self.size_bytes):
             raise RecordingError(
@@ -90,7 +90,7 @@ def available_bytes() -> int | None:
     The result is the minimum of the memory that the system, the control groups of the process (container or service
     limits) and the resource limits of the process (``ulimit -v``, ``ulimit -d``) leave available.
     """
-    stated = (available_system_bytes(), available_cgroup_bytes(), available_process_bytes())
+    stated = (available_system_bytes(), available_cgroup_bytes(), available_rlimit_bytes())
     known = [n for n in stated if n is not None]
     return max(min(known), 0) if known else None
 
@@ -117,7 +117,7 @@ def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int
     return min(left) if left else None
 
 
-def available_process_bytes(statm: Path = STATM) -> int | None:
+def available_rlimit_bytes(statm: Path = STATM) -> int | None:
     """Return the memory in bytes that the resource limits of the process leave available; None without a limit."""
     try:
         pages = [int(n) for n in statm.read_text().split()]

@@ -92,7 +92,7 @@ def count_npz_rows(path: Path) -> int:
         if not _has_index(path, file):
             return 0  # the number of rows of a truncated archive is checked during reading
         with _open_archive(path, file) as archive:
-            return _check_columns(path, archive, table.choose_columns(path, _array_names(archive), []))
+            return _check_columns(path, archive, table.select_known_columns(path, _array_names(archive), []))
 
 
 def read_npz(path: Path) -> table.Table:
@@ -109,7 +109,7 @@ def read_npz(path: Path) -> table.Table:
     with _BoundedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
-                chosen = table.choose_columns(path, _array_names(archive), notes)
+                chosen = table.select_known_columns(path, _array_names(archive), notes)
                 _check_columns(path, archive, chosen)
                 with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
                     columns = {n: _read_array(path, archive, key).astype(np.float64) for n, key in chosen.items()}
@@ -126,7 +126,8 @@ def _has_index(path: Path, file: IO[bytes]) -> bool:
     """Return True if a zip archive has an index, False if the archive is truncated. Raise an error for other files."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
         raise RecordingError(
-            f"{path}: is no .npz file, which is a zip archive with one array per column{table.describe_content(path)}"
+            f"{path}: is no .npz file, which is a zip archive with one array per column"
+            f"{table.describe_suffix_mismatch(path)}"
         )
     file.seek(0)
     complete = zipfile.is_zipfile(file)
@@ -164,7 +165,7 @@ def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, st
         if len(header.shape) != 1:
             raise RecordingError(f"{path}: {key} has shape {header.shape}, expected one dimension")
         rows = max(rows, header.values)
-        limit.check_rows(rows)
+        limit.check_row_count(rows)
         _check_size(path, limit, _find_member(archive, key), key, header)
     return rows
 
@@ -259,7 +260,7 @@ def _table_of_recovered(
     path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]
 ) -> table.Table:
     """Return the arrays of a truncated file as a ``Table``. Pad the truncated column with NaN."""
-    chosen = table.choose_columns(path, list(arrays), notes)
+    chosen = table.select_known_columns(path, list(arrays), notes)
     columns = {}
     for name, key in chosen.items():
         if arrays[key].ndim != 1:
@@ -358,7 +359,7 @@ def _read_up_to_cut(
     header: re.Match[bytes] | None = None
     most = MAX_HEADER_BYTES  # number of bytes to keep
     for part in pieces:
-        limit.check_unpacked(unpacked + pieces.unpacked)
+        limit.check_unpacked_size(unpacked + pieces.unpacked)
         if len(raw) >= most:
             continue  # read on to find the end of the member
         raw += part
@@ -368,7 +369,7 @@ def _read_up_to_cut(
             dtype, n = np.dtype(header["kind"].decode()), int(header["n"] or 1)
             most = header.end() + (n * dtype.itemsize if wanted else 0)
         if header is not None and wanted:
-            limit.check_rows(min(n, (len(raw) - header.end()) // dtype.itemsize))
+            limit.check_row_count(min(n, (len(raw) - header.end()) // dtype.itemsize))
     if header is None:
         return None
     complete = (len(raw) - header.end()) // dtype.itemsize if wanted else 0
@@ -386,12 +387,12 @@ def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendCo
     with ExitStack() as stack:
         collected = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
 
-        def append(columns: table.Columns) -> None:
+        def append_rows(columns: table.Columns) -> None:
             """Append rows to the temporary files."""
             for name, file in collected.items():
                 file.write(np.ascontiguousarray(columns[name]).data)
 
-        yield append
+        yield append_rows
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, file in collected.items():
                 _write_array(archive, name, file)

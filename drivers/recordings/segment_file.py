@@ -32,7 +32,7 @@ from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, mak
 from drivers.errors import ImuError, RecordingError
 from drivers.file_access import open_regular
 from drivers.number_ranges import COUNTER_STEP, RATE_HZ
-from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, first_line, import_pyarrow
+from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, first_message_line, import_pyarrow
 from drivers.recordings.arrow_message_sizes import iter_batch_sizes
 from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
@@ -410,9 +410,9 @@ def _arrow_errors(path: Path) -> Iterator[None]:
             raise RecordingError(f"{path}: {error.strerror}") from error
         if error.errno is not None:
             raise
-        raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
+        raise RecordingError(f"{path}: is no segment of a recording ({first_message_line(error)})") from error
     except (import_pyarrow(path).ArrowException, UnicodeDecodeError, RecursionError, msgspec.DecodeError) as error:
-        raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
+        raise RecordingError(f"{path}: is no segment of a recording ({first_message_line(error)})") from error
     except MemoryError as error:  # in a file of another type, the first bytes may be read as a length of gigabytes
         raise RecordingError(
             f"{path}: is no segment of a recording (it claims more bytes than the memory holds)"

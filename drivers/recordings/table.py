@@ -57,7 +57,7 @@ def check_column_count(path: Path, columns: int) -> None:
         )
 
 
-def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
+def select_known_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
     """Select the known columns of a file.
 
     Parameters
@@ -92,13 +92,13 @@ def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: st
             chosen.setdefault(name, alias)
     if not any(axis in chosen for axis in AXES):
         raise RecordingError(
-            f"{path}: no axis among its columns ({format_names(names)}){where}; "
-            f"a recording has some of {' '.join(AXES)}, in rad/s and m/s²{describe_content(path)}"
+            f"{path}: no axis among its columns ({format_name_list(names)}){where}; "
+            f"a recording has some of {' '.join(AXES)}, in rad/s and m/s²{describe_suffix_mismatch(path)}"
         )
     used = {*chosen.values(), "fs"}
     others = [name for name in names if name not in used]
     if others:
-        notes.append(f"Other columns are not used: {format_names(others)}.")
+        notes.append(f"Other columns are not used: {format_name_list(others)}.")
     return chosen
 
 
@@ -118,7 +118,7 @@ CONTENTS: Final = (
 """First bytes of a file, type of the content, and file suffixes of recordings with this content."""
 
 
-def describe_content(path: Path) -> str:
+def describe_suffix_mismatch(path: Path) -> str:
     """Return a text to append to an error message if the content of a file does not match the suffix.
 
     The text states the type of the content and the remedy. The text is empty if the type is unknown.
@@ -140,16 +140,16 @@ def describe_content(path: Path) -> str:
     return ""
 
 
-def format_names(names: Sequence[str], most: int = 12) -> str:
+def format_name_list(names: Sequence[str], max_names: int = 12) -> str:
     """Return a list of names for a message. The list and the names are shortened, without control characters.
 
     Parameters
     ----------
     names
         Names to list.
-    most
+    max_names
         Maximum number of names to show.
     """
-    shown = [name[:40] if name.isprintable() else ascii(name[:40]) for name in names[:most]]
-    more = [f"and {len(names) - most} more"] if len(names) > most else []
+    shown = [name[:40] if name.isprintable() else ascii(name[:40]) for name in names[:max_names]]
+    more = [f"and {len(names) - max_names} more"] if len(names) > max_names else []
     return ", ".join(shown + more)

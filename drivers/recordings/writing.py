@@ -16,7 +16,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings.formats import find_format
-from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_names
+from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_name_list
 
 
 class AppendSamples(Protocol):
@@ -58,20 +58,20 @@ def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) ->
     """
     unknown = [axis for axis in axes if axis not in AXES]
     if unknown or not axes:
-        what = f"unknown axis {format_names(unknown)}" if unknown else "no axis has a value"
+        what = f"unknown axis {format_name_list(unknown)}" if unknown else "no axis has a value"
         raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
     open_writer = find_format(path).open_writer
     names = ["t", *axes, *(["temperature"] if temperature else [])]
     with atomic_write_path(path) as part, open_writer(part, names) as append_columns:
 
-        def append(t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
+        def append_samples(t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
             _check_arrays(path, t_s, values, temperature_c)
             table = {"t": t_s} | {axis: values[:, AXES.index(axis)] for axis in axes}
             if temperature:
                 table["temperature"] = np.full(len(t_s), np.nan) if temperature_c is None else temperature_c
             append_columns({name: np.asarray(column, np.float64) for name, column in table.items()})
 
-        yield append
+        yield append_samples
 
 
 def save_samples(
@@ -107,8 +107,8 @@ def save_samples(
     if axes is None:
         axes = [axis for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()]
     temperature = temperature_c is not None and not np.isnan(temperature_c).all()
-    with open_recording_writer(path, axes, temperature) as append:
-        append(t_s, values, temperature_c)
+    with open_recording_writer(path, axes, temperature) as append_samples:
+        append_samples(t_s, values, temperature_c)
 
 
 @contextmanager

@@ -132,7 +132,7 @@ class ArrivalTimeline:
         """Discard a delay whose cause is not yet known, because the link was closed."""
         self._delay = None
 
-    def count_missing_after_delay(self, arrived_ns: int, counted: int, least: float = MIN_GAP_PERIODS) -> int:
+    def count_missing_after_delay(self, arrived_ns: int, counted: int, min_gap_samples: float = MIN_GAP_PERIODS) -> int:
         """Return the number of missing samples if a sudden delay of the arrivals has persisted for CATCH_UP_S.
 
         Parameters
@@ -141,13 +141,13 @@ class ArrivalTimeline:
             Arrival time of the newest sample in ns.
         counted : int
             Number of samples since the last call that have arrived or are known to be missing.
-        least : float
+        min_gap_samples : float
             Smallest number of missing samples in a gap.
         """
         period_s = self.line.period_s()
         if period_s is None or not self.line.can_tell_gap_from_jitter():
             return 0
-        least_s = max(least * period_s, MIN_GAP_S)
+        least_s = max(min_gap_samples * period_s, MIN_GAP_S)
         index, arrived_s = self.index + counted, self.seconds_since_origin(arrived_ns)
         behind_s = arrived_s - self.line.time_at_index_s(index)
         if self._delay is None:

@@ -52,7 +52,7 @@ class CounterGaps:
         self._clock_s = self._clock_index = 0.0
         self._stuck = 0  # number of samples since the counter last advanced
 
-    def resume(self, tick: int, ticks_per_sample: float) -> None:
+    def resume_at_tick(self, tick: int, ticks_per_sample: float) -> None:
         """Continue from the last counter value before a restart of the program.
 
         Parameters
@@ -63,20 +63,20 @@ class CounterGaps:
             Ticks per sample.
         """
         self._tick = tick
-        self.typical_step.update(np.array([round(ticks_per_sample)]))
+        self.typical_step.add_steps(np.array([round(ticks_per_sample)]))
 
     def forget_last_tick(self) -> None:
         """Forget the last counter value, because samples without a counter value have arrived."""
         self._tick = None
 
-    def count_missing(self, samples: SampleBlock, paused: bool) -> Ints:
+    def count_missing(self, samples: SampleBlock, link_was_closed: bool) -> Ints:
         """Return the number of missing samples [n] before each row.
 
         Parameters
         ----------
         samples : SampleBlock
             Samples with arrival times and counter values.
-        paused : bool
+        link_was_closed : bool
             True if the link was closed before these samples.
         """
         counter, arrived_ns = self._counter, int(samples.t_ns[-1])
@@ -86,17 +86,19 @@ class CounterGaps:
         steps[0] = samples.ticks[0] - previous % counter.modulus
         np.subtract(samples.ticks[1:], samples.ticks[:-1], out=steps[1:])
         steps %= counter.modulus
-        self.typical_step.update(steps)
+        self.typical_step.add_steps(steps)
         ticks_per_sample = self._ticks_per_sample()
         if not first:
-            steps[0] += counter.modulus * self._hidden_wraps(steps, ticks_per_sample, arrived_ns, paused)
+            steps[0] += counter.modulus * self._hidden_wraps(steps, ticks_per_sample, arrived_ns, link_was_closed)
         self._tick = int(samples.ticks[-1])
         waited = self._find_stuck_counter(samples, steps[1:] if first else steps)
         missing = np.zeros(len(samples), np.int64)
         if ticks_per_sample is not None:
             counted = np.rint(np.minimum(steps / ticks_per_sample, MAX_GAP_SAMPLES)).astype(np.int64)
             missing = np.maximum(counted - 1 - waited, 0)
-        unseen = self._timeline.count_missing_since_arrival(arrived_ns, len(samples)) if first and paused else 0
+        unseen = (
+            self._timeline.count_missing_since_arrival(arrived_ns, len(samples)) if first and link_was_closed else 0
+        )
         if not steps.any():  # a stuck counter gives no information
             missing[0] = max(samples.lost, unseen)
         elif self._has_jumped(missing, steps, arrived_ns):
@@ -127,14 +129,14 @@ class CounterGaps:
 
     def _ticks_per_sample(self) -> float | None:
         """Return the number of ticks per sample; None if the number is unknown."""
-        seen, rate_hz = self.typical_step.mean, self._timeline.nominal_hz
+        seen, rate_hz = self.typical_step.mean_ticks_per_sample, self._timeline.nominal_hz
         if self._counter.tick_s is None or rate_hz is None:
             return seen
         nominal = 1.0 / (rate_hz * self._counter.tick_s)
         # if the nominal rate is far from the typical step, the typical step is used
         return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else seen
 
-    def _hidden_wraps(self, steps: Ints, ticks_per_sample: float | None, arrived_ns: int, paused: bool) -> int:
+    def _hidden_wraps(self, steps: Ints, ticks_per_sample: float | None, arrived_ns: int, link_was_closed: bool) -> int:
         """Return the number of unseen wraps of a short counter while the link was closed or samples were missing."""
         if ticks_per_sample is None:
             return 0
@@ -145,7 +147,7 @@ class CounterGaps:
             return 0
         turn = counter.modulus / ticks_per_sample  # samples
         counted = int(np.rint(steps / ticks_per_sample).sum())
-        if paused:
+        if link_was_closed:
             timeline.forget_delay()
             elapsed_s = (arrived_ns - timeline.arrived_ns) / NS_PER_S
             turns = max(0, round((elapsed_s * rate_hz - counted) / turn))
@@ -198,27 +200,27 @@ class _TypicalStep:
         self._sum = self._count = 0
 
     @property
-    def mean(self) -> float | None:
+    def mean_ticks_per_sample(self) -> float | None:
         """Number of ticks per sample; None until the counter has advanced."""
         return self._sum / self._count if self._count else None
 
-    def update(self, steps: Ints) -> None:
+    def add_steps(self, steps: Ints) -> None:
         """Update the typical step with the steps that are not zero."""
         moved = steps[steps > 0]
         self._recent.extend(moved[-STEP_HISTORY:].tolist())
         near = self._near(moved)
-        self._add(near)
+        self._add_to_mean(near)
         if near.size < moved.size:
             recent = np.array(self._recent)
             if 2 * self._near(recent).size < recent.size:  # most of the recent steps differ: start again
                 self._sum = self._count = 0
-                self._add(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
+                self._add_to_mean(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
 
-    def _add(self, steps: Ints) -> None:
+    def _add_to_mean(self, steps: Ints) -> None:
         self._sum += int(steps.sum())
         self._count += int(steps.size)
 
     def _near(self, steps: Ints) -> Ints:
         """Return the steps that are near the typical step."""
-        mean = self.mean
+        mean = self.mean_ticks_per_sample
         return steps[:0] if mean is None else steps[np.abs(steps / mean - 1.0) < STEP_TOLERANCE]

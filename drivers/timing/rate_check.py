@@ -33,10 +33,10 @@ class RateCheck:
     Examples
     --------
     >>> check = RateCheck(200.0)
-    >>> check.update(99.3, uncertainty=0.001)
+    >>> check.compare_with_measured_rate(99.3, relative_uncertainty=0.001)
     >>> check.rate_hz, check.contradicted
     (99.3, True)
-    >>> check.update(200.3, uncertainty=0.001)
+    >>> check.compare_with_measured_rate(200.3, relative_uncertainty=0.001)
     >>> check.rate_hz, check.contradicted
     (200.0, False)
     """
@@ -50,21 +50,21 @@ class RateCheck:
         self.contradicted = False
         """True if the measured rate contradicts the configured rate."""
 
-    def update(self, measured_hz: float, uncertainty: float) -> None:
+    def compare_with_measured_rate(self, measured_hz: float, relative_uncertainty: float) -> None:
         """Compare the configured rate with a new measurement.
 
         Parameters
         ----------
         measured_hz : float
             Measured sample rate in Hz.
-        uncertainty : float
+        relative_uncertainty : float
             Plausible relative error of the measured rate.
         """
         self.measured_hz = measured_hz
         difference = abs(measured_hz / self.configured_hz - 1.0)
         limit = CONTRADICTION_LIMIT * (HYSTERESIS_FACTOR if self.contradicted else 1.0)
-        self.contradicted = difference > max(limit, uncertainty)
-        if difference <= max(AGREEMENT_LIMIT, uncertainty):
+        self.contradicted = difference > max(limit, relative_uncertainty)
+        if difference <= max(AGREEMENT_LIMIT, relative_uncertainty):
             self.rate_hz = self.configured_hz
         elif self.rate_hz == self.configured_hz or abs(measured_hz / self.rate_hz - 1.0) > UPDATE_THRESHOLD:
             self.rate_hz = snap_to_standard_rate(measured_hz)

@@ -81,17 +81,17 @@ class SampleClock:
         self._ended = self._resumed = self._paused = False
         self._idle_ns: int | None = None  # last time at which the link held no unread data
 
-    def resume(self, before: LastSample) -> None:
+    def resume_after_restart(self, last_sample: LastSample) -> None:
         """Continue from the last recorded sample before a restart. The samples after this sample are missing."""
         timeline = self._timeline
         self._resumed = self._paused = True
-        timeline.assumed_hz = timeline.nominal_hz or before.rate_hz
-        timeline.last_t_ns = timeline.arrived_ns = timeline.origin_ns = before.t_ns
+        timeline.assumed_hz = timeline.nominal_hz or last_sample.rate_hz
+        timeline.last_t_ns = timeline.arrived_ns = timeline.origin_ns = last_sample.t_ns
         timeline.earliest_time.start_clock(-MAX_RESUME_DELAY_S)
         if self._sender is not None:
             timeline.line.add_point(timeline.index, 0.0, timeline.assumed_hz)
-        if self._counter is not None and before.tick != NO_TICK and before.ticks_per_sample is not None:
-            self._counter.resume(before.tick, before.ticks_per_sample)
+        if self._counter is not None and last_sample.tick != NO_TICK and last_sample.ticks_per_sample is not None:
+            self._counter.resume_at_tick(last_sample.tick, last_sample.ticks_per_sample)
 
     @property
     def dropped_repeated_rows(self) -> int:
@@ -106,7 +106,7 @@ class SampleClock:
     @property
     def ticks_per_sample(self) -> float | None:
         """Number of ticks of the device counter per sample; None until the counter has advanced."""
-        return None if self._counter is None else self._counter.typical_step.mean
+        return None if self._counter is None else self._counter.typical_step.mean_ticks_per_sample
 
     @property
     def rate_hz(self) -> float | None:
@@ -128,7 +128,7 @@ class SampleClock:
         return self._timeline.line.rate_hz() if self._timeline.line.can_tell_gap_from_jitter() else None
 
     @property
-    def contradicted_hz(self) -> float | None:
+    def contradicting_rate_hz(self) -> float | None:
         """Measured rate in Hz if the measured rate contradicts the configured rate, otherwise None."""
         return self._check.measured_hz if self._check is not None and self._check.contradicted else None
 
@@ -158,12 +158,12 @@ class SampleClock:
         """Prepare for samples after a closed link. The next arrival time gives the number of missing samples."""
         self._paused = True
 
-    def note_no_unread_data(self, t_ns: int) -> None:
+    def note_no_unread_data(self, host_t_ns: int) -> None:
         """Store a time at which the link held no unread data, on the monotonic clock of the host.
 
         Only the last such time before the first sample is used. The time limits the delay of the first samples.
         """
-        self._idle_ns = t_ns
+        self._idle_ns = host_t_ns
 
     def assign_times(self, samples: SampleBlock) -> list[SampleBlock]:
         """Assign times to samples.
@@ -212,7 +212,7 @@ class SampleClock:
             line = self._timeline.line
         found = line.measure_rate(final) if self._check is not None and line is not None else None
         if self._check is not None and found is not None:
-            self._check.update(*found)
+            self._check.compare_with_measured_rate(*found)
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         """Determine missing samples and times according to the timing of the wire format."""

@@ -68,7 +68,7 @@ class SenderTimes:
         if kept is None:
             return None
         steps = np.diff(kept.t_ns)
-        order = None if (steps < -JUMP_S * NS_PER_S).any() else find_steady_order(kept.t_ns, period_s)
+        order = None if (steps < -JUMP_S * NS_PER_S).any() else find_evenly_spaced_order(kept.t_ns, period_s)
         if order is None:
             return kept
         n = int((steps < 0).sum())
@@ -165,7 +165,7 @@ class SenderTimes:
         return gap
 
 
-def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
+def find_evenly_spaced_order(t_ns: Ints, period_s: float) -> Ints | None:
     """Return the order in which sender times are evenly spaced.
 
     Parameters
@@ -182,9 +182,9 @@ def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
 
     Examples
     --------
-    >>> find_steady_order(np.array([0, 10, 30, 20, 40]) * 10**6, 0.01).tolist()
+    >>> find_evenly_spaced_order(np.array([0, 10, 30, 20, 40]) * 10**6, 0.01).tolist()
     [0, 1, 3, 2, 4]
-    >>> find_steady_order(np.array([0, 10, 8, 20, 18]) * 10**6, 0.01) is None
+    >>> find_evenly_spaced_order(np.array([0, 10, 8, 20, 18]) * 10**6, 0.01) is None
     True
     """
     if (np.diff(t_ns) >= 0).all():

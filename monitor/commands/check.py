@@ -1,16 +1,16 @@
 """Command ``check``: finds all mistakes in a configuration file and in the model files that it names. No device is
 opened.
 
-``settings.examine`` reads the configuration. Model files are read here, because the modules for models are in a higher
-layer than the settings. The check covers the noise model of each device with the limits that are relative to the model,
-and the model and effects of each simulated sensor.
+``settings.examine_config_file`` reads the configuration. Model files are read here, because the modules for models are
+in a higher layer than the settings. The check covers the noise model of each device with the limits that are relative
+to the model, and the model and effects of each simulated sensor.
 """
 
 from collections.abc import Iterator
 from pathlib import Path
 
 from drivers.errors import ConfigError
-from monitor.settings.loading import Config, ModelDependentSettings, examine
+from monitor.settings.loading import Config, ModelDependentSettings, examine_config_file
 
 
 def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
@@ -30,7 +30,7 @@ def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | Non
     wrong : list of str
         One line for each mistake, which begins with the file.
     """
-    reading = examine(path, pipe=pipe)
+    reading = examine_config_file(path, allow_pipe=pipe)
     wrong = [*reading.wrong, *(f"{path}: {use.device}: {line}" for use in reading.models for line in _problems(use))]
     return None if wrong else reading.config, wrong
 
@@ -48,8 +48,8 @@ def _problems(use: ModelDependentSettings) -> Iterator[str]:
         yield from error.lines
     try:
         if use.virtual is not None:
-            from monitor.simulator.encoding_sensor import check_sensor
+            from monitor.simulator.encoding_sensor import check_sensor_settings
 
-            check_sensor(use.virtual)
+            check_sensor_settings(use.virtual)
     except ConfigError as error:
         yield from error.lines

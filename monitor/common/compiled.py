@@ -15,7 +15,7 @@ does not change.
 Kernels receive and return NamedTuples of arrays. In a loop, array fields are first copied to local names, because Numba
 counts a reference at each access to a field.
 
-Until the kernels are compiled, a thread can run them in the Python interpreter (``interpreted``).
+Until the kernels are compiled, a thread can run them in the Python interpreter (``interpret_uncompiled_kernels``).
 """
 
 import contextlib
@@ -145,7 +145,7 @@ _interprets = ContextVar("interprets", default=False)  # each thread has its own
 
 
 @contextlib.contextmanager
-def interpreted() -> Iterator[None]:
+def interpret_uncompiled_kernels() -> Iterator[None]:
     """Run kernels that are not compiled yet in the Python interpreter, in this thread.
 
     The results agree except for the last digit of exponentials. A call takes about a hundred times as long as compiled
@@ -190,11 +190,11 @@ def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
         kernel.enable_caching()
         kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001
         # Numba compares the version before it reads the index, which may name types that no longer exist
-        kept._version = f"{kept._version} {source_hash(Path(inspect.getfile(function)))}"  # noqa: SLF001
+        kept._version = f"{kept._version} {hash_module_with_imports(Path(inspect.getfile(function)))}"  # noqa: SLF001
     return cast("Callable[P, R]", kernel)
 
 
-def cache_folder() -> Path | None:
+def kernel_cache_folder() -> Path | None:
     """Return the folder of compiled kernels on this machine; None if no such folder can be written."""
     kernel: Any = numba.njit(_nothing)
     try:
@@ -210,7 +210,7 @@ def _nothing() -> None: ...
 
 
 @cache
-def source_hash(path: Path, root: Path = PACKAGE_ROOT) -> str:
+def hash_module_with_imports(path: Path, root: Path = PACKAGE_ROOT) -> str:
     """Return a hash of a file and of all modules of this program that it imports, directly or through others.
 
     Parameters

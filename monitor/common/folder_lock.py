@@ -4,9 +4,9 @@ The lock is ``flock`` on a file in the folder. The operating system releases the
 lock ends. The file is never deleted. It contains the process id and the host of the holder, for messages. Readers need
 no lock.
 
-``hold`` takes the lock, or checks that this process still holds the lock. If the folder or the lock file is deleted or
-replaced, the lock is lost. The file descriptor is closed when another program is executed, so hooks and viewers do not
-inherit it.
+``ensure_held`` takes the lock, or checks that this process still holds the lock. If the folder or the lock file is
+deleted or replaced, the lock is lost. The file descriptor is closed when another program is executed, so hooks and
+viewers do not inherit it.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ class FolderLock:
     Parameters
     ----------
     folder : Path
-        Folder to lock. ``hold`` creates it if it does not exist.
+        Folder to lock. ``ensure_held`` creates it if it does not exist.
     name : str
         Name of the lock file in the folder.
     """
@@ -49,7 +49,7 @@ class FolderLock:
         """Message if the file system does not support locks, so that the folder is used without a lock; else empty."""
         self._descriptor: int | None = None
 
-    def hold(self) -> str:
+    def ensure_held(self) -> str:
         """Take the lock, or check that this process still holds it. The method does not wait for another holder.
 
         Returns
@@ -81,8 +81,8 @@ class FolderLock:
                 os.close(descriptor)
 
     @property
-    def held(self) -> bool:
-        """True if the lock was held at the last call of ``hold``."""
+    def is_held(self) -> bool:
+        """True if the lock was held at the last call of ``ensure_held``."""
         return self._descriptor is not None
 
     def release(self) -> None:
@@ -119,7 +119,7 @@ class FolderLock:
         return False
 
 
-def lock_holder(folder: Path, name: str) -> str:
+def describe_lock_holder(folder: Path, name: str) -> str:
     """Return a text that names the holder of a folder's lock.
 
     Parameters

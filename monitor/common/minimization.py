@@ -2,7 +2,7 @@
 
 ``minimize_bfgs`` follows Nocedal & Wright, Numerical Optimization, 2006, algorithm 6.1. It uses forward differences for
 the gradient, a line search for the Wolfe conditions by bisection, and the BFGS update of the inverse of the Hessian.
-``golden_section`` searches an interval (Kiefer, Proc. Am. Math. Soc. 4, 1953).
+``minimize_by_golden_section`` searches an interval (Kiefer, Proc. Am. Math. Soc. 4, 1953).
 """
 
 from collections.abc import Callable, Generator
@@ -107,7 +107,7 @@ def _gradient(function: Callable[[Floats], float], x: Floats, value: float) -> F
     return found
 
 
-def golden_section(
+def minimize_by_golden_section(
     function: Callable[[float], float], low: float, high: float, tolerance: float
 ) -> Generator[None, None, tuple[float, float]]:
     """Return the value and the position of a minimum in an interval; yield after each call of the function.
@@ -136,7 +136,7 @@ def golden_section(
     ...             next(search)
     ...         except StopIteration as end:
     ...             return end.value
-    >>> value, place = run(golden_section(lambda x: (x - 1.0) ** 2 + 2.0, 0.0, 3.0, 1e-6))
+    >>> value, place = run(minimize_by_golden_section(lambda x: (x - 1.0) ** 2 + 2.0, 0.0, 3.0, 1e-6))
     >>> round(value, 9), round(place, 5)
     (2.0, 1.0)
     """

@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 CONFIG_FOLDER: Final = Path(__file__).resolve().parents[2] / "config"
 
 
-def model_path(name: str, folder: Path) -> Path:
+def resolve_model_path(name: str, folder: Path) -> Path:
     """Return the path of a noise model.
 
     Parameters

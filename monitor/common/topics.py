@@ -33,7 +33,7 @@ class Topic:
         """
         return f"{prefix}/{device}/{self.name}"
 
-    def schema(self) -> str:
+    def schema_name(self) -> str:
         """Return the content of the payload's ``schema`` field."""
         return f"imu-monitor/{self.name.split('/')[-1]}/1"
 

@@ -36,22 +36,22 @@ class Unit:
     factor: float
     name: str
 
-    def text(self, si: float, digits: int = 3) -> str:
+    def format_si_value(self, si_value: float, digits: int = 3) -> str:
         """Format a value with this unit.
 
         Parameters
         ----------
-        si : float
+        si_value : float
             Value in SI units.
         digits : int, optional
             Number of significant digits.
 
         Examples
         --------
-        >>> COEFFICIENT_UNITS["gyro"]["N"].text(1.5e-4)
+        >>> COEFFICIENT_UNITS["gyro"]["N"].format_si_value(1.5e-4)
         '0.516 °/√h'
         """
-        return f"{format_number(si * self.factor, digits)} {self.name}"
+        return f"{format_number(si_value * self.factor, digits)} {self.name}"
 
 
 COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
@@ -108,17 +108,17 @@ def axes_of(kind: Kind) -> tuple[str, ...]:
     return AXES[:3] if kind == "gyro" else AXES[3:]
 
 
-def unit_of(letter: str, axis: str) -> Unit:
+def coefficient_unit(coefficient: str, axis: str) -> Unit:
     """Return the customary unit of a noise coefficient.
 
     Parameters
     ----------
-    letter : {"Q", "N", "B", "K", "R"}
+    coefficient : {"Q", "N", "B", "K", "R"}
         Noise coefficient.
     axis : str
         Axis of ``AXES``.
     """
-    return COEFFICIENT_UNITS[sensor_kind(axis)][letter]
+    return COEFFICIENT_UNITS[sensor_kind(axis)][coefficient]
 
 
 def format_number(value: float, digits: int = 3) -> str:
@@ -148,7 +148,7 @@ def format_number(value: float, digits: int = 3) -> str:
     return f"{rounded:.{max(0, digits - 1 - exponent)}f}"
 
 
-def format_two_digits(value: float, sign: bool = False) -> str:
+def format_two_significant_digits(value: float, sign: bool = False) -> str:
     """Format a number with two significant digits and without an exponent.
 
     Parameters
@@ -161,28 +161,28 @@ def format_two_digits(value: float, sign: bool = False) -> str:
     return np.format_float_positional(float(f"{value:.1e}"), trim="-", sign=sign)
 
 
-def format_rate(axis: str, si: float, sign: bool = False) -> str:
+def format_axis_value(axis: str, si_value: float, sign: bool = False) -> str:
     """Format an angular rate in °/s, or an acceleration in mg or m/s², with two significant digits.
 
     Parameters
     ----------
     axis : str
         Axis of ``AXES``.
-    si : float
+    si_value : float
         Rate in rad/s or m/s².
     sign : bool, optional
         True if positive values get a sign, as for a difference.
 
     Examples
     --------
-    >>> format_rate("gz", 2.79), format_rate("ax", -0.0324, sign=True), format_rate("az", 27.0), format_rate("gx", 1e-6)
-    ('160 °/s', '-3.3 mg', '27 m/s²', '0.000057 °/s')
+    >>> format_axis_value("gz", 2.79), format_axis_value("ax", -0.0324, sign=True), format_axis_value("az", 27.0)
+    ('160 °/s', '-3.3 mg', '27 m/s²')
     """
     if axis.startswith("g"):
-        return f"{format_two_digits(math.degrees(si), sign)} °/s"
-    if abs(si) < 1000.0 * MILLI_G:
-        return f"{format_two_digits(si / MILLI_G, sign)} mg"
-    return f"{format_two_digits(si, sign)} m/s²"
+        return f"{format_two_significant_digits(math.degrees(si_value), sign)} °/s"
+    if abs(si_value) < 1000.0 * MILLI_G:
+        return f"{format_two_significant_digits(si_value / MILLI_G, sign)} mg"
+    return f"{format_two_significant_digits(si_value, sign)} m/s²"
 
 
 def format_sample_rate(rate_hz: float | None) -> str:

@@ -160,7 +160,7 @@ class HistoryWriter:
     def _write(self) -> bool:
         """Write the queue and merge old rows; return False after an error."""
         try:
-            if holder := self._folder.hold():
+            if holder := self._folder.ensure_held():
                 self._suspend(holder)
                 return False
             self._resume()

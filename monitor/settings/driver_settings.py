@@ -32,7 +32,7 @@ from drivers.settings_model import (
     check_table,
     fields_by_key,
 )
-from monitor.common.shipped_config_paths import model_path
+from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.settings.field_types import Duration
 
 VIRTUAL: Final = "virtual"
@@ -70,7 +70,7 @@ class FaultsTable(SettingsModel):
 
 def _model_file(name: str, info: ValidationInfo) -> str:
     """Return the path of a noise model for its name in a configuration file."""
-    return str(model_path(name, info.context.folder or Path())) if info.context else name
+    return str(resolve_model_path(name, info.context.folder or Path())) if info.context else name
 
 
 class VirtualTable(LinkSettings):
@@ -107,7 +107,7 @@ class Driver:
     silence_s: float = 3.0  # time without data after which the link is opened again; 0 = never
 
 
-def link_settings(name: str) -> type[LinkSettings]:
+def link_settings_class(name: str) -> type[LinkSettings]:
     """Return the settings class of a link.
 
     Raises
@@ -117,13 +117,13 @@ def link_settings(name: str) -> type[LinkSettings]:
     """
     if name == VIRTUAL:
         return VirtualTable
-    if name not in link_names():
-        raise ConfigError(f'"{name}"{discovery.format_choices(name, link_names())}')
+    if name not in list_link_names():
+        raise ConfigError(f'"{name}"{discovery.format_choices(name, list_link_names())}')
     settings: type[LinkSettings] = discovery.import_module(drivers.links, name, "_link").Settings
     return settings
 
 
-def link_names() -> tuple[str, ...]:
+def list_link_names() -> tuple[str, ...]:
     """Return the names of all links, with the link of a simulated sensor."""
     return tuple(sorted({*discovery.list_modules(drivers.links, "_link"), VIRTUAL}))
 
@@ -155,19 +155,19 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
     problems: list[Problem] = []
     link: Link | VirtualTable | None = None
     carrier, silence_s = "", 0.0
-    if not isinstance(name, str) or name not in link_names():
+    if not isinstance(name, str) or name not in list_link_names():
         said = "missing" if name is None else format_value(name)
-        problems.append(Problem("link", f"{said}{discovery.format_choices(str(name or ''), link_names())}"))
+        problems.append(Problem("link", f"{said}{discovery.format_choices(str(name or ''), list_link_names())}"))
     else:
         module = None if name == VIRTUAL else discovery.import_module(drivers.links, name, "_link")
-        checked = check_table(link_settings(name), keys, folder)
+        checked = check_table(link_settings_class(name), keys, folder)
         link = checked.value if isinstance(checked.value, VirtualTable) else _build(module, checked)
         problems += checked.problems
         carrier = "" if module is None else getattr(link, "carrier", "") or _carrier_of(module)
         decoder_name = decoder_name or getattr(link, "default_decoder", default_decoder(name))
         silence_s = checked.value.silence if checked.value is not None else 0.0
     decoder = None
-    if name in link_names() or decoder_name:
+    if name in list_link_names() or decoder_name:
         decoder = _read_decoder(decoder_name, options, folder, (str(name), carrier), problems)
     if problems or link is None or decoder is None:
         raise TableError(problems, link if isinstance(link, VirtualTable) else None)

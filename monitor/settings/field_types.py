@@ -31,46 +31,46 @@ class Metrics(NamedTuple):
     port: int
 
 
-def seconds(value: float | str) -> float:
+def parse_duration_s(value: float | str) -> float:
     """Return a duration in seconds, from a number of seconds or a text such as "90s", "30min", "1h", "2d".
 
-    >>> seconds("30min"), seconds(3600), seconds("1.5 h")
+    >>> parse_duration_s("30min"), parse_duration_s(3600), parse_duration_s("1.5 h")
     (1800.0, 3600.0, 5400.0)
     """
-    return DURATION_S.check(float(_seconds(value)))
+    return DURATION_S.check(float(_parse_duration_text(value)))
 
 
-def parse_rate_as_period(value: str, always: str) -> float:
-    """Return the period in seconds of a rate such as "10 Hz"; 0 for the text ``always``.
+def parse_rate_as_period(value: str, always_text: str) -> float:
+    """Return the period in seconds of a rate such as "10 Hz"; 0 for the text ``always_text``.
 
     Parameters
     ----------
     value
-        Rate with unit, or the text ``always``.
-    always
+        Rate with unit, or the text ``always_text``.
+    always_text
         Text for a run at each sample or block, for example "every sample".
 
     >>> parse_rate_as_period("10 Hz", "every sample"), parse_rate_as_period("every sample", "every sample")
     (0.1, 0.0)
     """
-    if value == always:
+    if value == always_text:
         return 0.0
     match = RATE_TEXT.fullmatch(value)
     rate_hz = _positive_number(match[1]) if match else 0.0
     if not rate_hz > 0.0:
-        raise ConfigError(f'{format_value(value)} is not a rate; write "10 Hz" or "{always}"')
+        raise ConfigError(f'{format_value(value)} is not a rate; write "10 Hz" or "{always_text}"')
     return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
 
 
-def period_annotation(always: str) -> ReadAs:
-    """Return the annotation of a period in seconds that the file states as a rate or as the text ``always``."""
-    return ReadAs(str, lambda value, folder: parse_rate_as_period(value, always))
+def rate_as_period_annotation(always_text: str) -> ReadAs:
+    """Return the annotation of a period in seconds that the file states as a rate or as the text ``always_text``."""
+    return ReadAs(str, lambda value, folder: parse_rate_as_period(value, always_text))
 
 
-def check_memory(size: str) -> None:
+def check_memory_limit(size: str) -> None:
     """Raise ConfigError if a text is not a memory limit of the viewer.
 
-    >>> check_memory("256MiB"), check_memory("25%")
+    >>> check_memory_limit("256MiB"), check_memory_limit("25%")
     (None, None)
     """
     match = SIZE_TEXT.fullmatch(size)
@@ -89,7 +89,7 @@ def check_viewer_mode(mode: str) -> None:
         raise ConfigError(f'"{mode}"{format_choices(mode, VIEWER_MODES)}, or a file ending in .rrd')
 
 
-def _seconds(value: Any) -> Any:
+def _parse_duration_text(value: Any) -> Any:
     """Convert a duration from text to seconds. Values of other types are returned unchanged and checked later."""
     if not isinstance(value, str):
         return value
@@ -132,7 +132,7 @@ def _address(text: str, _: Path | None) -> Metrics:
     return Metrics(match[1].strip("[]"), int(match[2]))
 
 
-DURATION_FROM_TEXT: Final = BeforeValidator(_seconds)
+DURATION_FROM_TEXT: Final = BeforeValidator(_parse_duration_text)
 """Annotation of a duration in seconds, which may be a text such as "1h" in the file."""
 Duration = Annotated[float, DURATION_S, DURATION_FROM_TEXT]
 RelativePath = Annotated[Path, ReadAs(str, _path)]

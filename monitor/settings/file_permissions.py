@@ -28,20 +28,20 @@ def explain_untrusted_file(path: Path) -> str:
     return ""
 
 
-def describe_exposed_secret(path: Path, secret: bool | None = None) -> str:
+def describe_exposed_secret(path: Path, is_secret: bool | None = None) -> str:
     """Return a warning if all users can read a secret in a file, else "".
 
     Parameters
     ----------
     path
         File to check.
-    secret
+    is_secret
         True if the file is a secret, such as a private key. By default, the file is searched for secrets.
     """
     real = real_path(path)
     if not _others_may(real, stat.S_IROTH) or not _is_reachable(real):
         return ""
-    if contains_secret(real) if secret is None else secret:
+    if contains_secret(real) if is_secret is None else is_secret:
         return f"holds a secret that anyone on this machine may read: chmod o-r {real}"
     return ""
 

@@ -14,7 +14,7 @@ from drivers.settings_model import Problem, TableCheckResult, check_table
 from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_parser
 from monitor.settings.driver_settings import Driver, FaultsTable, VirtualTable
-from monitor.settings.field_types import Metrics, check_viewer_mode, parse_rate_as_period, seconds
+from monitor.settings.field_types import Metrics, check_viewer_mode, parse_duration_s, parse_rate_as_period
 from monitor.settings.schema import (
     DEVICE_NAME,
     WINDOW_SAMPLES,
@@ -44,10 +44,10 @@ __all__ = [
     "VirtualTable",
     "ZenohTable",
     "check_viewer_mode",
-    "examine",
-    "load",
+    "examine_config_file",
+    "load_config",
+    "parse_duration_s",
     "parse_rate_as_period",
-    "seconds",
 ]
 
 DEVICE_PLACE: Final = re.compile(r"device\[(\d+)\]\.?(.*)")
@@ -82,7 +82,7 @@ class ModelDependentSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ConfigReading:
     """Result of reading a configuration file."""
 
     config: Config | None  # None if the file has mistakes
@@ -90,14 +90,14 @@ class Reading:
     models: tuple[ModelDependentSettings, ...] = ()
 
 
-def load(path: Path, *, pipe: bool = False) -> Config:
+def load_config(path: Path, *, allow_pipe: bool = False) -> Config:
     """Return the configuration in a file.
 
     Parameters
     ----------
     path
         Configuration file.
-    pipe
+    allow_pipe
         True if a pipe may be read as well, see ``drivers.file_access.read_small_file``.
 
     Raises
@@ -105,31 +105,33 @@ def load(path: Path, *, pipe: bool = False) -> Config:
     ConfigError
         If the file has mistakes. The message describes the first mistake and states the number of further mistakes.
     """
-    reading = examine(path, pipe=pipe)
+    reading = examine_config_file(path, allow_pipe=allow_pipe)
     if reading.config is None:
         count = len(reading.wrong) - 1
         raise ConfigError(reading.wrong[0] + (f" (and {count} more: imu-monitor check {path})" if count else ""))
     return reading.config
 
 
-def examine(path: Path, *, pipe: bool = False) -> Reading:
+def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReading:
     """Read a configuration file, and find all mistakes.
 
     Parameters
     ----------
     path
         Configuration file.
-    pipe
+    allow_pipe
         True if a pipe may be read as well.
     """
     try:
-        table = toml_parser.parse_toml(file_access.read_small_file(path, pipe=pipe).decode("utf-8"))
+        table = toml_parser.parse_toml(file_access.read_small_file(path, pipe=allow_pipe).decode("utf-8"))
     except FileNotFoundError:
-        return Reading(None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"])
+        return ConfigReading(
+            None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]
+        )
     except (OSError, UnicodeDecodeError) as error:
-        return Reading(None, [f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"])
+        return ConfigReading(None, [f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"])
     except ConfigError as error:
-        return Reading(None, [f"{path}: {error}"])
+        return ConfigReading(None, [f"{path}: {error}"])
     checked = check_table(ConfigFile, table, path.resolve().parent)
     warnings = _check_zenoh_file(checked)
     wrong = [_format_problem(problem, table) for problem in checked.problems]
@@ -139,10 +141,10 @@ def examine(path: Path, *, pipe: bool = False) -> Reading:
         warnings.insert(0, line)
     models = _model_dependent_settings(checked, table)
     if wrong or checked.value is None:
-        return Reading(None, [format_one_line(f"{path}: {line}") for line in wrong], models)
+        return ConfigReading(None, [format_one_line(f"{path}: {line}") for line in wrong], models)
     config = _configuration(checked.value)
     lines = tuple(f"{path}: {line}" for line in warnings)
-    return Reading(dataclasses.replace(config, path=path, table=table, warnings=lines), [], models)
+    return ConfigReading(dataclasses.replace(config, path=path, table=table, warnings=lines), [], models)
 
 
 def _configuration(file: ConfigFile) -> Config:

@@ -34,21 +34,21 @@ LIST_TABLES: Final = ("device", "hook", "device.limit")
 
 def format_defaults() -> str:
     """Return a configuration file with the keys of all tables, links and decoders."""
-    links = [name for name in driver_settings.link_names() if name != FIRST_LINK]
+    links = [name for name in driver_settings.list_link_names() if name != FIRST_LINK]
     decoders = [name for name in discovery.list_modules(drivers.decoders) if name != FIRST_DECODER]
     top = {key: find_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
     blocks = [
         INTRODUCTION,
         _table(Device, "device", omit=("driver", "axes", "limit")),
-        format_link(FIRST_LINK),
-        format_decoder(FIRST_DECODER),
+        format_link_defaults(FIRST_LINK),
+        format_decoder_defaults(FIRST_DECODER),
         "\n".join(
             ["[device.axes]", *(_line(axis, axis, str(fields_by_key(Device)["axes"].description)) for axis in AXES)]
         ),
         "# The other links. Replace the table [device.driver] above by one of these tables.",
-        *(_commented(format_link(name)) for name in links),
+        *(_commented(format_link_defaults(name)) for name in links),
         "# The other decoders.",
-        *(_commented(format_decoder(name)) for name in decoders),
+        *(_commented(format_decoder_defaults(name)) for name in decoders),
         _commented(_table(Limit, "device.limit", "any number of tables")),
         _commented(_table(Hook, "hook", "any number of tables")),
         *(_table(model, key) for key, model in top.items() if model is not None and key not in LIST_TABLES),
@@ -56,7 +56,7 @@ def format_defaults() -> str:
     return "\n\n".join(block.strip("\n") for block in blocks) + "\n"
 
 
-def format_link(name: str) -> str:
+def format_link_defaults(name: str) -> str:
     """Return the table ``[device.driver]`` with all keys of a link.
 
     Raises
@@ -64,9 +64,12 @@ def format_link(name: str) -> str:
     ConfigError
         If there is no such link.
     """
-    settings, decoder = driver_settings.link_settings(name), driver_settings.default_decoder(name) or FIRST_DECODER
+    settings, decoder = (
+        driver_settings.link_settings_class(name),
+        driver_settings.default_decoder(name) or FIRST_DECODER,
+    )
     header, keys = _table(settings, "device.driver", omit=("faults",)).split("\n", 1)
-    link = _line("link", name, f"one of {', '.join(driver_settings.link_names())}")
+    link = _line("link", name, f"one of {', '.join(driver_settings.list_link_names())}")
     text = "\n".join((header, link, f"{keys}{_line('decoder', decoder, 'wire format of the sensor')}\n"))
     if name != driver_settings.VIRTUAL:
         return text
@@ -74,7 +77,7 @@ def format_link(name: str) -> str:
     return f"{text}\n{faults}"
 
 
-def format_decoder(name: str) -> str:
+def format_decoder_defaults(name: str) -> str:
     """Return the table ``[device.driver.decoder_options]`` with all keys of a decoder.
 
     Raises
@@ -111,7 +114,7 @@ def _commented(text: str) -> str:
 
 def _line(key: str, value: object, comment: str) -> str:
     """Return the line of a key with its comment."""
-    return f"{f'{key} = {format_toml(value)}':<{COMMENT_COLUMN - 1}} # {comment}"
+    return f"{f'{key} = {format_toml_value(value)}':<{COMMENT_COLUMN - 1}} # {comment}"
 
 
 def _values(info: FieldInfo) -> str:
@@ -133,14 +136,18 @@ def _find_parts(types: Iterable[Any]) -> Iterator[object]:
             yield from _find_parts(get_args(one))
 
 
-def format_toml(value: Any) -> str:
+def format_toml_value(value: Any) -> str:
     """Return a value in TOML notation.
 
-    >>> format_toml({"gx": 0.5}), format_toml(("a", "b")), format_toml(True)
+    >>> format_toml_value({"gx": 0.5}), format_toml_value(("a", "b")), format_toml_value(True)
     ('{ gx = 0.5 }', '["a", "b"]', 'true')
     """
     if isinstance(value, Mapping):
-        return "{}" if not value else f"{{ {', '.join(f'{key} = {format_toml(one)}' for key, one in value.items())} }}"
+        return (
+            "{}"
+            if not value
+            else f"{{ {', '.join(f'{key} = {format_toml_value(one)}' for key, one in value.items())} }}"
+        )
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(format_toml, value))}]"
+        return f"[{', '.join(map(format_toml_value, value))}]"
     return json.dumps(value, ensure_ascii=False)

@@ -21,7 +21,7 @@ from drivers.errors import ConfigError
 from drivers.links.base import Link
 from drivers.number_ranges import DAY_S, NumberRange
 from drivers.settings_model import Conflict, ListOf, ReadAs, SettingsModel, WordOr, checked_by, one_of
-from monitor.common.shipped_config_paths import model_path
+from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings.driver_settings import Driver, VirtualTable, read_driver
 from monitor.settings.field_types import (
@@ -31,9 +31,9 @@ from monitor.settings.field_types import (
     Endpoint,
     RelativePath,
     ZenohKey,
-    check_memory,
+    check_memory_limit,
     check_viewer_mode,
-    period_annotation,
+    rate_as_period_annotation,
 )
 
 WINDOW_SAMPLES: Final = (100, 10_000_000)
@@ -101,7 +101,7 @@ def _check_name(name: str) -> None:
 
 
 def _model_in_force(name: str, folder: Path | None) -> Path:
-    return model_path(name, folder or Path())
+    return resolve_model_path(name, folder or Path())
 
 
 class Device(SettingsModel):
@@ -121,13 +121,13 @@ class Device(SettingsModel):
         Literal["octave", "decade10"] | tuple[float, ...],
         WordOr({"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, number_ranges.AVERAGING_TIME_S]]),
     ] = Field("octave", description="averaging times: a grid, or a list of seconds")
-    refit_s: Annotated[float, period_annotation("every sample")] = Field(
+    refit_s: Annotated[float, rate_as_period_annotation("every sample")] = Field(
         0.1,
         alias="refit",
         examples=["10 Hz"],
         description='rate at which the coefficients are fitted, or "every sample"',
     )
-    publish_s: Annotated[float, period_annotation("every block")] = Field(
+    publish_s: Annotated[float, rate_as_period_annotation("every block")] = Field(
         0.1, alias="publish", examples=["10 Hz"], description='rate at which results are published, or "every block"'
     )
     motion: Literal["tell", "leave out"] = Field(
@@ -263,7 +263,7 @@ class ViewerTable(SettingsModel):
     )
     port: Annotated[int, number_ranges.PORT] = Field(9876, description="TCP port of the viewer's data, on loopback")
     web_port: Annotated[int, number_ranges.PORT] = Field(9090, description="TCP port of the viewer's page, on loopback")
-    memory: Annotated[str, checked_by(check_memory)] = Field(
+    memory: Annotated[str, checked_by(check_memory_limit)] = Field(
         "256MiB", description="memory for past data; the oldest data are dropped first"
     )
     history: Duration | None = Field(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, ParamSpec, TypeVar
 
 from drivers.errors import ConfigError
-from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.common import shipped_config_paths
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.noise.model_loading import read_model
 from monitor.settings import loading
@@ -23,7 +23,9 @@ DEMO_CONFIG: Final = CONFIG_FOLDER / "demo.toml"
 """Shipped configuration of the demo."""
 
 
-def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: float | None = None) -> Config:
+def build_demo_config(
+    sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: float | None = None
+) -> Config:
     """Return the configuration of ``demo``.
 
     Parameters
@@ -40,14 +42,14 @@ def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_a
     ConfigError
         If an option has an invalid value. The message begins with the name of the option.
     """
-    config = loading.load(DEMO_CONFIG)
+    config = loading.load_config(DEMO_CONFIG)
     (device,) = config.devices
     table = device.link
     assert isinstance(table, VirtualTable)
     given = {
         "model": None
         if sensor is None
-        else str(_for_option("--sensor", shipped_file_paths.model_path, sensor, Path.cwd())),
+        else str(_for_option("--sensor", shipped_config_paths.resolve_model_path, sensor, Path.cwd())),
         "effect": tuple(effects) or None,
         "effect_at": effect_at_s,
     }

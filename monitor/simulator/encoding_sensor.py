@@ -32,7 +32,7 @@ WARM_UP_S: Final = 300.0
 _log = structlog.get_logger("imu-monitor")
 
 
-def check_sensor(table: VirtualTable) -> None:
+def check_sensor_settings(table: VirtualTable) -> None:
     """Check the model and the effects of a simulated sensor without a simulation. An empty ``model`` is not checked.
 
     Raises

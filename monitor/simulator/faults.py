@@ -81,7 +81,7 @@ class DrawnFaults:
     """Random faults of consecutive samples."""
 
     kind: NDArray[np.int64]  # [n] of FaultKind
-    where: Floats  # [n] position of the fault in the frame, 0 to 1
+    position: Floats  # [n] position of the fault in the frame, 0 to 1
     pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
     def kind_per_sample(self) -> list[FaultKind]:
@@ -90,7 +90,7 @@ class DrawnFaults:
 
     def __getitem__(self, rows: slice) -> "DrawnFaults":
         """Return the faults of the selected samples."""
-        return DrawnFaults(self.kind[rows], self.where[rows], self.pulled[rows])
+        return DrawnFaults(self.kind[rows], self.position[rows], self.pulled[rows])
 
 
 class Faults:
@@ -125,14 +125,14 @@ class Faults:
         """Draw the delay of the next burst, in seconds."""
         return float(self._delay_rng.uniform(0.0, self._jitter_s)) if self._jitter_s else 0.0
 
-    def apply_fault(self, kind: FaultKind, where: float, chunks: list[Chunk]) -> list[Chunk]:
+    def apply_fault(self, kind: FaultKind, position: float, chunks: list[Chunk]) -> list[Chunk]:
         """Apply a fault to the chunks of one sample, and return the chunks to send.
 
         Parameters
         ----------
         kind : FaultKind
             Fault of the sample.
-        where : float
+        position : float
             Position of the fault in the chunk, 0 to 1.
         chunks : list of Chunk
             Encoded sample.
@@ -143,21 +143,21 @@ class Faults:
             case FaultKind.REPEATED:
                 return [*chunks, *chunks]
             case FaultKind.FLIPPED:
-                return [*chunks[:-1], *([] if self._has_checksum else [_flipped(chunks[-1], where)])]
+                return [*chunks[:-1], *([] if self._has_checksum else [_flipped(chunks[-1], position)])]
             case FaultKind.CUT:
-                return [*chunks[:-1], _cut(chunks[-1], where)]
+                return [*chunks[:-1], _cut(chunks[-1], position)]
             case _:
                 return chunks
 
 
-def _flipped(chunk: Chunk, where: float) -> Chunk:
+def _flipped(chunk: Chunk, position: float) -> Chunk:
     """Return a copy of a chunk with one flipped bit."""
-    at, bit = divmod(int(where * 8 * len(chunk.data)), 8)
+    at, bit = divmod(int(position * 8 * len(chunk.data)), 8)
     data = bytearray(chunk.data)
     data[at] ^= 1 << bit
     return replace(chunk, data=bytes(data))
 
 
-def _cut(chunk: Chunk, where: float) -> Chunk:
+def _cut(chunk: Chunk, position: float) -> Chunk:
     """Return a truncated chunk, with at least the first byte and without at least the last byte."""
-    return replace(chunk, data=chunk.data[: 1 + int(where * (len(chunk.data) - 1))])
+    return replace(chunk, data=chunk.data[: 1 + int(position * (len(chunk.data) - 1))])

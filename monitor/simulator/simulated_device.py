@@ -114,8 +114,8 @@ class SimulatedDevice:
     def _send(self, frames: list[list[Chunk]], draws: DrawnFaults) -> None:
         """Apply the faults to samples, send the samples, and count the faults."""
         faulty = [
-            (kind, self._faults.apply_fault(kind, where, chunks))
-            for kind, where, chunks in zip(draws.kind_per_sample(), draws.where.tolist(), frames, strict=True)
+            (kind, self._faults.apply_fault(kind, position, chunks))
+            for kind, position, chunks in zip(draws.kind_per_sample(), draws.position.tolist(), frames, strict=True)
         ]
         sent = self.port.send_chunks([chunk for _, chunks in faulty for chunk in chunks])
         for kind, chunks in faulty:

@@ -89,7 +89,7 @@ def decode_message(kind: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_B
     except RecursionError as error:
         raise ValueError(str(error)) from error
     if not isinstance(found, kind):
-        raise ValueError(f'schema "{Message.__name__}" instead of {kind.topic.schema()}')
+        raise ValueError(f'schema "{Message.__name__}" instead of {kind.topic.schema_name()}')
     return found
 
 

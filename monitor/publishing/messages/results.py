@@ -78,7 +78,7 @@ class WindowResultMessage(
     """Filled part of the window."""
 
 
-class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
+class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema_name()):
     """Message ``imu/<device>/allan``: Allan deviations of each measured axis."""
 
     topic = topics.ALLAN
@@ -137,7 +137,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         )
 
 
-class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
+class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema_name()):
     """Message ``imu/<device>/coefficients``: Q, N, B, K and R of each measured axis."""
 
     topic = topics.COEFFICIENTS
@@ -193,7 +193,7 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     z: Floats | None = None
 
 
-class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
+class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema_name()):
     """Message ``imu/<device>/gap``: comparison of the measured Allan deviations with the noise model of the device."""
 
     topic = topics.GAP
@@ -229,7 +229,7 @@ class ThermalMessage(
     Message,
     frozen=True,
     kw_only=True,
-    tag=topics.THERMAL.schema(),
+    tag=topics.THERMAL.schema_name(),
     rename={"interval_s": "interval", "temperature_c": "temperature"},
 ):
     """Message ``imu/<device>/thermal``: mean biases of the interval that ends at ``t``, and their predictions."""
@@ -261,7 +261,7 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
 
-class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()):
+class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema_name()):
     """Message ``imu/<device>/total``: total and Hadamard deviations, each with its own averaging times."""
 
     topic = topics.TOTAL
@@ -273,7 +273,7 @@ class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()
         return {"total": DeviationTable.of(result.total), "hadamard": DeviationTable.of(result.hadamard)}
 
 
-class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()):
+class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_name()):
     """Message ``imu/<device>/event``."""
 
     topic = topics.EVENT
@@ -330,7 +330,7 @@ class StatusMessage(
     Message,
     frozen=True,
     kw_only=True,
-    tag=topics.STATUS.schema(),
+    tag=topics.STATUS.schema_name(),
     rename={"rate_hz": "rate", "memory_bytes": "memory", "uptime_s": "uptime"},
 ):
     """Message ``imu/<device>/status``. The fields have the meaning of the fields of ``Health``."""
@@ -384,7 +384,7 @@ class StatusMessage(
         return Health(**known, latency_p50_s=self.latency.p50, latency_p99_s=self.latency.p99)
 
 
-class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
+class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema_name()):
     """Reply to ``imu/<device>/command/reset`` with a text for the user."""
 
     topic = topics.RESET
@@ -395,7 +395,7 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
         return {"text": result}
 
 
-class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
+class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema_name()):
     """First keys of the reply to ``imu/<device>/command/reconcile``. The keys of the report follow."""
 
     topic = topics.RECONCILE

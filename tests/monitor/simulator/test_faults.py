@@ -38,7 +38,7 @@ def test_the_same_however_samples_are_cut_into_bursts(cuts: tuple[int, ...]) -> 
     parts = [faults.draw_faults(n) for n in np.diff((0, *cuts, 1000)).tolist()]
     for name in ("kind", "where", "pulled"):
         assert np.array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
-    assert not np.array_equal(whole.where, Faults(SHARES, 6, "bytes").draw_faults(1000).where)
+    assert not np.array_equal(whole.position, Faults(SHARES, 6, "bytes").draw_faults(1000).position)
 
 
 def test_holding_back_bursts_changes_no_sample_fault() -> None:
