@@ -1,8 +1,7 @@
-"""Reading and writing of Parquet and Arrow IPC. pyarrow is optional and is imported only for these formats.
+"""Reading and writing of Parquet and Arrow IPC files with pyarrow, which is an optional dependency.
 
-If an Arrow file is truncated, the complete batches are read. A truncated Parquet file cannot be read, since the index
-is at the end of the file. The stated number of rows is checked against the limits of
-``drivers.recordings.memory_check`` before data are read.
+The reader returns the complete batches of a truncated Arrow file. A truncated Parquet file cannot be read, because the
+index is at the end of the file.
 """
 
 import os
@@ -21,7 +20,7 @@ from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, cou
 METADATA_KEY: Final = b"imu-monitor"
 """Key in the schema metadata of a segment that the daemon has recorded."""
 SEGMENT_COLUMNS: Final = ("ticks", "lost")
-"""Columns of a segment that are not measurements. A reader does not report these columns as unused."""
+"""Columns of a segment that are not measurements. The reader does not report these columns as unused."""
 SLACK_BYTES: Final = 1 << 20
 """Allowed size of a compressed buffer in addition to the size that its rows need."""
 MAX_DICTIONARY_BYTES: Final = 64_000_000
@@ -38,7 +37,7 @@ def import_pyarrow(path: Path) -> Any:
     Raises
     ------
     ConfigError
-        If pyarrow is not installed. The text names ``path`` as the file that cannot be read or written.
+        If pyarrow is not installed.
     """
     try:
         import pyarrow as pa
@@ -54,9 +53,9 @@ def read_parquet(path: Path) -> table.Table:
     Raises
     ------
     RecordingError
-        If the file is truncated, is not Parquet, or exceeds a limit.
+        If the file is truncated, is not a Parquet file, or exceeds a size limit.
     ConfigError
-        If pyarrow is not installed, or the samples do not fit into the memory.
+        If pyarrow is not installed, or the samples do not fit into memory.
     """
     notes: list[str] = []
     with _open_parquet(path) as file:
@@ -65,13 +64,12 @@ def read_parquet(path: Path) -> table.Table:
 
 
 def count_parquet_rows(path: Path) -> int:
-    """Return the number of rows according to the index."""
+    """Return the number of rows of a Parquet file according to the index of the file."""
     with _open_parquet(path) as file:
         return _check_parquet(path, file, [])[1]
 
 
 def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
-    """Check the limits, and return the columns to read and the number of rows."""
     metadata = file.metadata
     table.check_column_count(path, metadata.num_columns)
     chosen = table.select_known_columns(path, file.schema_arrow.names, notes)
@@ -84,7 +82,7 @@ def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, s
 
 @contextmanager
 def _open_parquet(path: Path) -> Iterator[Any]:
-    """Open a Parquet file. In the context, an error of pyarrow is converted to RecordingError."""
+    """Open a Parquet file, and convert errors of pyarrow to RecordingError."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
@@ -109,16 +107,16 @@ def _open_parquet(path: Path) -> Iterator[Any]:
 
 
 def read_ipc(path: Path) -> table.Table:
-    """Read the known columns of an Arrow file or stream. If the file is truncated, read the complete batches.
+    """Read the known columns of an Arrow file or stream. If the file is truncated, only the complete batches are read.
 
-    An Arrow file is an Arrow stream between two magic words, so a file is read like a stream.
+    An Arrow file is read as a stream, because the file contains an Arrow stream between two magic strings.
 
     Raises
     ------
     RecordingError
-        If the file is not Arrow IPC, or exceeds a limit.
+        If the file is not an Arrow IPC file, or exceeds a size limit.
     ConfigError
-        If pyarrow is not installed, or the samples do not fit into the memory.
+        If pyarrow is not installed, or the samples do not fit into memory.
     """
     pa = import_pyarrow(path)
     notes: list[str] = []
@@ -150,19 +148,19 @@ def read_ipc(path: Path) -> table.Table:
 
 
 def count_ipc_rows(path: Path) -> int:
-    """Return the total number of rows of all complete batches."""
+    """Return the number of rows in the complete batches of an Arrow file or stream."""
     with open_regular(path) as file:
         return _check_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
 def _ipc_start(path: Path) -> int:
-    """Return the offset of the stream in bytes: the length of the magic word for a file, 0 for a stream."""
+    """Return the offset in bytes of the Arrow stream in a file."""
     with open_regular(path) as file:
         return len(ARROW_MAGIC) if file.read(len(ARROW_MAGIC)) == ARROW_MAGIC else 0
 
 
 def _has_end_mark(path: Path, is_file: bool) -> bool:
-    """Return True if the file or stream ends with its end mark, so that it is not truncated."""
+    """Return True if an Arrow file or stream is complete, that is, ends with an end mark."""
     mark = ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END
     with open_regular(path) as file:
         file.seek(max(path.stat().st_size - len(mark), 0))
@@ -170,7 +168,7 @@ def _has_end_mark(path: Path, is_file: bool) -> bool:
 
 
 def _ipc_schema(path: Path, file: Any) -> Any:
-    """Return the schema of an open file. Raise RecordingError if the file is not Arrow IPC."""
+    """Return the Arrow schema of an open file. Raise RecordingError if the file is not an Arrow IPC file."""
     pa = import_pyarrow(path)
     try:
         file.seek(_ipc_start(path))
@@ -186,7 +184,6 @@ def _ipc_schema(path: Path, file: Any) -> Any:
 
 
 def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> tuple[int, int]:
-    """Check the limits and the column types, and return the numbers of record batches and rows."""
     pa = import_pyarrow(path)
     _check_types(path, schema, chosen)
     counts = [
@@ -214,7 +211,6 @@ def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -
 
 
 def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
-    """Raise RecordingError if a column is not numeric."""
     pa = import_pyarrow(path)
     numeric = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null)
     for key in chosen.values():
@@ -225,20 +221,20 @@ def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
 
 
 def _float_table(path: Path, data: Any, chosen: Mapping[str, str], notes: list[str]) -> table.Table:
-    """Return the chosen columns of a pyarrow table as float64. Null values become NaN."""
+    """Return the chosen columns of a pyarrow table as float64 arrays. Null values become NaN."""
     float64 = import_pyarrow(path).float64()
     columns = {name: data.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
     return table.Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
 
 
 def first_message_line(error: Exception) -> str:
-    """Return the first line of the text of an exception, without a final full stop."""
+    """Return the first line of an exception's message without the final full stop."""
     return str(error).strip().partition("\n")[0].rstrip(".")
 
 
 @contextmanager
 def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
-    """Write a Parquet file with the default compression. Each call of the yielded function writes one row group."""
+    """Open a Parquet file for writing. Each call of the yielded function writes one row group."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
@@ -249,7 +245,7 @@ def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.Appe
 
 @contextmanager
 def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[table.AppendColumns]:
-    """Write an Arrow file (Feather version 2), or an Arrow stream if ``stream`` is True."""
+    """Open an Arrow file (Feather version 2) for writing. If ``stream`` is True, the file is an Arrow stream."""
     pa = import_pyarrow(path)
     schema = _float_schema(pa, names)
     with (pa.ipc.new_stream if stream else pa.ipc.new_file)(str(path), schema) as file:
@@ -257,5 +253,4 @@ def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> I
 
 
 def _float_schema(pa: Any, names: Sequence[str]) -> Any:
-    """Return a schema of float64 columns."""
     return pa.schema([(name, pa.float64()) for name in names])

@@ -1,4 +1,4 @@
-"""Readers and writers of the recording formats by file suffix."""
+"""Table of the recording formats: the reader and the writer for each file suffix."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """Functions of one recording format."""
+    """Functions that read and write one recording format."""
 
     read: Callable[[Path], Table]
     open_writer: OpenWriter
     count_rows: Callable[[Path], int]
-    """Function that returns the number of rows without reading the samples. The exceptions are those of ``read``."""
+    """Function that returns the number of rows without reading the samples."""
 
 
 FORMATS: Final[Mapping[str, Format]] = {
@@ -38,7 +38,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 
 
 def find_format(path: Path) -> Format:
-    """Return the recording format for the suffix of a path. Raise ConfigError if the suffix is unknown."""
+    """Return the recording format for a file suffix. Raise ConfigError if the suffix is unknown."""
     suffix = _suffix(path)
     if not suffix:
         raise ConfigError(
@@ -49,11 +49,10 @@ def find_format(path: Path) -> Format:
 
 
 def is_recording(path: Path) -> bool:
-    """Return True if the suffix of a path is the suffix of a recording format. The file is not opened."""
+    """Return True if the file name has the suffix of a recording format."""
     return _suffix(path) in FORMATS
 
 
 def _suffix(path: Path) -> str:
-    """Return the suffix of a path if FORMATS contains the suffix, otherwise ""."""
     name = path.name.lower()
     return next((suffix for suffix in FORMATS if name.endswith(suffix)), "")

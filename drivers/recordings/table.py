@@ -1,4 +1,4 @@
-"""Types and functions that all recording formats share: tables, writers and the selection of columns."""
+"""Types and functions that all recording formats share."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +42,7 @@ OpenWriter = Callable[[Path, Sequence[str]], AbstractContextManager[AppendColumn
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Columns of a file, the stated sample rate, and notes about irregularities."""
+    """Columns and stated sample rate of a recording file, with notes about irregularities."""
 
     columns: dict[str, Floats]  # float64 arrays [n]; the keys are names in COLUMNS; NaN = missing
     fs: float | None  # sample rate in Hz; None if the file states no rate
@@ -50,7 +50,7 @@ class Table:
 
 
 def check_column_count(path: Path, columns: int) -> None:
-    """Raise RecordingError if the number of columns of a file exceeds the limit."""
+    """Raise RecordingError if a file has too many columns."""
     if columns > memory_check.MAX_COLUMNS:
         raise RecordingError(
             f"{path}: has {columns} columns, expected at most {memory_check.MAX_COLUMNS}; keep only {' '.join(COLUMNS)}"
@@ -58,7 +58,7 @@ def check_column_count(path: Path, columns: int) -> None:
 
 
 def select_known_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
-    """Select the known columns of a file.
+    """Select the known columns of a recording file.
 
     Parameters
     ----------
@@ -74,12 +74,12 @@ def select_known_columns(path: Path, names: Sequence[str], notes: list[str], whe
     Returns
     -------
     dict
-        Name in the file of each known column.
+        Mapping from the known column names to the names in the file.
 
     Raises
     ------
     RecordingError
-        If there is no axis among the columns, a known column occurs twice, or there are too many columns.
+        If no column is an axis, a known column occurs twice, or the file has too many columns.
     """
     check_column_count(path, len(names))
     known = {*COLUMNS, *ALIASES}
@@ -119,9 +119,9 @@ CONTENTS: Final = (
 
 
 def describe_suffix_mismatch(path: Path) -> str:
-    """Return a text to append to an error message if the content of a file does not match the suffix.
+    """Describe a mismatch between the content and the suffix of a file, for an error message.
 
-    The text states the type of the content and the remedy. The text is empty if the type is unknown.
+    The text names the detected type of content and the remedy. The text is empty if the type is unknown.
     """
     try:
         with open_regular(path) as file:
@@ -141,7 +141,8 @@ def describe_suffix_mismatch(path: Path) -> str:
 
 
 def format_name_list(names: Sequence[str], max_names: int = 12) -> str:
-    """Return a list of names for a message. The list and the names are shortened, without control characters.
+    """Format a list of names for a message. Long lists and long names are shortened, and control characters are
+    escaped.
 
     Parameters
     ----------

@@ -1,8 +1,7 @@
-"""Writing of recordings. A file appears only when it is complete.
+"""Writing of recordings to files of any supported format.
 
-A file is written under a temporary name and renamed when it is complete. If writing fails or is interrupted (Ctrl-C),
-the temporary file is removed, and an existing recording stays unchanged. The memory use does not depend on the number
-of rows.
+Each recording is written to a temporary file, which is renamed on completion. If writing fails or is interrupted, an
+existing recording remains unchanged.
 """
 
 import os
@@ -38,12 +37,12 @@ class AppendSamples(Protocol):
 
 @contextmanager
 def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[AppendSamples]:
-    """Write a recording in blocks of rows. The suffix of the path determines the format.
+    """Open a recording for writing. The suffix of the path determines the file format.
 
     Parameters
     ----------
     path
-        File to write. The file appears when the context ends without an exception.
+        File to write. The file appears when the context ends without exception.
     axes
         Columns to write, some of AXES.
     temperature
@@ -81,7 +80,7 @@ def save_samples(
     temperature_c: Floats | None = None,
     axes: Sequence[str] | None = None,
 ) -> None:
-    """Write a recording without loss of precision. The suffix of the path determines the format.
+    """Save samples as a recording without loss of precision. The suffix of the path determines the file format.
 
     Parameters
     ----------
@@ -94,7 +93,7 @@ def save_samples(
     temperature_c
         [n] float64 in °C. None if no temperature was measured.
     axes
-        Axes to write. If None, all axes that have at least one value are written.
+        Axes to write. By default, all axes with at least one value are written.
 
     Raises
     ------
@@ -113,7 +112,8 @@ def save_samples(
 
 @contextmanager
 def atomic_write_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path. At the end, rename the temporary file to ``path``, or remove it after an exception.
+    """Yield a temporary path, and rename the temporary file to ``path`` at the end of the context. After an exception,
+    the temporary file is removed.
 
     Raises
     ------
