@@ -1,6 +1,6 @@
 """Configuration of the ``demo`` command.
 
-The configuration is the shipped one. Options select another sensor and add effects.
+Options of the command can replace the sensor and add noise effects.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,27 +20,27 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 DEMO_CONFIG: Final = CONFIG_FOLDER / "demo.toml"
-"""Shipped configuration of the demo."""
+"""Path of the shipped configuration."""
 
 
 def build_demo_config(
     sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: float | None = None
 ) -> Config:
-    """Return the configuration of ``demo``.
+    """Build the configuration of the ``demo`` command.
 
     Parameters
     ----------
     sensor : str, optional
-        Model of the catalogue, or path of a model file. The default is the model of the shipped configuration.
+        Name of a shipped noise model, or path of a model file. By default, the shipped configuration is not changed.
     effects : sequence of str, optional
-        Effects in the syntax of ``parse_effects``.
+        Noise effects in the syntax of ``parse_effects``.
     effect_at_s : float, optional
-        Time at which the effects begin, in seconds since the start.
+        Start time of the effects in seconds after the start of the sensor.
 
     Raises
     ------
     ConfigError
-        If an option has an invalid value. The message begins with the name of the option.
+        If an option is invalid. The message begins with the name of the option.
     """
     config = loading.load_config(DEMO_CONFIG)
     (device,) = config.devices
@@ -66,7 +66,7 @@ def build_demo_config(
 
 
 def _for_option(option: str, function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
-    """Call a function, and prefix a ConfigError with the name of the option."""
+    """Call a function, and prepend the name of the option to the message of a ConfigError."""
     try:
         return function(*arguments, **named)
     except ConfigError as error:
