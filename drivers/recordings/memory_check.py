@@ -86,8 +86,7 @@ def measure_read_limit(path: Path) -> ReadLimit:
 def available_bytes() -> int | None:
     """Return the memory available to this process in bytes, or None if unknown.
 
-    The available memory is the smallest of three values: free system memory, control group limits (containers and
-    services), and resource limits of the process (``ulimit``).
+    The result is the smallest of the free system memory, the control group limit and the resource limit (``ulimit``).
     """
     stated = (available_system_bytes(), available_cgroup_bytes(), available_rlimit_bytes())
     known = [n for n in stated if n is not None]

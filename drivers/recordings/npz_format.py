@@ -375,8 +375,8 @@ def _read_up_to_cut(
 def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
     """Open a compressed .npz file for writing.
 
-    Zip members must be written one after the other, so each column is first written to an unnamed temporary file in the
-    folder of ``path``.
+    Each column is first written to a temporary file in the folder of ``path``, because zip members cannot be written in
+    parallel.
     """
     with ExitStack() as stack:
         collected = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}

@@ -192,8 +192,7 @@ def format_segment_name(number: int, unix_s: float) -> str:
 
 
 def parse_segment_start_s(path: Path) -> float:
-    """Return the start time of a segment according to the file name, as Unix time in s, or 0 if the name contains no
-    time.
+    """Return the Unix time in s in the file name of a segment, or 0 if the name contains no time.
 
     >>> parse_segment_start_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
     1700000000.0

@@ -96,9 +96,9 @@ class ArrivalRegression:
     def measure_rate(self, final: bool = False) -> tuple[float, float] | None:
         """Return the measured sample rate and the uncertainty of the rate.
 
-        By the Cauchy-Schwarz inequality, delays with standard deviation s change the slope by a relative error of at
-        most s/S, where S is the standard deviation of the times. For the residuals of the regression, s/S equals √(1/r²
-        − 1), where r is the correlation of time and index.
+        Delays with standard deviation s cause a relative error of the slope of at most s/S, where S is the standard
+        deviation of the times (Cauchy-Schwarz inequality). For the residuals of the regression, s/S equals √(1/r² − 1),
+        where r is the correlation of time and index.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
 """Lower bound of the time at which the newest sample of a device was taken.
 
 The arrival time is only an upper bound of the sample time, because samples may wait in buffers. The lower bound is a
-clock that advances by one sample period per sample, plus the minimum delay of the arrivals relative to the clock (Moon,
-Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements", 1999).
+clock that advances by one sample period per sample, plus the minimum delay of the arrivals. Source: Moon, Skelly and
+Towsley, "Estimation and removal of clock skew from network delay measurements", 1999.
 
 The minimum delay is computed over two consecutive windows of WINDOW_S, which limits the effect of an incorrect sample
 period. The bound is valid if at least one sample in the two windows was read without delay.

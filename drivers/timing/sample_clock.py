@@ -1,11 +1,11 @@
 """Sample clock, which assigns a time to each sample and detects missing and repeated samples.
 
-The source of the sample times depends on the wire format (``drivers.data_types.Timing``):
+The source of the sample times depends on the wire format (``drivers.data_types.Timing``). There are three sources.
 
-- With a device counter, counter values give the number of missing samples (``counter_gaps``), and arrival times give
-  the sample times.
-- Without a counter, arrival times give the sample times and the number of missing samples (``arrival_timeline``).
-- Sample times from the sender are used unchanged (``sender_times``).
+- Device counter: counter values give the number of missing samples, arrival times give the sample times
+  (``counter_gaps``).
+- Arrival times only: arrival times give the sample times and the number of missing samples (``arrival_timeline``).
+- Sender times: the times from the sender are used unchanged (``sender_times``).
 
 
 Repeated rows are removed (``duplicate_rows``). Measured values are never changed.

@@ -114,7 +114,7 @@ def _coefficients(z: float) -> tuple[float, ...]:
     """Return the coefficients y_k(z) of the Cornish-Fisher expansion of a gamma quantile.
 
     With shape a, normal quantile z and ε = 1/√a, the expansion is x = a (1 + ε Σ y_k ε^k). The differential equation x'
-    = φ(z)/f(x), with the normal density φ and the gamma density f, gives y_0 = z and y_k'' − z y_k' − y_k = r_k. The
+    = φ(z)/f(x) of the normal density φ and the gamma density f gives y_0 = z and y_k'' − z y_k' − y_k = r_k. The
     coefficient y_k is the only polynomial solution of the equation of order k. The first five coefficients agree with
     Goldberg & Levine (Annals of Mathematical Statistics 17, 1946).
     """
@@ -147,8 +147,7 @@ def _start(a: Floats, z: float, probability: float) -> Floats:
 def _refined(a: Floats, x: Floats, probability: float) -> Floats:
     """Solve P(a, x) = probability for x by Halley's iteration in ln x.
 
-    As a function of ln x, P has the first derivative x f(x) with the gamma density f, and the second derivative (a − x)
-    x f(x).
+    With the gamma density f, the derivatives of P with respect to ln x are x f(x) and (a − x) x f(x).
     """
     logs = np.array([lgamma(one) for one in a.tolist()])
     open_ = np.flatnonzero(x > 0.0)  # x is zero if the quantile underflows

@@ -1,7 +1,7 @@
 """Customary units of inertial navigation, and formatting of quantities, durations and numbers as text.
 
-The program computes in SI units. Terminal output and figures use customary units, with conversion factors from 1 rad =
-180/π °, 1 h = 3600 s and 1 g = 9.80665 m/s² (standard gravity, CGPM 1901).
+The program computes in SI units. Terminal output and figures use customary units. The conversion factors follow from 1
+rad = 180/π ° and standard gravity, 1 g = 9.80665 m/s² (CGPM 1901).
 """
 
 import math
