@@ -91,7 +91,7 @@ def first_cells(text: str) -> list[str]:
 def test_every_configuration_is_one(toml: str, tmp_path: Path) -> None:
     (tmp_path / "recording.csv").write_text("t,gz\n0.00,0.1\n0.01,0.2\n")
     (tmp_path / "page.toml").write_text(toml)
-    assert loading.examine(tmp_path / "page.toml").wrong == []
+    assert loading.examine_config_file(tmp_path / "page.toml").wrong == []
 
 
 @pytest.mark.parametrize("toml", [t for page in PAGES for t in fences(page, "toml") if "angle_random_walk]" in t])

@@ -1,16 +1,13 @@
-"""Reading and writing of recordings: CSV (plain or gzip), .npz, Parquet, Arrow IPC, or a folder of segments.
+"""Reading and writing of recordings in CSV, .npz, Parquet and Arrow files, or in a folder of segments.
 
-``load_samples`` reads a file or a folder and returns a ``Recording`` with times, six axes, temperature, a stated rate,
-and notes. Each note describes an irregularity of the file and how the irregularity was handled. The module of each
-format finds the columns (``Table``), and ``_assemble`` converts the columns to a recording.
+``load_samples`` reads a file or a folder and returns a ``Recording``. The recording includes notes about irregularities
+of the file, such as missing values.
 
-A ``Recording`` has at least one sample. If the file is not a recording, a ``RecordingError`` names the file, the error
-and the expected content in one line. If a setting (``--rate``) or a package (pyarrow) is missing, a ``ConfigError`` is
-raised. The complete part of a truncated file is read. An incomplete line, an unreadable field, and a value that is
-infinite or beyond 1e100 are read as missing values. A note states the number of missing values.
+The reader returns the complete part of a truncated file. Unreadable fields, infinite values and values beyond 1e100
+become missing values.
 
-Times are returned as stored, including jitter, gaps and steps back. The module does not resample, sort or interpolate
-data, does not guess units, and never unpickles objects.
+Sample times keep their jitter, gaps and backward steps. The reader never resamples, sorts or interpolates samples, and
+never unpickles Python objects.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -49,7 +46,7 @@ TIME_RESOLUTION_S: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """All samples of a file or folder in stored order. The arrays are read-only."""
+    """Samples of a file or folder in stored order. The arrays are read-only."""
 
     t_s: Floats | None  # [n] s as stored, with any origin; None if only a rate is known
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²; NaN = missing or absent
@@ -63,23 +60,23 @@ class Recording:
 
 
 def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None = None) -> Recording:
-    """Read a recording from a file, or from the segments in a folder in the order of their names.
+    """Read a recording from a file, or from all segments in a folder.
 
     Parameters
     ----------
     path
         File or folder.
     rate_hz
-        Sample rate in Hz for a file without ``t``. The argument takes precedence over ``fs`` in the file.
+        Sample rate in Hz for a file without ``t``. This rate takes precedence over the rate ``fs`` in the file.
     last_s
         Duration in s of the part to read at the end of the recording. None for the whole recording.
 
     Raises
     ------
     RecordingError
-        If the path contains no recording.
+        If the file or folder contains no recording.
     ConfigError
-        If a rate or a library is missing, the suffix is unknown, or the samples do not fit into the memory.
+        If the sample rate or a library is missing, the file suffix is unknown, or the samples do not fit into memory.
     """
     for option, quantity, value in (("--rate", RATE_HZ, rate_hz), ("--last", DURATION_S, last_s)):
         try:
@@ -99,7 +96,7 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
 
 
 def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]:
-    """Yield a recording in blocks of at most ``rows`` samples.
+    """Yield the samples of a recording in blocks.
 
     Parameters
     ----------
@@ -111,8 +108,7 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
     Yields
     ------
     SampleBlock
-        Samples with the times of the recording. If the recording has no times, the first sample is at 0 and the other
-        samples follow at the stated rate.
+        Consecutive samples. In a recording without times, the sample times start at 0 and follow from the sample rate.
     """
     for start in range(0, len(recording), rows):
         part = slice(start, min(start + rows, len(recording)))
@@ -120,7 +116,6 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
 
 
 def _error_text(path: Path, error: RecordingError | OSError) -> str:
-    """Return the reason why a file cannot be read, in one line that names the file."""
     if isinstance(error, RecordingError):
         return str(error)
     return f"{error.filename or path}: cannot be read: {describe_error(error)}"
@@ -130,7 +125,6 @@ def _error_text(path: Path, error: RecordingError | OSError) -> str:
 
 
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
-    """Read one regular file."""
     check_regular_file(path)
     if path.stat().st_size:
         return _assemble(path, find_format(path).read(path), rate_hz)
@@ -145,7 +139,6 @@ def _load_file(path: Path, rate_hz: float | None) -> Recording:
 
 
 def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
-    """Convert columns to a recording."""
     n = _common_length(path, table.columns)
     notes = list(table.notes)
     rate = _choose_rate(_supported_fs(table.fs, notes), rate_hz, notes)
@@ -172,7 +165,6 @@ def _read_only_recording(
     axes: tuple[str, ...],
     notes: Sequence[str],
 ) -> Recording:
-    """Make the arrays read-only, convert each note to one line, and return the recording."""
     for array in (t_s, values, temperature_c):
         if array is not None:
             array.flags.writeable = False
@@ -180,7 +172,7 @@ def _read_only_recording(
 
 
 def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
-    """Return the length of all columns. Raise RecordingError if the lengths differ or are zero."""
+    """Return the common length of all columns. Raise RecordingError if columns are empty or differ in length."""
     first = next(iter(columns))
     n = columns[first].size
     for name, column in columns.items():
@@ -194,7 +186,7 @@ def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
 
 
 def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
-    """Return the rate in the file. If the rate is outside the supported range, return None and add a note."""
+    """Return the sample rate of the file. If the sample rate is unsupported, return None and append a note."""
     try:
         return fs if fs is None else RATE_HZ.check(fs)
     except ConfigError as error:
@@ -203,7 +195,6 @@ def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
 
 
 def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> float | None:
-    """Return the rate of the caller if there is one, otherwise the rate in the file."""
     if rate_hz is not None and fs is not None and rate_hz != fs:
         notes.append(f"The file states {fs:g} Hz; the requested {rate_hz:g} Hz are used.")
     return fs if rate_hz is None else float(rate_hz)
@@ -212,7 +203,7 @@ def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> f
 def _usable_times(
     path: Path, t: Floats | None, rate_hz: float | None, notes: list[str]
 ) -> tuple[Floats | None, NDArray[np.bool_] | slice]:
-    """Return the usable times and the mask of their rows, or None and all rows if most times are unusable."""
+    """Return the usable times and a mask of the usable rows. If most times are unusable, return None and all rows."""
     if t is None:
         return None, slice(None)
     usable = np.abs(t) < T_LIMIT_S  # False for NaN as well
@@ -229,7 +220,7 @@ def _usable_times(
 
 
 def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
-    """Replace values beyond MAX_VALUE by NaN in place, and add a note with the number of replaced values."""
+    """Replace values beyond MAX_VALUE by NaN in place, and append a note with the number of replaced values."""
     count = 0
     for array in (values, temperature_c):
         large = np.abs(array) > MAX_VALUE
@@ -240,7 +231,6 @@ def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None
 
 
 def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
-    """Return the times of a range of samples in ns."""
     if recording.t_s is not None:
         seconds = recording.t_s[part]
     elif recording.rate_hz is not None:
@@ -254,7 +244,7 @@ def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
 
 
 def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Recording:
-    """Read the segments in a folder. If a segment cannot be read, skip the segment and add a note."""
+    """Read all segments in a folder. Skip unreadable segments, and append a note for each skipped segment."""
     segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != ".")
     if not segments:
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
@@ -272,7 +262,7 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
             continue
         parts.append(part)
         rows, size_bytes = rows + len(part), size_bytes + segment.stat().st_size
-        memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
+        memory_check.ReadLimit(path, size_bytes, free).check_row_count(rows)
         notes += [f"{segment.name}: {note}" for note in reversed(part.notes)]
         if last_s is not None and _duration_s(parts) > last_s:
             break
@@ -282,7 +272,7 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
 
 
 def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> None:
-    """Raise an error if the total number of rows exceeds the limits. Unreadable segments are ignored."""
+    """Raise an error if the readable segments together contain too many rows."""
     rows = size_bytes = 0
     for segment in segments:
         try:
@@ -291,11 +281,11 @@ def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> Non
         except (RecordingError, OSError):
             continue  # the note about the segment is added when the segment is read
         size_bytes += segment.stat().st_size
-        memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
+        memory_check.ReadLimit(path, size_bytes, free).check_row_count(rows)
 
 
 def _duration_s(parts: Sequence[Recording]) -> float:
-    """Return the time from the first to the last sample of all parts in s. The parts begin with the newest."""
+    """Return the total duration of recordings in s. ``parts`` is sorted from newest to oldest."""
     newest, oldest = parts[0].t_s, parts[-1].t_s
     if newest is not None and oldest is not None:
         return float(newest[-1] - oldest[0])
@@ -303,7 +293,6 @@ def _duration_s(parts: Sequence[Recording]) -> float:
 
 
 def _take_last(found: Recording, last_s: float) -> Recording:
-    """Return the samples of the last ``last_s`` seconds."""
     if found.t_s is not None:
         older = np.flatnonzero(found.t_s <= found.t_s[-1] - last_s + TIME_RESOLUTION_S)
         # the newest sample is always included
@@ -317,7 +306,6 @@ def _take_last(found: Recording, last_s: float) -> Recording:
 
 
 def _concatenate(path: Path, parts: Sequence[Recording], notes: list[str]) -> Recording:
-    """Concatenate the recordings of all segments."""
     times = [part.t_s for part in parts if part.t_s is not None]
     rates = {part.rate_hz for part in parts}
     if 0 < len(times) < len(parts):

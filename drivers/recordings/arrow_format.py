@@ -1,8 +1,7 @@
-"""Reading and writing of Parquet and Arrow IPC. pyarrow is optional and is imported only for these formats.
+"""Reading and writing of Parquet and Arrow IPC files with pyarrow, which is an optional dependency.
 
-If an Arrow file is truncated, the complete batches are read. A truncated Parquet file cannot be read, since the index
-is at the end of the file. The stated number of rows is checked against the limits of
-``drivers.recordings.memory_check`` before data are read.
+The reader returns the complete batches of a truncated Arrow file. A truncated Parquet file cannot be read, because the
+index is at the end of the file.
 """
 
 import os
@@ -16,12 +15,12 @@ import numpy as np
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
-from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
+from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
 
 METADATA_KEY: Final = b"imu-monitor"
 """Key in the schema metadata of a segment that the daemon has recorded."""
 SEGMENT_COLUMNS: Final = ("ticks", "lost")
-"""Columns of a segment that are not measurements. A reader does not report these columns as unused."""
+"""Columns of a segment that are not measurements. The reader does not report these columns as unused."""
 SLACK_BYTES: Final = 1 << 20
 """Allowed size of a compressed buffer in addition to the size that its rows need."""
 MAX_DICTIONARY_BYTES: Final = 64_000_000
@@ -38,7 +37,7 @@ def import_pyarrow(path: Path) -> Any:
     Raises
     ------
     ConfigError
-        If pyarrow is not installed. The text names ``path`` as the file that cannot be read or written.
+        If pyarrow is not installed.
     """
     try:
         import pyarrow as pa
@@ -54,9 +53,9 @@ def read_parquet(path: Path) -> table.Table:
     Raises
     ------
     RecordingError
-        If the file is truncated, is not Parquet, or exceeds a limit.
+        If the file is truncated, is not a Parquet file, or exceeds a size limit.
     ConfigError
-        If pyarrow is not installed, or the samples do not fit into the memory.
+        If pyarrow is not installed, or the samples do not fit into memory.
     """
     notes: list[str] = []
     with _open_parquet(path) as file:
@@ -65,26 +64,25 @@ def read_parquet(path: Path) -> table.Table:
 
 
 def count_parquet_rows(path: Path) -> int:
-    """Return the number of rows according to the index."""
+    """Return the number of rows of a Parquet file according to the index of the file."""
     with _open_parquet(path) as file:
         return _check_parquet(path, file, [])[1]
 
 
 def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
-    """Check the limits, and return the columns to read and the number of rows."""
     metadata = file.metadata
     table.check_column_count(path, metadata.num_columns)
-    chosen = table.choose_columns(path, file.schema_arrow.names, notes)
+    chosen = table.select_known_columns(path, file.schema_arrow.names, notes)
     _check_types(path, file.schema_arrow, chosen)
     rows = int(metadata.num_rows)
     stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
-    memory_check.measure_read_limit(path).check_rows(max(rows, stated))
+    memory_check.measure_read_limit(path).check_row_count(max(rows, stated))
     return chosen, rows
 
 
 @contextmanager
 def _open_parquet(path: Path) -> Iterator[Any]:
-    """Open a Parquet file. In the context, an error of pyarrow is converted to RecordingError."""
+    """Open a Parquet file, and convert errors of pyarrow to RecordingError."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
@@ -103,22 +101,22 @@ def _open_parquet(path: Path) -> Iterator[Any]:
                 yield opened
         except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             raise RecordingError(
-                f"{path}: is no complete Parquet file ({first_line(error)}); its index is at the end, "
-                f"so a file that is cut off cannot be read{table.describe_content(path)}"
+                f"{path}: is no complete Parquet file ({first_message_line(error)}); its index is at the end, "
+                f"so a file that is cut off cannot be read{table.describe_suffix_mismatch(path)}"
             ) from error
 
 
 def read_ipc(path: Path) -> table.Table:
-    """Read the known columns of an Arrow file or stream. If the file is truncated, read the complete batches.
+    """Read the known columns of an Arrow file or stream. If the file is truncated, only the complete batches are read.
 
-    An Arrow file is an Arrow stream between two magic words, so a file is read like a stream.
+    An Arrow file is read as a stream, because the file contains an Arrow stream between two magic strings.
 
     Raises
     ------
     RecordingError
-        If the file is not Arrow IPC, or exceeds a limit.
+        If the file is not an Arrow IPC file, or exceeds a size limit.
     ConfigError
-        If pyarrow is not installed, or the samples do not fit into the memory.
+        If pyarrow is not installed, or the samples do not fit into memory.
     """
     pa = import_pyarrow(path)
     notes: list[str] = []
@@ -126,7 +124,7 @@ def read_ipc(path: Path) -> table.Table:
     with open_regular_file(path) as file:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
-        chosen = table.choose_columns(
+        chosen = table.select_known_columns(
             path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes
         )
         count, _ = _check_ipc(path, start, schema, chosen)
@@ -144,25 +142,25 @@ def read_ipc(path: Path) -> table.Table:
         except StopIteration:
             pass  # the stream has ended
         except (pa.ArrowException, OSError) as error:
-            notes.append(f"Only {len(batches)} complete batches could be read: {first_line(error)}.")
+            notes.append(f"Only {len(batches)} complete batches could be read: {first_message_line(error)}.")
     schema = batches[0].schema if batches else schema
     return _float_table(path, pa.Table.from_batches(batches, schema), chosen, notes)
 
 
 def count_ipc_rows(path: Path) -> int:
-    """Return the total number of rows of all complete batches."""
+    """Return the number of rows in the complete batches of an Arrow file or stream."""
     with open_regular_file(path) as file:
         return _check_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
 def _ipc_start(path: Path) -> int:
-    """Return the offset of the stream in bytes: the length of the magic word for a file, 0 for a stream."""
+    """Return the offset in bytes of the Arrow stream in a file."""
     with open_regular_file(path) as file:
         return len(ARROW_MAGIC) if file.read(len(ARROW_MAGIC)) == ARROW_MAGIC else 0
 
 
 def _has_end_mark(path: Path, is_file: bool) -> bool:
-    """Return True if the file or stream ends with its end mark, so that it is not truncated."""
+    """Return True if an Arrow file or stream is complete, that is, ends with an end mark."""
     mark = ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END
     with open_regular_file(path) as file:
         file.seek(max(path.stat().st_size - len(mark), 0))
@@ -170,7 +168,7 @@ def _has_end_mark(path: Path, is_file: bool) -> bool:
 
 
 def _ipc_schema(path: Path, file: Any) -> Any:
-    """Return the schema of an open file. Raise RecordingError if the file is not Arrow IPC."""
+    """Return the Arrow schema of an open file. Raise RecordingError if the file is not an Arrow IPC file."""
     pa = import_pyarrow(path)
     try:
         file.seek(_ipc_start(path))
@@ -179,19 +177,19 @@ def _ipc_schema(path: Path, file: Any) -> Any:
         schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
-            f"{path}: is no Arrow IPC file or stream ({first_line(error)}){table.describe_content(path)}"
+            f"{path}: is no Arrow IPC file or stream ({first_message_line(error)})"
+            f"{table.describe_suffix_mismatch(path)}"
         ) from error
     return schema
 
 
 def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> tuple[int, int]:
-    """Check the limits and the column types, and return the numbers of record batches and rows."""
     pa = import_pyarrow(path)
     _check_types(path, schema, chosen)
     counts = [
         count if count is None or field.name in chosen.values() else -count
         for field in schema
-        for count in (count_buffers(pa, field.type),)
+        for count in (count_column_buffers(pa, field.type),)
     ]
     limit = memory_check.measure_read_limit(path)
     batches = rows = dictionaries = 0
@@ -206,14 +204,13 @@ def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -
                     )
                 continue
             batches, rows = batches + 1, rows + size.rows
-            limit.check_rows(rows)
-            if wrong := check_buffer_sizes(size, counts, SLACK_BYTES):
+            limit.check_row_count(rows)
+            if wrong := check_batch_buffer_sizes(size, counts, SLACK_BYTES):
                 raise RecordingError(f"{path}: batch {batches} is damaged: {wrong}")
     return batches, rows
 
 
 def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
-    """Raise RecordingError if a column is not numeric."""
     pa = import_pyarrow(path)
     numeric = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null)
     for key in chosen.values():
@@ -224,20 +221,20 @@ def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
 
 
 def _float_table(path: Path, data: Any, chosen: Mapping[str, str], notes: list[str]) -> table.Table:
-    """Return the chosen columns of a pyarrow table as float64. Null values become NaN."""
+    """Return the chosen columns of a pyarrow table as float64 arrays. Null values become NaN."""
     float64 = import_pyarrow(path).float64()
     columns = {name: data.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
     return table.Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
 
 
-def first_line(error: Exception) -> str:
-    """Return the first line of the text of an exception, without a final full stop."""
+def first_message_line(error: Exception) -> str:
+    """Return the first line of an exception's message without the final full stop."""
     return str(error).strip().partition("\n")[0].rstrip(".")
 
 
 @contextmanager
 def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
-    """Write a Parquet file with the default compression. Each call of the yielded function writes one row group."""
+    """Open a Parquet file for writing. Each call of the yielded function writes one row group."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
@@ -248,7 +245,7 @@ def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.Appe
 
 @contextmanager
 def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[table.AppendColumns]:
-    """Write an Arrow file (Feather version 2), or an Arrow stream if ``stream`` is True."""
+    """Open an Arrow file (Feather version 2) for writing. If ``stream`` is True, the file is an Arrow stream."""
     pa = import_pyarrow(path)
     schema = _float_schema(pa, names)
     with (pa.ipc.new_stream if stream else pa.ipc.new_file)(str(path), schema) as file:
@@ -256,5 +253,4 @@ def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> I
 
 
 def _float_schema(pa: Any, names: Sequence[str]) -> Any:
-    """Return a schema of float64 columns."""
     return pa.schema([(name, pa.float64()) for name in names])

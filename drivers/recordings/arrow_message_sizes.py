@@ -1,12 +1,10 @@
-"""Stated sizes of the messages in an Arrow IPC stream, read before data are unpacked.
+"""Sizes that the message headers of an Arrow IPC stream state, read before any data are unpacked.
 
-A record batch states the number of rows, and a compressed buffer states the unpacked size. pyarrow allocates the stated
-sizes and does not support a limit. ``iter_batch_sizes`` therefore reads the sizes from the metadata of each message and
-from the first eight bytes of each compressed buffer.
+pyarrow allocates the sizes that a file states and offers no limit, so a damaged file could exhaust the memory.
+``iter_batch_sizes`` therefore reads the stated sizes without unpacking data.
 
-Sources: the Arrow columnar format, "Encapsulated message format" and "Compression",
-https://arrow.apache.org/docs/format; format/Message.fbs and Schema.fbs for the field numbers; the FlatBuffers internals
-for tables and vectors.
+Sources: Arrow columnar format, https://arrow.apache.org/docs/format ("Encapsulated message format", "Compression",
+Message.fbs), and FlatBuffers internals.
 """
 
 import os
@@ -33,7 +31,7 @@ BUFFER: Final = struct.Struct("<qq")  # offset in the body, length
 
 @dataclass(frozen=True, slots=True)
 class StatedBatchSize:
-    """Stated size of one record batch or dictionary batch."""
+    """Size of one record batch or dictionary batch according to the message header."""
 
     rows: int
     body_bytes: int  # size in the file
@@ -42,7 +40,7 @@ class StatedBatchSize:
 
 
 def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSize]:
-    """Yield the stated size of each batch in a stream. Stop if the stream is truncated or the metadata are damaged.
+    """Yield the stated size of each batch in an Arrow stream. Stop at a truncated or damaged message.
 
     Parameters
     ----------
@@ -65,14 +63,14 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSiz
         metadata = file.read(size)
         body = at + size
         try:
-            message = _Table.root(metadata)
+            message = _FlatbufferTable.parse_root(metadata)
             kind = message.read_number(MESSAGE_HEADER_TYPE, "B")
             body_bytes = message.read_number(MESSAGE_BODY_LENGTH, "q")
             if body_bytes < 0:
                 return
             if kind in (RECORD_BATCH, DICTIONARY_BATCH):
-                batch = message.read_table(MESSAGE_HEADER)
-                batch = batch.read_table(DICTIONARY_DATA) if kind == DICTIONARY_BATCH else batch
+                batch = message.read_subtable(MESSAGE_HEADER)
+                batch = batch.read_subtable(DICTIONARY_DATA) if kind == DICTIONARY_BATCH else batch
                 yield _read_batch_size(file, batch, body, body_bytes, kind == DICTIONARY_BATCH)
             elif kind != SCHEMA:
                 return
@@ -81,28 +79,27 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSiz
         at = body + body_bytes
 
 
-def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
-    """Check that the unpacked buffers of numeric columns are not larger than the number of rows requires.
+def check_batch_buffer_sizes(size: StatedBatchSize, buffer_counts: Sequence[int | None], slack_bytes: int) -> str:
+    """Check that no numeric column unpacks to more bytes than the rows of the batch require.
 
     Parameters
     ----------
     size
         Stated size of the batch.
-    counts
-        Number of buffers of each column in the order of the schema. The number is negative if the column is not read,
-        and None if the number of buffers is unknown. If a number is unknown, all buffers from this column on are
-        checked.
+    buffer_counts
+        Number of buffers of each column in schema order. Negative for columns that are not read. None if unknown, in
+        which case the buffers of all following columns are checked as well.
     slack_bytes
         Allowed size in addition to eight bytes per row.
 
     Returns
     -------
     str
-        Description of the error; "" if there is no error.
+        Description of the problem, or an empty string if all buffers are small enough.
     """
     most = 8 * size.rows + slack_bytes
     at = 0
-    for count in counts:
+    for count in buffer_counts:
         n = len(size.buffers) - at if count is None else abs(count)
         used = count is None or count > 0
         large = max(size.buffers[at : at + n], default=0) if used else 0
@@ -114,8 +111,8 @@ def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slac
     return ""
 
 
-def count_buffers(pa: Any, type_: Any) -> int | None:
-    """Return the number of buffers of a column.
+def count_column_buffers(pa: Any, type_: Any) -> int | None:
+    """Return the number of Arrow buffers of a column.
 
     Parameters
     ----------
@@ -127,7 +124,7 @@ def count_buffers(pa: Any, type_: Any) -> int | None:
     Returns
     -------
     int or None
-        None if the number varies, because the type is nested or has views.
+        Number of buffers, or None for nested types and view types, which have a variable number of buffers.
     """
     types = pa.types
     if types.is_null(type_):
@@ -140,12 +137,14 @@ def count_buffers(pa: Any, type_: Any) -> int | None:
     return 3 if any(is_type(type_) for is_type in variable) else 2
 
 
-def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> StatedBatchSize:
-    """Return the stated size of the batch whose body begins at the offset ``body`` in the file."""
+def _read_batch_size(
+    file: IO[bytes], batch: "_FlatbufferTable", body: int, body_bytes: int, dictionary: bool
+) -> StatedBatchSize:
+    """Return the stated size of a batch. ``body`` is the offset of the message body in the file."""
     rows = batch.read_number(BATCH_LENGTH, "q")
     packed = batch.has_field(BATCH_COMPRESSION)
     sizes = []
-    for offset, length in batch.read_structs(BATCH_BUFFERS, BUFFER):
+    for offset, length in batch.read_struct_vector(BATCH_BUFFERS, BUFFER):
         unpacked = length
         if packed and length >= 8 and 0 <= offset <= body_bytes - 8:
             file.seek(body + offset)
@@ -156,35 +155,33 @@ def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: in
 
 
 @dataclass(frozen=True, slots=True)
-class _Table:
-    """Table of a flatbuffer. The methods raise struct.error or LookupError if an offset is outside the buffer."""
+class _FlatbufferTable:
+    """FlatBuffers table. The methods raise struct.error or LookupError if an offset points outside the buffer."""
 
     data: bytes
     at: int
 
     @classmethod
-    def root(cls, data: bytes) -> "_Table":
-        """Return the root table of a flatbuffer."""
+    def parse_root(cls, data: bytes) -> "_FlatbufferTable":
         return cls(data, struct.unpack_from("<I", data)[0])
 
     def has_field(self, field: int) -> bool:
-        """Return True if the table contains a field."""
         return self._field(field) != 0
 
     def read_number(self, field: int, number_format: str) -> int:
-        """Return a number; 0 if the field is absent. ``number_format`` is a format character of ``struct``."""
+        """Return a number of the ``struct`` format ``number_format``, or 0 if the field is absent."""
         at = self._field(field)
         return int(_unpack_number(f"<{number_format}", self.data, at)) if at else 0
 
-    def read_table(self, field: int) -> "_Table":
-        """Return the table to which a field refers."""
+    def read_subtable(self, field: int) -> "_FlatbufferTable":
+        """Return the nested table in a field."""
         at = self._field(field)
         if not at:
             raise LookupError(field)
-        return _Table(self.data, at + _unpack_number("<I", self.data, at))
+        return _FlatbufferTable(self.data, at + _unpack_number("<I", self.data, at))
 
-    def read_structs(self, field: int, layout: struct.Struct) -> Iterator[tuple[Any, ...]]:
-        """Yield the structs in a vector; nothing if the field is absent."""
+    def read_struct_vector(self, field: int, layout: struct.Struct) -> Iterator[tuple[Any, ...]]:
+        """Iterate over the structs in a vector field. An absent field counts as an empty vector."""
         at = self._field(field)
         if not at:
             return iter(())
@@ -195,7 +192,7 @@ class _Table:
         return layout.iter_unpack(self.data[at + 4 : at + 4 + count * layout.size])
 
     def _field(self, field: int) -> int:
-        """Return the offset of a field; 0 if the field is absent."""
+        """Return the offset of a field in the buffer, or 0 if the field is absent."""
         entries = self.at - _unpack_number("<i", self.data, self.at)
         entry = 4 + 2 * field
         if entries < 0 or entry >= _unpack_number("<H", self.data, entries):
@@ -205,7 +202,6 @@ class _Table:
 
 
 def _unpack_number(number_format: str, data: bytes, at: int) -> int:
-    """Unpack one number at an offset."""
     if at < 0:
         raise LookupError(at)
     return int(struct.unpack_from(number_format, data, at)[0])

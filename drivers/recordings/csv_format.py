@@ -1,14 +1,11 @@
-"""Reading and writing of CSV recordings, plain or gzip. An empty field or ``nan`` is a missing value.
+"""Reading and writing of plain and gzip-compressed CSV recordings.
 
-Blank lines and comment lines (``#`` or ``%``) before the header are skipped. The header itself may be a comment line.
+An empty field or ``nan`` is a missing value. Blank lines and comment lines before the header line are skipped.
 
-The text is parsed in pieces of complete lines. If all lines of a piece are regular, NumPy parses the whole piece.
-Otherwise each line is parsed separately, so that a damaged line does not affect other lines and is reported with the
-line number. A last line without a line end is skipped, since it may end inside a number. A file with more bad lines
-than good lines is not a recording.
+NumPy parses regular text quickly in large pieces. A piece with a damaged line is parsed line by line, so that only the
+damaged line is lost. A last line without a line end is skipped, because the last number may be incomplete.
 
-The lines are counted before they are parsed, and their number is checked against the limits of
-``drivers.recordings.memory_check``. Reading ends at a line that is longer than ``MAX_LINE_BYTES``.
+Lines are counted before parsing, so that ``drivers.recordings.memory_check`` can reject a file that is too large.
 """
 
 import csv
@@ -48,26 +45,25 @@ GZIP_LEVEL: Final = 1
 
 @dataclass(slots=True)
 class _BadLines:
-    """Number of lines that are not samples, and a description of the first such line."""
+    """Number of invalid lines, and a description of the first invalid line."""
 
     count: int = 0
     first: str = ""
 
-    def count_line(self, number: int, reason: str) -> None:
-        """Count a bad line, and store the description of the first bad line."""
-        self.first = self.first or f"line {number}: {reason}"
+    def record_bad_line(self, line_number: int, reason: str) -> None:
+        self.first = self.first or f"line {line_number}: {reason}"
         self.count += 1
 
 
 def read_csv(path: Path) -> table.Table:
-    """Read the known columns of a plain or gzip CSV file. If the file is truncated, read the complete lines.
+    """Read the known columns of a plain or gzip-compressed CSV file. A truncated last line is skipped.
 
     Raises
     ------
     RecordingError
-        If the file has no header or no samples, or most of its lines are not samples.
+        If the file has no header or no samples, or if most lines are invalid.
     ConfigError
-        If the samples do not fit into the memory.
+        If the samples do not fit into memory.
     """
     notes: list[str] = []
     bad = _BadLines()
@@ -79,7 +75,7 @@ def read_csv(path: Path) -> table.Table:
             what = notes[-1] if notes else "It has no line at all."
             raise RecordingError(f"{path}: has not one complete line, expected {table.EXAMPLE_HEADER}. {what}")
         names = _column_names(path, head)
-        chosen = table.choose_columns(path, names, notes, f" in line {head.number}")
+        chosen = table.select_known_columns(path, names, notes, f" in line {head.number}")
         use = [names.index(name) for name in chosen.values()]
         parts = list(_parse_pieces(path, head, texts, names, use, bad))
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
@@ -94,31 +90,27 @@ def read_csv(path: Path) -> table.Table:
 
 
 def count_csv_rows(path: Path) -> int:
-    """Return the number of complete lines. Raise an error if the number of lines or the unpacked size is too large."""
+    """Return the number of complete lines in a CSV file. Raise an error if the file exceeds a size limit."""
     limit = memory_check.measure_read_limit(path)
     lines = unpacked = 0
     with open_regular_file(path) as file:
         for text in _whole_lines(_decompressed(file, []), []):
             lines += text.count(b"\n")
             unpacked += len(text)
-            limit.check_rows(lines)
+            limit.check_row_count(lines)
             if unpacked > limit.size_bytes:
-                limit.check_unpacked(unpacked)
+                limit.check_unpacked_size(unpacked)
     return lines
 
 
 def _too_many_bad_lines(path: Path, bad: _BadLines, rows: int) -> RecordingError:
-    """Return the error for a file in which most lines are bad."""
     return RecordingError(
         f"{path}: {bad.count} of {rows} lines are not samples ({bad.first}); every field must be a number, empty or nan"
     )
 
 
 def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
-    """Yield the text of a plain or gzip file in pieces of at most READ_BYTES. Stop if the file is truncated or damaged.
-
-    The first bytes of the file, not the file name, determine whether the file is compressed.
-    """
+    """Yield the decompressed text of a plain or gzip file in pieces. Stop where the file is truncated or damaged."""
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
     if not zipped:
@@ -151,7 +143,7 @@ def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
 
 
 def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
-    """Yield the text in pieces of complete lines. Stop at a line that is longer than MAX_LINE_BYTES."""
+    """Join and split pieces of text at line ends. Stop at a line that is longer than MAX_LINE_BYTES."""
     rest: list[bytes] = []  # parts of an incomplete line
     size = lines = 0
     for text in texts:
@@ -172,7 +164,7 @@ def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """Header line, and the lines that were read together with the header line."""
+    """Header line of a CSV file, and the text that was read together with the header line."""
 
     line: bytes
     number: int  # line number of the header
@@ -181,10 +173,10 @@ class _Header:
 
 
 def _find_header(path: Path, texts: Iterator[bytes]) -> _Header | None:
-    """Find the header line after blank lines and comments; None if the text has no complete line.
+    """Find the header line of a CSV file. Return None if the text contains no complete line.
 
-    The header is the first line that is not a comment. ``numpy.savetxt`` writes the header as a comment. The last
-    comment is therefore the header if the comment names an axis and the line after the comment does not.
+    The header is the first line that is not a comment. ``numpy.savetxt``, however, writes the header as a comment. If
+    the last comment names an axis and the next line does not, the comment is the header.
     """
     number = size = 0
     comment: _Header | None = None
@@ -211,17 +203,17 @@ def _find_header(path: Path, texts: Iterator[bytes]) -> _Header | None:
 
 
 def _has_axis(line: bytes) -> bool:
-    """Return True if a field of the line is the name of an axis. Ignore a comment mark before the first field."""
+    """Return True if a CSV line contains the name of an axis, with or without a comment mark before the first field."""
     fields = line.lstrip(b"#% ").decode("utf-8", errors="replace").split(",")
     return any(field.strip(' \t"') in AXES for field in fields)
 
 
 def _column_names(path: Path, head: _Header) -> list[str]:
-    """Return the column names in a header line. Raise RecordingError if the line is not a header."""
+    """Return the column names in a header line. Raise RecordingError if the line is not a header line."""
     if b"\0" in head.line or not head.line:
         raise RecordingError(
             f"{path}: is no CSV text, expected a first line such as {table.EXAMPLE_HEADER}"
-            f"{table.describe_content(path)}"
+            f"{table.describe_suffix_mismatch(path)}"
         )
     text = head.line.decode("utf-8", errors="replace")
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
@@ -242,7 +234,7 @@ def _column_names(path: Path, head: _Header) -> list[str]:
 def _parse_pieces(
     path: Path, head: _Header, texts: Iterable[bytes], names: Sequence[str], use: Sequence[int], bad: _BadLines
 ) -> Iterator[Floats]:
-    """Yield an array [lines, used columns] for each piece of text."""
+    """Yield a float array [lines, used columns] for each piece of CSV text."""
     number, rows = head.rest_number, 0
     for text in chain((head.rest,), texts):
         text = text.replace(b"\r\n", b"\n")
@@ -258,7 +250,7 @@ def _parse_pieces(
 
 
 def _parse_regular_lines(text: bytes, lines: list[str], width: int, use: Sequence[int]) -> Floats | None:
-    """Return an array [lines, used columns], or None if a line has missing fields or a field is not a number."""
+    """Return a float array [lines, used columns], or None if any line is irregular."""
     codes = np.frombuffer(text, np.uint8)
     commas_before = np.searchsorted(np.flatnonzero(codes == ord(",")), np.flatnonzero(codes == ord("\n")))
     if np.any(np.diff(commas_before, prepend=0) != width - 1):
@@ -272,7 +264,7 @@ def _parse_regular_lines(text: bytes, lines: list[str], width: int, use: Sequenc
 def _parse_line_by_line(
     lines: Sequence[str], number: int, names: Sequence[str], use: Sequence[int], bad: _BadLines
 ) -> Floats:
-    """Return an array [lines, used columns]. A bad line becomes a row of missing values."""
+    """Return a float array [lines, used columns]. Invalid lines become rows of NaN."""
     missing = [np.nan] * len(use)
     rows: list[list[float]] = []
     for offset, line in enumerate(lines):
@@ -281,13 +273,12 @@ def _parse_line_by_line(
         try:
             rows.append(_parse_sample(line, names, use))
         except ValueError as error:
-            bad.count_line(number + offset, str(error))
+            bad.record_bad_line(number + offset, str(error))
             rows.append(missing)
     return np.array(rows).reshape(len(rows), len(use))
 
 
 def _parse_sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[float]:
-    """Return the numbers in the used fields of one line. Raise ValueError with the reason if the line is bad."""
     fields = _split_fields(line)
     if len(fields) != len(names):
         raise ValueError(f"{len(fields)} fields where the header has {len(names)}")
@@ -301,7 +292,6 @@ def _parse_sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[f
 
 
 def _split_fields(line: str) -> list[str]:
-    """Split a line into fields."""
     if '"' not in line:
         return line.split(",")
     try:
@@ -311,7 +301,7 @@ def _split_fields(line: str) -> list[str]:
 
 
 def _parse_number(field: str) -> float | None:
-    """Return the number in a field, NaN for an empty field, or None for text. Unlike ``float``, reject 1_000."""
+    """Return the number in a CSV field, NaN for an empty field, or None for text. Unlike ``float``, reject 1_000."""
     if not field or field.isspace():
         return float("nan")
     try:
@@ -321,23 +311,23 @@ def _parse_number(field: str) -> float | None:
 
 
 @contextmanager
-def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> Iterator[table.AppendColumns]:
-    """Write a CSV file with one header line and one line per sample. A missing value is written as ``nan``.
+def open_csv_writer(path: Path, names: Sequence[str], use_gzip: bool = False) -> Iterator[table.AppendColumns]:
+    """Open a CSV file for writing, with one header line and one line per sample. Missing values are written as ``nan``.
 
-    If ``packed`` is True, the file is compressed with gzip. The gzip header has no time stamp, so that equal data give
-    equal files.
+    If ``use_gzip`` is True, the file is compressed with gzip. The gzip header contains no time stamp, so equal samples
+    give equal files.
     """
     with ExitStack() as stack:
         raw: IO[bytes] = stack.enter_context(path.open("wb"))
-        if packed:
+        if use_gzip:
             raw = cast("IO[bytes]", stack.enter_context(gzip.GzipFile("", "wb", GZIP_LEVEL, raw, mtime=0)))
         file = stack.enter_context(io.TextIOWrapper(raw, "ascii", newline=""))
         file.write(",".join(names) + "\n")
 
-        def append(columns: table.Columns) -> None:
-            """Append rows. ``repr`` gives the shortest text from which the same float64 can be read."""
+        def append_rows(columns: table.Columns) -> None:
             for start in range(0, columns[names[0]].size, table.BATCH_ROWS):
+                # repr gives the shortest text from which the same float64 can be read
                 fields = [map(repr, columns[name][start : start + table.BATCH_ROWS].tolist()) for name in names]
                 file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
 
-        yield append
+        yield append_rows

@@ -1,12 +1,11 @@
-"""Limits on the size of a recording, and the available memory.
+"""Limits on the size of a recording, which protect the machine against exhaustion of the memory.
 
-A reader checks the size of a recording before it allocates memory for the samples. If a process allocates more memory
-than the machine has, the kernel kills the process and possibly the daemon on the same machine. A compressed file of a
-few megabytes can contain gigabytes of data, so a check of the file size is not sufficient.
+Each reader checks the number of samples before allocating memory. A check of the file size is not sufficient, because a
+compressed file of a few megabytes can unpack to gigabytes.
 
-Four limits apply (docs/recording.md). Only the first limit depends on the machine.
+Four limits apply (docs/recording.md):
 
-- The samples and their copies must fit into the available memory.
+- The samples, including copies during an analysis, must fit into the available memory.
 - A file contains at most ``MIN_ROW_LIMIT`` rows or ``MAX_ROWS_PER_BYTE`` rows per byte on disk, whichever is more.
 - The unpacked size is at most ``MIN_UNPACKED_LIMIT_BYTES`` or ``MAX_UNPACKING_RATIO`` times the size on disk, whichever
   is more.
@@ -33,7 +32,7 @@ ROW_BYTES: Final = 64
 """Size of one sample in memory: time, six axes and temperature as float64."""
 MIN_ROW_LIMIT: Final = 20_000_000
 MAX_ROWS_PER_BYTE: Final = 8
-"""Maximum number of rows per byte on disk. In every format, a row of measured values needs more than one bit."""
+"""Maximum number of rows per byte on disk. A row of measured values needs more than one bit in every format."""
 MIN_UNPACKED_LIMIT_BYTES: Final = 2_000_000_000
 MAX_UNPACKING_RATIO: Final = 100
 MAX_COLUMNS: Final = 10_000
@@ -47,15 +46,15 @@ class ReadLimit:
     size_bytes: int  # size on disk
     free: int | None  # available memory in bytes; None if unknown
 
-    def check_rows(self, rows: int) -> None:
-        """Check the number of samples before the samples are read.
+    def check_row_count(self, rows: int) -> None:
+        """Raise an error if a recording with this number of samples must not be read.
 
         Raises
         ------
         RecordingError
-            If the file is too small to contain this number of measured samples.
+            If the file is too small for this number of measured samples.
         ConfigError
-            If the samples and the copies for an analysis do not fit into the available memory.
+            If the samples do not fit into the available memory.
         """
         if rows > max(MIN_ROW_LIMIT, MAX_ROWS_PER_BYTE * self.size_bytes):
             raise RecordingError(
@@ -69,8 +68,8 @@ class ReadLimit:
                 f"{self.free / 1e9:.1f} GB are free; read the end of a folder with --last 1d, or split the file"
             )
 
-    def check_unpacked(self, unpacked_bytes: int) -> None:
-        """Raise RecordingError if the unpacked size so far exceeds the limit."""
+    def check_unpacked_size(self, unpacked_bytes: int) -> None:
+        """Raise RecordingError if the unpacked data exceed the size limit."""
         if unpacked_bytes > max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKING_RATIO * self.size_bytes):
             raise RecordingError(
                 f"{self.path}: unpacks to more than {unpacked_bytes / 1e9:.1f} GB from {self.size_bytes / 1e6:.1f} MB; "
@@ -80,31 +79,30 @@ class ReadLimit:
 
 
 def measure_read_limit(path: Path) -> ReadLimit:
-    """Return the limits on a file with the presently available memory. Raise OSError if the file does not exist."""
+    """Return the size limits of a file. Raise OSError if the file does not exist."""
     return ReadLimit(path, path.stat().st_size, available_bytes())
 
 
 def available_bytes() -> int | None:
-    """Return the memory that is available to this process in bytes; None if unknown.
+    """Return the memory available to this process in bytes, or None if unknown.
 
-    The result is the minimum of the memory that the system, the control groups of the process (container or service
-    limits) and the resource limits of the process (``ulimit -v``, ``ulimit -d``) leave available.
+    The result is the smallest of the free system memory, the control group limit and the resource limit (``ulimit``).
     """
-    stated = (available_system_bytes(), available_cgroup_bytes(), available_process_bytes())
+    stated = (available_system_bytes(), available_cgroup_bytes(), available_rlimit_bytes())
     known = [n for n in stated if n is not None]
     return max(min(known), 0) if known else None
 
 
 def available_system_bytes(meminfo: Path = MEMINFO) -> int | None:
-    """Return the available memory of the system in bytes; None if unknown."""
+    """Return the available memory of the system in bytes, or None if unknown."""
     found = _parse_fields(meminfo, ":").get("MemAvailable")
     return None if found is None else 1024 * found
 
 
 def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
-    """Return the memory in bytes that the control groups of this process leave available; None without a limit.
+    """Return the memory available under the control group limits of this process, in bytes, or None without a limit.
 
-    The page cache counts as available memory, since the kernel can drop the cache.
+    The page cache counts as available memory, because the kernel can drop the page cache.
 
     Parameters
     ----------
@@ -117,8 +115,8 @@ def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int
     return min(left) if left else None
 
 
-def available_process_bytes(statm: Path = STATM) -> int | None:
-    """Return the memory in bytes that the resource limits of the process leave available; None without a limit."""
+def available_rlimit_bytes(statm: Path = STATM) -> int | None:
+    """Return the memory available under the resource limits of this process, in bytes, or None without a limit."""
     try:
         pages = [int(n) for n in statm.read_text().split()]
     except (OSError, ValueError):
@@ -131,7 +129,7 @@ def available_process_bytes(statm: Path = STATM) -> int | None:
 
 
 def _cgroup_folders(own: Path, root: Path) -> Iterator[Path]:
-    """Yield the control groups that limit the memory of this process, each followed by its parents."""
+    """Yield the folders of all control groups that limit the memory of this process, including parent groups."""
     try:
         lines = own.read_text().splitlines()
     except OSError:
@@ -149,7 +147,7 @@ def _cgroup_folders(own: Path, root: Path) -> Iterator[Path]:
 
 
 def _left_in_cgroup(folder: Path) -> int | None:
-    """Return the memory in bytes that a control group of version 2 or 1 leaves available; None without a limit."""
+    """Return the memory available in a control group (version 1 or 2) in bytes, or None without a limit."""
     for limit, usage, prefix in (
         ("memory.max", "memory.current", ""),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_"),
@@ -164,7 +162,6 @@ def _left_in_cgroup(folder: Path) -> int | None:
 
 
 def _parse_fields(path: Path, separator: str) -> dict[str, int]:
-    """Return the whole numbers in a file of ``name value`` lines. Omit unreadable numbers."""
     found: dict[str, int] = {}
     try:
         lines = path.read_text().splitlines()

@@ -1,8 +1,8 @@
-"""Reading and writing of .npz recordings, with one array per column. The rate ``fs`` in Hz can replace ``t``.
+"""Reading and writing of .npz recordings with one array per column. The sample rate ``fs`` in Hz can replace the times
+``t``.
 
-Arrays of Python objects are refused and never unpickled. The headers of all columns are checked against the limits of
-``drivers.recordings.memory_check`` before data are read. The index of a zip archive is at the end of the file. In a
-truncated file, the reader therefore searches for the local header of each array.
+The reader rejects arrays of Python objects, because unpickling can execute code. A truncated zip archive has no index,
+so the reader searches for the local header of each array.
 """
 
 import io
@@ -54,19 +54,18 @@ NPY_HEADER: Final = re.compile(
 )
 """Header of a numeric array with at most one dimension, as all versions of NumPy write the header.
 
-The header is matched by a pattern and not evaluated as Python code.
+The header is matched by a regular expression, and never evaluated as Python code.
 """
 
 
 class _BoundedFile(FileIO):
     """File that refuses to read more than MAX_INDEX_BYTES at once.
 
-    ``zipfile`` reads the whole index of an archive at once, and needs about 500 bytes of memory for an entry with 50
-    bytes.
+    ``zipfile`` reads the whole index at once and needs about ten times the size of the index as memory.
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read up to ``size`` bytes."""
+        """Read up to ``size`` bytes from the file."""
         if size is not None and size > MAX_INDEX_BYTES:
             raise zipfile.BadZipFile(f"the index has {size} bytes, expected at most {MAX_INDEX_BYTES}")
         return super().read(size) or b""
@@ -74,7 +73,7 @@ class _BoundedFile(FileIO):
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """Header of an array in the .npy format."""
+    """Header of an array in .npy format."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -87,29 +86,29 @@ class _Header:
 
 
 def count_npz_rows(path: Path) -> int:
-    """Return the number of rows according to the headers of the columns; 0 if the file is truncated."""
+    """Return the number of rows of a .npz file according to the array headers, or 0 if the file is truncated."""
     with _BoundedFile(path) as file:
         if not _has_index(path, file):
             return 0  # the number of rows of a truncated archive is checked during reading
         with _open_archive(path, file) as archive:
-            return _check_columns(path, archive, table.choose_columns(path, _array_names(archive), []))
+            return _check_columns(path, archive, table.select_known_columns(path, _array_names(archive), []))
 
 
 def read_npz(path: Path) -> table.Table:
-    """Read the known arrays of a .npz file. If the file is truncated, read the values before the truncation.
+    """Read the known arrays of a .npz file. If the file is truncated, only the complete values are read.
 
     Raises
     ------
     RecordingError
-        If the file is not a .npz file, contains no readable number, or exceeds a limit.
+        If the file is not a .npz file, contains no readable number, or exceeds a size limit.
     ConfigError
-        If the samples do not fit into the memory.
+        If the samples do not fit into memory.
     """
     notes: list[str] = []
     with _BoundedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
-                chosen = table.choose_columns(path, _array_names(archive), notes)
+                chosen = table.select_known_columns(path, _array_names(archive), notes)
                 _check_columns(path, archive, chosen)
                 with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
                     columns = {n: _read_array(path, archive, key).astype(np.float64) for n, key in chosen.items()}
@@ -123,10 +122,11 @@ def read_npz(path: Path) -> table.Table:
 
 
 def _has_index(path: Path, file: IO[bytes]) -> bool:
-    """Return True if a zip archive has an index, False if the archive is truncated. Raise an error for other files."""
+    """Return True if a zip archive is complete, that is, has an index. Raise an error for other files."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
         raise RecordingError(
-            f"{path}: is no .npz file, which is a zip archive with one array per column{table.describe_content(path)}"
+            f"{path}: is no .npz file, which is a zip archive with one array per column"
+            f"{table.describe_suffix_mismatch(path)}"
         )
     file.seek(0)
     complete = zipfile.is_zipfile(file)
@@ -143,18 +143,16 @@ def _open_archive(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
 
 
 def _array_names(archive: zipfile.ZipFile) -> list[str]:
-    """Return the names of the arrays in an archive."""
     return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
 def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
-    """Return the zip entry of an array."""
     names = archive.NameToInfo
     return names[key] if key in names else names[f"{key}.npy"]
 
 
 def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> int:
-    """Check the headers of all columns, and return the number of rows of the longest column."""
+    """Check the array headers of all columns, and return the length of the longest column."""
     rows = 0
     limit = memory_check.measure_read_limit(path)
     for key in chosen.values():
@@ -164,7 +162,7 @@ def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, st
         if len(header.shape) != 1:
             raise RecordingError(f"{path}: {key} has shape {header.shape}, expected one dimension")
         rows = max(rows, header.values)
-        limit.check_rows(rows)
+        limit.check_row_count(rows)
         _check_size(path, limit, _find_member(archive, key), key, header)
     return rows
 
@@ -182,7 +180,7 @@ def _check_size(path: Path, limit: memory_check.ReadLimit, member: zipfile.ZipIn
 
 
 def _read_header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
-    """Return the header of an array without reading its data."""
+    """Read the header of an array without reading the data."""
     method = _find_member(archive, key).compress_type
     if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # zipfile unpacks other methods without a limit
         raise RecordingError(
@@ -210,19 +208,18 @@ def _read_header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
 
 
 def _describe_dtype(dtype: np.dtype[Any]) -> str:
-    """Return a description of a type for messages."""
     return "Python objects" if dtype.hasobject else str(dtype)
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, key: str) -> NDArray[Any]:
-    """Return an array of numbers. An array of objects is refused, since unpickling objects would execute code."""
+    """Read a numeric array. Arrays of Python objects are rejected, because unpickling can execute code."""
     with _member_errors(path, key), archive.open(_find_member(archive, key)) as member:
         return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
 
 
 @contextmanager
 def _member_errors(path: Path, key: str) -> Iterator[None]:
-    """Convert the exceptions that NumPy and zipfile raise for a damaged member to RecordingError."""
+    """Convert exceptions of NumPy and zipfile to RecordingError."""
     try:
         with warnings.catch_warnings():  # NumPy warns about headers of old versions
             warnings.simplefilter("ignore")
@@ -234,7 +231,7 @@ def _member_errors(path: Path, key: str) -> Iterator[None]:
 
 
 def _read_fs(path: Path, archive: zipfile.ZipFile, notes: list[str]) -> float | None:
-    """Return the rate ``fs`` in Hz; None if the archive contains no usable rate."""
+    """Return the sample rate ``fs`` in Hz, or None if the archive contains no usable rate."""
     if "fs" not in _array_names(archive):
         return None
     header = _read_header(path, archive, "fs")
@@ -245,7 +242,7 @@ def _read_fs(path: Path, archive: zipfile.ZipFile, notes: list[str]) -> float | 
 
 
 def _single_number(fs: NDArray[Any], notes: list[str]) -> float | None:
-    """Return the rate ``fs`` in Hz. If ``fs`` is not a single number, return None and add a note."""
+    """Return the sample rate ``fs`` in Hz. If ``fs`` is not a single number, return None and append a note."""
     if fs.size == 1 and fs.dtype.kind in NUMERIC_KINDS:
         return float(fs.item())
     notes.append("fs is not one number in Hz and is not used.")
@@ -258,8 +255,8 @@ def _single_number(fs: NDArray[Any], notes: list[str]) -> float | None:
 def _table_of_recovered(
     path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]
 ) -> table.Table:
-    """Return the arrays of a truncated file as a ``Table``. Pad the truncated column with NaN."""
-    chosen = table.choose_columns(path, list(arrays), notes)
+    """Return the arrays of a truncated archive as a ``Table``. Pad the truncated column with NaN."""
+    chosen = table.select_known_columns(path, list(arrays), notes)
     columns = {}
     for name, key in chosen.items():
         if arrays[key].ndim != 1:
@@ -274,9 +271,9 @@ def _table_of_recovered(
 
 
 def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
-    """Find the arrays in a truncated .npz file by their local headers.
+    """Recover the arrays of a truncated .npz file by searching for local zip headers.
 
-    Return the arrays by name, and the name of the truncated array if there is one. Arrays with unknown names are empty.
+    Return the arrays by name, and the name of the truncated array or None. Arrays with unknown names are empty.
     """
     limit = memory_check.measure_read_limit(path)
     arrays: dict[str, NDArray[Any]] = {}
@@ -305,10 +302,9 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
 
 
 class _MemberReader:
-    """Iterator over the unpacked content of a zip member in pieces. ``size`` is None if the header lacks the size.
+    """Iterator over the unpacked content of a zip member. ``size`` is None if the zip header does not state the size.
 
-    After the last piece, ``end`` is the offset of the end of the member in the file. ``end`` is None if the file is
-    truncated inside the member.
+    After iteration, ``end`` is the offset of the end of the member, or None if the member is truncated.
     """
 
     def __init__(self, data: mmap, start: int, method: int, size: int | None) -> None:
@@ -328,7 +324,6 @@ class _MemberReader:
             yield from self._inflated()
 
     def _inflated(self) -> Iterator[bytes]:
-        """Yield the content of a compressed member in pieces."""
         unzip = zlib.decompressobj(-zlib.MAX_WBITS)
         while not unzip.eof:
             packed = self._data[self._at : self._at + COPY_BYTES]
@@ -349,16 +344,16 @@ class _MemberReader:
 def _read_up_to_cut(
     pieces: _MemberReader, limit: memory_check.ReadLimit, unpacked: int, *, wanted: bool
 ) -> NDArray[Any] | None:
-    """Return the complete numbers in a member; None if the member is not an array of numbers.
+    """Return the complete numbers in a zip member, or None if the member is not a numeric array.
 
-    ``unpacked`` is the unpacked size of all earlier members in bytes. If ``wanted`` is False, read the member only to
-    find its end, and return an empty array.
+    ``unpacked`` is the unpacked size of all earlier members in bytes. If ``wanted`` is False, the returned array is
+    empty.
     """
     raw = bytearray()
     header: re.Match[bytes] | None = None
     most = MAX_HEADER_BYTES  # number of bytes to keep
     for part in pieces:
-        limit.check_unpacked(unpacked + pieces.unpacked)
+        limit.check_unpacked_size(unpacked + pieces.unpacked)
         if len(raw) >= most:
             continue  # read on to find the end of the member
         raw += part
@@ -368,7 +363,7 @@ def _read_up_to_cut(
             dtype, n = np.dtype(header["kind"].decode()), int(header["n"] or 1)
             most = header.end() + (n * dtype.itemsize if wanted else 0)
         if header is not None and wanted:
-            limit.check_rows(min(n, (len(raw) - header.end()) // dtype.itemsize))
+            limit.check_row_count(min(n, (len(raw) - header.end()) // dtype.itemsize))
     if header is None:
         return None
     complete = (len(raw) - header.end()) // dtype.itemsize if wanted else 0
@@ -378,27 +373,26 @@ def _read_up_to_cut(
 
 @contextmanager
 def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
-    """Write a compressed .npz file.
+    """Open a compressed .npz file for writing.
 
-    The arrays of an archive must be written one after the other. The columns are therefore first written to unnamed
-    temporary files in the folder of ``path``, with 8 bytes per number.
+    Each column is first written to a temporary file in the folder of ``path``, because zip members cannot be written in
+    parallel.
     """
     with ExitStack() as stack:
         collected = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
 
-        def append(columns: table.Columns) -> None:
-            """Append rows to the temporary files."""
+        def append_rows(columns: table.Columns) -> None:
             for name, file in collected.items():
                 file.write(np.ascontiguousarray(columns[name]).data)
 
-        yield append
+        yield append_rows
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, file in collected.items():
                 _write_array(archive, name, file)
 
 
 def _write_array(archive: zipfile.ZipFile, name: str, numbers: IO[bytes]) -> None:
-    """Write an array like ``numpy.savez_compressed``, but from a file and not from memory."""
+    """Write an array like ``numpy.savez_compressed``, but copy the numbers from a file instead of memory."""
     shape = (numbers.tell() // ITEM_DTYPE.itemsize,)
     numbers.seek(0)
     member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, so that equal columns give equal bytes

@@ -1,15 +1,11 @@
-"""Segments, which are the recording files of the daemon. A segment is an Arrow IPC stream that grows during recording.
+"""Segment files, in which the daemon records samples or raw data as a growing Arrow IPC stream.
 
-The folder of a device contains segments such as ``00000042_2026-11-22T03-00-00Z.arrows``. The number gives the order of
-the segments independently of the clock of the host. The time in the file name is the time of the first sample. The
-columns are ``t`` (Unix time in s), six axes, ``temperature``, ``ticks`` (device counter) and ``lost`` (samples missing
-just before the row). Every batch contains the state of the daemon after the batch (``DaemonState``), so that the daemon
-can continue after a restart. A segment of raw data contains the received chunks, with the columns ``t_ns`` (Unix time),
-``address``, ``data`` and ``attachment``.
+A file name such as ``00000042_2026-11-22T03-00-00Z.arrows`` consists of the segment number and the time of the first
+sample. Each batch of samples includes the state of the daemon (``DaemonState``), so that the daemon can continue after
+a restart.
 
-The daemon appends small batches without compression, and all complete batches of an unfinished segment can be read.
-After a segment has ended, the daemon replaces the file by a copy with large compressed batches. The replacement is
-atomic.
+The daemon appends small uncompressed batches, so that an unfinished segment can be read. The daemon atomically replaces
+each finished segment by a compressed copy.
 """
 
 import errno
@@ -32,7 +28,7 @@ from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, mak
 from drivers.errors import ImuError, RecordingError
 from drivers.file_access import open_regular_file
 from drivers.number_ranges import COUNTER_STEP, RATE_HZ
-from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, first_line, import_pyarrow
+from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, first_message_line, import_pyarrow
 from drivers.recordings.arrow_message_sizes import iter_batch_sizes
 from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
@@ -42,60 +38,60 @@ NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
 MAX_BATCH_BYTES: Final = 64_000_000
-"""Maximum unpacked size of a batch, far above the size of the batches that the daemon writes."""
+"""Maximum unpacked size of a batch. The batches of the daemon are much smaller."""
 MAX_LOST_SAMPLES: Final = 10**11
-"""Maximum number of consecutive missing samples, more than the sample clock can report."""
+"""Maximum number of consecutive missing samples in a valid segment."""
 
 Kind = Literal["samples", "raw"]
 
 
 class SegmentMetadata(msgspec.Struct, frozen=True):
-    """Source of the data in a segment."""
+    """Metadata of a segment, which describe the device and the type of data."""
 
     device: str
     kind: Kind
     axes: str = ""  # mounting of the sensor; a change of the mounting begins a new recording
     carrier: str = ""  # carrier of the link, for raw data
     decoder: str = ""
-    packed: bool = False  # True if the segment has been written again with compression
+    packed: bool = False  # True if the segment has been compressed
     schema: str = SCHEMA
 
 
 class DaemonState(msgspec.Struct, frozen=True):
-    """State of the daemon at the end of a batch, from which the daemon continues after a restart."""
+    """State of the daemon at the end of a batch, used to continue after a restart."""
 
     rate: float | None = None  # sample rate in Hz
     since: tuple[float | None, ...] = (None,) * 6
-    """Unix time in s before which the samples of an axis are not used, after a noise change or a cleared window."""
+    """Unix time in s since which the samples of each axis are used. Set after a noise change or a cleared window."""
     tick_step: float | None = None  # ticks of the device counter per sample
     theta: tuple[float | None, ...] = ()
     """Coefficients [5, 6] of the newest fit, row by row."""
     entered: tuple[bool, ...] = ()
-    """True for each term that the newest fit includes [5, 6], row by row."""
+    """True for each noise term that the newest fit includes [5, 6], row by row."""
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentPiece:
-    """Consecutive samples in one batch of a segment."""
+    """Consecutive samples of a segment without missing samples in between."""
 
     samples: SampleBlock  # t_ns are Unix times
     state: DaemonState
 
 
 class SingleSegmentWriter:
-    """Writer that appends batches to one segment.
+    """Writer that appends batches to one segment file.
 
     Parameters
     ----------
     path
-        New file, which appears with its first batch.
+        Segment file to create. The file appears when the first batch is written.
     origin
-        Source of the data.
+        Metadata of the segment.
 
     Raises
     ------
     OSError
-        If writing to the disk fails. Every method can raise this error. Complete batches remain readable.
+        If writing to the disk fails. Complete batches remain readable.
     """
 
     def __init__(self, path: Path, origin: SegmentMetadata) -> None:
@@ -122,15 +118,15 @@ class SingleSegmentWriter:
         self._write_batch(_sample_batch(self._pa, self._schema, blocks), {b"state": msgspec.json.encode(state)})
 
     def write_chunks(self, chunks: Sequence[Chunk]) -> None:
-        """Write one batch of chunks whose ``t_ns`` are Unix times."""
+        """Write one batch of raw chunks whose ``t_ns`` are Unix times."""
         self._write_batch(_chunk_batch(self._pa, self._schema, chunks), None)
 
     def flush_to_disk(self) -> None:
-        """Flush the written data to the disk, so that a power failure does not destroy them."""
+        """Flush written batches to the disk, so that the batches survive a power failure."""
         os.fdatasync(self._file.fileno())
 
     def describe_external_change(self) -> str:
-        """Describe how another program has changed the open file; "" if the file is unchanged."""
+        """Describe how another program has changed the open file. Return an empty string if the file is unchanged."""
         try:
             named = os.stat(self.path if self._valid_bytes else self._temporary_path, follow_symlinks=False)
         except OSError:
@@ -141,7 +137,8 @@ class SingleSegmentWriter:
         return "was cut or written by another program" if self._valid_bytes and own.st_size != self._valid_bytes else ""
 
     def close_changed_file(self) -> None:
-        """Close a file that another program has changed. Write the end mark only if the length is unchanged."""
+        """Close a segment file that another program has changed. The end mark is written only if the file length is
+        unchanged."""
         try:
             if os.fstat(self._file.fileno()).st_size == self._valid_bytes:
                 self._writer.close()
@@ -149,7 +146,7 @@ class SingleSegmentWriter:
             self._file.close()
 
     def close(self) -> None:
-        """Write the end of the stream and close the file. An error does not affect data that were already written."""
+        """Write the end mark of the Arrow stream, and close the segment file."""
         try:
             self._writer.close()
         finally:
@@ -158,7 +155,7 @@ class SingleSegmentWriter:
                 self._temporary_path.unlink(missing_ok=True)
 
     def _write_batch(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
-        """Write one batch. After an error, truncate the file to the complete batches."""
+        """Write one batch. If writing fails, truncate the file to the complete batches."""
         try:
             self._writer.write_batch(batch, custom_metadata=meta)
         except OSError:
@@ -195,7 +192,7 @@ def format_segment_name(number: int, unix_s: float) -> str:
 
 
 def parse_segment_start_s(path: Path) -> float:
-    """Return the Unix time in the name of a segment in s; 0 if the name contains no time.
+    """Return the Unix time in s in the file name of a segment, or 0 if the name contains no time.
 
     >>> parse_segment_start_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
     1700000000.0
@@ -207,30 +204,30 @@ def parse_segment_start_s(path: Path) -> float:
 
 
 def list_segments(folder: Path) -> list[Path]:
-    """Return the segments in a folder, oldest first; an empty list if the folder does not exist."""
+    """Return the paths of all segments in a folder, oldest first. Return an empty list if the folder does not exist."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if NAME.fullmatch(path.name))
 
 
 def parse_segment_number(path: Path) -> int:
-    """Return the number in the name of a segment; 0 if the file name is not the name of a segment."""
+    """Return the segment number in a file name, or 0 if the file is not a segment."""
     found = NAME.fullmatch(path.name)
     return int(found[1]) if found else 0
 
 
 def read_metadata(path: Path) -> SegmentMetadata:
-    """Return the source of the data in a segment. Raise RecordingError if the file is not a segment."""
+    """Return the metadata of a segment. Raise RecordingError if the file is not a segment."""
     pa = import_pyarrow(path)
     with _arrow_errors(path), open_regular_file(path) as file:
         return _check_schema(path, pa.ipc.open_stream(file).schema)
 
 
 def read_last_piece(path: Path) -> SegmentPiece | None:
-    """Return the last piece of a segment that has ended; None if the segment is empty.
+    """Return the last samples of a finished segment, or None if the segment is empty.
 
-    The file is mapped into memory, so that the other batches are not read. Raise RecordingError if the file is not a
-    segment.
+    Raise RecordingError if the file is not a segment. The file is memory-mapped, so that only the last batch is read
+    from the disk.
     """
     last = deque(_read_batches(path, "samples", mapped=True), maxlen=1)
     pieces = [piece for batch in last for piece in _split_batch(*batch)]
@@ -238,13 +235,14 @@ def read_last_piece(path: Path) -> SegmentPiece | None:
 
 
 def read_samples(path: Path) -> Iterator[SegmentPiece]:
-    """Yield the pieces in the complete batches of a segment. Raise RecordingError for any other file."""
+    """Yield the samples in all complete batches of a segment. Raise RecordingError if the file is not a segment of
+    samples."""
     for batch, meta in _read_batches(path, "samples"):
         yield from _split_batch(batch, meta)
 
 
 def _split_batch(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
-    """Yield the samples of a batch, divided where samples are missing. Yield nothing if the batch is implausible."""
+    """Split the samples of a batch where samples are missing. Skip a batch with implausible values."""
     columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
     values = np.column_stack([columns[axis] for axis in AXES])
     if not _is_plausible(columns) or np.isinf(values).any():
@@ -259,7 +257,7 @@ def _split_batch(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
 
 
 def _is_plausible(columns: Mapping[str, Any]) -> bool:
-    """Return True if times and numbers of lost samples are in the supported ranges."""
+    """Return True if all times and numbers of missing samples are in the supported ranges."""
     # a null value converts a column of integers to floats
     lost, ticks = columns["lost"], columns["ticks"]
     whole = lost.dtype == ticks.dtype == np.int64
@@ -267,7 +265,8 @@ def _is_plausible(columns: Mapping[str, Any]) -> bool:
 
 
 def _decode_state(meta: Any) -> DaemonState:
-    """Return the state in the metadata of a batch; an empty state if the metadata are invalid."""
+    """Decode the state of the daemon from the metadata of a batch. Return an empty state if the metadata are
+    invalid."""
     try:
         found = msgspec.json.decode(meta.get(b"state", b"{}"), type=DaemonState) if meta else DaemonState()
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -279,9 +278,9 @@ def _decode_state(meta: Any) -> DaemonState:
 
 
 def read_chunks(path: Path) -> Iterator[Chunk]:
-    """Yield the chunks in the complete batches of a segment of raw data, with Unix times.
+    """Yield the chunks in all complete batches of a raw-data segment, with Unix times.
 
-    Raise RecordingError if the file is not a segment of raw data.
+    Raise RecordingError if the file is not a raw-data segment.
     """
     for batch, _ in _read_batches(path, "raw"):
         for start in range(0, batch.num_rows, BATCH_ROWS):
@@ -293,9 +292,9 @@ def read_chunks(path: Path) -> Iterator[Chunk]:
 
 
 def compress_segment(path: Path) -> Iterator[None]:
-    """Replace a segment that has ended by a compressed copy.
+    """Replace a finished segment by a compressed copy.
 
-    The generator yields after each batch, so that the caller can do other work between two batches.
+    The generator yields after each batch, so that the caller can do other work during the compression.
 
     Raises
     ------
@@ -326,7 +325,7 @@ def compress_segment(path: Path) -> Iterator[None]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Flush the entries of a folder to the disk, so that a power failure does not remove a new file."""
+    """Flush a folder to the disk, so that new files survive a power failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -335,7 +334,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any, dict[bytes, bytes] | None]]:
-    """Yield large batches that are combined from small batches, each with the state after the last row."""
+    """Combine small batches into large batches, each with the state after the last row."""
     waiting: list[Any] = []
     rows = size = 0
     meta: dict[bytes, bytes] | None = None
@@ -351,15 +350,14 @@ def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tu
 
 
 def _combine_batches(pa: Any, schema: Any, batches: list[Any]) -> Any:
-    """Combine batches into one batch."""
     table = pa.Table.from_batches(batches).combine_chunks()
     return pa.RecordBatch.from_arrays([column.chunk(0) for column in table.columns], schema=schema)
 
 
 def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any, Any]]:
-    """Yield the complete batches with their metadata. Stop before a batch with an implausible size.
+    """Yield the complete batches of a segment and their metadata. Stop before a batch with an implausible size.
 
-    If ``mapped`` is True, the file is mapped into memory, so that unused rows are not read from the disk.
+    If ``mapped`` is True, the file is memory-mapped, so that unused rows are not read from the disk.
     """
     pa = import_pyarrow(path)
     # the file is opened only once, because the daemon may replace the file by a compressed file at any time
@@ -381,7 +379,7 @@ def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tupl
 
 
 def _count_regular_batches(file: IO[bytes]) -> int:
-    """Return the number of batches before the first batch with an implausible size."""
+    """Count the batches before the first batch with an implausible size."""
     count = 0
     for size in iter_batch_sizes(file):
         large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
@@ -392,7 +390,7 @@ def _count_regular_batches(file: IO[bytes]) -> int:
 
 
 def _memory_map(pa: Any, file: IO[bytes]) -> Any:
-    """Map a file into memory. Return an empty file unchanged, since an empty file cannot be mapped."""
+    """Map a file into memory. Return an empty file unchanged, because empty files cannot be mapped."""
     if not os.fstat(file.fileno()).st_size:
         return file
     return pa.BufferReader(pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
@@ -400,7 +398,7 @@ def _memory_map(pa: Any, file: IO[bytes]) -> Any:
 
 @contextmanager
 def _arrow_errors(path: Path) -> Iterator[None]:
-    """Convert the errors of pyarrow and msgspec for a file that is not a segment to RecordingError."""
+    """Convert errors of pyarrow and msgspec to RecordingError."""
     try:
         yield
     except ImuError:
@@ -410,9 +408,9 @@ def _arrow_errors(path: Path) -> Iterator[None]:
             raise RecordingError(f"{path}: {error.strerror}") from error
         if error.errno is not None:
             raise
-        raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
+        raise RecordingError(f"{path}: is no segment of a recording ({first_message_line(error)})") from error
     except (import_pyarrow(path).ArrowException, UnicodeDecodeError, RecursionError, msgspec.DecodeError) as error:
-        raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
+        raise RecordingError(f"{path}: is no segment of a recording ({first_message_line(error)})") from error
     except MemoryError as error:  # in a file of another type, the first bytes may be read as a length of gigabytes
         raise RecordingError(
             f"{path}: is no segment of a recording (it claims more bytes than the memory holds)"
@@ -420,7 +418,7 @@ def _arrow_errors(path: Path) -> Iterator[None]:
 
 
 def _check_schema(path: Path, schema: Any) -> SegmentMetadata:
-    """Return the source of the data according to the schema. Raise RecordingError if the file is not a segment."""
+    """Return the metadata in an Arrow schema. Raise RecordingError if the schema is not the schema of a segment."""
     meta = (schema.metadata or {}).get(METADATA_KEY)
     if meta is None:
         raise RecordingError(f"{path}: is no segment of a recording: it does not state its device")
@@ -433,7 +431,6 @@ def _check_schema(path: Path, schema: Any) -> SegmentMetadata:
 
 
 def _schema(pa: Any, of: SegmentMetadata) -> Any:
-    """Return the schema of a segment."""
     if of.kind == "samples":
         fields = [(name, pa.float64()) for name in ("t", *AXES, "temperature")]
         fields += [(name, pa.int64()) for name in SEGMENT_COLUMNS]
@@ -443,7 +440,6 @@ def _schema(pa: Any, of: SegmentMetadata) -> Any:
 
 
 def _sample_batch(pa: Any, schema: Any, blocks: Sequence[SampleBlock]) -> Any:
-    """Return blocks of samples as one record batch."""
     rows = concatenate_blocks(blocks)
     lost = np.zeros(len(rows), np.int64)
     at = 0
@@ -455,7 +451,6 @@ def _sample_batch(pa: Any, schema: Any, blocks: Sequence[SampleBlock]) -> Any:
 
 
 def _chunk_batch(pa: Any, schema: Any, chunks: Sequence[Chunk]) -> Any:
-    """Return chunks as one record batch."""
     columns = (
         [one.t_ns for one in chunks], [one.address for one in chunks],
         [one.data for one in chunks], [one.attachment for one in chunks],

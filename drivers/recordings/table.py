@@ -1,4 +1,4 @@
-"""Types and functions that all recording formats share: tables, writers and the selection of columns."""
+"""Types and functions that all recording formats share."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +42,7 @@ OpenWriter = Callable[[Path, Sequence[str]], AbstractContextManager[AppendColumn
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Columns of a file, the stated sample rate, and notes about irregularities."""
+    """Columns and stated sample rate of a recording file, with notes about irregularities."""
 
     columns: dict[str, Floats]  # float64 arrays [n]; the keys are names in COLUMNS; NaN = missing
     fs: float | None  # sample rate in Hz; None if the file states no rate
@@ -50,15 +50,15 @@ class Table:
 
 
 def check_column_count(path: Path, columns: int) -> None:
-    """Raise RecordingError if the number of columns of a file exceeds the limit."""
+    """Raise RecordingError if a file has too many columns."""
     if columns > memory_check.MAX_COLUMNS:
         raise RecordingError(
             f"{path}: has {columns} columns, expected at most {memory_check.MAX_COLUMNS}; keep only {' '.join(COLUMNS)}"
         )
 
 
-def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
-    """Select the known columns of a file.
+def select_known_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
+    """Select the known columns of a recording file.
 
     Parameters
     ----------
@@ -74,12 +74,12 @@ def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: st
     Returns
     -------
     dict
-        Name in the file of each known column.
+        Mapping from the known column names to the names in the file.
 
     Raises
     ------
     RecordingError
-        If there is no axis among the columns, a known column occurs twice, or there are too many columns.
+        If no column is an axis, a known column occurs twice, or the file has too many columns.
     """
     check_column_count(path, len(names))
     known = {*COLUMNS, *ALIASES}
@@ -92,13 +92,13 @@ def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: st
             chosen.setdefault(name, alias)
     if not any(axis in chosen for axis in AXES):
         raise RecordingError(
-            f"{path}: no axis among its columns ({format_names(names)}){where}; "
-            f"a recording has some of {' '.join(AXES)}, in rad/s and m/s²{describe_content(path)}"
+            f"{path}: no axis among its columns ({format_name_list(names)}){where}; "
+            f"a recording has some of {' '.join(AXES)}, in rad/s and m/s²{describe_suffix_mismatch(path)}"
         )
     used = {*chosen.values(), "fs"}
     others = [name for name in names if name not in used]
     if others:
-        notes.append(f"Other columns are not used: {format_names(others)}.")
+        notes.append(f"Other columns are not used: {format_name_list(others)}.")
     return chosen
 
 
@@ -118,10 +118,10 @@ CONTENTS: Final = (
 """First bytes of a file, type of the content, and file suffixes of recordings with this content."""
 
 
-def describe_content(path: Path) -> str:
-    """Return a text to append to an error message if the content of a file does not match the suffix.
+def describe_suffix_mismatch(path: Path) -> str:
+    """Describe a mismatch between the content and the suffix of a file, for an error message.
 
-    The text states the type of the content and the remedy. The text is empty if the type is unknown.
+    The text names the detected type of content and the remedy. The text is empty if the type is unknown.
     """
     try:
         with open_regular_file(path) as file:
@@ -140,16 +140,17 @@ def describe_content(path: Path) -> str:
     return ""
 
 
-def format_names(names: Sequence[str], most: int = 12) -> str:
-    """Return a list of names for a message. The list and the names are shortened, without control characters.
+def format_name_list(names: Sequence[str], max_names: int = 12) -> str:
+    """Format a list of names for a message. Long lists and long names are shortened, and control characters are
+    escaped.
 
     Parameters
     ----------
     names
         Names to list.
-    most
+    max_names
         Maximum number of names to show.
     """
-    shown = [name[:40] if name.isprintable() else ascii(name[:40]) for name in names[:most]]
-    more = [f"and {len(names) - most} more"] if len(names) > most else []
+    shown = [name[:40] if name.isprintable() else ascii(name[:40]) for name in names[:max_names]]
+    more = [f"and {len(names) - max_names} more"] if len(names) > max_names else []
     return ", ".join(shown + more)

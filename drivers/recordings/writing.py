@@ -1,8 +1,7 @@
-"""Writing of recordings. A file appears only when it is complete.
+"""Writing of recordings to files of any supported format.
 
-A file is written under a temporary name and renamed when it is complete. If writing fails or is interrupted (Ctrl-C),
-the temporary file is removed, and an existing recording stays unchanged. The memory use does not depend on the number
-of rows.
+Each recording is written to a temporary file, which is renamed on completion. If writing fails or is interrupted, an
+existing recording remains unchanged.
 """
 
 import os
@@ -16,7 +15,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings.formats import find_format
-from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_names
+from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_name_list
 
 
 class AppendSamples(Protocol):
@@ -38,12 +37,12 @@ class AppendSamples(Protocol):
 
 @contextmanager
 def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[AppendSamples]:
-    """Write a recording in blocks of rows. The suffix of the path determines the format.
+    """Open a recording for writing. The suffix of the path determines the file format.
 
     Parameters
     ----------
     path
-        File to write. The file appears when the context ends without an exception.
+        File to write. The file appears when the context ends without exception.
     axes
         Columns to write, some of AXES.
     temperature
@@ -58,20 +57,20 @@ def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) ->
     """
     unknown = [axis for axis in axes if axis not in AXES]
     if unknown or not axes:
-        what = f"unknown axis {format_names(unknown)}" if unknown else "no axis has a value"
+        what = f"unknown axis {format_name_list(unknown)}" if unknown else "no axis has a value"
         raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
     open_writer = find_format(path).open_writer
     names = ["t", *axes, *(["temperature"] if temperature else [])]
     with atomic_write_path(path) as part, open_writer(part, names) as append_columns:
 
-        def append(t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
+        def append_samples(t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
             _check_arrays(path, t_s, values, temperature_c)
             table = {"t": t_s} | {axis: values[:, AXES.index(axis)] for axis in axes}
             if temperature:
                 table["temperature"] = np.full(len(t_s), np.nan) if temperature_c is None else temperature_c
             append_columns({name: np.asarray(column, np.float64) for name, column in table.items()})
 
-        yield append
+        yield append_samples
 
 
 def save_samples(
@@ -81,7 +80,7 @@ def save_samples(
     temperature_c: Floats | None = None,
     axes: Sequence[str] | None = None,
 ) -> None:
-    """Write a recording without loss of precision. The suffix of the path determines the format.
+    """Save samples as a recording without loss of precision. The suffix of the path determines the file format.
 
     Parameters
     ----------
@@ -94,7 +93,7 @@ def save_samples(
     temperature_c
         [n] float64 in °C. None if no temperature was measured.
     axes
-        Axes to write. If None, all axes that have at least one value are written.
+        Axes to write. By default, all axes with at least one value are written.
 
     Raises
     ------
@@ -107,13 +106,14 @@ def save_samples(
     if axes is None:
         axes = [axis for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()]
     temperature = temperature_c is not None and not np.isnan(temperature_c).all()
-    with open_recording_writer(path, axes, temperature) as append:
-        append(t_s, values, temperature_c)
+    with open_recording_writer(path, axes, temperature) as append_samples:
+        append_samples(t_s, values, temperature_c)
 
 
 @contextmanager
 def atomic_write_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path. At the end, rename the temporary file to ``path``, or remove it after an exception.
+    """Yield a temporary path, and rename the temporary file to ``path`` at the end of the context. After an exception,
+    the temporary file is removed.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Time-stamping of samples, detection of missing, repeated and late samples, and check of the sample rate."""
+"""Sample times, detection of missing and repeated samples, and check of the sample rate."""

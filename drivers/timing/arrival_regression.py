@@ -1,4 +1,4 @@
-"""Sample rate from arrival times: regression of time on sample index, and the standard rates of sensors."""
+"""Estimation of the sample rate by linear regression of arrival time on sample index."""
 
 from math import exp, inf, sqrt
 from typing import Final
@@ -6,29 +6,29 @@ from typing import Final
 import numpy as np
 
 FORGET_S: Final = 30.0
-"""Time constant of the fitted line, long compared with arrival jitter and short compared with crystal warm-up."""
+"""Time constant of the exponential forgetting: longer than arrival jitter, shorter than the warm-up of a crystal."""
 MIN_SPAN_S: Final = 2.0
-"""Minimum duration of the points from which the rate is determined."""
+"""Minimum time between the first and the last point for a rate estimate."""
 MIN_SAMPLES: Final = 20
-"""Minimum number of samples from which the rate is determined."""
+"""Minimum number of samples for a rate estimate."""
 MIN_FORGETTING_FACTOR: Final = 0.9
-"""Smallest factor by which a new point reduces the weight of earlier points.
+"""Smallest factor by which each new point multiplies the weight of earlier points.
 
-The limit ensures that the line depends on ten points or more, also for slow sensors and long blocks.
+The effective number of points in the regression is therefore at least ten, even for slow sensors.
 """
 MIN_POINTS: Final = 5
-"""Minimum number of points from which the scatter about the line is determined."""
+"""Minimum number of points for an estimate of the scatter about the line."""
 UNCERTAINTY_FACTOR: Final = 2.0
-"""Ratio of the plausible error of the rate to the error that the residuals of the line indicate.
+"""Safety factor between the error indicated by the residuals and the stated uncertainty of the rate.
 
-The residuals are the delays that the line has not followed. The delays that the line has followed are assumed to be of
-the same magnitude. The factor is empirical. In simulations with stalls, bursts and slowly varying delays, only slowly
-varying delays caused larger errors, in the first seconds.
+The factor is empirical, because slowly varying delays shift the regression line without appearing in the residuals. In
+simulations with stalls, bursts and slowly varying delays, only slowly varying delays caused larger errors, in the first
+seconds.
 """
 STANDARD_RATE_TOLERANCE: Final = 0.002
 """Relative difference up to which a measured rate is replaced by the nearest standard rate.
 
-Crystals and RC oscillators with a larger difference keep their measured rate.
+A measured rate with a larger difference is not replaced.
 """
 # fmt: off
 STANDARD_RATES_HZ: Final = np.array([
@@ -40,10 +40,7 @@ STANDARD_RATES_HZ: Final = np.array([
 
 
 class ArrivalRegression:
-    """Least-squares line of time on sample index with exponential forgetting.
-
-    The sums are stored relative to the newest point.
-    """
+    """Recursive linear regression of time on sample index, with exponential forgetting."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -52,16 +49,16 @@ class ArrivalRegression:
         self._w = self._mx = self._mt = self._sxx = self._sxt = self._stt = 0.0
 
     def add_point(self, index: float, t_s: float, nominal_hz: float | None = None) -> None:
-        """Add one point.
+        """Add one point to the regression.
 
         Parameters
         ----------
         index
-            Sample index, including missing samples.
+            Sample index, which counts missing samples as well.
         t_s
             Time of the sample in s.
         nominal_hz
-            Nominal sample rate in Hz, which determines the slope while there are too few points. None if unknown.
+            Nominal sample rate in Hz, used while there are too few points for an estimate. None if unknown.
         """
         if self.count == 0:
             self._first_x, self._first_t = index, t_s
@@ -84,34 +81,34 @@ class ArrivalRegression:
         self.count += 1
 
     def shift_points(self, samples: float) -> None:
-        """Increase the index of all points by a number of samples that are missing before the first point."""
+        """Increase the sample index of all points by the number of samples missing before the first point."""
         self._x0 += samples
         self._first_x += samples
 
     def elapsed_s(self) -> float:
-        """Return the time from the first point to the newest point in seconds."""
+        """Return the time between the first and the newest point in seconds."""
         return self._t0 - self._first_t
 
     def can_tell_gap_from_jitter(self) -> bool:
-        """Return True if there are enough points to tell a gap from jitter."""
+        """Return True if the regression has enough points to distinguish a gap from jitter."""
         return self._x0 - self._first_x >= MIN_SAMPLES and self.elapsed_s() >= MIN_SPAN_S
 
     def measure_rate(self, final: bool = False) -> tuple[float, float] | None:
-        """Return the sample rate according to the points, without the nominal rate, and the uncertainty.
+        """Return the measured sample rate and the uncertainty of the rate.
 
-        Delays with the standard deviation s change the slope of the line by at most the ratio s/S, where S is the
-        standard deviation of the times (Cauchy-Schwarz inequality). For the residuals of the line, this ratio is
-        √(1/r² − 1), where r is the correlation of time and index.
+        Delays with standard deviation s cause a relative error of the slope of at most s/S, where S is the standard
+        deviation of the times (Cauchy-Schwarz inequality). For the residuals of the regression, s/S equals √(1/r² − 1),
+        where r is the correlation of time and index.
 
         Parameters
         ----------
         final : bool
-            True if no more points will be added. MIN_SAMPLES are then sufficient, even in less than MIN_SPAN_S.
+            True if no more points will be added. The minimum duration MIN_SPAN_S is then ignored.
 
         Returns
         -------
         tuple of float, or None
-            Rate in Hz and plausible relative error of the rate. None if there are too few points.
+            Sample rate in Hz and relative uncertainty, or None if there are too few points.
         """
         enough = (
             self._x0 - self._first_x >= MIN_SAMPLES - 1
@@ -124,31 +121,31 @@ class ArrivalRegression:
         return self._sxx / self._sxt, UNCERTAINTY_FACTOR * sqrt(max(1.0 / r2 - 1.0, 0.0)) if r2 > 0.0 else inf
 
     def is_slower_than(self, period_s: float) -> bool:
-        """Return True if the sample period is longer than ``period_s`` by more than the uncertainty."""
+        """Return True if the measured sample period is significantly longer than ``period_s``."""
         found = self.measure_rate()
         return found is not None and found[0] * period_s < 1.0 - found[1]
 
     def period_s(self) -> float | None:
-        """Return the sample period in seconds; None if there are too few points and no nominal rate."""
+        """Return the sample period in seconds, or None without a nominal rate and enough points."""
         if self.count >= 2 and self._sxt > 0.0 and (self.can_tell_gap_from_jitter() or self._nominal_s is None):
             return self._sxt / self._sxx
         return self._nominal_s if self.count else None
 
     def rate_hz(self) -> float | None:
-        """Return the sample rate in Hz; None if the rate is unknown."""
+        """Return the sample rate in Hz, or None if the sample rate is unknown."""
         period = self.period_s()
         return 1.0 / period if period else None
 
     def time_at_index_s(self, index: float) -> float:
-        """Return the fitted time at a sample index in seconds."""
+        """Return the time on the regression line at a sample index, in seconds."""
         period = self.period_s() or 0.0
         return self._t0 + self._mt + (index - self._x0 - self._mx) * period
 
 
 def snap_to_standard_rate(measured_hz: float) -> float:
-    """Return the nearest standard rate in Hz if it is within STANDARD_RATE_TOLERANCE of the measured rate.
+    """Round a measured sample rate to the nearest standard rate of sensors within STANDARD_RATE_TOLERANCE.
 
-    Otherwise return the measured rate rounded to 5 digits.
+    A rate that is not near a standard rate is rounded to 5 digits.
 
     >>> snap_to_standard_rate(99.97), snap_to_standard_rate(99.32)
     (100.0, 99.32)

@@ -1,11 +1,10 @@
-"""Sample times from a line fitted to arrival times, and detection of gaps from arrival times.
+"""Sample times and missing samples, estimated from arrival times.
 
-A line of arrival time against sample index is fitted to the last sample of each chunk, with exponential forgetting. The
-line gives the sample times. The jitter of a USB port or of the scheduler of the host therefore has little effect on the
+Sample times lie on a regression line of arrival time on sample index, so that transport jitter has little effect on the
 sample times.
 
-If later arrivals catch up with the line within CATCH_UP_S, a delay was caused by the scheduler of the host. If the
-delay persists, samples are missing.
+A short delay of the arrivals is attributed to the scheduler of the host. A delay that persists for CATCH_UP_S indicates
+missing samples.
 """
 
 from dataclasses import dataclass
@@ -19,25 +18,25 @@ from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.earliest_sample_time import EarliestSampleTime
 
 CATCH_UP_S: Final = 3.0
-"""Time after which a delay that persists means that samples are missing."""
+"""Time after which a persistent delay of the arrivals indicates missing samples."""
 MIN_GAP_PERIODS: Final = 3.0
-"""Shortest pause of the arrivals, in sample periods, that can be a gap."""
+"""Shortest pause between arrivals that can indicate missing samples, in sample periods."""
 MIN_GAP_S: Final = 0.05
-"""Shortest pause of the arrivals, in seconds, that can be a gap."""
+"""Shortest pause between arrivals that can indicate missing samples, in seconds."""
 JUMP_S: Final = 1.0
-"""Time by which a step of the device counter may exceed the elapsed time of the host. A larger step is a jump."""
+"""Time by which the clock of a device may advance more than the clock of the host. A larger step is a clock jump."""
 PERIOD_TOLERANCE: Final = 0.05
-"""Plausible relative error of the sample period when the missing samples of a gap are compared with a time."""
+"""Assumed relative error of the sample period."""
 MAX_RATE_HZ: Final = 32_000.0
 """Highest sample rate of an inertial sensor, which limits the number of missing samples."""
 MAX_GAP_SAMPLES: Final = 10**10
-"""Maximum number of missing samples in one gap, 116 days at 1 kHz."""
+"""Maximum number of consecutive missing samples, equivalent to 116 days at 1 kHz."""
 MAX_OFFSET_S: Final = 4.6e9
 """Largest time since the first sample, half of the range of int64 nanoseconds."""
 
 
 class ArrivalTimeline:
-    """Number of samples so far, and a fitted line of arrival time against sample index.
+    """Regression line of arrival time on sample index, which gives sample times and missing samples of one device.
 
     Parameters
     ----------
@@ -48,17 +47,17 @@ class ArrivalTimeline:
     def __init__(self, nominal_hz: float | None) -> None:
         self.nominal_hz = nominal_hz
         self.assumed_hz = nominal_hz
-        """Sample rate in Hz until the line gives a rate: the configured rate, or the rate before a restart."""
+        """Sample rate in Hz before a rate has been measured: the configured rate, or the rate before a restart."""
         self.line = ArrivalRegression()
         self.earliest_time = EarliestSampleTime()
         self.index = 0.0
-        """Number of samples since the start, including missing samples."""
+        """Number of received and missing samples since the start."""
         self.arrived_ns = 0
-        """Newest arrival time."""
+        """Newest arrival time in ns."""
         self.last_t_ns = -(1 << 62)
-        """Time of the newest sample."""
+        """Time of the newest sample in ns."""
         self.origin_ns: int | None = None
-        """Origin of the times in seconds. Unix time in float64 would have a resolution of only 240 ns."""
+        """Origin of times in seconds, because Unix time in float64 has a resolution of only 240 ns."""
         self._delay: _Delay | None = None
 
     def seconds_since_origin(self, t_ns: int) -> float:
@@ -66,13 +65,13 @@ class ArrivalTimeline:
         return (t_ns - (self.origin_ns or 0)) / NS_PER_S
 
     def restart_line(self) -> None:
-        """Fit a new line, because the number of missing samples is unknown or the clock has jumped."""
+        """Discard the regression line after a clock jump or an unknown number of missing samples."""
         self.line = ArrivalRegression()
 
     def undelayed_period_s(self) -> float | None:
-        """Return the sample period in s without the effect of late readings.
+        """Return the sample period in s, unaffected by delayed arrivals.
 
-        The configured period is used until the arrivals show one.
+        The configured period is used before a period has been measured.
         """
         found = self.line.measure_rate() if self.earliest_time.has_enough_arrivals else None
         if found is not None and found[1] < PERIOD_TOLERANCE:
@@ -80,7 +79,7 @@ class ArrivalTimeline:
         return None if self.earliest_time.period_s or not self.assumed_hz else 1.0 / self.assumed_hz
 
     def assign_line_times(self, samples: SampleBlock, missing: Ints) -> list[SampleBlock]:
-        """Add the newest arrival to the fitted line, and assign times on the line to the samples.
+        """Add the newest arrival to the regression, and assign times on the regression line to the samples.
 
         Parameters
         ----------
@@ -113,7 +112,7 @@ class ArrivalTimeline:
         return split_at_gaps(samples, t_ns, missing)
 
     def count_missing_since_arrival(self, arrived_ns: int, arrived: int) -> int:
-        """Return the number of missing samples according to the time since the previous arrival.
+        """Estimate the number of missing samples from the time since the previous arrival.
 
         Parameters
         ----------
@@ -129,25 +128,25 @@ class ArrivalTimeline:
         return min(max(0, round(elapsed_s * min(rate_hz, MAX_RATE_HZ)) - arrived), MAX_GAP_SAMPLES)
 
     def forget_delay(self) -> None:
-        """Discard a delay whose cause is not yet known, because the link was closed."""
+        """Discard the current delay of the arrivals, because the link was closed."""
         self._delay = None
 
-    def count_missing_after_delay(self, arrived_ns: int, counted: int, least: float = MIN_GAP_PERIODS) -> int:
-        """Return the number of missing samples if a sudden delay of the arrivals has persisted for CATCH_UP_S.
+    def count_missing_after_delay(self, arrived_ns: int, counted: int, min_gap_samples: float = MIN_GAP_PERIODS) -> int:
+        """Estimate the number of missing samples from a sudden delay that has persisted for CATCH_UP_S.
 
         Parameters
         ----------
         arrived_ns : int
             Arrival time of the newest sample in ns.
         counted : int
-            Number of samples since the last call that have arrived or are known to be missing.
-        least : float
-            Smallest number of missing samples in a gap.
+            Number of samples since the last call that have arrived, or are known to be missing.
+        min_gap_samples : float
+            Minimum number of consecutive missing samples to detect.
         """
         period_s = self.line.period_s()
         if period_s is None or not self.line.can_tell_gap_from_jitter():
             return 0
-        least_s = max(least * period_s, MIN_GAP_S)
+        least_s = max(min_gap_samples * period_s, MIN_GAP_S)
         index, arrived_s = self.index + counted, self.seconds_since_origin(arrived_ns)
         behind_s = arrived_s - self.line.time_at_index_s(index)
         if self._delay is None:
@@ -178,7 +177,7 @@ class ArrivalTimeline:
 
 @dataclass(slots=True)
 class _Delay:
-    """Sudden delay of the arrivals, whose cause may be a gap."""
+    """Sudden delay of the arrivals, possibly caused by missing samples."""
 
     since_ns: int  # time of the first delayed arrival, or of the last reported gap
     least_s: float  # minimum delay of the arrivals since ``since_ns`` relative to the fitted line
@@ -186,7 +185,7 @@ class _Delay:
 
 
 def split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[SampleBlock]:
-    """Return the samples with new times, in blocks that begin where samples are missing.
+    """Split a block where samples are missing, and assign new times to the samples.
 
     Parameters
     ----------

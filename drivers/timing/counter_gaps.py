@@ -1,11 +1,10 @@
-"""Missing samples according to the counter of a device.
+"""Detection of missing samples from the counter of a device.
 
-The counter gives the exact number of missing samples, unless a short counter wraps more than once in a gap. The number
-of wraps is then estimated from the duration of the gap (``drivers.timing.arrival_timeline``).
+Counter values give the exact number of missing samples. If a short counter may have wrapped several times, the number
+of wraps is estimated from arrival times (``drivers.timing.arrival_timeline``).
 
-A sample may be read late but never early. ``drivers.timing.earliest_sample_time`` gives the earliest time at which the
-last sample can have been taken. A counter step is a gap if the missing samples fit between this time and the arrival
-time. A longer step is a jump of the counter, and the arrival time decides how many samples are missing.
+A counter step that is longer than the elapsed time allows is a counter jump (``drivers.timing.earliest_sample_time``).
+After a counter jump, the number of missing samples is estimated from arrival times.
 """
 
 from collections import deque
@@ -21,15 +20,15 @@ from drivers.timing.event_rate_limiter import EventRateLimiter
 MAX_STEP_TICKS: Final = 1 << 62
 """Largest step of the counter."""
 MIN_STUCK_SAMPLES: Final = 10
-"""Number of consecutive samples with the same counter value after which the counter is reported as stuck."""
+"""Number of consecutive samples with the same counter value after which a stuck counter is reported."""
 STEP_HISTORY: Final = 255
-"""Number of recent counter steps from which the typical step is determined."""
+"""Number of recent counter steps used to determine the typical step."""
 STEP_TOLERANCE: Final = 0.25
 """Maximum relative difference of a counter step from the typical step."""
 
 
 class CounterGaps:
-    """Detector of gaps in the counter values of one device.
+    """Detector of missing samples from the counter values of one device.
 
     Parameters
     ----------
@@ -44,7 +43,7 @@ class CounterGaps:
     def __init__(self, counter: CounterTimedFormat, timeline: ArrivalTimeline, events: EventRateLimiter) -> None:
         self.typical_step = _TypicalStep()
         self.clock_line = ArrivalRegression()
-        """Fitted line of device time against sample index. The line has no points if the tick length is unknown."""
+        """Regression of device time on sample index. The regression is empty if the tick length is unknown."""
         self._counter = counter
         self._timeline = timeline
         self._events = events
@@ -52,8 +51,8 @@ class CounterGaps:
         self._clock_s = self._clock_index = 0.0
         self._stuck = 0  # number of samples since the counter last advanced
 
-    def resume(self, tick: int, ticks_per_sample: float) -> None:
-        """Continue from the last counter value before a restart of the program.
+    def resume_at_tick(self, tick: int, ticks_per_sample: float) -> None:
+        """Continue from the last counter value before a program restart.
 
         Parameters
         ----------
@@ -63,20 +62,20 @@ class CounterGaps:
             Ticks per sample.
         """
         self._tick = tick
-        self.typical_step.update(np.array([round(ticks_per_sample)]))
+        self.typical_step.add_steps(np.array([round(ticks_per_sample)]))
 
     def forget_last_tick(self) -> None:
-        """Forget the last counter value, because samples without a counter value have arrived."""
+        """Discard the last counter value after samples without a counter value."""
         self._tick = None
 
-    def count_missing(self, samples: SampleBlock, paused: bool) -> Ints:
-        """Return the number of missing samples [n] before each row.
+    def count_missing(self, samples: SampleBlock, link_was_closed: bool) -> Ints:
+        """Return the number of missing samples before each row [n].
 
         Parameters
         ----------
         samples : SampleBlock
             Samples with arrival times and counter values.
-        paused : bool
+        link_was_closed : bool
             True if the link was closed before these samples.
         """
         counter, arrived_ns = self._counter, int(samples.t_ns[-1])
@@ -86,17 +85,19 @@ class CounterGaps:
         steps[0] = samples.ticks[0] - previous % counter.modulus
         np.subtract(samples.ticks[1:], samples.ticks[:-1], out=steps[1:])
         steps %= counter.modulus
-        self.typical_step.update(steps)
+        self.typical_step.add_steps(steps)
         ticks_per_sample = self._ticks_per_sample()
         if not first:
-            steps[0] += counter.modulus * self._hidden_wraps(steps, ticks_per_sample, arrived_ns, paused)
+            steps[0] += counter.modulus * self._hidden_wraps(steps, ticks_per_sample, arrived_ns, link_was_closed)
         self._tick = int(samples.ticks[-1])
         waited = self._find_stuck_counter(samples, steps[1:] if first else steps)
         missing = np.zeros(len(samples), np.int64)
         if ticks_per_sample is not None:
             counted = np.rint(np.minimum(steps / ticks_per_sample, MAX_GAP_SAMPLES)).astype(np.int64)
             missing = np.maximum(counted - 1 - waited, 0)
-        unseen = self._timeline.count_missing_since_arrival(arrived_ns, len(samples)) if first and paused else 0
+        unseen = (
+            self._timeline.count_missing_since_arrival(arrived_ns, len(samples)) if first and link_was_closed else 0
+        )
         if not steps.any():  # a stuck counter gives no information
             missing[0] = max(samples.lost, unseen)
         elif self._has_jumped(missing, steps, arrived_ns):
@@ -110,7 +111,7 @@ class CounterGaps:
         return missing
 
     def _discard_jump(self, samples: SampleBlock, missing: Ints, steps: Ints, first: bool) -> None:
-        """Report a jump of the counter, and correct ``missing`` and ``steps`` in place by the arrival time."""
+        """Report a counter jump, and correct ``missing`` and ``steps`` in place from arrival times."""
         arrived_ns, ahead = int(samples.t_ns[-1]), int(steps.max())
         modulus = self._counter.modulus
         elapsed_s = (arrived_ns - self._timeline.arrived_ns) / NS_PER_S
@@ -126,16 +127,15 @@ class CounterGaps:
             missing[at] = self._timeline.count_missing_since_arrival(arrived_ns, len(samples) + int(missing.sum()))
 
     def _ticks_per_sample(self) -> float | None:
-        """Return the number of ticks per sample; None if the number is unknown."""
-        seen, rate_hz = self.typical_step.mean, self._timeline.nominal_hz
+        seen, rate_hz = self.typical_step.mean_ticks_per_sample, self._timeline.nominal_hz
         if self._counter.tick_s is None or rate_hz is None:
             return seen
         nominal = 1.0 / (rate_hz * self._counter.tick_s)
         # if the nominal rate is far from the typical step, the typical step is used
         return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else seen
 
-    def _hidden_wraps(self, steps: Ints, ticks_per_sample: float | None, arrived_ns: int, paused: bool) -> int:
-        """Return the number of unseen wraps of a short counter while the link was closed or samples were missing."""
+    def _hidden_wraps(self, steps: Ints, ticks_per_sample: float | None, arrived_ns: int, link_was_closed: bool) -> int:
+        """Estimate the number of additional counter wraps during a pause of the data."""
         if ticks_per_sample is None:
             return 0
         counter, timeline = self._counter, self._timeline
@@ -145,7 +145,7 @@ class CounterGaps:
             return 0
         turn = counter.modulus / ticks_per_sample  # samples
         counted = int(np.rint(steps / ticks_per_sample).sum())
-        if paused:
+        if link_was_closed:
             timeline.forget_delay()
             elapsed_s = (arrived_ns - timeline.arrived_ns) / NS_PER_S
             turns = max(0, round((elapsed_s * rate_hz - counted) / turn))
@@ -154,7 +154,7 @@ class CounterGaps:
         return turns if turns * counter.modulus < MAX_STEP_TICKS else 0
 
     def _find_stuck_counter(self, samples: SampleBlock, steps: Ints) -> Ints:
-        """Return the number of samples with a stuck counter before each row [n] at which the counter advances again."""
+        """Report a stuck counter. Return the length of the stuck period before each row [n], in samples."""
         before = self._stuck
         if not before and steps.all():
             return np.zeros(len(samples), np.int64)
@@ -170,10 +170,10 @@ class CounterGaps:
         return np.where(waited >= MIN_STUCK_SAMPLES, waited, 0)
 
     def _has_jumped(self, missing: Ints, steps: Ints, arrived_ns: int) -> bool:
-        """Return True if more samples are missing than the device can have sent since the previous sample.
+        """Return True if the device cannot have taken the missing samples in the elapsed time.
 
-        The elapsed time is counted from the earliest time at which the previous sample can have been taken. The arrival
-        time of the previous sample is not used, since the sample may have waited in a buffer.
+        The elapsed time starts at the earliest possible time of the previous sample, because the previous sample may
+        have arrived late.
         """
         counter, timeline = self._counter, self._timeline
         period_s = timeline.earliest_time.period_s or timeline.undelayed_period_s()
@@ -191,34 +191,33 @@ class CounterGaps:
 
 
 class _TypicalStep:
-    """Typical step of a counter, which is the mean of all steps near the median of the recent steps."""
+    """Typical step of a counter: the mean of all steps near the median of recent steps."""
 
     def __init__(self) -> None:
         self._recent: deque[int] = deque(maxlen=STEP_HISTORY)
         self._sum = self._count = 0
 
     @property
-    def mean(self) -> float | None:
-        """Number of ticks per sample; None until the counter has advanced."""
+    def mean_ticks_per_sample(self) -> float | None:
+        """Mean number of ticks per sample, or None before the counter has advanced."""
         return self._sum / self._count if self._count else None
 
-    def update(self, steps: Ints) -> None:
-        """Update the typical step with the steps that are not zero."""
+    def add_steps(self, steps: Ints) -> None:
+        """Add counter steps to the mean. Steps of zero are ignored."""
         moved = steps[steps > 0]
         self._recent.extend(moved[-STEP_HISTORY:].tolist())
         near = self._near(moved)
-        self._add(near)
+        self._add_to_mean(near)
         if near.size < moved.size:
             recent = np.array(self._recent)
             if 2 * self._near(recent).size < recent.size:  # most of the recent steps differ: start again
                 self._sum = self._count = 0
-                self._add(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
+                self._add_to_mean(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
 
-    def _add(self, steps: Ints) -> None:
+    def _add_to_mean(self, steps: Ints) -> None:
         self._sum += int(steps.sum())
         self._count += int(steps.size)
 
     def _near(self, steps: Ints) -> Ints:
-        """Return the steps that are near the typical step."""
-        mean = self.mean
+        mean = self.mean_ticks_per_sample
         return steps[:0] if mean is None else steps[np.abs(steps / mean - 1.0) < STEP_TOLERANCE]

@@ -1,7 +1,7 @@
-"""Detection of repeated rows by a key, which is the sender time or the device counter, and by the values.
+"""Detection and removal of repeated rows.
 
-A row is a repeat if an earlier row has the same key and the same values. If many rows with equal keys have different
-values, the resolution of the keys is too low to distinguish rows. In this case, no row is treated as a repeat.
+A row is a repeat if an earlier row has the same key (sender time or counter value) and the same values. If many rows
+share keys but not values, the keys are too coarse, and no row is treated as a repeat.
 """
 
 from collections import deque
@@ -26,13 +26,13 @@ from drivers.timing.event_rate_limiter import EventRateLimiter
 Mask = NDArray[np.bool_]
 
 MIN_NEW_KEYS: Final = 20
-"""Minimum number of rows with different keys before a row is treated as a repeat."""
+"""Minimum number of rows with different keys before repeats are detected."""
 MAX_SHARED_FRACTION: Final = 0.05
-"""Maximum fraction of rows with the key of another row but other values, up to which repeats are detected."""
+"""Maximum fraction of rows that share a key but not the values. Above this fraction, repeats are not detected."""
 SHARED_FRACTION_ROWS: Final = 2000
-"""Number of recent rows over which the fraction of shared keys is computed."""
+"""Number of recent rows used to compute the fraction of shared keys."""
 SEARCH_ROWS: Final = 256
-"""Number of earlier rows that are searched for a repeat."""
+"""Number of earlier rows that are compared with a new row."""
 
 
 class DuplicateDetector:
@@ -41,8 +41,8 @@ class DuplicateDetector:
     Parameters
     ----------
     ordered : bool
-        True for sender times, which increase. Other rows may then precede the repeat of a row. False for a counter that
-        wraps. A repeat must then follow the row immediately.
+        True for keys that increase, such as sender times. False for a counter that wraps, for which only consecutive
+        rows are compared.
     """
 
     def __init__(self, ordered: bool) -> None:
@@ -65,9 +65,9 @@ class DuplicateDetector:
         Returns
         -------
         repeats : array of bool, shape (n,), or None
-            True for each repeat. None if there are no repeats.
+            True for each repeated row. None if no row is a repeat.
         shared : int
-            Number of rows with the key of an earlier row but other values.
+            Number of rows that share the key of an earlier row but not the values.
         """
         n = len(keys)
         fresh = int(keys[0]) > self._last if self._ordered else int(keys[0]) != self._last
@@ -97,7 +97,8 @@ class DuplicateDetector:
         return (repeats if repeats.any() else None), int((~same).sum())
 
     def _same_key(self, keys: Ints, at: int) -> tuple[Ints, Ints]:
-        """Return the indices of pairs of rows with the same key. The index of the later row is at least ``at``."""
+        """Return the row indices of pairs with the same key. The later row of each pair has an index of at least
+        ``at``."""
         order = np.argsort(keys, kind="stable") if self._ordered else np.arange(len(keys))
         pairs = np.flatnonzero(np.diff(keys[order]) == 0)
         of, row = order[pairs], order[pairs + 1]
@@ -105,7 +106,7 @@ class DuplicateDetector:
         return of[known], row[known]
 
     def _update_shared_fraction(self, fresh: int, shared: int) -> None:
-        """Count rows with new and shared keys. Scale the counts down if their sum exceeds SHARED_FRACTION_ROWS."""
+        """Count rows with new keys and rows with shared keys, with forgetting after SHARED_FRACTION_ROWS rows."""
         self._fresh += fresh
         self._shared += shared
         if self._fresh + self._shared > SHARED_FRACTION_ROWS:
@@ -113,7 +114,7 @@ class DuplicateDetector:
             self._fresh, self._shared = self._fresh * scale, self._shared * scale
 
     def _remember(self, keys: Ints, values: Floats) -> None:
-        """Keep the last SEARCH_ROWS rows for the next search."""
+        """Store the last SEARCH_ROWS rows for comparison with later rows."""
         self._tail.append((keys[-SEARCH_ROWS:], values[-SEARCH_ROWS:]))
         self._kept += len(self._tail[-1][0])
         while self._kept - len(self._tail[0][0]) >= SEARCH_ROWS:
@@ -121,19 +122,19 @@ class DuplicateDetector:
 
 
 class RowFilter:
-    """Filter that removes rows from blocks and adds their ``lost`` counts to the next row.
+    """Filter that removes rows from blocks and preserves the number of missing samples.
 
     Parameters
     ----------
     timing : Timing
-        Source of the sample times, which determines the key of a row.
+        Timing of the wire format, which determines the key of a row.
     events : EventRateLimiter
         Queue for the events about repeated rows.
     """
 
     def __init__(self, timing: Timing, events: EventRateLimiter) -> None:
         self.dropped_repeated_rows = 0
-        """Number of rows that were removed because they repeat an earlier row."""
+        """Number of removed rows that repeat an earlier row."""
         self._timing = timing
         self._events = events
         self._detector = DuplicateDetector(ordered=isinstance(timing, SenderTimedFormat))
@@ -161,9 +162,9 @@ class RowFilter:
         return self.select_rows(samples, np.flatnonzero(~repeats))
 
     def select_rows(self, samples: SampleBlock, rows: Ints) -> SampleBlock | None:
-        """Return the selected rows of a block, or None if no row is selected.
+        """Return the selected rows of a block, or None if the selection is empty.
 
-        Samples that are missing before a removed row count as missing before the next row.
+        Samples that are missing before a removed row are counted before the next row.
 
         Parameters
         ----------

@@ -1,34 +1,31 @@
-"""Earliest time at which the newest sample of a device can have been taken.
+"""Lower bound of the time at which the newest sample of a device was taken.
 
-A sample can be read late but never early. While the reading process gets no processor time, samples wait in the buffers
-of the system and then arrive in one burst. The arrival time is therefore only an upper bound of the sample time. A
-lower bound follows from a clock that advances by one sample period per sample: the sample time is the clock plus the
-minimum delay of the arrivals after this clock (Moon, Skelly and Towsley, "Estimation and removal of clock skew from
-network delay measurements", 1999).
+The arrival time is only an upper bound of the sample time, because samples may wait in buffers. The lower bound is a
+clock that advances by one sample period per sample, plus the minimum delay of the arrivals. Source: Moon, Skelly and
+Towsley, "Estimation and removal of clock skew from network delay measurements", 1999.
 
-The minimum delay is taken over the current window of WINDOW_S and the window before it, so that an error of the assumed
-sample period has a limited effect. The bound is valid if at least one sample in the two windows was read without delay.
-The module does no I/O and reads no clock.
+The minimum delay is computed over two consecutive windows of WINDOW_S, which limits the effect of an incorrect sample
+period. The bound is valid if at least one sample in the two windows was read without delay.
 """
 
 from math import inf
 from typing import Final
 
 WINDOW_S: Final = 60.0
-"""Length of each of the two windows over which the minimum delay is taken."""
+"""Length of each of the two windows for the minimum delay."""
 MAX_STEP_S: Final = 1.0
-"""Maximum time that one arrival adds to a window. After a long pause, a single arrival measures only one delay."""
+"""Maximum time that one arrival adds to a window, so that a long pause does not fill a window."""
 SETTLED_S: Final = 10.0
-"""Minimum duration of the arrivals from which the sample period is determined.
+"""Minimum duration of the arrivals for an estimate of the sample period.
 
-In a shorter time, a single late arrival has a large effect on the period.
+In a shorter time, a single late arrival would distort the sample period.
 """
 MAX_PROMPT_DELAY_S: Final = 0.05
-"""Maximum delay, relative to the minimum delay, of an arrival at which a new sample period is adopted."""
+"""Maximum delay of an arrival at which a new sample period is adopted, relative to the minimum delay."""
 
 
 class EarliestSampleTime:
-    """Earliest host time at which the newest sample can have been taken.
+    """Estimator of the earliest time at which the newest sample can have been taken.
 
     Examples
     --------
@@ -42,7 +39,7 @@ class EarliestSampleTime:
 
     def __init__(self) -> None:
         self.period_s: float | None = None
-        """Sample period in s by the clock of the host, determined when a sample was read without delay."""
+        """Sample period in s on the clock of the host, updated when a sample is read without delay."""
         self._clock_s: float | None = None  # clock that advances by one period per sample
         self._uncounted = 0.0  # number of samples that arrived before a period was known
         self._start_delay_s = inf  # delay of the start, if the clock was started before the first arrival
@@ -52,18 +49,18 @@ class EarliestSampleTime:
 
     @property
     def newest_sample_not_before_s(self) -> float | None:
-        """Earliest time at which the newest sample can have been taken, in s; None before the first sample."""
+        """Earliest possible time of the newest sample in s, or None before the first sample."""
         if self._clock_s is None:
             return None
         return self._clock_s + min(self._start_delay_s, self._delay_s, self._previous_delay_s)
 
     @property
     def has_enough_arrivals(self) -> bool:
-        """True if samples have arrived for SETTLED_S. Pauses of the reader do not count."""
+        """True if samples have arrived for at least SETTLED_S, excluding pauses."""
         return self._total_s >= SETTLED_S
 
     def start_clock(self, not_before_s: float) -> None:
-        """Start the clock at the time ``not_before_s`` in s, before which the previous sample was not taken."""
+        """Start the clock at the earliest possible time of the previous sample in s."""
         self._clock_s = self._arrived_s = not_before_s
         self._start_delay_s = 0.0
 
@@ -77,7 +74,7 @@ class EarliestSampleTime:
         arrived_s : float
             Arrival time of the newest sample in s.
         period_s : float or None
-            Sample period in s according to the arrivals so far; None if the period is unknown.
+            Sample period in s according to the arrivals so far, or None if unknown.
         """
         self._uncounted += samples
         step_s = 0.0

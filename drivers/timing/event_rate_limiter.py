@@ -1,17 +1,17 @@
-"""Rate limiter for events: at most one event of each kind per second of sample time."""
+"""Rate limiter that passes at most one event of each kind per second."""
 
 from typing import Final
 
 from drivers.data_types import NS_PER_S, Event
 
 MIN_EVENT_INTERVAL_S: Final = 1.0
-"""Shortest time between two events of one kind."""
+"""Minimum time between two events of the same kind."""
 
 
 class EventRateLimiter:
-    """Queue of events that passes at most one event of each kind in MIN_EVENT_INTERVAL_S of sample time.
+    """Event queue that passes at most one event of each kind per MIN_EVENT_INTERVAL_S of sample time.
 
-    The next event of the kind states the number of events that were held back.
+    Excess events are held back and counted in the next event of the same kind.
     """
 
     def __init__(self) -> None:
@@ -20,7 +20,7 @@ class EventRateLimiter:
         self._held_back: dict[tuple[str, str], tuple[int, str, int]] = {}
 
     def report_event(self, kind: str, t_ns: int, text: str, n: int = 0) -> None:
-        """Report an event.
+        """Add an event, or hold the event back if the previous event of the same kind is too recent.
 
         Parameters
         ----------
@@ -29,9 +29,9 @@ class EventRateLimiter:
         t_ns : int
             Time of the event in ns.
         text : str
-            Text of the event. ``{n}`` is replaced by the sum of ``n`` over this event and the events held back.
+            Text of the event. ``{n}`` is replaced by the sum of ``n`` over all combined events.
         n : int
-            Number of rows that the event concerns.
+            Number of affected rows.
         """
         key = (kind, text if "{n}" in text else "")
         held = self._held_back.pop(key, None)
@@ -44,7 +44,7 @@ class EventRateLimiter:
         self.release_held_events(t_ns)
 
     def release_held_events(self, t_ns: int) -> None:
-        """Move the events that have been held back long enough at the time ``t_ns`` to the queue."""
+        """Release held events whose waiting time has ended at the time ``t_ns``."""
         for (kind, what), (at_ns, text, n) in [*self._held_back.items()] if self._held_back else ():
             if kind not in self._last_ns or abs(t_ns - self._last_ns[kind]) >= MIN_EVENT_INTERVAL_S * NS_PER_S:
                 del self._held_back[(kind, what)]
@@ -53,7 +53,7 @@ class EventRateLimiter:
                 self._events.append(Event(kind, at_ns, text.replace("{n}", str(n)) + more))
 
     def take_events(self, ended: bool = False) -> list[Event]:
-        """Return the events since the last call. If ``ended`` is True, include the events that are held back."""
+        """Remove and return the queued events. If ``ended`` is True, include all held events."""
         while ended and self._held_back:
             self._last_ns.clear()
             self.release_held_events(0)

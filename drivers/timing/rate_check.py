@@ -1,11 +1,9 @@
-"""Comparison of the configured sample rate with the measured sample rate.
+"""Check of the configured sample rate against the measured sample rate.
 
-A wrong rate shifts the Allan deviation along τ and scales the coefficients. N scales with the square root of the error
-of the rate, K with the inverse square root. If the two rates agree within the measurement uncertainty, the configured
-rate is used. If the difference is larger but within the tolerance of an oscillator, the measured rate is used. If the
-difference exceeds this tolerance, the measured rate contradicts the configured rate, and the program cannot determine
-the cause. The caller must then not publish results that depend on the rate. The reasons are in
-docs/decisions/rate-is-a-label.md and docs/decisions/contradicted-rate.md. The module does no I/O and reads no clock.
+An incorrect sample rate shifts the Allan deviation along τ and scales the noise coefficients. A difference within the
+tolerance of an oscillator is corrected by using the measured rate. After a larger difference, results that depend on
+the sample rate must not be published, because the cause is unknown (docs/decisions/rate-is-a-label.md,
+docs/decisions/contradicted-rate.md).
 """
 
 from typing import Final
@@ -13,17 +11,18 @@ from typing import Final
 from drivers.timing.arrival_regression import snap_to_standard_rate
 
 AGREEMENT_LIMIT: Final = 0.005
-"""Relative difference up to which two rates agree. The resulting error of N and K is at most a quarter of a percent."""
+"""Relative difference up to which two rates agree. The resulting error of N and K is at most 0.25 %."""
 CONTRADICTION_LIMIT: Final = 0.02
-"""Relative difference above which the rates contradict each other. Oscillators of sensors are more accurate."""
+"""Relative difference above which the measured rate contradicts the configured rate. Sensor oscillators are more
+accurate."""
 HYSTERESIS_FACTOR: Final = 0.75
-"""Ratio of the limit at which a contradiction ends to the limit at which the contradiction begins."""
+"""Ratio of the threshold for the end of a contradiction to the threshold for the beginning."""
 UPDATE_THRESHOLD: Final = 0.001
-"""Relative change of the measured rate above which the rate in use is replaced."""
+"""Relative change of the measured rate above which the rate in use is updated."""
 
 
 class RateCheck:
-    """Comparison of the configured sample rate of one device with the measured rate.
+    """Check of the configured sample rate of one device against measured rates.
 
     Parameters
     ----------
@@ -33,10 +32,10 @@ class RateCheck:
     Examples
     --------
     >>> check = RateCheck(200.0)
-    >>> check.update(99.3, uncertainty=0.001)
+    >>> check.compare_with_measured_rate(99.3, relative_uncertainty=0.001)
     >>> check.rate_hz, check.contradicted
     (99.3, True)
-    >>> check.update(200.3, uncertainty=0.001)
+    >>> check.compare_with_measured_rate(200.3, relative_uncertainty=0.001)
     >>> check.rate_hz, check.contradicted
     (200.0, False)
     """
@@ -46,25 +45,25 @@ class RateCheck:
         self.measured_hz: float | None = None
         """Newest measured rate in Hz; None before the first measurement."""
         self.rate_hz = configured_hz
-        """Rate to use, in Hz."""
+        """Sample rate in use, in Hz."""
         self.contradicted = False
         """True if the measured rate contradicts the configured rate."""
 
-    def update(self, measured_hz: float, uncertainty: float) -> None:
-        """Compare the configured rate with a new measurement.
+    def compare_with_measured_rate(self, measured_hz: float, relative_uncertainty: float) -> None:
+        """Compare the configured sample rate with a new measurement.
 
         Parameters
         ----------
         measured_hz : float
             Measured sample rate in Hz.
-        uncertainty : float
-            Plausible relative error of the measured rate.
+        relative_uncertainty : float
+            Relative uncertainty of the measured rate.
         """
         self.measured_hz = measured_hz
         difference = abs(measured_hz / self.configured_hz - 1.0)
         limit = CONTRADICTION_LIMIT * (HYSTERESIS_FACTOR if self.contradicted else 1.0)
-        self.contradicted = difference > max(limit, uncertainty)
-        if difference <= max(AGREEMENT_LIMIT, uncertainty):
+        self.contradicted = difference > max(limit, relative_uncertainty)
+        if difference <= max(AGREEMENT_LIMIT, relative_uncertainty):
             self.rate_hz = self.configured_hz
         elif self.rate_hz == self.configured_hz or abs(measured_hz / self.rate_hz - 1.0) > UPDATE_THRESHOLD:
             self.rate_hz = snap_to_standard_rate(measured_hz)

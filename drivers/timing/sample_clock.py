@@ -1,17 +1,14 @@
-"""Sample clock, which assigns a time to each sample and detects missing samples.
+"""Sample clock, which assigns a time to each sample and detects missing and repeated samples.
 
-Sample times have one of three sources, depending on the wire format (``drivers.data_types.Timing``):
+The source of the sample times depends on the wire format (``drivers.data_types.Timing``). There are three sources.
 
-- A device counter (``counter_gaps``) gives the exact number of missing samples.
-- If there are only arrival times (``arrival_timeline``), missing samples are detected from rejected frames, from the
-  time during which the link was closed, and from persistent delays.
-- The sender gives the sample times (``sender_times``), which are used unchanged.
+- Device counter: counter values give the number of missing samples, arrival times give the sample times
+  (``counter_gaps``).
+- Arrival times only: arrival times give the sample times and the number of missing samples (``arrival_timeline``).
+- Sender times: the times from the sender are used unchanged (``sender_times``).
 
-In the first two cases, the sample times are on a line that is fitted to the arrival times. ``lost`` of each returned
-block is the number of samples that are missing just before the block, including rejected frames.
 
-Repeated rows are dropped and reported (``duplicate_rows``). There is at most one event of each kind per second of
-sample time (``event_rate_limiter``). The sample clock does not change values, does no I/O and reads no clock.
+Repeated rows are removed (``duplicate_rows``). Measured values are never changed.
 """
 
 from dataclasses import dataclass
@@ -30,19 +27,18 @@ from drivers.timing.rate_check import RateCheck
 from drivers.timing.sender_times import SenderTimes
 
 MAX_RESUME_DELAY_S: Final = 10.0
-"""Assumed maximum delay between taking and reading the last sample before a restart."""
+"""Assumed maximum delay of the last sample before a restart."""
 RATE_CHECK_S: Final = 30.0
 RATE_CHECK_SAMPLES: Final = (2 * MIN_SAMPLES, round(MIN_SPAN_S * MAX_RATE_HZ))
-"""Numbers of samples after which the rate check is abandoned if no rate could be measured.
+"""Numbers of samples after which the rate check is abandoned without a measured rate.
 
-The check is abandoned after the first number of samples if RATE_CHECK_S has passed, and otherwise after the second
-number of samples.
+The first number applies after RATE_CHECK_S, the second number before.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class LastSample:
-    """Last sample before a restart of the program."""
+    """Time, counter value and rates of the last sample before a restart."""
 
     t_ns: int  # on the clock of the sample times of the device
     tick: int  # counter of the device; NO_TICK = none
@@ -51,17 +47,16 @@ class LastSample:
 
 
 class SampleClock:
-    """Sample times and missing samples of one device.
+    """Clock that assigns sample times and detects missing samples of one device.
 
     Parameters
     ----------
     timing : Timing
-        Source of the sample times in the wire format.
+        Timing of the wire format.
     rate_hz : float or None
-        Configured sample rate in Hz. None if the rate is determined from the data.
+        Configured sample rate in Hz, or None to measure the sample rate.
     arrivals_are_timed : bool
-        False if arrival times do not depend on the sample rate, because bytes are read from a file, or because a
-        simulated sensor does not run in real time.
+        False if arrival times are unrelated to the sample rate, as for bytes from a file.
     """
 
     def __init__(self, timing: Timing, rate_hz: float | None, arrivals_are_timed: bool = True) -> None:
@@ -81,39 +76,38 @@ class SampleClock:
         self._ended = self._resumed = self._paused = False
         self._idle_ns: int | None = None  # last time at which the link held no unread data
 
-    def resume(self, before: LastSample) -> None:
-        """Continue from the last recorded sample before a restart. The samples after this sample are missing."""
+    def resume_after_restart(self, last_sample: LastSample) -> None:
+        """Continue from the last recorded sample before a restart."""
         timeline = self._timeline
         self._resumed = self._paused = True
-        timeline.assumed_hz = timeline.nominal_hz or before.rate_hz
-        timeline.last_t_ns = timeline.arrived_ns = timeline.origin_ns = before.t_ns
+        timeline.assumed_hz = timeline.nominal_hz or last_sample.rate_hz
+        timeline.last_t_ns = timeline.arrived_ns = timeline.origin_ns = last_sample.t_ns
         timeline.earliest_time.start_clock(-MAX_RESUME_DELAY_S)
         if self._sender is not None:
             timeline.line.add_point(timeline.index, 0.0, timeline.assumed_hz)
-        if self._counter is not None and before.tick != NO_TICK and before.ticks_per_sample is not None:
-            self._counter.resume(before.tick, before.ticks_per_sample)
+        if self._counter is not None and last_sample.tick != NO_TICK and last_sample.ticks_per_sample is not None:
+            self._counter.resume_at_tick(last_sample.tick, last_sample.ticks_per_sample)
 
     @property
     def dropped_repeated_rows(self) -> int:
-        """Number of rows that were dropped because they repeat earlier rows."""
+        """Number of dropped rows that repeat an earlier row."""
         return self._rows.dropped_repeated_rows
 
     @property
     def dropped_late_rows(self) -> int:
-        """Number of rows that were dropped because they had already been counted as missing."""
+        """Number of dropped rows that arrived after the sample had been counted as missing."""
         return 0 if self._sender is None else self._sender.dropped_late_rows
 
     @property
     def ticks_per_sample(self) -> float | None:
-        """Number of ticks of the device counter per sample; None until the counter has advanced."""
-        return None if self._counter is None else self._counter.typical_step.mean
+        """Number of ticks of the device counter per sample, or None before the counter has advanced."""
+        return None if self._counter is None else self._counter.typical_step.mean_ticks_per_sample
 
     @property
     def rate_hz(self) -> float | None:
-        """Sample rate in Hz, configured or measured; None if the rate is unknown or outside the supported range.
+        """Configured or measured sample rate in Hz, or None if the rate is unknown or unsupported.
 
-        A measured rate that contradicts the configured rate replaces the configured rate
-        (``drivers.timing.rate_check``).
+        A contradicting measured rate replaces the configured rate (``drivers.timing.rate_check``).
         """
         if self._check is not None:
             return self._check.rate_hz
@@ -124,17 +118,17 @@ class SampleClock:
 
     @property
     def measured_hz(self) -> float | None:
-        """Measured sample rate in Hz by the clock of the host, without rounding; None if unknown."""
+        """Sample rate in Hz measured with the clock of the host, or None if unknown."""
         return self._timeline.line.rate_hz() if self._timeline.line.can_tell_gap_from_jitter() else None
 
     @property
-    def contradicted_hz(self) -> float | None:
-        """Measured rate in Hz if the measured rate contradicts the configured rate, otherwise None."""
+    def contradicting_rate_hz(self) -> float | None:
+        """Measured sample rate in Hz if the configured rate is contradicted, otherwise None."""
         return self._check.measured_hz if self._check is not None and self._check.contradicted else None
 
     @property
     def rate_check_pending(self) -> bool:
-        """True if samples have arrived but the configured rate has not been checked."""
+        """True if samples have arrived but the configured sample rate has not been checked."""
         if self._check is None or self._check.measured_hz is not None or self._ended:
             return False
         if not self._stamped:
@@ -145,25 +139,25 @@ class SampleClock:
         return self._arrivals_are_timed or self._sender is not None or self._has_device_clock
 
     def compare_rates_at_end(self) -> None:
-        """Check the configured rate with the available samples, because no more samples will arrive."""
+        """Check the configured sample rate at the end of the data."""
         if not self._ended and self._check is not None and self._check.measured_hz is None:
             self._check_rate(final=True)
         self._ended = True
 
     def take_events(self, ended: bool = False) -> list[Event]:
-        """Return the events since the last call. If ``ended`` is True, include the events that are held back."""
+        """Remove and return the queued events. If ``ended`` is True, include all held events."""
         return self._events.take_events(ended)
 
     def note_link_closed(self) -> None:
-        """Prepare for samples after a closed link. The next arrival time gives the number of missing samples."""
+        """Record that the link was closed. The next arrival time then gives the number of missing samples."""
         self._paused = True
 
-    def note_no_unread_data(self, t_ns: int) -> None:
-        """Store a time at which the link held no unread data, on the monotonic clock of the host.
+    def note_no_unread_data(self, host_t_ns: int) -> None:
+        """Record a host time at which the link contained no unread data.
 
-        Only the last such time before the first sample is used. The time limits the delay of the first samples.
+        The last recorded time before the first sample limits the delay of the first sample.
         """
-        self._idle_ns = t_ns
+        self._idle_ns = host_t_ns
 
     def assign_times(self, samples: SampleBlock) -> list[SampleBlock]:
         """Assign times to samples.
@@ -171,12 +165,13 @@ class SampleClock:
         Parameters
         ----------
         samples : SampleBlock
-            Decoded samples whose ``t_ns`` are arrival times or sender times.
+            Decoded samples. ``t_ns`` contains arrival times or sender times.
 
         Returns
         -------
         list of SampleBlock
-            Samples with assigned times. A new block begins where samples are missing.
+            Samples with assigned times, split where samples are missing. ``lost`` is the number of missing samples
+            before a block.
         """
         timeline = self._timeline
         if timeline.origin_ns is None:
@@ -197,13 +192,13 @@ class SampleClock:
 
     @property
     def _has_device_clock(self) -> bool:
-        """True if the counter of the device measures time."""
+        """True if the device counter measures time."""
         return self._counter is not None and self._counter.clock_line.count > 0
 
     def _check_rate(self, final: bool = False) -> None:
-        """Compare the configured rate with the measured rate, preferably by the clock of the device.
+        """Compare the configured sample rate with the rate by the device clock or by arrival times.
 
-        At the end of a short recording, the rate by arrival times is too inaccurate and is not used.
+        If ``final`` is True, arrival times are not used, because a short series of arrival times is inaccurate.
         """
         line = None
         if self._counter is not None and self._has_device_clock:
@@ -212,10 +207,10 @@ class SampleClock:
             line = self._timeline.line
         found = line.measure_rate(final) if self._check is not None and line is not None else None
         if self._check is not None and found is not None:
-            self._check.update(*found)
+            self._check.compare_with_measured_rate(*found)
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Determine missing samples and times according to the timing of the wire format."""
+        """Assign times and missing samples according to the timing of the wire format."""
         if self._sender is not None:
             return self._sender.split_at_missing_samples(samples)
         if self._paused and self.rate_hz is None:
@@ -230,7 +225,7 @@ class SampleClock:
         return self._timeline.assign_line_times(samples, missing)
 
     def _missing_by_arrival(self, samples: SampleBlock) -> Ints:
-        """Return the number of missing samples [n] before each row according to the arrival times."""
+        """Estimate the number of missing samples before each row [n] from arrival times."""
         missing = np.zeros(len(samples), np.int64)
         arrived_ns = int(samples.t_ns[-1])
         if self._paused:

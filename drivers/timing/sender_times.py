@@ -1,10 +1,10 @@
-"""Order and gaps of samples whose times the sender gives.
+"""Detection of missing, late and reordered rows from sender times.
 
-If the sender stamps samples on arrival, times may be wrong by whole periods although no sample is missing. A long step
-between two times therefore counts as a gap only if the other steps are regular.
+Irregular sender times can contain long steps although no sample is missing. A long step therefore indicates missing
+samples only if most other steps are regular.
 
-If the times of one block become evenly spaced by sorting, the rows are sorted. Otherwise the times are only affected by
-jitter, and the order of arrival is kept. A row that arrives after the sample was counted as missing is dropped.
+Rows are sorted by time only if sorting makes the times evenly spaced. Late rows that were already counted as missing
+are dropped.
 """
 
 from collections import deque
@@ -19,35 +19,35 @@ from drivers.timing.duplicate_rows import SEARCH_ROWS, RowFilter
 from drivers.timing.event_rate_limiter import EventRateLimiter
 
 FORWARD_JUMP_S: Final = 3600.0
-"""Step between two sender times above which an event is reported."""
+"""Forward step of the sender time above which a clock jump is reported."""
 STEP_HISTORY: Final = 255
-"""Number of recent steps from which the typical deviation is determined."""
+"""Number of recent steps used to determine the typical deviation."""
 STEP_TOLERANCE: Final = 0.25
-"""Maximum deviation of a step from a whole number of periods, in periods, for evenly spaced times."""
+"""Maximum deviation of a step from a whole number of periods, in periods."""
 CERTAIN_GAP_PERIODS: Final = 4.0
-"""Step in periods above which a step is a gap, even if the step is not a whole number of periods."""
+"""Step in periods above which samples are missing, even if the step is not a whole number of periods."""
 MAX_LATENESS_RATIO: Final = 8.0
-"""Ratio of the longest step without a gap to the upper quartile of the deviations, both as excess over one period."""
+"""Largest deviation of a step without missing samples, as a multiple of the upper quartile of the deviations."""
 MAX_PERIOD_NS: Final = float(1 << 54)
-"""Longest period for which the times of missing samples are stored, 200 days, so that the times fit into int64."""
+"""Longest sample period for which times of missing samples fit into int64, about 200 days."""
 
 
 class SenderTimes:
-    """Detector of gaps and reordered rows in sender times.
+    """Detector of missing, late and reordered rows in sender times.
 
     Parameters
     ----------
     timeline : ArrivalTimeline
-        Fitted line of sender time against sample index.
+        Regression line of sender time on sample index.
     rows : RowFilter
-        Filter that removes rows and keeps their ``lost`` counts.
+        Filter that removes rows.
     events : EventRateLimiter
         Queue for the events about jumps and reordered rows.
     """
 
     def __init__(self, timeline: ArrivalTimeline, rows: RowFilter, events: EventRateLimiter) -> None:
         self.dropped_late_rows = 0
-        """Number of rows that were dropped because they had already been counted as missing."""
+        """Number of dropped rows that arrived after the sample had been counted as missing."""
         self._timeline = timeline
         self._rows = rows
         self._events = events
@@ -56,7 +56,7 @@ class SenderTimes:
         self._steps_s: deque[float] = deque(maxlen=STEP_HISTORY)
 
     def sort_rows(self, samples: SampleBlock) -> SampleBlock | None:
-        """Sort the rows of a block by time, and remove late rows. Return None if no row remains."""
+        """Sort the rows of a block by time, and remove late rows. Return None if all rows are removed."""
         t, last_ns = samples.t_ns, self._timeline.last_t_ns
         in_order = t[0] >= last_ns and (len(t) == 1 or (np.diff(t) >= 0).all())
         if not self._timeline.line.count or in_order:
@@ -68,7 +68,7 @@ class SenderTimes:
         if kept is None:
             return None
         steps = np.diff(kept.t_ns)
-        order = None if (steps < -JUMP_S * NS_PER_S).any() else find_steady_order(kept.t_ns, period_s)
+        order = None if (steps < -JUMP_S * NS_PER_S).any() else find_evenly_spaced_order(kept.t_ns, period_s)
         if order is None:
             return kept
         n = int((steps < 0).sum())
@@ -76,7 +76,7 @@ class SenderTimes:
         return self._rows.select_rows(kept, order)
 
     def split_at_missing_samples(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Return the samples with unchanged times, in blocks that begin where samples are missing."""
+        """Split a block where samples are missing, without changing the sample times."""
         t, timeline = samples.t_ns, self._timeline
         steps = np.empty(len(samples), np.int64)
         steps[0] = t[0] - timeline.last_t_ns if timeline.line.count else 0
@@ -101,7 +101,7 @@ class SenderTimes:
         return split_at_gaps(samples, t, missing)
 
     def _remove_late_rows(self, samples: SampleBlock, period_s: float) -> SampleBlock | None:
-        """Remove the rows that have already been counted as missing. Return None if no row remains."""
+        """Remove rows that were already counted as missing. Return None if all rows are removed."""
         distance_ns = np.abs(samples.t_ns[:, None] - np.array(self._missing_t_ns))
         late = samples.t_ns < self._timeline.last_t_ns
         late &= distance_ns.min(axis=1) < STEP_TOLERANCE * period_s * NS_PER_S
@@ -116,14 +116,14 @@ class SenderTimes:
         return self._rows.select_rows(samples, np.flatnonzero(~late))
 
     def _keep_missing_times(self, t: Ints, missing: Ints, period_s: float) -> None:
-        """Store the times of missing samples, because the samples may arrive later."""
+        """Store the times of missing samples, which may arrive later."""
         period_ns = min(period_s * NS_PER_S, MAX_PERIOD_NS)
         for row in np.flatnonzero((missing > 0) & (missing <= SEARCH_ROWS)).tolist():
             before_ns = np.rint(np.arange(1, missing[row] + 1) * period_ns)
             self._missing_t_ns.extend((t[row] - before_ns).astype(np.int64).tolist())
 
     def _period_s(self, steps: Ints) -> float | None:
-        """Return the sample period for the detection of gaps; None while the period is unknown."""
+        """Return the sample period in s for the detection of missing samples, or None if unknown."""
         if self._timeline.line.can_tell_gap_from_jitter():
             return self._timeline.line.period_s()
         if self._timeline.assumed_hz:
@@ -131,7 +131,7 @@ class SenderTimes:
         return _typical_period_s(steps) if steps.sum() > MIN_SPAN_S * NS_PER_S else None
 
     def _report_jumps(self, t: Ints, steps: Ints) -> None:
-        """Report times that went back or jumped ahead."""
+        """Report backward and forward jumps of the sender time."""
         back = steps < (-JUMP_S * NS_PER_S if self._went_back else 0.0)  # small steps back are reported only once
         if back.any():
             at = int(np.argmax(back))
@@ -142,10 +142,10 @@ class SenderTimes:
             self._events.report_event("clock_jumped", int(t[at]), f"time jumped ahead by {steps[at] / NS_PER_S:.6g} s")
 
     def _count_missing(self, steps_s: Floats, period_s: float) -> Ints:
-        """Return the number of missing samples [n] before each row; 0 unless most steps are one period long.
+        """Return the number of missing samples before each row [n]. If most steps are irregular, return zeros.
 
-        A short gap must be a whole number of periods and exceed the typical deviation. If a neighbouring step is
-        shorter by the same time, the row was only late.
+        A short step must be a whole number of periods and exceed the typical deviation. A neighbouring short step shows
+        that the row was only late.
         """
         last_s = self._steps_s[-1] if self._steps_s else period_s
         self._steps_s.extend(steps_s[-STEP_HISTORY:].tolist())
@@ -165,8 +165,8 @@ class SenderTimes:
         return gap
 
 
-def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
-    """Return the order in which sender times are evenly spaced.
+def find_evenly_spaced_order(t_ns: Ints, period_s: float) -> Ints | None:
+    """Return the row order in which the sender times are evenly spaced.
 
     Parameters
     ----------
@@ -178,13 +178,13 @@ def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
     Returns
     -------
     array of int64, shape (n,), or None
-        Row index of each position. None if the times are already in order, or are not evenly spaced in any order.
+        Row index at each position, or None if the times are already sorted or irregular.
 
     Examples
     --------
-    >>> find_steady_order(np.array([0, 10, 30, 20, 40]) * 10**6, 0.01).tolist()
+    >>> find_evenly_spaced_order(np.array([0, 10, 30, 20, 40]) * 10**6, 0.01).tolist()
     [0, 1, 3, 2, 4]
-    >>> find_steady_order(np.array([0, 10, 8, 20, 18]) * 10**6, 0.01) is None
+    >>> find_evenly_spaced_order(np.array([0, 10, 8, 20, 18]) * 10**6, 0.01) is None
     True
     """
     if (np.diff(t_ns) >= 0).all():
@@ -199,9 +199,9 @@ def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
 
 
 def _typical_period_s(steps: Ints) -> float | None:
-    """Estimate the sample period in s from the steps; None if no step is positive.
+    """Estimate the sample period in s from time steps. Return None if no step is positive.
 
-    The estimate is the median if the steps are regular, otherwise the mean.
+    The estimate is the median of regular steps, or the mean of irregular steps.
     """
     forward = steps[steps > 0] / NS_PER_S
     if not forward.size:

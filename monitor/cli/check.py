@@ -46,8 +46,8 @@ def _defaults(link: str | None, decoder: str | None) -> str:
 
     texts = []
     for option, name, form in (
-        ("--link", link, printed_defaults.format_link),
-        ("--decoder", decoder, printed_defaults.format_decoder),
+        ("--link", link, printed_defaults.format_link_defaults),
+        ("--decoder", decoder, printed_defaults.format_decoder_defaults),
     ):
         if name is not None:
             with name_option_in_config_errors(option):

@@ -26,7 +26,7 @@ def demo(
     viewer: options.Viewer = None,
 ) -> None:
     """Run the service on a simulated MEMS IMU that sends a real wire format over a pseudo-terminal."""
-    from monitor.simulator.demo_config import demo_config as configuration
+    from monitor.simulator.demo_config import build_demo_config as configuration
 
     service_in_terminal.run_service(
         configuration(sensor, effect or (), options.parse_duration("--effect-at", effect_at)), seconds, viewer

@@ -142,7 +142,7 @@ def _history_path(source: Path) -> Path:
         return source / FILE_NAME
     if source.name == FILE_NAME:
         return source
-    config = loading.load(source, pipe=True)
+    config = loading.load_config(source, allow_pipe=True)
     if config.storage is None:
         raise ConfigError(f"{source}: stores no history, because [storage] has no folder")
     return config.storage.folder / FILE_NAME

@@ -21,6 +21,6 @@ def run(
     from monitor.settings import loading
 
     found = service_in_terminal.with_viewer_history_length(
-        loading.load(config, pipe=True), options.parse_duration("--history", history)
+        loading.load_config(config, allow_pipe=True), options.parse_duration("--history", history)
     )
     service_in_terminal.run_service(found, seconds, viewer)

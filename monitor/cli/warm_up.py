@@ -12,12 +12,12 @@ from monitor.cli.shared import output
 
 def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True)] = False) -> None:
     """Compile the numerical kernels and store the compiled kernels on disk for a quick start."""
-    from monitor.common.compiled import cache_folder
+    from monitor.common.compiled import kernel_cache_folder
     from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
     if from_stdin:
         kernel_compilation.compile_from_stdin(sys.stdin, sys.stdout)
-    folder = cache_folder()
+    folder = kernel_cache_folder()
     if folder is None:
         raise ConfigError(
             "compiled kernels cannot be stored, because no cache folder can be written; set NUMBA_CACHE_DIR to a "

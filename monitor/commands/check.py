@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from drivers.errors import ConfigError
-from monitor.settings.loading import Config, ModelDependentSettings, examine
+from monitor.settings.loading import Config, ModelDependentSettings, examine_config_file
 
 
 def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
@@ -27,7 +27,7 @@ def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | Non
     wrong : list of str
         One line of text for each mistake. The line begins with the path of the file.
     """
-    reading = examine(path, pipe=pipe)
+    reading = examine_config_file(path, allow_pipe=pipe)
     wrong = [*reading.wrong, *(f"{path}: {use.device}: {line}" for use in reading.models for line in _problems(use))]
     return None if wrong else reading.config, wrong
 
@@ -44,8 +44,8 @@ def _problems(use: ModelDependentSettings) -> Iterator[str]:
         yield from error.lines
     try:
         if use.virtual is not None:
-            from monitor.simulator.encoding_sensor import check_sensor
+            from monitor.simulator.encoding_sensor import check_sensor_settings
 
-            check_sensor(use.virtual)
+            check_sensor_settings(use.virtual)
     except ConfigError as error:
         yield from error.lines

@@ -30,7 +30,7 @@ from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
 from drivers.number_ranges import DAY_S
 from monitor.commands.check import check_configuration
-from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
+from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, describe_lock_holder
 from monitor.common.units import format_count
 from monitor.settings.file_permissions import contains_secret
 from monitor.settings.loading import Config, Storage
@@ -343,7 +343,7 @@ def _check_storage(config: Config) -> Iterator[Finding]:
 def _check_in_use(own: Storage) -> Iterator[Finding]:
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
     do = "no problem if it is this service; otherwise end it, or choose another folder: only one program records"
-    for holder in sorted({lock_holder(own.folder, name) for name, on in wanted.items() if on} - {""}):
+    for holder in sorted({describe_lock_holder(own.folder, name) for name, on in wanted.items() if on} - {""}):
         yield _doubt("storage", f"{own.folder}: in use by {holder}", do)
 
 
@@ -354,8 +354,8 @@ def recorded_bytes_per_day(config: Config) -> float | None:
     --------
     >>> import dataclasses
     >>> from monitor.common.shipped_config_paths import CONFIG_FOLDER
-    >>> from monitor.settings.loading import load
-    >>> one = load(CONFIG_FOLDER / "demo.toml")
+    >>> from monitor.settings.loading import load_config
+    >>> one = load_config(CONFIG_FOLDER / "demo.toml")
     >>> kept = Storage(folder=Path("kept"))
     >>> recorded_bytes_per_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES
     True
@@ -484,11 +484,11 @@ def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
 
 
 def _check_kernels() -> Finding:
-    from monitor.common.compiled import cache_folder
+    from monitor.common.compiled import kernel_cache_folder
     from monitor.daemon.kernels.kernel_compilation import is_warm
     from monitor.daemon.kernels.kernel_parts import SERVICE
 
-    folder = cache_folder()
+    folder = kernel_cache_folder()
     if folder is None:
         text = "no folder for compiled kernels is writable: every start compiles them again, for one or two minutes"
         return _doubt("kernels", text, "set NUMBA_CACHE_DIR to a folder of the service's user")

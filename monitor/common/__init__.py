@@ -1,1 +1,1 @@
-"""Modules that all packages share: units, compiled kernels, zenoh topics, distributions, minimization, folder locks."""
+"""Modules that all packages of the monitor share."""

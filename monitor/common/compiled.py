@@ -1,21 +1,17 @@
-"""Decorators for numerical kernels: compile with Numba at the first call, cache on disk, release the GIL.
+"""Decorators that compile numerical functions (kernels) with Numba and cache the machine code on disk.
 
-If no cache folder can be written (a read-only system, a user without a home folder), kernels are compiled at every
-start.
+Without a writable cache folder, kernels are compiled at every start of the program.
 
-Before loading cached code, Numba only checks whether the file of the kernel has changed. A kernel also contains
-functions and constants from other files. The version of the cache therefore covers all imported files.
+A cached kernel becomes invalid if the source file of the kernel or any imported module changes.
 
-By default, Numba generates machine code for each kernel, and again for the copy of the kernel inside every calling
-kernel. LLVM would compile a function at the fifth level of calls five times. ``Kernel`` therefore keeps a function that
-other kernels call as intermediate code. This code is optimised once, as a part of the kernel that Python calls. The
-first start takes more than a quarter less time (``docs/benchmarks-service.md``). The machine code of the outer kernels
-does not change.
+By default, Numba generates machine code for every function that a kernel calls, although Python never calls the
+function. ``Kernel`` keeps such functions as intermediate code, which shortens the first start by more than a quarter
+(``docs/benchmarks-service.md``).
 
-Kernels receive and return NamedTuples of arrays. In a loop, array fields are first copied to local names, because Numba
-counts a reference at each access to a field.
+Kernels copy array fields of a NamedTuple to local variables before a loop, because Numba counts a reference at each
+access to a field.
 
-Until the kernels are compiled, a thread can run them in the Python interpreter (``interpreted``).
+``interpret_uncompiled_kernels`` runs kernels in the Python interpreter during compilation.
 """
 
 import contextlib
@@ -35,7 +31,7 @@ import numpy as np
 
 _masked = "scipy" not in sys.modules
 if _masked:
-    # Numba imports scipy.linalg if SciPy is installed. The import takes 17 MB, and no kernel of the program uses it.
+    # no kernel needs scipy.linalg, which Numba imports if SciPy is installed (17 MB of memory)
     sys.modules["scipy"] = None  # type: ignore[assignment]
 try:
     import numba.np.arraymath
@@ -58,8 +54,7 @@ IMPORT_STATEMENT: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]
 
 
 class _IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """LLVM module that is only linked into other modules. It is neither optimised as a whole nor translated to machine
-    code."""
+    """LLVM module that is linked into other modules, without machine code."""
 
     def _optimize_final_module(self) -> None: ...
 
@@ -68,8 +63,6 @@ class _IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _IntermediateCompiler(Compiler):  # type: ignore[misc]
-    """Compiler that compiles a function to an ``_IntermediateLibrary``."""
-
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *more: Any) -> None:
         library = _IntermediateLibrary(target_context.codegen(), "intermediate")
         super().__init__(typing_context, target_context, library, *more)
@@ -77,34 +70,33 @@ class _IntermediateCompiler(Compiler):  # type: ignore[misc]
 
 
 def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:
-    """Return a placeholder object that identifies the compiled function inside Numba and must never be called."""
+    """Return a placeholder that represents the compiled function inside Numba. The placeholder must never be called."""
     library._ensure_finalized()  # noqa: SLF001
     return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
 
 
 class _IntermediateDispatcher(CPUDispatcher):  # type: ignore[misc]
-    """Dispatcher that compiles a function for calls from other kernels."""
+    """Numba dispatcher that compiles a function to intermediate code for calls from other kernels."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, bool | str]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=_IntermediateCompiler)
 
     def __call__(self, *_: object) -> Any:
-        """Raise TypeError, because there is no machine code to call."""
         raise TypeError(f"{self.py_func.__name__} is intermediate code, which only other kernels can call")
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """Dispatcher that compiles a function at its first call from Python, or as a part of a kernel that calls it.
+    """Numba dispatcher that compiles a function at the first call from Python or from another kernel.
 
-    ``signatures`` lists the argument types for which the function has been compiled to be called from Python.
-    ``intermediate.signatures`` lists the argument types for which it has become a part of other kernels.
+    ``signatures`` lists the compiled argument types for calls from Python, and ``intermediate.signatures`` for calls
+    from other kernels.
 
     Parameters
     ----------
     function : callable
         Python function to compile.
     inline : bool
-        True if LLVM must copy the function into every kernel that calls it.
+        True if LLVM must inline the function into every calling kernel.
     """
 
     def __init__(self, function: Callable[..., Any], inline: bool) -> None:
@@ -115,28 +107,25 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.intermediate = _IntermediateDispatcher(function, options | {"no_cpython_wrapper": True})
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Compile for a call from another kernel. Numba calls this method when it infers the types of that kernel.
+        """Compile the function for a call from another kernel. Numba calls this method during type inference.
 
-        Constant arguments are treated like variables of the same type, so the function is compiled once for all
-        constants.
+        Constant arguments are treated as variables, so that the function is compiled only once for all constants.
         """
         kws = {name: types.unliteral(one) for name, one in kws.items()}
         return self.intermediate.get_call_template([types.unliteral(one) for one in args], kws)
 
     def get_overload(self, sig: Any) -> Any:
-        """Return the function that ``get_call_template`` compiled. Numba calls this method to lower the calling
-        kernel."""
+        """Return the function that ``get_call_template`` compiled. Numba calls this method during code generation."""
         return self.intermediate.get_overload(sig)
 
     def _compile_for_args(self, *args: Any, **kws: Any) -> Any:
-        """Return the function to call. Numba calls this method if no machine code for the types of the arguments is
-        loaded."""
+        """Return the function to call. Numba calls this method if no machine code for the argument types is loaded."""
         if _interprets.get():
             return self.py_func
         return super()._compile_for_args(*args, **kws)
 
     def compile(self, sig: Any) -> Any:
-        """Compile for a call from Python, or load the machine code from the cache on disk."""
+        """Compile the function for a call from Python, or load cached machine code."""
         with _no_garbage_collection():
             return super().compile(sig)
 
@@ -145,11 +134,11 @@ _interprets = ContextVar("interprets", default=False)  # each thread has its own
 
 
 @contextlib.contextmanager
-def interpreted() -> Iterator[None]:
-    """Run kernels that are not compiled yet in the Python interpreter, in this thread.
+def interpret_uncompiled_kernels() -> Iterator[None]:
+    """Run uncompiled kernels in the Python interpreter in the current thread.
 
-    The results agree except for the last digit of exponentials. A call takes about a hundred times as long as compiled
-    code, but need not wait for the compiler. Compiled kernels are not affected.
+    Interpreted kernels are about a hundred times slower than compiled kernels. The results agree except for the last
+    digit of exponentials.
     """
     token = _interprets.set(True)
     try:
@@ -161,7 +150,7 @@ def interpreted() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Pause the garbage collector, which takes a tenth of the compilation time and frees almost nothing."""
+    """Pause the garbage collector, which would take a tenth of the compilation time and free almost no memory."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -172,30 +161,30 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function in nopython mode, without fast-math, because compensated sums must keep their order."""
+    """Compile a function with Numba in nopython mode. Fast-math is off, because compensated sums need a fixed order."""
     return _cached(Kernel(function, inline=False), function)
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function as ``compiled`` does, and make LLVM copy it into every kernel that calls it.
+    """Compile a function with Numba, and inline the function into every calling kernel.
 
-    Use this decorator for the body of an inner loop that is too long for LLVM to inline automatically.
+    The decorator is for bodies of inner loops that are too long for automatic inlining by LLVM.
     """
     return _cached(Kernel(function, inline=True), function)
 
 
 def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
-    """Enable the cache on disk for a kernel, if a cache folder can be written."""
+    """Enable the disk cache of a kernel if a cache folder is writable."""
     with contextlib.suppress(RuntimeError):  # no cache folder can be written
         kernel.enable_caching()
         kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001
-        # Numba compares the version before it reads the index, which may name types that no longer exist
-        kept._version = f"{kept._version} {source_hash(Path(inspect.getfile(function)))}"  # noqa: SLF001
+        # Numba compares the version before reading the index, which may refer to types that no longer exist
+        kept._version = f"{kept._version} {hash_module_with_imports(Path(inspect.getfile(function)))}"  # noqa: SLF001
     return cast("Callable[P, R]", kernel)
 
 
-def cache_folder() -> Path | None:
-    """Return the folder of compiled kernels on this machine; None if no such folder can be written."""
+def kernel_cache_folder() -> Path | None:
+    """Return the cache folder of compiled kernels, or None if no cache folder is writable."""
     kernel: Any = numba.njit(_nothing)
     try:
         kernel.enable_caching()
@@ -210,8 +199,8 @@ def _nothing() -> None: ...
 
 
 @cache
-def source_hash(path: Path, root: Path = PACKAGE_ROOT) -> str:
-    """Return a hash of a file and of all modules of this program that it imports, directly or through others.
+def hash_module_with_imports(path: Path, root: Path = PACKAGE_ROOT) -> str:
+    """Return a hash of a Python file and of all imported modules of this program, including indirect imports.
 
     Parameters
     ----------
@@ -223,7 +212,7 @@ def source_hash(path: Path, root: Path = PACKAGE_ROOT) -> str:
     Returns
     -------
     str
-        SHA-256 of the contents, in hexadecimal.
+        SHA-256 hash in hexadecimal notation.
     """
     texts: dict[Path, bytes] = {}
     left = [path]

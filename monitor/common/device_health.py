@@ -1,4 +1,4 @@
-"""Status of a device for the status message, the viewer and the terminal."""
+"""Health of a device, as shown in status messages, the viewer and the terminal."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ MAX_PROBLEMS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Status of one device at one moment. Counts are since the start."""
+    """Health of one device at one moment. Numbers of samples are counted since the start of the device."""
 
     state: str  # running | waiting | lost | ended
     rate_hz: float | None  # measured; None until known
@@ -34,7 +34,7 @@ class Health:
 
 
 def format_service_status(healths: Mapping[str, Health], outputs: Mapping[str, str], stuck: Sequence[str] = ()) -> str:
-    """Return the status of the whole service in one line, for systemd.
+    """Format the status of all devices and outputs in one line for systemd.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Quantiles and tail probabilities of the normal, χ², Student and F distributions, without SciPy.
+"""Quantiles and tail probabilities of the normal, χ², Student and F distributions.
 
-The service needs few of these functions, and SciPy would be the second largest package of an installation. The tests
-compare each function with SciPy over the range that its docstring states, to a relative difference of 1e-12.
+The functions avoid a dependency on SciPy, which is a large package. Over the documented ranges, the relative difference
+from SciPy is at most 1e-12.
 """
 
 from functools import lru_cache
@@ -18,15 +18,14 @@ Floats = NDArray[np.float64]
 
 CORNISH_FISHER_TERMS: Final = 10
 MIN_ASYMPTOTIC_EDF: Final = 1000.0
-"""Smallest number of degrees of freedom for which the expansion is exact to rounding."""
+"""Smallest number of degrees of freedom for which the Cornish-Fisher expansion is exact to rounding."""
 MIN_EXPANDED_EDF: Final = 30.0
-"""Smallest number of degrees of freedom for which the iteration starts from the expansion.
+"""Smallest number of degrees of freedom for which the Halley iteration starts from the Cornish-Fisher expansion.
 
-With fewer degrees of freedom, the iteration starts from the power law at zero or from Wilson and Hilferty's formula.
 """
 MAX_ITERATIONS: Final = 60
 STEP_TOLERANCE: Final = 1e-7
-"""Relative step at which a Halley or Newton iteration ends. The result is then exact to rounding."""
+"""Relative step below which a Halley or Newton iteration ends. The result is then exact to rounding."""
 FRACTION_TOLERANCE: Final = 1e-15
 MIN_ASYMPTOTIC_DF: Final = 1000
 """Smallest number of degrees of freedom for which four terms of the expansion of Student's quantile are exact to
@@ -38,16 +37,16 @@ TINY: Final = 1e-300
 Z95: Final = 1.959963984540054
 """Quantile of the standard normal distribution for a two-sided probability of 95 %."""
 HALF_CHI2_95: Final = 0.5 * Z95**2
-"""Half of the 95 % quantile of χ² with one degree of freedom, by which a log-likelihood falls at the ends of a 95 %
-interval."""
+"""Decrease of the log-likelihood at the ends of a 95 % interval: half of the 95 % quantile of χ² with one degree of
+freedom."""
 NORMAL_QUARTILE: Final = 0.6744897501960817
-"""Upper quartile of the standard normal distribution. It is also the median of the absolute value."""
+"""Upper quartile of the standard normal distribution, which is also the median absolute value."""
 
 _NORMAL: Final = NormalDist()
 
 
 def normal_quantile(probability: float) -> float:
-    """Return the quantile of the standard normal distribution, which is infinite at 0 and 1.
+    """Return the quantile of the standard normal distribution. The quantiles of 0 and 1 are infinite.
 
     Parameters
     ----------
@@ -68,18 +67,18 @@ def normal_quantile(probability: float) -> float:
 
 
 def chi2_quantile(edf: Floats, probability: float) -> Floats:
-    """Return the quantile of χ², which solves P(edf/2, x/2) = probability.
+    """Return the quantile of the χ² distribution.
 
-    The function uses Halley's iteration on the regularised incomplete gamma function P. The start value is accurate
-    enough for two or three steps. For MIN_ASYMPTOTIC_EDF degrees of freedom or more, the function returns the
-    Cornish-Fisher expansion without iteration.
+    The quantile x solves P(edf/2, x/2) = probability, where P is the regularised incomplete gamma function. The
+    function uses Halley's iteration, and a Cornish-Fisher expansion for many degrees of freedom.
 
     Parameters
     ----------
     edf : float64 [...]
-        Degrees of freedom, 0.01 or more, not necessarily whole. NaN and values that are not positive give NaN.
+        Degrees of freedom, at least 0.01, not necessarily integers. The result is NaN for NaN, zero and negative
+        values.
     probability : float
-        Lower tail probability, from 0.001 to 0.975. Values nearer to one lose digits.
+        Lower tail probability, from 0.001 to 0.975. The accuracy decreases above 0.975.
 
     Returns
     -------
@@ -105,20 +104,19 @@ def chi2_quantile(edf: Floats, probability: float) -> Floats:
 
 
 def _expanded(a: Floats, z: float) -> Floats:
-    """Return the quantile of the gamma distribution of shape a by its Cornish-Fisher expansion."""
+    """Return the Cornish-Fisher expansion of the quantile of the gamma distribution with shape ``a``."""
     epsilon = 1.0 / np.sqrt(a)
     return np.asarray(a * (1.0 + epsilon * np.polynomial.polynomial.polyval(epsilon, _coefficients(z))))
 
 
 @lru_cache(maxsize=16)
 def _coefficients(z: float) -> tuple[float, ...]:
-    """Return the coefficients y_k(z) of the Cornish-Fisher expansion of the gamma quantile.
+    """Return the coefficients y_k(z) of the Cornish-Fisher expansion of a gamma quantile.
 
-    The expansion is x = a (1 + ε y) with y = Σ y_k ε^k and ε = 1/√a, where a is the shape and z is the normal quantile.
-    The quantile x of a density f satisfies the differential equation x' = φ(z)/f(x) with the normal density φ. For the
-    gamma distribution, the derivative of this equation is (1 + εy) y'' = −z (1 + εy) y' + (ε + y) y'². The terms of
-    equal powers of ε give y_0 = z and y_k'' − z y_k' − y_k = r_k, whose only polynomial solution is y_k. The first five
-    coefficients agree with Goldberg & Levine (Annals of Mathematical Statistics 17, 1946).
+    With shape a, normal quantile z and ε = 1/√a, the expansion is x = a (1 + ε Σ y_k ε^k). The differential equation x'
+    = φ(z)/f(x) of the normal density φ and the gamma density f gives y_0 = z and y_k'' − z y_k' − y_k = r_k. The
+    coefficient y_k is the only polynomial solution of the equation of order k. The first five coefficients agree with
+    Goldberg & Levine (Annals of Mathematical Statistics 17, 1946).
     """
     poly = np.polynomial.Polynomial
     x = poly([0.0, 1.0])
@@ -138,7 +136,7 @@ def _coefficients(z: float) -> tuple[float, ...]:
 
 
 def _start(a: Floats, z: float, probability: float) -> Floats:
-    """Return a start value for the gamma quantile, from the power law at zero or from Wilson and Hilferty's formula."""
+    """Return a start value for the gamma quantile: the power law near zero, or the formula of Wilson and Hilferty."""
     logs = np.array([lgamma(one + 1.0) for one in a.tolist()])
     with np.errstate(under="ignore"):
         at_zero = np.exp((np.log(probability) + logs) / a)
@@ -147,10 +145,9 @@ def _start(a: Floats, z: float, probability: float) -> Floats:
 
 
 def _refined(a: Floats, x: Floats, probability: float) -> Floats:
-    """Return the solution x of P(a, x) = probability by Halley's iteration in ln x.
+    """Solve P(a, x) = probability for x by Halley's iteration in ln x.
 
-    As a function of ln x, P has the first derivative x f(x) with the gamma density f. The second derivative divided by
-    the first is a − x.
+    With the gamma density f, the derivatives of P with respect to ln x are x f(x) and (a − x) x f(x).
     """
     logs = np.array([lgamma(one) for one in a.tolist()])
     open_ = np.flatnonzero(x > 0.0)  # x is zero if the quantile underflows
@@ -169,7 +166,7 @@ def _refined(a: Floats, x: Floats, probability: float) -> Floats:
 
 @compiled
 def _series(a: Floats, x: Floats) -> Floats:
-    """Return Σ_n x^n / (a (a + 1) … (a + n)), which is P(a, x) divided by x^a e^−x / Γ(a). All terms are positive."""
+    """Return the power series Σ_n x^n / (a (a + 1) … (a + n)), which equals P(a, x) Γ(a) / (x^a e^−x)."""
     out = np.empty(a.size)
     for i in range(a.size):
         term = 1.0 / a[i]
@@ -186,10 +183,9 @@ def _series(a: Floats, x: Floats) -> Floats:
 
 
 def incomplete_beta(a: float, b: float, x: Floats) -> Floats:
-    """Return the regularised incomplete beta function I_x(a, b) by its continued fraction (DLMF 8.17.22).
+    """Return the regularised incomplete beta function I_x(a, b), computed by a continued fraction (DLMF 8.17.22).
 
-    The upper tail of the F distribution with m and n degrees of freedom is P(F > f) = I_x(n/2, m/2) with x = n/(n + m
-    f).
+    For the F distribution with m and n degrees of freedom, P(F > f) = I_x(n/2, m/2) with x = n / (n + m f).
 
     Parameters
     ----------
@@ -219,7 +215,6 @@ def incomplete_beta(a: float, b: float, x: Floats) -> Floats:
 
 
 def _fraction(a: Floats, b: Floats, x: Floats) -> Floats:
-    """Return the continued fraction by the modified method of Lentz."""
     c = np.ones(x.shape)
     d = 1.0 / _away_from_zero(1.0 - (a + b) * x / (a + 1.0))
     found = d
@@ -237,15 +232,15 @@ def _fraction(a: Floats, b: Floats, x: Floats) -> Floats:
 
 
 def _away_from_zero(x: Floats) -> Floats:
-    """Replace values near zero by TINY, to avoid a division by zero."""
+    """Replace values near zero by TINY to prevent a division by zero."""
     return np.where(np.abs(x) < TINY, TINY, x)
 
 
 def student_quantile(df: int, probability: float) -> float:
-    """Return the quantile of Student's distribution.
+    """Return the quantile of Student's t distribution.
 
-    The function uses Newton's iteration on the incomplete beta function. For MIN_ASYMPTOTIC_DF degrees of freedom or
-    more, the result is the expansion of Fisher & Cornish (Abramowitz & Stegun 26.7.5).
+    The function uses Newton's iteration, and an asymptotic expansion for many degrees of freedom (Abramowitz & Stegun
+    26.7.5).
 
     Parameters
     ----------
@@ -277,7 +272,7 @@ def student_quantile(df: int, probability: float) -> float:
 
 
 def _student_terms(z: float) -> tuple[float, float, float, float]:
-    """Return the coefficients of 1/df, 1/df², 1/df³ and 1/df⁴ in the expansion of Student's quantile."""
+    """Return the coefficients of 1/df, 1/df², 1/df³ and 1/df⁴ in the asymptotic expansion of Student's quantile."""
     return (
         (z**3 + z) / 4.0,
         (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,

@@ -1,12 +1,9 @@
-"""Advisory lock on a storage folder: one process at a time writes recordings there, and one writes the history.
+"""Advisory lock on a storage folder, which prevents two processes from writing the same files.
 
-The lock is ``flock`` on a file in the folder. The operating system releases the lock when the process that holds the
-lock ends. The file is never deleted. It contains the process id and the host of the holder, for messages. Readers need
-no lock.
+The lock is ``flock`` on a lock file in the folder, so the operating system releases the lock at the end of the process.
+The lock file contains the process id and the host name of the lock holder. Readers need no lock.
 
-``hold`` takes the lock, or checks that this process still holds the lock. If the folder or the lock file is deleted or
-replaced, the lock is lost. The file descriptor is closed when another program is executed, so hooks and viewers do not
-inherit it.
+A process loses the lock if the folder or the lock file is deleted or replaced. Child processes do not inherit the lock.
 """
 
 import contextlib
@@ -26,18 +23,18 @@ HISTORY_LOCK: Final = "history.lock"
 LOCKS_UNSUPPORTED_ERRNOS: Final = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
 """Error numbers of ``flock`` on a file system without locks."""
 RETRY_S: Final = 0.05
-"""Pause before the second attempt, because the command ``doctor`` briefly holds the lock during its check."""
+"""Pause before the second attempt, because the ``doctor`` command holds the lock for a short time."""
 HOLDER_BYTES: Final = 300
-"""Largest length of the text about the holder in the lock file."""
+"""Maximum length of the text in the lock file."""
 
 
 class FolderLock:
-    """Lock of a folder for one purpose: recordings or history.
+    """Lock of a folder for one purpose, such as recordings or history.
 
     Parameters
     ----------
     folder : Path
-        Folder to lock. ``hold`` creates it if it does not exist.
+        Folder to lock. ``ensure_held`` creates the folder if necessary.
     name : str
         Name of the lock file in the folder.
     """
@@ -46,16 +43,16 @@ class FolderLock:
         self.folder = folder
         self.path = folder / name
         self.warning = ""
-        """Message if the file system does not support locks, so that the folder is used without a lock; else empty."""
+        """Warning if the file system does not support locks, otherwise an empty string."""
         self._descriptor: int | None = None
 
-    def hold(self) -> str:
-        """Take the lock, or check that this process still holds it. The method does not wait for another holder.
+    def ensure_held(self) -> str:
+        """Acquire the lock without waiting, or check that this process still holds the lock.
 
         Returns
         -------
         str
-            "" if the lock is held, else one line that names the process that holds it.
+            Empty string if this process holds the lock, otherwise a message that names the lock holder.
 
         Raises
         ------
@@ -81,8 +78,8 @@ class FolderLock:
                 os.close(descriptor)
 
     @property
-    def held(self) -> bool:
-        """True if the lock was held at the last call of ``hold``."""
+    def is_held(self) -> bool:
+        """True if the last call of ``ensure_held`` acquired or confirmed the lock."""
         return self._descriptor is not None
 
     def release(self) -> None:
@@ -92,14 +89,14 @@ class FolderLock:
             os.close(descriptor)
 
     def _in_place(self, descriptor: int) -> bool:
-        """Return True if the open lock file is still the file of that name in the folder."""
+        """Return True if the open lock file has not been deleted or replaced."""
         try:
             return os.path.samestat(os.stat(self.path, follow_symlinks=False), os.fstat(descriptor))
         except OSError:
             return False
 
     def _lock(self, descriptor: int) -> bool:
-        """Try to lock the file; return True if it succeeds, or if the file system has no locks."""
+        """Try to lock the lock file. Return True on success, or if the file system does not support locks."""
         self.warning = ""
         for wait_s in (RETRY_S, 0.0):
             try:
@@ -119,20 +116,20 @@ class FolderLock:
         return False
 
 
-def lock_holder(folder: Path, name: str) -> str:
-    """Return a text that names the holder of a folder's lock.
+def describe_lock_holder(folder: Path, name: str) -> str:
+    """Return the name of the process that holds the lock of a folder.
 
     Parameters
     ----------
     folder : Path
         Locked folder.
     name : str
-        Name of the lock file in the folder. It is not created.
+        Name of the lock file in the folder. The lock file is not created.
 
     Returns
     -------
     str
-        "" if the lock is free, or if its state cannot be determined.
+        Process and host of the lock holder. Empty if the lock is free or cannot be checked.
     """
     try:
         descriptor = os.open(folder / name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW)
@@ -156,9 +153,9 @@ def _open_lock_file(path: Path) -> int:
     Raises
     ------
     OSError
-        If the file cannot be opened, or if it is not a regular file.
+        If the lock file cannot be opened, or is not a regular file.
     """
-    # NFS locks only files that are open for writing. Without O_NONBLOCK, opening a FIFO would block.
+    # O_RDWR: NFS locks only files that are open for writing; O_NONBLOCK: opening a FIFO must not block
     flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
     descriptor = os.open(path, flags, 0o644)
     mode = os.fstat(descriptor).st_mode
@@ -170,15 +167,13 @@ def _open_lock_file(path: Path) -> int:
 
 
 def _write_holder(descriptor: int) -> None:
-    """Write the process id and the host name into the lock file."""
-    # on a full disk the lock still works, but its holder has no name
+    # on a full disk, the lock works without the name of the lock holder
     with contextlib.suppress(OSError):
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode(errors="replace"), 0)
 
 
 def _holder(descriptor: int) -> str:
-    """Return the name of the holder, as read from the lock file."""
     words = os.pread(descriptor, HOLDER_BYTES, 0).decode(errors="replace").split()
     if len(words) != 2 or not words[0].isdecimal():
         return "another process"

@@ -1,8 +1,7 @@
-"""Minimization of a function of one or a few variables.
+"""Local minimization of functions of one or several variables.
 
-``minimize_bfgs`` follows Nocedal & Wright, Numerical Optimization, 2006, algorithm 6.1. It uses forward differences for
-the gradient, a line search for the Wolfe conditions by bisection, and the BFGS update of the inverse of the Hessian.
-``golden_section`` searches an interval (Kiefer, Proc. Am. Math. Soc. 4, 1953).
+Sources: Nocedal & Wright, Numerical Optimization, 2006, algorithm 6.1 (BFGS); Kiefer, Proc. Am. Math. Soc. 4, 1953
+(golden-section search).
 """
 
 from collections.abc import Callable, Generator
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 FORWARD_DIFFERENCE_STEP: Final = 2.0**-26
-"""Relative step of a forward difference: the square root of the rounding error."""
+"""Relative step of a forward difference, which is the square root of the rounding error."""
 WOLFE_DECREASE: Final = 1e-4
 WOLFE_CURVATURE: Final = 0.9
 MAX_BISECTIONS: Final = 40
@@ -26,21 +25,21 @@ INVERSE_GOLDEN_RATIO: Final = (sqrt(5.0) - 1.0) / 2.0
 def minimize_bfgs(
     function: Callable[[Floats], float], start: Floats, gradient_tolerance: float
 ) -> tuple[float, Floats]:
-    """Return the value and the position of a local minimum.
+    """Minimize a function of several variables with the BFGS algorithm.
 
     Parameters
     ----------
     function : callable
-        Smooth function of float64 [n].
+        Smooth function of a float64 array [n].
     start : float64 [n]
         Start of the search.
     gradient_tolerance : float
-        The search ends if no component of the gradient is larger, or if no step decreases the function.
+        Largest component of the gradient at which the search ends.
 
     Returns
     -------
     value : float
-        Value of the function at the minimum.
+        Minimum value of the function.
     x : float64 [n]
         Position of the minimum.
     """
@@ -72,9 +71,9 @@ def minimize_bfgs(
 def _line_search(
     function: Callable[[Floats], float], x: Floats, value: float, slope: Floats, direction: Floats, step: float
 ) -> tuple[float, float, Floats] | None:
-    """Return step, value and gradient at a point that fulfils the Wolfe conditions, or else at the lowest point found.
+    """Return step, value and gradient at a point that satisfies the Wolfe conditions, or at the lowest point.
 
-    The result is None if no step decreases the function.
+    Return None if no step decreases the function.
     """
     falling = float(slope @ direction)
     low, high = 0.0, inf
@@ -98,7 +97,7 @@ def _line_search(
 
 
 def _gradient(function: Callable[[Floats], float], x: Floats, value: float) -> Floats:
-    """Return the gradient [n] by forward differences from the value at x."""
+    """Return the gradient [n] at ``x``, computed by forward differences."""
     found = np.empty(x.size)
     for i in range(x.size):
         beside = x.copy()
@@ -107,24 +106,24 @@ def _gradient(function: Callable[[Floats], float], x: Floats, value: float) -> F
     return found
 
 
-def golden_section(
+def minimize_by_golden_section(
     function: Callable[[float], float], low: float, high: float, tolerance: float
 ) -> Generator[None, None, tuple[float, float]]:
-    """Return the value and the position of a minimum in an interval; yield after each call of the function.
+    """Minimize a function in an interval by golden-section search. The generator yields after each function call.
 
     Parameters
     ----------
     function : callable
-        Function of a float, with one minimum between ``low`` and ``high``.
+        Function of a float with one minimum between ``low`` and ``high``.
     low, high : float
         Ends of the interval.
     tolerance : float
-        Largest error of the position.
+        Maximum error of the position of the minimum.
 
     Returns
     -------
     value : float
-        Value of the function at the minimum.
+        Minimum value of the function.
     position : float
         Position of the minimum.
 
@@ -136,7 +135,7 @@ def golden_section(
     ...             next(search)
     ...         except StopIteration as end:
     ...             return end.value
-    >>> value, place = run(golden_section(lambda x: (x - 1.0) ** 2 + 2.0, 0.0, 3.0, 1e-6))
+    >>> value, place = run(minimize_by_golden_section(lambda x: (x - 1.0) ** 2 + 2.0, 0.0, 3.0, 1e-6))
     >>> round(value, 9), round(place, 5)
     (2.0, 1.0)
     """

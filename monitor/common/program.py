@@ -1,11 +1,11 @@
-"""Command line with which the program starts itself in a child process."""
+"""Command line that starts this program in a child process."""
 
 import sys
 from pathlib import Path
 from typing import Final
 
 PROGRAM: Final = (sys.executable, "-P", str(Path(__file__).resolve().parents[2] / "imu_monitor.py"))
-"""Interpreter and path of the program. The option -P keeps the folder of the program out of the module path.
+"""Python interpreter, options and path of the program, to which the caller appends a command.
 
-A foreign module with the name ``monitor`` is therefore never imported. The caller appends the name of a command.
+The Python option -P prevents the import of unrelated modules with the name ``monitor``.
 """

@@ -1,4 +1,4 @@
-"""Paths of the files in ``config/``: example configurations, noise models and DBC files."""
+"""Paths of the configuration files and noise models that are shipped with the program."""
 
 import os
 from pathlib import Path
@@ -11,26 +11,26 @@ from drivers.errors import ConfigError
 CONFIG_FOLDER: Final = Path(__file__).resolve().parents[2] / "config"
 
 
-def model_path(name: str, folder: Path) -> Path:
-    """Return the path of a noise model.
+def resolve_model_path(name: str, folder: Path) -> Path:
+    """Return the path of a noise model that is given by name or by path.
 
     Parameters
     ----------
     name : str
-        Name of a shipped model, or path of a file.
+        Name of a shipped model, or path of a model file.
     folder : Path
-        Folder at which relative paths begin.
+        Folder to which relative paths refer.
 
     Raises
     ------
     ConfigError
-        If there is no such model and no such file. The message suggests the nearest name.
+        If no such noise model exists. The message suggests the most similar name.
     """
     models = CONFIG_FOLDER / "models"
     shipped = models / f"{name}.toml"
     path = shipped if file_access.is_file(shipped) else folder / file_access.expand_user(name)
     if os.path.exists(path) and not path.is_dir():
-        return path  # the reader reports a file that is no model
+        return path
     names = sorted(file.stem for file in models.glob("*.toml"))
     raise ConfigError(
         f'no model "{name}", neither a file nor one of those shipped{discovery.format_suggestion(name, names)}'

@@ -1,6 +1,6 @@
-"""Table of all zenoh topics of the program: name, encoding and rate.
+"""Table of all zenoh topics on which the program publishes data or answers queries.
 
-Keys are ``<prefix>/<device>/<name>``. The prefix is ``imu`` unless ``[zenoh] prefix`` sets another one.
+The zenoh key of a topic is ``<prefix>/<device>/<name>``. The default prefix is ``imu``.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ MSGPACK: Final = "application/msgpack"
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """Row of the table."""
+    """Zenoh topic with name, encoding and time of publication."""
 
     name: str
     encoding: str
@@ -22,7 +22,7 @@ class Topic:
     kept: int = 0  # number of messages that a daemon keeps for late subscribers
 
     def key(self, prefix: str, device: str) -> str:
-        """Return the key expression of this topic for one device.
+        """Return the zenoh key expression of a topic for one device.
 
         Parameters
         ----------
@@ -33,8 +33,8 @@ class Topic:
         """
         return f"{prefix}/{device}/{self.name}"
 
-    def schema(self) -> str:
-        """Return the content of the payload's ``schema`` field."""
+    def schema_name(self) -> str:
+        """Return the text of the ``schema`` field in all messages of a topic."""
         return f"imu-monitor/{self.name.split('/')[-1]}/1"
 
 

@@ -1,8 +1,7 @@
-"""Units of inertial navigation, and the formatting of quantities, durations and counts as text.
+"""Customary units of inertial navigation, and formatting of quantities, durations and numbers as text.
 
-The program computes in SI units (rad, m, s). Terminal output and figures use the customary units of inertial
-navigation. Only this module converts SI units to customary units. The factors follow from 1 rad = 180/π °, 1 h = 3600 s
-(√h = 60 √s) and 1 g = 9.80665 m/s² (standard gravity, CGPM 1901).
+The program computes in SI units. Terminal output and figures use customary units. The conversion factors follow from 1
+rad = 180/π ° and standard gravity, 1 g = 9.80665 m/s² (CGPM 1901).
 """
 
 import math
@@ -31,27 +30,27 @@ DURATION_UNITS: Final = ((DAY_S, "d"), (HOUR_S, "h"), (60, "min"), (1, "s"))
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """Customary unit: a value in SI units times ``factor`` is a value in this unit."""
+    """Customary unit with the conversion factor from SI units."""
 
     factor: float
     name: str
 
-    def text(self, si: float, digits: int = 3) -> str:
-        """Format a value with this unit.
+    def format_si_value(self, si_value: float, digits: int = 3) -> str:
+        """Format a value in the customary unit.
 
         Parameters
         ----------
-        si : float
+        si_value : float
             Value in SI units.
         digits : int, optional
             Number of significant digits.
 
         Examples
         --------
-        >>> COEFFICIENT_UNITS["gyro"]["N"].text(1.5e-4)
+        >>> COEFFICIENT_UNITS["gyro"]["N"].format_si_value(1.5e-4)
         '0.516 °/√h'
         """
-        return f"{format_number(si * self.factor, digits)} {self.name}"
+        return f"{format_number(si_value * self.factor, digits)} {self.name}"
 
 
 COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
@@ -99,30 +98,30 @@ COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
 
 
 def sensor_kind(axis: str) -> Kind:
-    """Return the kind of sensor to which an axis of ``AXES`` belongs."""
+    """Return the kind of sensor, gyroscope or accelerometer, of an axis."""
     return "gyro" if axis.startswith("g") else "accel"
 
 
 def axes_of(kind: Kind) -> tuple[str, ...]:
-    """Return the three axes of a kind of sensor."""
+    """Return the three axes of the gyroscopes or the accelerometers."""
     return AXES[:3] if kind == "gyro" else AXES[3:]
 
 
-def unit_of(letter: str, axis: str) -> Unit:
+def coefficient_unit(coefficient: str, axis: str) -> Unit:
     """Return the customary unit of a noise coefficient.
 
     Parameters
     ----------
-    letter : {"Q", "N", "B", "K", "R"}
+    coefficient : {"Q", "N", "B", "K", "R"}
         Noise coefficient.
     axis : str
         Axis of ``AXES``.
     """
-    return COEFFICIENT_UNITS[sensor_kind(axis)][letter]
+    return COEFFICIENT_UNITS[sensor_kind(axis)][coefficient]
 
 
 def format_number(value: float, digits: int = 3) -> str:
-    """Format a number, without an exponent if it is easy to read without one.
+    """Format a number for display, in decimal notation from 1e-4 to 1e6 and otherwise with an exponent.
 
     Parameters
     ----------
@@ -148,50 +147,50 @@ def format_number(value: float, digits: int = 3) -> str:
     return f"{rounded:.{max(0, digits - 1 - exponent)}f}"
 
 
-def format_two_digits(value: float, sign: bool = False) -> str:
-    """Format a number with two significant digits and without an exponent.
+def format_two_significant_digits(value: float, sign: bool = False) -> str:
+    """Format a number with two significant digits in decimal notation.
 
     Parameters
     ----------
     value : float
         Number to format.
     sign : bool, optional
-        True if positive values get a sign.
+        True to show the sign of positive values.
     """
     return np.format_float_positional(float(f"{value:.1e}"), trim="-", sign=sign)
 
 
-def format_rate(axis: str, si: float, sign: bool = False) -> str:
-    """Format an angular rate in °/s, or an acceleration in mg or m/s², with two significant digits.
+def format_axis_value(axis: str, si_value: float, sign: bool = False) -> str:
+    """Format an angular rate in °/s or an acceleration in mg or m/s², with two significant digits.
 
     Parameters
     ----------
     axis : str
         Axis of ``AXES``.
-    si : float
-        Rate in rad/s or m/s².
+    si_value : float
+        Angular rate in rad/s or acceleration in m/s².
     sign : bool, optional
-        True if positive values get a sign, as for a difference.
+        True to show the sign of positive values, as for a difference.
 
     Examples
     --------
-    >>> format_rate("gz", 2.79), format_rate("ax", -0.0324, sign=True), format_rate("az", 27.0), format_rate("gx", 1e-6)
-    ('160 °/s', '-3.3 mg', '27 m/s²', '0.000057 °/s')
+    >>> format_axis_value("gz", 2.79), format_axis_value("ax", -0.0324, sign=True), format_axis_value("az", 27.0)
+    ('160 °/s', '-3.3 mg', '27 m/s²')
     """
     if axis.startswith("g"):
-        return f"{format_two_digits(math.degrees(si), sign)} °/s"
-    if abs(si) < 1000.0 * MILLI_G:
-        return f"{format_two_digits(si / MILLI_G, sign)} mg"
-    return f"{format_two_digits(si, sign)} m/s²"
+        return f"{format_two_significant_digits(math.degrees(si_value), sign)} °/s"
+    if abs(si_value) < 1000.0 * MILLI_G:
+        return f"{format_two_significant_digits(si_value / MILLI_G, sign)} mg"
+    return f"{format_two_significant_digits(si_value, sign)} m/s²"
 
 
 def format_sample_rate(rate_hz: float | None) -> str:
-    """Format a sample rate with two decimals."""
+    """Format a sample rate in Hz with two decimal places."""
     return NO_VALUE if rate_hz is None else f"{rate_hz:.2f} Hz"
 
 
 def format_duration(seconds: float) -> str:
-    """Format a duration with the two largest units.
+    """Format a duration in the two largest suitable units.
 
     >>> format_duration(3725.0), format_duration(0.5), format_duration(90.0)
     ('1 h 02 min', '0.500 s', '1 min 30 s')
@@ -208,7 +207,7 @@ def format_duration(seconds: float) -> str:
 
 
 def format_age(seconds: float) -> str:
-    """Format an age with one unit.
+    """Format an age in a single suitable unit.
 
     >>> format_age(0.44), format_age(75.0), format_age(600.0), format_age(90_000.0)
     ('0.4 s', '75 s', '10 min', '25 h')
@@ -221,7 +220,7 @@ def format_age(seconds: float) -> str:
 
 
 def format_whole_duration(seconds: int) -> str:
-    """Format a duration with the largest unit of which it is a multiple.
+    """Format a duration as a whole number of the largest possible unit.
 
     >>> format_whole_duration(300), format_whole_duration(21_600), format_whole_duration(604_800)
     ('5 min', '6 h', '7 d')
@@ -236,7 +235,7 @@ def format_milliseconds(seconds: float | None) -> str:
 
 
 def format_utc(t_s: float) -> str:
-    """Format a Unix time [s] as date and time in UTC.
+    """Format a Unix time in seconds as date and time in UTC.
 
     >>> format_utc(90.0)
     '1970-01-01 00:01:30'
@@ -248,7 +247,7 @@ def format_utc(t_s: float) -> str:
 
 
 def format_count(count: int, noun: str) -> str:
-    """Format a count with its noun in singular or plural.
+    """Format a number of objects with the singular or plural of a noun.
 
     >>> format_count(1, "frame"), format_count(2000, "frame")
     ('1 frame', '2,000 frames')
@@ -264,13 +263,13 @@ def format_count(count: int, noun: str) -> str:
 
 
 def format_short_count(count: int) -> str:
-    """Format a count with at most five characters.
+    """Format a number of objects with at most five characters.
 
     >>> format_short_count(9_999), format_short_count(123_456), format_short_count(999_999)
     ('9999', '123k', '1M')
     """
     if count < 10_000:
         return str(count)
-    count = int(float(f"{count:.2e}"))  # rounded first, so that 999 999 becomes 1M
+    count = int(float(f"{count:.2e}"))  # round first, so that 999 999 becomes 1M
     power = min((len(str(count)) - 1) // 3, 4)
     return f"{count / 1000**power:.3g}{'kMGT'[power - 1]}"

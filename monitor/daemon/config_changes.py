@@ -69,7 +69,7 @@ def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) 
     """
     if running.path is None:
         raise ConfigError("the running configuration was not read from a file; there is no file to read again")
-    new = loading.load(running.path)
+    new = loading.load_config(running.path)
     old_tables, new_tables = _by_name(running.table), _by_name(new.table)
     added, limited = [], []
     for device in new.devices:

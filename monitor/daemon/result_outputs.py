@@ -49,7 +49,7 @@ class ZenohOutput(Output):
         self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int
     ) -> None:
         """Publish a block of compensated samples as one msgpack message."""
-        schema = topics.COMPENSATED.schema()
+        schema = topics.COMPENSATED.schema_name()
         self._zenoh.put(topics.COMPENSATED, device, encode_samples(device, received, samples, offset_ns, schema))
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:

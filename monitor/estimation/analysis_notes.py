@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from monitor.common.units import format_rate, format_two_digits
+from monitor.common.units import format_axis_value, format_two_significant_digits
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.line_and_outlier_detection import (
@@ -204,7 +204,7 @@ def describe_lines_and_outliers(lines: Sequence[SpectralLine], outlier_shares: F
     groups = _group_by_frequency(lines)
     notes = []
     for here in groups[:MAX_NOTES]:
-        sizes = [f"{AXES[one.axis]} {format_rate(AXES[one.axis], one.amplitude)}" for one in here]
+        sizes = [f"{AXES[one.axis]} {format_axis_value(AXES[one.axis], one.amplitude)}" for one in here]
         notes.append(f"{_line_name(here[0])}: {', '.join(sizes)}")
     left = [one for here in groups[MAX_NOTES:] for one in here]
     notes += _count_omitted(MAX_NOTES + len(left), "lines")
@@ -296,7 +296,7 @@ def _group_by_line(
 
 
 def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
-    upto = ", ".join(dict.fromkeys(format_two_digits(float(tau_s[i])) for i in axes))
+    upto = ", ".join(dict.fromkeys(format_two_significant_digits(float(tau_s[i])) for i in axes))
     return (
         f"{', '.join(AXES[i] for i in axes)}: the fit leaves out τ up to {upto} s, which the five terms do not "
         f"explain: {why}"
@@ -324,7 +324,7 @@ def _misfit_note(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at:
     low, high = (f"{f(fit.misfit[i] for i in runs) ** 0.5:.2g}" for f in (min, max))
     times = low if low == high else f"{low} to {high}"
     first, last = min(run[0] for run in runs.values()), max(run[1] for run in runs.values())
-    since, upto = format_two_digits(float(tau_s[first])), format_two_digits(float(tau_s[last]))
+    since, upto = format_two_significant_digits(float(tau_s[first])), format_two_significant_digits(float(tau_s[last]))
     where = f"τ = {since} s" if first == last else f"τ from {since} to {upto} s"
     axes = ", ".join(AXES[i] for i in sorted(runs))
     return (

@@ -20,7 +20,7 @@ from drivers.timing.arrival_regression import snap_to_standard_rate
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
 from drivers.timing.sender_times import FORWARD_JUMP_S
-from monitor.common.units import format_rate, format_two_digits
+from monitor.common.units import format_axis_value, format_two_significant_digits
 from monitor.estimation.detection.coarse_quantization import QuantizationStep, find_coarsely_quantized_axes
 from monitor.estimation.detection.repeated_share import estimate_repeated_row_share
 from monitor.estimation.missing_sample_count import count_missing_samples
@@ -214,11 +214,11 @@ def _repeated_notes(values: Floats) -> list[str]:
 def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
     alike: dict[str, list[QuantizationStep]] = {}
     for one in found:
-        alike.setdefault(format_rate(AXES[one.axis], one.step), []).append(one)
+        alike.setdefault(format_axis_value(AXES[one.axis], one.step), []).append(one)
     notes = []
     for size, those in alike.items():
         axes = ", ".join(AXES[one.axis] for one in those)
-        low, high = (format_two_digits(f(one.step / one.noise for one in those)) for f in (min, max))
+        low, high = (format_two_significant_digits(f(one.step / one.noise for one in those)) for f in (min, max))
         times = low if low == high else f"{low} to {high}"
         notes.append(
             f"values have steps of {size} ({axes}), {times} times the noise from sample to sample; quantization "

@@ -155,7 +155,7 @@ class HistoryWriter:
 
     def _write(self) -> bool:
         try:
-            if holder := self._folder.hold():
+            if holder := self._folder.ensure_held():
                 self._suspend(holder)
                 return False
             self._resume()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from drivers import file_access
 from drivers.errors import ConfigError
-from monitor.common.shipped_config_paths import model_path
+from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.noise.model import NoiseModel
 
 
@@ -41,4 +41,4 @@ def load_model(name_or_path: str, base_folder: Path) -> NoiseModel:
     ConfigError
         If the model does not exist or is not valid.
     """
-    return read_model(model_path(name_or_path, base_folder))
+    return read_model(resolve_model_path(name_or_path, base_folder))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.data_types import AXES
-from monitor.common.units import NO_VALUE, format_number, unit_of
+from monitor.common.units import NO_VALUE, coefficient_unit, format_number
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 
 TEMPERATURE_MARK: Final = "†"
@@ -36,7 +36,7 @@ def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digit
         Number of significant digits.
     """
     at = SYMBOLS.index(symbol), AXES.index(axis)
-    unit = unit_of(symbol, axis)
+    unit = coefficient_unit(symbol, axis)
     value, lo, hi = (float(a[at]) * unit.factor for a in (coefficients.value, coefficients.lo, coefficients.hi))
     match Status(int(coefficients.status[at])):
         case Status.ESTIMATED:

@@ -1,1 +1,1 @@
-"""Configuration files: keys, conversion of values, and all errors of a file."""
+"""Reading and validation of configuration files."""

@@ -1,8 +1,7 @@
-"""Table ``[device.driver]`` of a configuration file, which names a link and a decoder.
+"""Configuration table ``[device.driver]``, which names the link and the decoder of a device.
 
-The modules of links and decoders define the keys of their settings. Only the modules of the named link and decoder are
-imported. The keys of a simulated sensor (``link = "virtual"``) are defined here. ``monitor.simulator``, which is in a
-higher layer, creates the simulated sensor.
+Each link module and decoder module defines configuration keys. Only the modules of the named link and decoder are
+imported.
 """
 
 import re
@@ -32,7 +31,7 @@ from drivers.settings_model import (
     check_table,
     fields_by_key,
 )
-from monitor.common.shipped_config_paths import model_path
+from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.settings.field_types import Duration
 
 VIRTUAL: Final = "virtual"
@@ -44,7 +43,7 @@ Share = Annotated[float, number_ranges.FRACTION]
 
 
 class FaultsTable(SettingsModel):
-    """``[device.driver.faults]``: faults between a simulated sensor and the link. The seed determines all faults."""
+    """Table ``[device.driver.faults]``: random transmission faults of a simulated sensor."""
 
     lost: Share = Field(0.0, description="share of samples that are not sent; the counter of the sensor continues")
     repeated: Share = Field(0.0, description="share of samples that are sent twice")
@@ -62,22 +61,21 @@ class FaultsTable(SettingsModel):
     )
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if the shares of faulty samples add up to more than 1."""
+        """Yield a conflict if the fractions of faulty samples add up to more than 1."""
         if self.lost + self.repeated + self.flipped + self.cut > 1.0:
             text = "lost, repeated, flipped and cut are shares of all samples: their sum is at most 1"
             yield Conflict("", text, ("lost", "repeated", "flipped", "cut"))
 
 
 def _model_file(name: str, info: ValidationInfo) -> str:
-    """Return the path of a noise model for its name in a configuration file."""
-    return str(model_path(name, info.context.folder or Path())) if info.context else name
+    return str(resolve_model_path(name, info.context.folder or Path())) if info.context else name
 
 
 class VirtualTable(LinkSettings):
-    """Keys of ``link = "virtual"``, a simulated IMU that sends a real wire format over a real link.
+    """Configuration keys of a simulated sensor (``link = "virtual"``), which sends a real wire format over a real link.
 
-    The decoder determines the link: bytes over a pseudo-terminal, CAN frames over a bus of python-can in this process,
-    or messages over zenoh on loopback.
+    The decoder determines the type of link: a pseudo-terminal, a virtual CAN bus of python-can, or zenoh on the
+    loopback interface.
     """
 
     model: Annotated[str, AfterValidator(_model_file)] = Field(
@@ -100,43 +98,43 @@ class VirtualTable(LinkSettings):
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """Link and decoder of a device. The link is not open."""
+    """Link and decoder of a device, built from a configuration. The link is not open."""
 
     link: Link | VirtualTable
     decoder: Decoder
     silence_s: float = 3.0  # time without data after which the link is opened again; 0 = never
 
 
-def link_settings(name: str) -> type[LinkSettings]:
-    """Return the settings class of a link.
+def link_settings_class(name: str) -> type[LinkSettings]:
+    """Return the settings class of a link, which defines the configuration keys of the link.
 
     Raises
     ------
     ConfigError
-        If there is no such link. The message lists all links, the most similar name first.
+        If no link has this name. The message lists all links, the most similar name first.
     """
     if name == VIRTUAL:
         return VirtualTable
-    if name not in link_names():
-        raise ConfigError(f'"{name}"{discovery.format_choices_by_similarity(name, link_names())}')
+    if name not in list_link_names():
+        raise ConfigError(f'"{name}"{discovery.format_choices_by_similarity(name, list_link_names())}')
     settings: type[LinkSettings] = discovery.import_module(drivers.links, name, "_link").Settings
     return settings
 
 
-def link_names() -> tuple[str, ...]:
-    """Return the names of all links, with the link of a simulated sensor."""
+def list_link_names() -> tuple[str, ...]:
+    """Return the names of all links, including the link of a simulated sensor."""
     return tuple(sorted({*discovery.list_modules(drivers.links, "_link"), VIRTUAL}))
 
 
 def default_decoder(link: str) -> str:
-    """Return the default decoder of a link; "" if the configuration must name a decoder."""
+    """Return the default decoder of a link, or an empty string if a configuration must name the decoder."""
     if link == VIRTUAL:
         return VIRTUAL_DECODER
     return str(discovery.import_module(drivers.links, link, "_link").DEFAULT_DECODER)
 
 
 def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
-    """Return link and decoder of a table ``[device.driver]``.
+    """Build the link and the decoder from a configuration table ``[device.driver]``.
 
     Parameters
     ----------
@@ -148,28 +146,28 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
     Raises
     ------
     TableError
-        If the table has mistakes. ``partial`` is the ``VirtualTable`` of a simulated sensor.
+        If the table is invalid. ``partial`` is the ``VirtualTable`` of a simulated sensor.
     """
     keys = dict(table)
     name, decoder_name, options = keys.pop("link", None), keys.pop("decoder", ""), keys.pop("decoder_options", {})
     problems: list[Problem] = []
     link: Link | VirtualTable | None = None
     carrier, silence_s = "", 0.0
-    if not isinstance(name, str) or name not in link_names():
+    if not isinstance(name, str) or name not in list_link_names():
         said = "missing" if name is None else format_value(name)
         problems.append(
-            Problem("link", f"{said}{discovery.format_choices_by_similarity(str(name or ''), link_names())}")
+            Problem("link", f"{said}{discovery.format_choices_by_similarity(str(name or ''), list_link_names())}")
         )
     else:
         module = None if name == VIRTUAL else discovery.import_module(drivers.links, name, "_link")
-        checked = check_table(link_settings(name), keys, folder)
+        checked = check_table(link_settings_class(name), keys, folder)
         link = checked.value if isinstance(checked.value, VirtualTable) else _build(module, checked)
         problems += checked.problems
         carrier = "" if module is None else getattr(link, "carrier", "") or _carrier_of(module)
         decoder_name = decoder_name or getattr(link, "default_decoder", default_decoder(name))
         silence_s = checked.value.silence if checked.value is not None else 0.0
     decoder = None
-    if name in link_names() or decoder_name:
+    if name in list_link_names() or decoder_name:
         decoder = _read_decoder(decoder_name, options, folder, (str(name), carrier), problems)
     if problems or link is None or decoder is None:
         raise TableError(problems, link if isinstance(link, VirtualTable) else None)
@@ -181,7 +179,7 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
 def _read_decoder(
     name: object, options: object, folder: Path | None, link: tuple[str, str], problems: list[Problem]
 ) -> Decoder | None:
-    """Return the decoder for a link, given as name and carrier. If there are problems, append them and return None."""
+    """Build the decoder for a link, which is given by name and carrier. Append all problems to ``problems``."""
     known = discovery.list_modules(drivers.decoders)
     if not isinstance(name, str) or name not in known:
         said = format_value(name) if name else "missing"
@@ -205,7 +203,7 @@ def _read_decoder(
 
 
 def _build(module: ModuleType | None, checked: TableCheckResult[Any]) -> Any:
-    """Return the link or decoder that a module builds; None if the settings have mistakes, which are added."""
+    """Build a link or decoder from checked settings. Return None and add the problems if the settings are invalid."""
     if checked.value is None or module is None:
         return None
     keys = fields_by_key(type(checked.value))
@@ -226,6 +224,6 @@ def _build(module: ModuleType | None, checked: TableCheckResult[Any]) -> Any:
 
 
 def _carrier_of(module: ModuleType) -> str:
-    """Return the carrier of a link or decoder; "" if the carrier depends on the settings."""
+    """Return the carrier of a link or decoder module, or an empty string if the carrier depends on the settings."""
     kinds = [one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__]
     return next((str(kind.carrier) for kind in kinds if hasattr(kind, "carrier")), "")

@@ -1,4 +1,4 @@
-"""Types of configuration keys that are not plain numbers: durations, rates, paths, zenoh keys and addresses."""
+"""Types of configuration values with a special notation, such as durations, rates and addresses."""
 
 import re
 from pathlib import Path
@@ -25,52 +25,52 @@ SIZE_TEXT: Final = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,20})?)\s*(?:([kMGT]?)(i
 
 
 class Metrics(NamedTuple):
-    """Address on which the service answers Prometheus."""
+    """Host and port on which the service answers requests of Prometheus."""
 
     host: str
     port: int
 
 
-def seconds(value: float | str) -> float:
-    """Return a duration in seconds, from a number of seconds or a text such as "90s", "30min", "1h", "2d".
+def parse_duration_s(value: float | str) -> float:
+    """Return a duration in seconds. The value is a number of seconds or a text such as "90s", "30min", "1h" or "2d".
 
-    >>> seconds("30min"), seconds(3600), seconds("1.5 h")
+    >>> parse_duration_s("30min"), parse_duration_s(3600), parse_duration_s("1.5 h")
     (1800.0, 3600.0, 5400.0)
     """
-    return DURATION_S.check(float(_seconds(value)))
+    return DURATION_S.check(float(_parse_duration_text(value)))
 
 
-def parse_rate_as_period(value: str, always: str) -> float:
-    """Return the period in seconds of a rate such as "10 Hz"; 0 for the text ``always``.
+def parse_rate_as_period(value: str, always_text: str) -> float:
+    """Convert a rate such as "10 Hz" to the period in seconds. The text ``always_text`` gives a period of 0.
 
     Parameters
     ----------
     value
-        Rate with unit, or the text ``always``.
-    always
-        Text for a run at each sample or block, for example "every sample".
+        Rate with unit, or the text ``always_text``.
+    always_text
+        Text for the shortest possible period, for example "every sample".
 
     >>> parse_rate_as_period("10 Hz", "every sample"), parse_rate_as_period("every sample", "every sample")
     (0.1, 0.0)
     """
-    if value == always:
+    if value == always_text:
         return 0.0
     match = RATE_TEXT.fullmatch(value)
     rate_hz = _positive_number(match[1]) if match else 0.0
     if not rate_hz > 0.0:
-        raise ConfigError(f'{format_value(value)} is not a rate; write "10 Hz" or "{always}"')
+        raise ConfigError(f'{format_value(value)} is not a rate; write "10 Hz" or "{always_text}"')
     return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
 
 
-def period_annotation(always: str) -> ConvertedFrom:
-    """Return the annotation of a period in seconds that the file states as a rate or as the text ``always``."""
-    return ConvertedFrom(str, lambda value, folder: parse_rate_as_period(value, always))
+def rate_as_period_annotation(always_text: str) -> ConvertedFrom:
+    """Return the type annotation of a period that a configuration states as a rate or as ``always_text``."""
+    return ConvertedFrom(str, lambda value, folder: parse_rate_as_period(value, always_text))
 
 
-def check_memory(size: str) -> None:
-    """Raise ConfigError if a text is not a memory limit of the viewer.
+def check_memory_limit(size: str) -> None:
+    """Raise ConfigError if a text is not a valid memory size such as "256MiB" or "25%".
 
-    >>> check_memory("256MiB"), check_memory("25%")
+    >>> check_memory_limit("256MiB"), check_memory_limit("25%")
     (None, None)
     """
     match = SIZE_TEXT.fullmatch(size)
@@ -84,13 +84,13 @@ def check_memory(size: str) -> None:
 
 
 def check_viewer_mode(mode: str) -> None:
-    """Raise ConfigError for an unknown mode of the viewer."""
+    """Raise ConfigError if the viewer mode is unknown."""
     if mode not in VIEWER_MODES and not mode.endswith(".rrd"):
         raise ConfigError(f'"{mode}"{format_choices_by_similarity(mode, VIEWER_MODES)}, or a file ending in .rrd')
 
 
-def _seconds(value: Any) -> Any:
-    """Convert a duration from text to seconds. Values of other types are returned unchanged and checked later."""
+def _parse_duration_text(value: Any) -> Any:
+    """Convert a duration from text to seconds. Values of other types are returned unchanged."""
     if not isinstance(value, str):
         return value
     match = DURATION_TEXT.fullmatch(value)
@@ -101,7 +101,6 @@ def _seconds(value: Any) -> Any:
 
 
 def _positive_number(text: str) -> float:
-    """Return the number in a text; 0 if the text is not a number."""
     try:
         return float(text)
     except ValueError:
@@ -109,7 +108,7 @@ def _positive_number(text: str) -> float:
 
 
 def _path(name: str, folder: Path | None) -> Path:
-    """Return a path. A relative path refers to the folder of the configuration file."""
+    """Resolve a path relative to the folder of the configuration file."""
     return (folder or Path()) / file_access.expand_user(name)
 
 
@@ -125,18 +124,18 @@ def _check_zenoh_key(key: str) -> None:
 
 
 def _address(text: str, _: Path | None) -> Metrics:
-    """Return host and port of an address such as "127.0.0.1:9464"."""
+    """Parse an address such as "127.0.0.1:9464"."""
     match = ADDRESS_TEXT.fullmatch(text)
     if match is None or int(match[2]) == 0 or not PORT.supports(int(match[2])):
         raise ConfigError(f'{format_value(text)} is not a host and port; write "127.0.0.1:9464"')
     return Metrics(match[1].strip("[]"), int(match[2]))
 
 
-DURATION_FROM_TEXT: Final = BeforeValidator(_seconds)
-"""Annotation of a duration in seconds, which may be a text such as "1h" in the file."""
+DURATION_FROM_TEXT: Final = BeforeValidator(_parse_duration_text)
+"""Annotation of a duration in seconds that a configuration may state as a text such as "1h"."""
 Duration = Annotated[float, DURATION_S, DURATION_FROM_TEXT]
 RelativePath = Annotated[Path, ConvertedFrom(str, _path)]
-"""Path. A relative path refers to the folder of the configuration file."""
+"""Path type. Relative paths refer to the folder of the configuration file."""
 Endpoint = Annotated[str, checked_by(_check_endpoint)]
 ZenohKey = Annotated[str, checked_by(_check_zenoh_key)]
 Address = Annotated[Metrics, ConvertedFrom(str, _address)]

@@ -1,8 +1,7 @@
-"""Checks whether other users of this machine can change or read the files of the service.
+"""Checks whether other users of the machine can change or read configuration files.
 
-A configuration names commands, ports and keys. Users who can change or replace the file can run commands as the user of
-the service, so such a file is refused. A file with a secret that all users can read causes a warning. The group of a
-file is trusted, because many systems have one group per user. Without POSIX permissions, files are not checked.
+A user who can change a configuration file can run commands as the user of the service. The group of a file is trusted,
+because many systems have one group per user. Without POSIX permissions, files are not checked.
 """
 
 import os
@@ -18,7 +17,7 @@ MAX_SECRET_FILE_BYTES: Final = 1_000_000
 
 
 def explain_untrusted_file(path: Path) -> str:
-    """Return why a file cannot be trusted, because other users can change or replace it; "" if it can be trusted."""
+    """Return a message if other users can change or replace a file, otherwise an empty string."""
     real = real_path(path)
     if _others_may(real, stat.S_IWOTH):
         return f"anyone on this machine may change it, and with it what the daemon runs: chmod o-w {real}"
@@ -28,26 +27,26 @@ def explain_untrusted_file(path: Path) -> str:
     return ""
 
 
-def describe_exposed_secret(path: Path, secret: bool | None = None) -> str:
-    """Return a warning if all users can read a secret in a file, else "".
+def describe_exposed_secret(path: Path, is_secret: bool | None = None) -> str:
+    """Return a warning if all users can read a secret in a file, otherwise an empty string.
 
     Parameters
     ----------
     path
         File to check.
-    secret
-        True if the file is a secret, such as a private key. By default, the file is searched for secrets.
+    is_secret
+        True if the whole file is secret, such as a private key. By default, the file is searched for secrets.
     """
     real = real_path(path)
     if not _others_may(real, stat.S_IROTH) or not _is_reachable(real):
         return ""
-    if contains_secret(real) if secret is None else secret:
+    if contains_secret(real) if is_secret is None else is_secret:
         return f"holds a secret that anyone on this machine may read: chmod o-r {real}"
     return ""
 
 
 def contains_secret(path: Path) -> bool:
-    """Return True if a file seems to contain a password or a key."""
+    """Return True if a file probably contains a password or a private key."""
     try:
         with open_regular_file(path) as file:
             return has_secret(file.read(MAX_SECRET_FILE_BYTES).decode("utf-8", "replace"))
@@ -60,12 +59,12 @@ def _others_may(path: Path, permission: int) -> bool:
 
 
 def _is_reachable(path: Path) -> bool:
-    """Return True if other users can enter all folders above a file."""
+    """Return True if other users can access all parent folders of a file."""
     return all(_mode(folder) & stat.S_IXOTH for folder in path.parents)
 
 
 def _mode(path: Path) -> int:
-    """Return the permissions of a file; 0 for a missing file, which is reported elsewhere."""
+    """Return the permission bits of a file, or 0 if the file does not exist."""
     try:
         return path.stat().st_mode
     except OSError:

@@ -1,4 +1,4 @@
-"""Reading of configuration files. All mistakes of a file are reported together. No device is opened."""
+"""Reading of configuration files, which reports all mistakes of a file together."""
 
 import dataclasses
 import os
@@ -14,7 +14,7 @@ from drivers.settings_model import Problem, TableCheckResult, check_table
 from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_parser
 from monitor.settings.driver_settings import Driver, FaultsTable, VirtualTable
-from monitor.settings.field_types import Metrics, check_viewer_mode, parse_rate_as_period, seconds
+from monitor.settings.field_types import Metrics, check_viewer_mode, parse_duration_s, parse_rate_as_period
 from monitor.settings.schema import (
     DEVICE_NAME,
     WINDOW_SAMPLES,
@@ -44,10 +44,10 @@ __all__ = [
     "VirtualTable",
     "ZenohTable",
     "check_viewer_mode",
-    "examine",
-    "load",
+    "examine_config_file",
+    "load_config",
+    "parse_duration_s",
     "parse_rate_as_period",
-    "seconds",
 ]
 
 DEVICE_PLACE: Final = re.compile(r"device\[(\d+)\]\.?(.*)")
@@ -55,7 +55,7 @@ DEVICE_PLACE: Final = re.compile(r"device\[(\d+)\]\.?(.*)")
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Configuration of the service."""
+    """Validated configuration of the service."""
 
     devices: tuple[Device, ...]
     zenoh: ZenohTable
@@ -73,7 +73,7 @@ class Config:
 
 @dataclass(frozen=True, slots=True)
 class ModelDependentSettings:
-    """Settings of a device that depend on model files. They are checked even if other keys are wrong."""
+    """Settings of a device whose validation needs noise model files."""
 
     device: str  # "device bench-1"
     model: Path | None  # model in force
@@ -82,54 +82,56 @@ class ModelDependentSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
-    """Result of reading a configuration file."""
+class ConfigReading:
+    """Result of reading a configuration file: a configuration or a list of mistakes."""
 
     config: Config | None  # None if the file has mistakes
     wrong: list[str]  # one line per mistake, beginning with the path of the file
     models: tuple[ModelDependentSettings, ...] = ()
 
 
-def load(path: Path, *, pipe: bool = False) -> Config:
-    """Return the configuration in a file.
+def load_config(path: Path, *, allow_pipe: bool = False) -> Config:
+    """Load a configuration file, and raise an error if the file has mistakes.
 
     Parameters
     ----------
     path
         Configuration file.
-    pipe
-        True if a pipe may be read as well, see ``drivers.file_access.read_small_file``.
+    allow_pipe
+        True to accept a pipe instead of a regular file (``drivers.file_access.read_small_file``).
 
     Raises
     ------
     ConfigError
-        If the file has mistakes. The message describes the first mistake and states the number of further mistakes.
+        If the file has mistakes. The message describes the first mistake and counts the other mistakes.
     """
-    reading = examine(path, pipe=pipe)
+    reading = examine_config_file(path, allow_pipe=allow_pipe)
     if reading.config is None:
         count = len(reading.wrong) - 1
         raise ConfigError(reading.wrong[0] + (f" (and {count} more: imu-monitor check {path})" if count else ""))
     return reading.config
 
 
-def examine(path: Path, *, pipe: bool = False) -> Reading:
-    """Read a configuration file, and find all mistakes.
+def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReading:
+    """Read a configuration file, and collect all mistakes.
 
     Parameters
     ----------
     path
         Configuration file.
-    pipe
-        True if a pipe may be read as well.
+    allow_pipe
+        True to accept a pipe instead of a regular file.
     """
     try:
-        table = toml_parser.parse_toml(file_access.read_small_file(path, allow_pipe=pipe).decode("utf-8"))
+        table = toml_parser.parse_toml(file_access.read_small_file(path, allow_pipe=allow_pipe).decode("utf-8"))
     except FileNotFoundError:
-        return Reading(None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"])
+        return ConfigReading(
+            None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]
+        )
     except (OSError, UnicodeDecodeError) as error:
-        return Reading(None, [f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"])
+        return ConfigReading(None, [f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"])
     except ConfigError as error:
-        return Reading(None, [f"{path}: {error}"])
+        return ConfigReading(None, [f"{path}: {error}"])
     checked = check_table(ConfigFile, table, path.resolve().parent)
     warnings = _check_zenoh_file(checked)
     wrong = [_format_problem(problem, table) for problem in checked.problems]
@@ -139,20 +141,19 @@ def examine(path: Path, *, pipe: bool = False) -> Reading:
         warnings.insert(0, line)
     models = _model_dependent_settings(checked, table)
     if wrong or checked.value is None:
-        return Reading(None, [sanitize_error_text(f"{path}: {line}") for line in wrong], models)
+        return ConfigReading(None, [sanitize_error_text(f"{path}: {line}") for line in wrong], models)
     config = _configuration(checked.value)
     lines = tuple(f"{path}: {line}" for line in warnings)
-    return Reading(dataclasses.replace(config, path=path, table=table, warnings=lines), [], models)
+    return ConfigReading(dataclasses.replace(config, path=path, table=table, warnings=lines), [], models)
 
 
 def _configuration(file: ConfigFile) -> Config:
-    """Return the configuration of a file without mistakes."""
     storage = None if file.storage.folder == Path() else file.storage
     return Config(file.devices, file.zenoh, file.viewer, file.log, storage, file.hooks, file.metrics.listen)
 
 
 def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
-    """Check that zenoh accepts the zenoh file and that the file is safe; return warnings about readable secrets."""
+    """Check the zenoh configuration file, and return warnings about secrets that all users can read."""
     zenoh = checked.value.zenoh if checked.value else None
     if zenoh is None or zenoh.config is None or zenoh.mode == "none":
         return []
@@ -173,7 +174,8 @@ def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
 
 
 def _zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
-    """Return the files of keys and passwords that a zenoh file names; raise ConfigError if zenoh refuses the file."""
+    """Return the key and password files in a zenoh configuration. Raise ConfigError if zenoh rejects the
+    configuration."""
     import zenoh
 
     try:
@@ -184,14 +186,14 @@ def _zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
 
 
 def _format_problem(problem: Problem, table: Mapping[str, Any]) -> str:
-    """Return the message of a problem. For a problem of a device, the message begins with its name."""
+    """Format a problem as a message, which begins with the name of the affected device."""
     match = DEVICE_PLACE.fullmatch(problem.key_path)
     name = _device_name(table, int(match[1])) if match else ""
     return f"{name}: {Problem(match[2], problem.text)}" if match and name else str(problem)
 
 
 def _device_name(table: Mapping[str, Any], index: int) -> str:
-    """Return "device NAME"; "" if the device has no valid name."""
+    """Return "device NAME", or an empty string if the device has no valid name."""
     entry = table["device"][index]
     name = entry.get("name") if isinstance(entry, dict) else None
     return f"device {name}" if isinstance(name, str) and DEVICE_NAME.fullmatch(name) else ""
@@ -200,7 +202,7 @@ def _device_name(table: Mapping[str, Any], index: int) -> str:
 def _model_dependent_settings(
     checked: TableCheckResult[ConfigFile], table: Mapping[str, Any]
 ) -> tuple[ModelDependentSettings, ...]:
-    """Return the settings to check against model files, without settings that have mistakes."""
+    """Return the valid settings of all devices that must be checked against noise model files."""
     uses = []
     for i, device in enumerate(checked.value.devices if checked.value else ()):
         at = f"device[{i}]"

@@ -1,6 +1,6 @@
-"""Text of a configuration file with all keys, generated from the settings classes.
+"""Generation of a configuration file that lists all keys with default values.
 
-The keys of the required tables have their default values. All other keys are in comments with example values.
+Optional keys are printed as comments with example values.
 """
 
 import json
@@ -25,7 +25,7 @@ INTRODUCTION: Final = """\
 # folder of this file.
 """
 FIRST_LINK, FIRST_DECODER = "serial", "vectornav_ascii"
-"""Link and decoder of the device that is not in a comment."""
+"""Link and decoder of the device that is printed without comment marks."""
 COMMENT_COLUMN: Final = 30
 COMMENT: Final = "# "
 DECODER_TABLE: Final = "device.driver.decoder_options"
@@ -33,22 +33,22 @@ LIST_TABLES: Final = ("device", "hook", "device.limit")
 
 
 def format_defaults() -> str:
-    """Return a configuration file with the keys of all tables, links and decoders."""
-    links = [name for name in driver_settings.link_names() if name != FIRST_LINK]
+    """Format a configuration file with the keys of all tables, links and decoders."""
+    links = [name for name in driver_settings.list_link_names() if name != FIRST_LINK]
     decoders = [name for name in discovery.list_modules(drivers.decoders) if name != FIRST_DECODER]
     top = {key: find_settings_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
     blocks = [
         INTRODUCTION,
         _table(Device, "device", omit=("driver", "axes", "limit")),
-        format_link(FIRST_LINK),
-        format_decoder(FIRST_DECODER),
+        format_link_defaults(FIRST_LINK),
+        format_decoder_defaults(FIRST_DECODER),
         "\n".join(
             ["[device.axes]", *(_line(axis, axis, str(fields_by_key(Device)["axes"].description)) for axis in AXES)]
         ),
         "# The other links. Replace the table [device.driver] above by one of these tables.",
-        *(_commented(format_link(name)) for name in links),
+        *(_commented(format_link_defaults(name)) for name in links),
         "# The other decoders.",
-        *(_commented(format_decoder(name)) for name in decoders),
+        *(_commented(format_decoder_defaults(name)) for name in decoders),
         _commented(_table(Limit, "device.limit", "any number of tables")),
         _commented(_table(Hook, "hook", "any number of tables")),
         *(_table(model, key) for key, model in top.items() if model is not None and key not in LIST_TABLES),
@@ -56,17 +56,20 @@ def format_defaults() -> str:
     return "\n\n".join(block.strip("\n") for block in blocks) + "\n"
 
 
-def format_link(name: str) -> str:
-    """Return the table ``[device.driver]`` with all keys of a link.
+def format_link_defaults(name: str) -> str:
+    """Format the configuration table ``[device.driver]`` with all keys of a link.
 
     Raises
     ------
     ConfigError
-        If there is no such link.
+        If no link has this name.
     """
-    settings, decoder = driver_settings.link_settings(name), driver_settings.default_decoder(name) or FIRST_DECODER
+    settings, decoder = (
+        driver_settings.link_settings_class(name),
+        driver_settings.default_decoder(name) or FIRST_DECODER,
+    )
     header, keys = _table(settings, "device.driver", omit=("faults",)).split("\n", 1)
-    link = _line("link", name, f"one of {', '.join(driver_settings.link_names())}")
+    link = _line("link", name, f"one of {', '.join(driver_settings.list_link_names())}")
     text = "\n".join((header, link, f"{keys}{_line('decoder', decoder, 'wire format of the sensor')}\n"))
     if name != driver_settings.VIRTUAL:
         return text
@@ -74,13 +77,13 @@ def format_link(name: str) -> str:
     return f"{text}\n{faults}"
 
 
-def format_decoder(name: str) -> str:
-    """Return the table ``[device.driver.decoder_options]`` with all keys of a decoder.
+def format_decoder_defaults(name: str) -> str:
+    """Format the configuration table ``[device.driver.decoder_options]`` with all keys of a decoder.
 
     Raises
     ------
     ConfigError
-        If there is no such decoder.
+        If no decoder has this name.
     """
     known = discovery.list_modules(drivers.decoders)
     if name not in known:
@@ -91,7 +94,7 @@ def format_decoder(name: str) -> str:
 
 
 def _table(model: type[SettingsModel], name: str, about: str = "", omit: tuple[str, ...] = ()) -> str:
-    """Return the header and the keys of a table, with optional keys in comments."""
+    """Format the header and the keys of a configuration table, with optional keys in comments."""
     header = f"[[{name}]]" if name in LIST_TABLES else f"[{name}]"
     lines = [f"{header:<{COMMENT_COLUMN - 1}} # {about}" if about else header]
     for key, info in fields_by_key(model).items():
@@ -105,17 +108,15 @@ def _table(model: type[SettingsModel], name: str, about: str = "", omit: tuple[s
 
 
 def _commented(text: str) -> str:
-    """Return the lines of a text as comments."""
     return "\n".join(line if line.startswith(COMMENT) or not line else COMMENT + line for line in text.split("\n"))
 
 
 def _line(key: str, value: object, comment: str) -> str:
-    """Return the line of a key with its comment."""
-    return f"{f'{key} = {format_toml(value)}':<{COMMENT_COLUMN - 1}} # {comment}"
+    return f"{f'{key} = {format_toml_value(value)}':<{COMMENT_COLUMN - 1}} # {comment}"
 
 
 def _values(info: FieldInfo) -> str:
-    """Return the possible words or the range of a key, in parentheses."""
+    """Format the possible values or the range of a configuration key in parentheses."""
     parts = list(_find_parts((info.annotation, *info.metadata)))
     words = [str(one) for one in parts if not isinstance(one, NumberRange)]
     ranges = [one.format_range() for one in parts if isinstance(one, NumberRange)]
@@ -123,7 +124,7 @@ def _values(info: FieldInfo) -> str:
 
 
 def _find_parts(types: Iterable[Any]) -> Iterator[object]:
-    """Yield the words of all Literal types and the Quantity objects in type annotations."""
+    """Yield the values of Literal types and the NumberRange objects in type annotations."""
     for one in types:
         if isinstance(one, NumberRange):
             yield one
@@ -133,14 +134,18 @@ def _find_parts(types: Iterable[Any]) -> Iterator[object]:
             yield from _find_parts(get_args(one))
 
 
-def format_toml(value: Any) -> str:
-    """Return a value in TOML notation.
+def format_toml_value(value: Any) -> str:
+    """Format a value in TOML notation.
 
-    >>> format_toml({"gx": 0.5}), format_toml(("a", "b")), format_toml(True)
+    >>> format_toml_value({"gx": 0.5}), format_toml_value(("a", "b")), format_toml_value(True)
     ('{ gx = 0.5 }', '["a", "b"]', 'true')
     """
     if isinstance(value, Mapping):
-        return "{}" if not value else f"{{ {', '.join(f'{key} = {format_toml(one)}' for key, one in value.items())} }}"
+        return (
+            "{}"
+            if not value
+            else f"{{ {', '.join(f'{key} = {format_toml_value(one)}' for key, one in value.items())} }}"
+        )
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(format_toml, value))}]"
+        return f"[{', '.join(map(format_toml_value, value))}]"
     return json.dumps(value, ensure_ascii=False)

@@ -1,6 +1,6 @@
-"""Settings classes of the tables of a configuration file: keys, types with ranges, defaults and descriptions.
+"""Settings classes, which define the keys, types, ranges and defaults of a configuration file.
 
-``driver_settings`` defines the table ``[device.driver]``. Values are converted: "1h" in the file becomes 3600.0.
+``monitor.settings.driver_settings`` defines the table ``[device.driver]``.
 """
 
 import os
@@ -21,7 +21,7 @@ from drivers.errors import ConfigError
 from drivers.links.base import Link
 from drivers.number_ranges import DAY_S, NumberRange
 from drivers.settings_model import Conflict, ConvertedFrom, KeywordOrType, ListOf, SettingsModel, checked_by, one_of
-from monitor.common.shipped_config_paths import model_path
+from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings.driver_settings import Driver, VirtualTable, read_driver
 from monitor.settings.field_types import (
@@ -31,17 +31,17 @@ from monitor.settings.field_types import (
     Endpoint,
     RelativePath,
     ZenohKey,
-    check_memory,
+    check_memory_limit,
     check_viewer_mode,
-    period_annotation,
+    rate_as_period_annotation,
 )
 
 WINDOW_SAMPLES: Final = (100, 10_000_000)
-"""Smallest and largest number of samples in the window."""
+"""Smallest and largest number of samples in the sliding window."""
 MAX_WINDOW_S: Final = 40 * DAY_S
-"""Longest window if the sample rate is not configured."""
+"""Longest sliding window if the sample rate is not configured."""
 THERMAL_INTERVAL_SAMPLES: Final = 8
-"""Minimum number of samples in a thermal interval. The scatter of the samples gives the uncertainty of the mean."""
+"""Minimum number of samples in a thermal interval, for an estimate of the uncertainty of the mean."""
 THERMAL_INTERVAL_S: Final = NumberRange("s", 1e-6, DAY_S)
 SEGMENT_LENGTH_S: Final = NumberRange("s", 10.0, DAY_S)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
@@ -51,7 +51,7 @@ Coefficient = Annotated[float, number_ranges.COEFFICIENT]
 
 
 def select_axes(pattern: str, _: object = None) -> tuple[str, ...]:
-    """Return the axes that an axis name, "g*", "a*" or "*" selects.
+    """Return the axes that match an axis name or one of the patterns "g*", "a*" and "*".
 
     >>> select_axes("g*"), select_axes("az")
     (('gx', 'gy', 'gz'), ('az',))
@@ -62,7 +62,7 @@ def select_axes(pattern: str, _: object = None) -> tuple[str, ...]:
 
 
 class Limit(SettingsModel):
-    """``[[device.limit]]``: bounds of one noise coefficient."""
+    """Table ``[[device.limit]]``: bounds of one noise coefficient."""
 
     axes: Annotated[tuple[str, ...], ConvertedFrom(str, select_axes)] = Field(
         examples=["g*"], description='gx ... az, "g*", "a*" or "*"'
@@ -85,7 +85,7 @@ class Limit(SettingsModel):
     )
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if there is no bound, or if the bounds exclude each other."""
+        """Yield a conflict if the limit has no bound, or if the bounds contradict each other."""
         bounds = ("above", "below", "times_model")
         if self.above is None and self.below is None and self.times_model is None:
             yield Conflict("", "no bound; add above, below or times_model", bounds)
@@ -101,11 +101,11 @@ def _check_name(name: str) -> None:
 
 
 def _model_in_force(name: str, folder: Path | None) -> Path:
-    return model_path(name, folder or Path())
+    return resolve_model_path(name, folder or Path())
 
 
 class Device(SettingsModel):
-    """``[[device]]``: one device. The link is not open."""
+    """Table ``[[device]]``: settings of one device."""
 
     name: Annotated[str, checked_by(_check_name)] = Field(
         examples=["bench-1"], description="letters, digits, - and _; unique, since it is part of every zenoh key"
@@ -123,13 +123,13 @@ class Device(SettingsModel):
             {"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, number_ranges.AVERAGING_TIME_S]]
         ),
     ] = Field("octave", description="averaging times: a grid, or a list of seconds")
-    refit_s: Annotated[float, period_annotation("every sample")] = Field(
+    refit_s: Annotated[float, rate_as_period_annotation("every sample")] = Field(
         0.1,
         alias="refit",
         examples=["10 Hz"],
         description='rate at which the coefficients are fitted, or "every sample"',
     )
-    publish_s: Annotated[float, period_annotation("every block")] = Field(
+    publish_s: Annotated[float, rate_as_period_annotation("every block")] = Field(
         0.1, alias="publish", examples=["10 Hz"], description='rate at which results are published, or "every block"'
     )
     motion: Literal["tell", "leave out"] = Field(
@@ -166,7 +166,7 @@ class Device(SettingsModel):
 
     @property
     def link(self) -> Link | VirtualTable:
-        """Link of the device, or the settings of a simulated sensor."""
+        """Link of the device, or settings of a simulated sensor."""
         return self.driver.link
 
     @property
@@ -176,16 +176,17 @@ class Device(SettingsModel):
 
     @property
     def silence_s(self) -> float:
-        """Time without data in seconds after which the link is opened again; 0 = never."""
+        """Time without data in seconds after which the link is reopened, or 0 for never."""
         return self.driver.silence_s
 
     @property
     def leave_out_motion(self) -> bool:
-        """True if motion is excluded from the noise."""
+        """True if samples during motion are excluded from the noise analysis."""
         return self.motion == "leave out"
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict for each time that does not match the sample rate, and for each limit without a model."""
+        """Yield a conflict for each duration that does not match the sample rate, and for each relative limit without a
+        noise model."""
         if text := self._window_problem():
             yield Conflict("window", text, ("rate",))
         if text := self._tau_problem():
@@ -199,7 +200,7 @@ class Device(SettingsModel):
                 yield Conflict(f"limit[{i}].times_model", "the device has no model in force; add model", ("model",))
 
     def _window_problem(self) -> str:
-        """Return why the window is too short or too long; "" if its length is possible."""
+        """Return a message if the sliding window is too short or too long, otherwise an empty string."""
         if self.rate_hz is None:
             return f"{self.window_s:g} s; at most {MAX_WINDOW_S:g} s" if self.window_s > MAX_WINDOW_S else ""
         low, high = WINDOW_SAMPLES
@@ -212,7 +213,7 @@ class Device(SettingsModel):
         )
 
     def _tau_problem(self) -> str:
-        """Return why no averaging time is possible; "" if one is possible after rounding to whole samples."""
+        """Return a message if no configured averaging time is possible, otherwise an empty string."""
         shortest_s = 1.0 / self.rate_hz if self.rate_hz else 0.0
         if isinstance(self.tau, str) or any(0.5 * shortest_s < one <= 0.5 * self.window_s for one in self.tau):
             return ""
@@ -221,7 +222,7 @@ class Device(SettingsModel):
 
 
 class ZenohTable(SettingsModel):
-    """``[zenoh]``: session of the daemon. If the zenoh file decides, ``mode`` and ``listen`` are None."""
+    """Table ``[zenoh]``: settings of the zenoh session of the daemon."""
 
     mode: Literal["peer", "client", "router", "none"] | None = Field("peer", description="mode of the session")
     listen: ListOf[Endpoint] | None = Field(
@@ -238,34 +239,34 @@ class ZenohTable(SettingsModel):
     @model_validator(mode="before")
     @classmethod
     def _prefer_file(cls, table: Any, info: ValidationInfo) -> Any:
-        """If the table names a zenoh file, let this file decide ``mode`` and ``listen``."""
+        """Set ``mode`` and ``listen`` to None if a zenoh file is named, because the zenoh file takes precedence."""
         if info.context is None or not isinstance(table, dict) or "config" not in table:
             return table
         return {"mode": None, "listen": None, **table}
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if a client has no endpoint of a router."""
+        """Yield a conflict if a zenoh client has no router endpoint."""
         if self.mode == "client" and not self.connect and self.config is None:
             text = 'empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]'
             yield Conflict("connect", text, ("mode", "config"))
 
 
 def _viewer_mode(mode: str, info: ValidationInfo) -> str:
-    """Return the mode of the viewer. A file name is completed to a path."""
+    """Check the viewer mode, and resolve a file name relative to the configuration file."""
     check_viewer_mode(mode)
     folder = info.context.folder if info.context else None
     return str(folder / file_access.expand_user(mode)) if folder and mode.endswith(".rrd") else mode
 
 
 class ViewerTable(SettingsModel):
-    """``[viewer]``: live view."""
+    """Table ``[viewer]``: settings of the live viewer."""
 
     mode: Annotated[str, AfterValidator(_viewer_mode)] = Field(
         "auto", description="auto, native, web, none, or a file ending in .rrd"
     )
     port: Annotated[int, number_ranges.PORT] = Field(9876, description="TCP port of the viewer's data, on loopback")
     web_port: Annotated[int, number_ranges.PORT] = Field(9090, description="TCP port of the viewer's page, on loopback")
-    memory: Annotated[str, checked_by(check_memory)] = Field(
+    memory: Annotated[str, checked_by(check_memory_limit)] = Field(
         "256MiB", description="memory for past data; the oldest data are dropped first"
     )
     history: Duration | None = Field(
@@ -274,7 +275,7 @@ class ViewerTable(SettingsModel):
 
 
 class Storage(SettingsModel):
-    """``[storage]``: samples and results that are kept on disk."""
+    """Table ``[storage]``: settings for samples and results on disk."""
 
     folder: RelativePath = Field(
         Path(),
@@ -297,14 +298,14 @@ class Storage(SettingsModel):
     history: bool = Field(True, description="keep results, events and status for years, thinned with age")
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if segments are deleted before they are complete."""
+        """Yield a conflict if segments would be deleted before completion."""
         if self.keep_s < self.segment_s:
             text = f"{self.keep_s:g} s is shorter than a segment of {self.segment_s:g} s"
             yield Conflict("keep", text, ("segment",))
 
 
 def _program(words: tuple[str, ...], folder: Path | None) -> tuple[str, ...]:
-    """Return a program and its arguments. A relative path refers to the folder of the configuration file."""
+    """Check a command, and resolve the program path relative to the configuration file."""
     if not words:
         return ()
     if "/" not in words[0]:
@@ -325,7 +326,7 @@ def _check_events(kinds: frozenset[str]) -> None:
 
 
 class Hook(SettingsModel):
-    """``[[hook]]``: a command or a message for certain events."""
+    """Table ``[[hook]]``: a command or a zenoh message for certain events."""
 
     on: Annotated[frozenset[Annotated[str, one_of((*EVENT_KINDS, "*"))]], Strict(False), checked_by(_check_events)] = (
         Field(examples=[["limit_crossed", "link_lost"]], description='kinds of events, or ["*"]')
@@ -346,13 +347,13 @@ class Hook(SettingsModel):
     )
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if the hook has no action."""
+        """Yield a conflict if the hook has neither a command nor a zenoh key."""
         if not self.command and self.key is None:
             yield Conflict("", "nothing to do; add command or key", ("command", "key"))
 
 
 class MetricsTable(SettingsModel):
-    """``[metrics]``: numbers for Prometheus."""
+    """Table ``[metrics]``: settings of the metrics for Prometheus."""
 
     listen: Address | None = Field(
         None,
@@ -362,14 +363,14 @@ class MetricsTable(SettingsModel):
 
 
 class LogTable(SettingsModel):
-    """``[log]``: messages of the service."""
+    """Table ``[log]``: settings of the log messages."""
 
     level: Literal["debug", "info", "warning", "error"] = Field("info", description="least important level to write")
     format: Literal["text", "json"] = Field("text", description="format of the lines")
 
 
 class ConfigFile(SettingsModel):
-    """Whole configuration file."""
+    """Complete configuration file."""
 
     devices: ListOf[Device] = Field((), alias="device", description="devices")
     zenoh: ZenohTable = Field(ZenohTable(), description="zenoh session of the daemon")
@@ -380,7 +381,7 @@ class ConfigFile(SettingsModel):
     log: LogTable = Field(LogTable(), description="messages of the service")
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield the conflicts between tables."""
+        """Yield the conflicts between tables of a configuration file."""
         names = [device.name for device in self.devices]
         places = tuple(f"device[{i}].name" for i in range(len(names)))
         if not names:

@@ -1,6 +1,6 @@
-"""Parser of TOML text for configurations and noise models.
+"""TOML parser for configuration files and noise models.
 
-Integers are limited to 64 bits, the range that the TOML standard guarantees.
+Integers are limited to 64 bits, which is the range that the TOML standard guarantees.
 """
 
 import tomllib
@@ -12,7 +12,7 @@ MAX_INTEGER: Final = 1 << 63
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the tables of a TOML text.
+    """Parse a TOML text into nested dictionaries.
 
     >>> parse_toml("a = 1")
     {'a': 1}
@@ -20,7 +20,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     Raises
     ------
     ConfigError
-        If the text is not TOML, is nested too deeply, or contains an integer of more than 64 bits.
+        If the text is not valid TOML, is nested too deeply, or contains an integer of more than 64 bits.
     """
     try:
         found = tomllib.loads(text)

@@ -1,7 +1,6 @@
-"""Port of a simulated sensor on a virtual CAN bus of python-can.
+"""Port of a simulated sensor on a virtual CAN bus (python-can).
 
-The channel of the bus has a random name, so no other program uses it. As on a real bus, the bus remains when the sensor
-is disconnected. The link then detects that no frames arrive.
+The virtual bus has a random channel name, so that no other program uses the bus.
 """
 
 import secrets
@@ -16,13 +15,13 @@ if TYPE_CHECKING:
     import can
 
 ID_MASK: Final = 0x1FFF_FFFF
-"""Bits of a CAN identifier in the address of a chunk."""
+"""Mask of the CAN identifier in the address of a chunk."""
 CLASSIC_BYTES: Final = 8
-"""Largest payload of a classic CAN frame; longer frames are CAN FD."""
+"""Largest payload of a classic CAN frame in bytes. Longer frames are CAN FD frames."""
 
 
 class CanPort(Port):
-    """Port with a CAN controller on a separate bus. The link is lost after ``silence_s`` seconds without frames."""
+    """Port of a simulated sensor on a virtual CAN bus. The link is lost after ``silence_s`` seconds without frames."""
 
     def __init__(self, silence_s: float) -> None:
         self._channel = f"imu-monitor-{secrets.token_hex(8)}"
@@ -31,7 +30,7 @@ class CanPort(Port):
         self._bus: can.BusABC | None = None
 
     def plug(self) -> None:
-        """Connect to the bus."""
+        """Connect the simulated sensor to the virtual CAN bus."""
         import can
 
         with self._plugging:
@@ -39,14 +38,14 @@ class CanPort(Port):
                 self._bus = can.Bus(interface="virtual", channel=self._channel, ignore_config=True)
 
     def unplug(self) -> None:
-        """Disconnect from the bus."""
+        """Disconnect the simulated sensor from the virtual CAN bus."""
         with self._plugging:
             bus, self._bus = self._bus, None
             if bus is not None:
                 bus.shutdown()
 
     def send_chunks(self, chunks: Sequence[Chunk]) -> int:
-        """Send each chunk as one CAN frame; return the number of chunks that were sent."""
+        """Send each chunk as one CAN frame, and return the number of sent chunks."""
         import can
 
         with self._plugging:

@@ -1,6 +1,6 @@
 """Configuration of the ``demo`` command.
 
-The configuration is the shipped one. Options select another sensor and add effects.
+Options of the command can replace the sensor and add noise effects.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, ParamSpec, TypeVar
 
 from drivers.errors import ConfigError
-from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.common import shipped_config_paths
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.noise.model_loading import read_model
 from monitor.settings import loading
@@ -20,34 +20,36 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 DEMO_CONFIG: Final = CONFIG_FOLDER / "demo.toml"
-"""Shipped configuration of the demo."""
+"""Path of the shipped configuration."""
 
 
-def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: float | None = None) -> Config:
-    """Return the configuration of ``demo``.
+def build_demo_config(
+    sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: float | None = None
+) -> Config:
+    """Build the configuration of the ``demo`` command.
 
     Parameters
     ----------
     sensor : str, optional
-        Model of the catalogue, or path of a model file. The default is the model of the shipped configuration.
+        Name of a shipped noise model, or path of a model file. By default, the shipped configuration is not changed.
     effects : sequence of str, optional
-        Effects in the syntax of ``parse_effects``.
+        Noise effects in the syntax of ``parse_effects``.
     effect_at_s : float, optional
-        Time at which the effects begin, in seconds since the start.
+        Start time of the effects in seconds after the start of the sensor.
 
     Raises
     ------
     ConfigError
-        If an option has an invalid value. The message begins with the name of the option.
+        If an option is invalid. The message begins with the name of the option.
     """
-    config = loading.load(DEMO_CONFIG)
+    config = loading.load_config(DEMO_CONFIG)
     (device,) = config.devices
     table = device.link
     assert isinstance(table, VirtualTable)
     given = {
         "model": None
         if sensor is None
-        else str(_for_option("--sensor", shipped_file_paths.model_path, sensor, Path.cwd())),
+        else str(_for_option("--sensor", shipped_config_paths.resolve_model_path, sensor, Path.cwd())),
         "effect": tuple(effects) or None,
         "effect_at": effect_at_s,
     }
@@ -64,7 +66,7 @@ def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_a
 
 
 def _for_option(option: str, function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
-    """Call a function, and prefix a ConfigError with the name of the option."""
+    """Call a function, and prepend the name of the option to the message of a ConfigError."""
     try:
         return function(*arguments, **named)
     except ConfigError as error:

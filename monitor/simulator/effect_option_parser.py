@@ -1,4 +1,4 @@
-"""Parser for effects that begin while a simulated sensor runs, such as "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
+"""Parser for noise effects in the syntax "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
 
 import json
 import re
@@ -10,20 +10,20 @@ from monitor.noise.effect import Effect
 from monitor.noise.model import NoiseModel
 
 EFFECT_SYNTAX: Final = re.compile(r"\s*([^.:\s]+)\.([^.:\s]+)\s*:\s*(.*)")
-"""Regular expression for an effect: axis, name and parameters."""
+"""Regular expression for a noise effect: axis, name and parameters."""
 EXAMPLE: Final = "gz.sinusoidal:amplitude=1e-3,frequency=17"
-"""Example in the error message."""
+"""Example for error messages."""
 
 
 def parse_effects(text: str) -> list[tuple[str, Effect]]:
-    """Parse an effect; return one pair of axis and effect for each axis that the text selects (``gz``, ``g*``).
+    """Parse a noise effect, and return pairs of axis and effect for all selected axes.
 
-    The effect is read as a table of a model file, so that mistakes give the same messages.
+    The effect is parsed as a table of a noise model file, so that error messages are the same.
 
     Raises
     ------
     ConfigError
-        If the text is not a valid effect. For an unknown name, the message suggests the most similar known name.
+        If the text is not a valid noise effect.
 
     Examples
     --------
@@ -39,7 +39,6 @@ def parse_effects(text: str) -> list[tuple[str, Effect]]:
 
 
 def _parameters(text: str, parameters: str) -> Iterator[str]:
-    """Yield the parameters as lines of TOML."""
     given: set[str] = set()
     for part in filter(None, map(str.strip, parameters.split(","))):
         name, equals, value = (word.strip() for word in part.partition("="))
@@ -52,7 +51,7 @@ def _parameters(text: str, parameters: str) -> Iterator[str]:
 
 
 def _toml(value: str) -> str:
-    """Return a value in TOML: a number unquoted, and any other value, such as an axis, in quotes."""
+    """Format a number or a quoted string in TOML notation."""
     for kind in (int, float):
         try:
             return repr(kind(value))

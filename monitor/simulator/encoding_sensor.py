@@ -1,7 +1,6 @@
-"""Simulated sensor: encoded samples of a noise model, with effects that begin while the sensor runs.
+"""Simulated sensor, which encodes samples of a noise model in the wire format of a decoder.
 
-The clock of the sensor shows the number of the sample divided by the sample rate of the model. Counters and time stamps
-follow this clock, even if the samples are sent at another rate.
+Counters and time stamps follow the nominal sample rate of the noise model, even if samples are sent at another rate.
 """
 
 import copy
@@ -21,24 +20,24 @@ from monitor.settings.loading import VirtualTable
 from monitor.simulator.effect_option_parser import parse_effects
 
 DEFAULT_RATE_HZ: Final = 100.0
-"""Sample rate if the model has none."""
+"""Sample rate in Hz if the noise model does not state a sample rate."""
 AMBIENT_C: Final = 24.0
-"""Temperature at the start if the model has no temperature."""
+"""Initial temperature in °C if the noise model does not include the temperature."""
 WARM_UP_C: Final = 6.0
-"""Rise of the die temperature after the start if the model has no temperature."""
+"""Final temperature rise in °C if the noise model does not include the temperature."""
 WARM_UP_S: Final = 300.0
-"""Time constant of the rise of the die temperature."""
+"""Time constant of the temperature rise in s."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
-def check_sensor(table: VirtualTable) -> None:
-    """Check the model and the effects of a simulated sensor without a simulation. An empty ``model`` is not checked.
+def check_sensor_settings(table: VirtualTable) -> None:
+    """Check the noise model and the effects of a simulated sensor. An empty ``model`` is not checked.
 
     Raises
     ------
     ConfigError
-        If the model or an effect is invalid. The message has one line for each mistake.
+        If the noise model or an effect is invalid. The message has one line per mistake.
     """
     wrong: list[str] = []
     coming = []
@@ -65,21 +64,21 @@ def check_sensor(table: VirtualTable) -> None:
 
 
 class SimulatedSensor:
-    """Simulated sensor without a link.
+    """Simulated sensor that generates encoded samples.
 
     Parameters
     ----------
     table : VirtualTable
-        Model, seed and effects.
+        Noise model, seed and effects.
     decoder : Decoder
-        Wire format. A copy of the decoder encodes the samples.
+        Decoder of the wire format, used to encode samples.
     name : str
-        Name of the device, for the log.
+        Name of the device in log messages.
 
     Raises
     ------
     ConfigError
-        If the model or an effect cannot be used.
+        If the noise model or an effect is invalid.
     """
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str) -> None:
@@ -96,18 +95,18 @@ class SimulatedSensor:
         self._add_effects(self._create_stream(table.seed))  # reports errors of the effects before the sensor starts
 
     def start_clock(self) -> None:
-        """Start the clock of the sensor, after the kernels of the simulation have been compiled."""
+        """Compile the simulation kernels, and start the clock of the sensor."""
         trial = self._create_stream(0)
         self._add_effects(trial)
         trial.draw_samples_with_temperature(1)
         self._unix_ns = time.time_ns()
 
     def skip_samples(self, n: int) -> None:
-        """Skip ``n`` samples. The counter of the sensor continues."""
+        """Skip ``n`` samples. The sample counter of the sensor continues."""
         self._made += n
 
     def encode_next_samples(self, n: int) -> list[list[Chunk]]:
-        """Return the chunks of each of the next ``n`` samples."""
+        """Simulate and encode the next ``n`` samples. Return a list of chunks for each sample."""
         index = np.arange(self._made, self._made + n)
         values, temperature_c = self._measured(n)
         if np.isnan(temperature_c).all():
@@ -122,7 +121,7 @@ class SimulatedSensor:
         return [chunks[i * each : (i + 1) * each] for i in range(n)]
 
     def _measured(self, n: int) -> tuple[Floats, Floats]:
-        """Return values [n, 6] and temperature [n] of the next samples, with the effects from their start on."""
+        """Simulate values [n, 6] and temperature [n] of the next samples, including effects that have begun."""
         before = max(self._effects_begin_at - self._made, 0)
         if not self._pending_effects or before >= n:
             drawn = self._stream.draw_samples_with_temperature(n)
@@ -137,11 +136,10 @@ class SimulatedSensor:
         return np.concatenate([p.values for p in parts]), np.concatenate([p.temperature_c for p in parts])
 
     def _create_stream(self, seed: int) -> ModelStream:
-        """Create a random series of the noise model."""
         return self._model.start_stream(self.rate_hz, seed)
 
     def _add_effects(self, stream: ModelStream) -> None:
-        """Add the effects that have not begun to a random series."""
+        """Add the pending effects to a simulated stream."""
         for text, axis, effect in self._pending_effects:
             try:
                 stream.add_effect(axis, effect)
@@ -149,7 +147,6 @@ class SimulatedSensor:
                 raise ConfigError(f'effect "{text}": {error}') from error
 
     def _ticks(self, index: Ints) -> Ints:
-        """Return the counter values of samples."""
         timing = self._decoder.timing
         if not isinstance(timing, CounterTimedFormat):
             return np.full(index.size, NO_TICK, np.int64)

@@ -1,10 +1,8 @@
-"""Random faults between a simulated sensor and the reader: lost, repeated, corrupted and truncated samples.
+"""Random transmission faults of a simulated sensor: lost, repeated, corrupted and truncated samples.
 
-Each sample has at most one fault. The fault depends only on the seed and on the number of the sample. It does not
-depend on the bursts in which samples are sent. If a sample has several chunks (CAN frames), the fault affects the last
-chunk. A CAN frame with a flipped bit does not arrive, because the checksum of the bus rejects the frame.
+Each sample has at most one fault, which depends only on the seed and the sample number. If a sample consists of several
+CAN frames, the fault affects the last frame.
 
-A test can compare ``FaultCounts`` with the counts of the reader. The module does no input or output.
 """
 
 from dataclasses import dataclass, replace
@@ -19,13 +17,13 @@ from drivers.data_types import Chunk, Floats
 from monitor.settings.loading import FaultsTable
 
 SPAWN_KEY: Final = crc32(b"faults")
-"""Key of the random streams of the faults."""
+"""Spawn key of the random generators for faults."""
 DRAWS_PER_SAMPLE: Final = 3
-"""Number of uniform random numbers per sample: kind of fault, position in the frame, and pulled cable."""
+"""Random numbers per sample: kind of fault, position of the fault, and unplugged cable."""
 
 
 class FaultKind(IntEnum):
-    """Kind of fault of a sample, in the order in which the probabilities are added up."""
+    """Kind of transmission fault. The order is the order of the cumulative probabilities."""
 
     LOST = 0
     REPEATED = 1
@@ -36,7 +34,7 @@ class FaultKind(IntEnum):
 
 @dataclass(slots=True)
 class FaultCounts:
-    """Number of samples of a simulated sensor, by fault."""
+    """Number of samples of a simulated sensor for each kind of fault."""
 
     sent: int = 0  # samples sent without corruption; a repeated sample counts once
     lost: int = 0
@@ -49,18 +47,18 @@ class FaultCounts:
 
     @property
     def sample_count(self) -> int:
-        """Number of simulated samples: sent + lost + flipped + cut + dropped."""
+        """Total number of simulated samples: sent + lost + flipped + cut + dropped."""
         return self.sent + self.lost + self.flipped + self.cut + self.dropped
 
     def count_sample(self, kind: FaultKind, all_sent: bool) -> None:
-        """Count one sample.
+        """Add one sample to the number of samples with the same fault.
 
         Parameters
         ----------
         kind : FaultKind
             Fault of the sample.
         all_sent : bool
-            True if all chunks of the sample were sent, except those that the fault removes.
+            True if all remaining chunks of the sample were sent.
         """
         match kind:
             case _ if not all_sent:
@@ -78,32 +76,32 @@ class FaultCounts:
 
 @dataclass(frozen=True, slots=True)
 class DrawnFaults:
-    """Random faults of consecutive samples."""
+    """Randomly drawn faults of consecutive samples."""
 
     kind: NDArray[np.int64]  # [n] of FaultKind
-    where: Floats  # [n] position of the fault in the frame, 0 to 1
+    position: Floats  # [n] position of the fault in the frame, 0 to 1
     pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
     def kind_per_sample(self) -> list[FaultKind]:
-        """Return the fault of each sample."""
+        """Return the kind of fault of each sample."""
         return [FaultKind(kind) for kind in self.kind.tolist()]
 
     def __getitem__(self, rows: slice) -> "DrawnFaults":
         """Return the faults of the selected samples."""
-        return DrawnFaults(self.kind[rows], self.where[rows], self.pulled[rows])
+        return DrawnFaults(self.kind[rows], self.position[rows], self.pulled[rows])
 
 
 class Faults:
-    """Random faults of one sensor.
+    """Generator of random faults for one simulated sensor.
 
     Parameters
     ----------
     table : FaultsTable
         Probability of each fault.
     seed : int
-        Seed of the sensor.
+        Seed of the simulated sensor.
     carrier : str
-        Carrier of the wire format.
+        Carrier of the wire format, such as "bytes" or "frames".
     """
 
     def __init__(self, table: FaultsTable, seed: int, carrier: str) -> None:
@@ -117,25 +115,25 @@ class Faults:
         )
 
     def draw_faults(self, n: int) -> DrawnFaults:
-        """Draw the faults of the next ``n`` samples."""
+        """Draw random faults for the next ``n`` samples."""
         u = self._rng.random((n, DRAWS_PER_SAMPLE))
         return DrawnFaults(np.searchsorted(self._edges, u[:, 0], "right"), u[:, 1], u[:, 2] < self._unplug_probability)
 
     def draw_delay_s(self) -> float:
-        """Draw the delay of the next burst, in seconds."""
+        """Draw the random delay of the next burst of samples in seconds."""
         return float(self._delay_rng.uniform(0.0, self._jitter_s)) if self._jitter_s else 0.0
 
-    def apply_fault(self, kind: FaultKind, where: float, chunks: list[Chunk]) -> list[Chunk]:
-        """Apply a fault to the chunks of one sample, and return the chunks to send.
+    def apply_fault(self, kind: FaultKind, position: float, chunks: list[Chunk]) -> list[Chunk]:
+        """Apply a fault to the encoded chunks of one sample, and return the chunks to send.
 
         Parameters
         ----------
         kind : FaultKind
             Fault of the sample.
-        where : float
-            Position of the fault in the chunk, 0 to 1.
+        position : float
+            Relative position of the fault in the chunk, from 0 to 1.
         chunks : list of Chunk
-            Encoded sample.
+            Chunks of the encoded sample.
         """
         match kind:
             case FaultKind.LOST:
@@ -143,21 +141,21 @@ class Faults:
             case FaultKind.REPEATED:
                 return [*chunks, *chunks]
             case FaultKind.FLIPPED:
-                return [*chunks[:-1], *([] if self._has_checksum else [_flipped(chunks[-1], where)])]
+                return [*chunks[:-1], *([] if self._has_checksum else [_flipped(chunks[-1], position)])]
             case FaultKind.CUT:
-                return [*chunks[:-1], _cut(chunks[-1], where)]
+                return [*chunks[:-1], _cut(chunks[-1], position)]
             case _:
                 return chunks
 
 
-def _flipped(chunk: Chunk, where: float) -> Chunk:
-    """Return a copy of a chunk with one flipped bit."""
-    at, bit = divmod(int(where * 8 * len(chunk.data)), 8)
+def _flipped(chunk: Chunk, position: float) -> Chunk:
+    """Flip one bit of a chunk."""
+    at, bit = divmod(int(position * 8 * len(chunk.data)), 8)
     data = bytearray(chunk.data)
     data[at] ^= 1 << bit
     return replace(chunk, data=bytes(data))
 
 
-def _cut(chunk: Chunk, where: float) -> Chunk:
-    """Return a truncated chunk, with at least the first byte and without at least the last byte."""
-    return replace(chunk, data=chunk.data[: 1 + int(where * (len(chunk.data) - 1))])
+def _cut(chunk: Chunk, position: float) -> Chunk:
+    """Truncate a chunk by at least one byte, and keep at least one byte."""
+    return replace(chunk, data=chunk.data[: 1 + int(position * (len(chunk.data) - 1))])

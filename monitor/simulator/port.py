@@ -1,6 +1,6 @@
-"""Ports of simulated sensors. A port is the sensor's end of the link that the service reads.
+"""Ports of simulated sensors. A port is the sensor side of a link.
 
-Each carrier has a module with its port. ``Port.link`` is an ordinary link, as for a real sensor.
+``Port.link`` is an ordinary link, as for a real sensor.
 """
 
 import threading
@@ -11,14 +11,14 @@ from drivers.links.base import Link
 
 
 class Port:
-    """Base class of the ports.
+    """Base class of the ports of simulated sensors.
 
-    Any thread may call ``plug`` and ``unplug``. Repeated calls have no effect.
+    ``plug`` and ``unplug`` are thread-safe. Repeated calls have no effect.
 
     Parameters
     ----------
     link : Link
-        Link that reads the data of the sensor.
+        Link that receives the data of the simulated sensor.
     """
 
     def __init__(self, link: Link) -> None:
@@ -26,7 +26,7 @@ class Port:
         self._plugging = threading.Lock()
 
     def plug(self) -> None:
-        """Connect the sensor.
+        """Connect the simulated sensor to the link.
 
         Raises
         ------
@@ -36,25 +36,25 @@ class Port:
         raise NotImplementedError
 
     def unplug(self) -> None:
-        """Disconnect the sensor, as if its cable was pulled."""
+        """Disconnect the simulated sensor from the link, like pulling a cable."""
         raise NotImplementedError
 
     def send_chunks(self, chunks: Sequence[Chunk]) -> int:
-        """Send chunks without waiting for a reader; return the number of chunks that were sent completely."""
+        """Send chunks without waiting for a reader, and return the number of completely sent chunks."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Disconnect the sensor permanently, and remove the files of the port."""
+        """Disconnect the simulated sensor permanently, and remove temporary files."""
         self.unplug()
 
 
 def create_port(carrier: str, silence_s: float) -> Port:
-    """Create the port for a carrier.
+    """Create the port of a simulated sensor for a carrier.
 
     Parameters
     ----------
     carrier : str
-        Carrier of the wire format: "frames" (CAN), "messages" (zenoh), otherwise bytes (serial).
+        Carrier of the wire format: "frames" for CAN, "messages" for zenoh, otherwise serial bytes.
     silence_s : float
         Time in seconds without data after which the link counts as lost.
     """

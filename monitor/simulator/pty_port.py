@@ -1,7 +1,7 @@
-"""Port of a simulated sensor on a pseudo-terminal.
+"""Port of a simulated sensor on a pseudo-terminal, which replaces a serial port.
 
-The sensor writes to the master side, and the serial link reads from the slave side. A symbolic link in a temporary
-folder keeps the name of the port constant. Data that do not fit into the buffer of the terminal are dropped.
+A symbolic link keeps the path of the port constant. Bytes that do not fit into the buffer of the pseudo-terminal are
+dropped.
 """
 
 import contextlib
@@ -19,11 +19,11 @@ from drivers.links import serial_link
 from monitor.simulator.port import Port
 
 WAIT_S: Final = 0.01
-"""Longest wait for space in the buffer of the terminal."""
+"""Maximum waiting time for space in the buffer of the pseudo-terminal."""
 
 
 class PtyPort(Port):
-    """Serial port on a pseudo-terminal. The link is lost after ``silence_s`` seconds without data."""
+    """Port of a simulated sensor on a pseudo-terminal. The link is lost after ``silence_s`` seconds without data."""
 
     def __init__(self, silence_s: float) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="imu-monitor-"))
@@ -33,7 +33,7 @@ class PtyPort(Port):
         self._master: int | None = None
 
     def plug(self) -> None:
-        """Create the pseudo-terminal and the symbolic link to it."""
+        """Create the pseudo-terminal and the symbolic link."""
         import tty
 
         with self._plugging:
@@ -49,7 +49,7 @@ class PtyPort(Port):
             self._master = master
 
     def unplug(self) -> None:
-        """Close the pseudo-terminal, and remove the symbolic link to it."""
+        """Close the pseudo-terminal, and remove the symbolic link."""
         with self._plugging:
             master, self._master = self._master, None
             self.path.unlink(missing_ok=True)
@@ -57,7 +57,8 @@ class PtyPort(Port):
                 os.close(master)
 
     def send_chunks(self, chunks: Sequence[Chunk]) -> int:
-        """Write chunks while the reader empties the buffer; return the number of completely written chunks."""
+        """Write chunks to the pseudo-terminal until the buffer is full. Return the number of completely written
+        chunks."""
         data = b"".join(chunk.data for chunk in chunks)
         view = memoryview(data)
         with self._plugging, contextlib.suppress(BlockingIOError):
@@ -69,6 +70,6 @@ class PtyPort(Port):
         return sum(end <= written for end in accumulate(len(chunk.data) for chunk in chunks))
 
     def close(self) -> None:
-        """Disconnect the sensor, and remove the folder of the symbolic link."""
+        """Disconnect the simulated sensor, and remove the folder of the symbolic link."""
         self.unplug()
         shutil.rmtree(self._folder, ignore_errors=True)

@@ -1,7 +1,7 @@
-"""Simulated device: sends the samples of a simulated sensor over a real link, in real time or faster, with faults.
+"""Simulated device, which sends the samples of a simulated sensor over a real link.
 
-An ordinary link reads the samples, as for a real sensor. The device does not wait for the reader. Samples that cannot
-be sent are dropped, and the counter of the sensor shows the gap.
+The device does not wait for a reader. Samples that cannot be sent are dropped, and the sample counter reveals the
+missing samples.
 """
 
 import threading
@@ -21,39 +21,39 @@ from monitor.simulator.faults import DrawnFaults, FaultCounts, Faults
 from monitor.simulator.port import create_port
 
 BURST_S: Final = 0.01
-"""Length of a burst of samples, as from a USB adapter."""
+"""Time between bursts of samples in s, similar to a USB adapter."""
 MAX_DELAY_S: Final = 1.0
-"""Delay after which the sensor skips samples instead of catching up."""
+"""Delay in s above which the sensor skips samples instead of catching up."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 class SimulatedDevice:
-    """Simulated device with its own thread.
+    """Simulated device, which sends samples in a separate thread.
 
     Parameters
     ----------
     table : VirtualTable
-        Model, seed, speed, effects and faults.
+        Noise model, seed, speed, effects and faults.
     decoder : Decoder
-        Wire format.
+        Decoder of the wire format.
     name : str, optional
-        Name of the device, for the log.
+        Name of the device in log messages.
 
     Raises
     ------
     ConfigError
-        If the noise model or an effect cannot be used.
+        If the noise model or an effect is invalid.
     """
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str = "virtual") -> None:
         self.name = name
         self.fault_counts = FaultCounts()  # number of samples with each fault
         self.now_s: Callable[[], float] = time.monotonic
-        """Clock of the simulation, in seconds. Tests may replace the clock before ``start``."""
+        """Clock of the simulation in seconds, which tests may replace."""
         self._sensor = SimulatedSensor(table, decoder, name)
         self.rate_hz = self._sensor.rate_hz * table.speed
-        """Nominal sample rate. The clock of the sensor may deviate from it."""
+        """Nominal sample rate in Hz."""
         self._pace_hz = self.rate_hz * table.faults.clock
         self._faults = Faults(table.faults, table.seed, decoder.carrier)
         self._unplugged_samples = max(1, round(table.faults.unplugged_for * self._sensor.rate_hz))
@@ -63,12 +63,12 @@ class SimulatedDevice:
         self._thread = threading.Thread(target=self._run, name="virtual imu", daemon=True)
 
     def start(self) -> None:
-        """Connect the cable and start to send samples."""
+        """Connect the simulated device, and start sending samples."""
         self.port.plug()
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop to send samples, and remove the port."""
+        """Stop sending samples, and close the port."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -77,7 +77,7 @@ class SimulatedDevice:
     # --- thread of the sensor
 
     def _run(self) -> None:
-        """Send samples in bursts until the sensor is stopped."""
+        """Send samples in bursts until the device is stopped."""
         self._sensor.start_clock()
         begun_s, made = self.now_s(), 0
         step_s = max(BURST_S, 0.5 / self._pace_hz)  # a sensor with a low rate needs two steps per sample
@@ -94,7 +94,7 @@ class SimulatedDevice:
                 made = due
 
     def _make_and_send(self, first: int, n: int) -> None:
-        """Simulate ``n`` samples, and send the samples during which the simulated cable is connected."""
+        """Simulate ``n`` samples, and send all samples except those during a cable fault."""
         frames, draws = self._sensor.encode_next_samples(n), self._faults.draw_faults(n)
         at = 0
         while at < n:
@@ -112,10 +112,9 @@ class SimulatedDevice:
             at = stop
 
     def _send(self, frames: list[list[Chunk]], draws: DrawnFaults) -> None:
-        """Apply the faults to samples, send the samples, and count the faults."""
         faulty = [
-            (kind, self._faults.apply_fault(kind, where, chunks))
-            for kind, where, chunks in zip(draws.kind_per_sample(), draws.where.tolist(), frames, strict=True)
+            (kind, self._faults.apply_fault(kind, position, chunks))
+            for kind, position, chunks in zip(draws.kind_per_sample(), draws.position.tolist(), frames, strict=True)
         ]
         sent = self.port.send_chunks([chunk for _, chunks in faulty for chunk in chunks])
         for kind, chunks in faulty:
@@ -123,13 +122,11 @@ class SimulatedDevice:
             self.fault_counts.count_sample(kind, all_sent=sent >= 0)
 
     def _unplug_by_fault(self, index: int) -> None:
-        """Disconnect the cable because of a fault."""
         self.port.unplug()
         self.fault_counts.unplugged += 1
         self._back_at = index + self._unplugged_samples
 
     def _plug_again(self) -> None:
-        """Connect the cable again after a fault."""
         self._back_at = None
         try:
             self.port.plug()
@@ -139,7 +136,6 @@ class SimulatedDevice:
             )
 
     def _burst_delay_s(self) -> float:
-        """Return the delay of the next burst, in seconds."""
         held_s = self._faults.draw_delay_s()
         self.fault_counts.held_s = max(self.fault_counts.held_s, held_s)
         return held_s

@@ -1,7 +1,4 @@
-"""Port of a simulated sensor that publishes over zenoh on the loopback interface.
-
-The link connects only to the session of this port.
-"""
+"""Port of a simulated sensor that publishes samples over zenoh on the loopback interface."""
 
 import socket
 from collections.abc import Sequence
@@ -17,11 +14,12 @@ if TYPE_CHECKING:
     import zenoh
 
 KEY: Final = "imu-monitor/virtual/samples"
-"""Key of the published samples."""
+"""Zenoh key of the published samples."""
 
 
 class ZenohPort(Port):
-    """Port with a separate zenoh session. The link is lost after ``silence_s`` seconds without messages."""
+    """Port of a simulated sensor with a separate zenoh session. The link is lost after ``silence_s`` seconds without
+    messages."""
 
     def __init__(self, silence_s: float) -> None:
         self._endpoint = f"tcp/127.0.0.1:{_free_port()}"
@@ -31,7 +29,7 @@ class ZenohPort(Port):
         self._publisher: Any = None
 
     def plug(self) -> None:
-        """Open the session."""
+        """Open the zenoh session of the simulated sensor."""
         import zenoh
 
         with self._plugging:
@@ -44,14 +42,14 @@ class ZenohPort(Port):
                 raise LinkUnavailable(f"simulated sensor at {self._endpoint}: {format_zenoh_error(error)}") from error
 
     def unplug(self) -> None:
-        """Close the session."""
+        """Close the zenoh session of the simulated sensor."""
         with self._plugging:
             session, self._session = self._session, None
             if session is not None:
                 session.close()  # type: ignore[no-untyped-call]
 
     def send_chunks(self, chunks: Sequence[Chunk]) -> int:
-        """Publish each chunk as one message; return the number of published chunks. Slow readers miss messages."""
+        """Publish each chunk as one zenoh message, and return the number of published chunks."""
         with self._plugging:
             if self._session is None:
                 return 0
@@ -61,7 +59,6 @@ class ZenohPort(Port):
 
 
 def _free_port() -> int:
-    """Return a free TCP port of the loopback interface."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port: int = server.getsockname()[1]
         return port

@@ -22,7 +22,7 @@ def test_what_is_too_large_is_one_line_for_every_reader(tmp_path: Path) -> None:
         file.truncate(file_access.MAX_BYTES + 1)
     with pytest.raises(OSError, match="more than 32 MB"):
         file_access.read_small_file(path)
-    reading = loading.examine(path)
+    reading = loading.examine_config_file(path)
     config, wrong = reading.config, reading.wrong
     assert config is None
     assert "more than 32 MB" in wrong[0]

@@ -18,7 +18,7 @@ from drivers.recordings import segment_file as segment
 from drivers.recordings.writing import atomic_write_path
 from drivers.zenoh.session_config import build_session_config
 from monitor.commands import thermal
-from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.common import shipped_config_paths
 from monitor.history import sqlite_store
 from monitor.noise.model_loading import read_model
 from monitor.publishing.zenoh.subscriber import client_configurations
@@ -132,9 +132,9 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("configuration", loading.load),
+        ("configuration", loading.load_config),
         ("model", read_model),
-        ("model name", lambda path: shipped_file_paths.model_path(str(path), path.parent)),
+        ("model name", lambda path: shipped_config_paths.resolve_model_path(str(path), path.parent)),
         ("zenoh file", lambda path: client_configurations((), path)),
     ],
 )
@@ -234,10 +234,10 @@ def test_a_socket_or_device_on_the_command_line_is_status_2_and_one_line(command
 
 
 def test_a_configuration_and_a_model_from_a_pipe(tmp_path: Path) -> None:
-    text = (shipped_file_paths.CONFIG_FOLDER / "demo.toml").read_text()
+    text = (shipped_config_paths.CONFIG_FOLDER / "demo.toml").read_text()
     done = finished(["check", "/dev/stdin"], input=text)
     assert (done.returncode, done.stderr) == (0, "")
-    model = (shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
+    model = (shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
     for name in ("/dev/stdin", "-"):
         done = finished(["export", name, "--format", "kalibr"], input=model)
         assert (done.returncode, done.stderr) == (0, "")

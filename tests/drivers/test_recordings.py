@@ -32,7 +32,7 @@ from drivers.recordings import (
     open_recording_writer,
     save_samples,
 )
-from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
+from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
 from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recordings.writing import atomic_write_path
 from tests.support.recordings import recordings
@@ -813,22 +813,22 @@ class TestRoom:
         statm = written(tmp_path / "statm", "500 100 50 10 0 200 0\n")
         limits = {resource.RLIMIT_AS: resource.RLIM_INFINITY, resource.RLIMIT_DATA: resource.RLIM_INFINITY}
         monkeypatch.setattr(resource, "getrlimit", lambda kind: (limits[kind], limits[kind]))
-        assert memory_check.available_process_bytes(statm) is None
-        assert memory_check.available_process_bytes(tmp_path / "absent") is None
+        assert memory_check.available_rlimit_bytes(statm) is None
+        assert memory_check.available_rlimit_bytes(tmp_path / "absent") is None
         limits[resource.RLIMIT_AS] = 1500 * page
-        assert memory_check.available_process_bytes(statm) == 1000 * page
+        assert memory_check.available_rlimit_bytes(statm) == 1000 * page
         limits[resource.RLIMIT_DATA] = 300 * page
-        assert memory_check.available_process_bytes(statm) == 100 * page
+        assert memory_check.available_rlimit_bytes(statm) == 100 * page
 
     def test_the_least_counts(self, monkeypatch):
         for name, free in (
             ("available_system_bytes", 900),
             ("available_cgroup_bytes", None),
-            ("available_process_bytes", 300),
+            ("available_rlimit_bytes", 300),
         ):
             monkeypatch.setattr(memory_check, name, lambda free=free: free)
         assert memory_check.available_bytes() == 300
-        monkeypatch.setattr(memory_check, "available_process_bytes", lambda: -5)
+        monkeypatch.setattr(memory_check, "available_rlimit_bytes", lambda: -5)
         assert memory_check.available_bytes() == 0
 
     def test_a_file_that_does_not_fit_is_refused_before_it_is_read(self, path, monkeypatch):
@@ -977,17 +977,17 @@ class TestArrowMessages:
             dictionary, *batches = iter_batch_sizes(file, 8 if suffix == ".arrow" else 0)
         assert dictionary.dictionary
         assert [batch.rows for batch in batches] == [2000, 2000, 1000]
-        counts = [count_buffers(pa, field.type) for field in table.schema]
+        counts = [count_column_buffers(pa, field.type) for field in table.schema]
         assert counts == [2, 2, 3, 0, 2]
         for batch in batches:
             assert len(batch.buffers) == sum(counts)
             assert batch.buffers[1] == 8 * batch.rows
             assert batch.buffers[3] == 4 * batch.rows
             assert batch.buffers[6] == 4 * batch.rows
-            assert check_buffer_sizes(batch, counts, 0) == ""
-        assert "unpacks to 16000 bytes" in check_buffer_sizes(replace(batches[0], rows=1999), counts, 0)
-        assert check_buffer_sizes(replace(batches[0], rows=1999), [-2, -2, -3, 0, -2], 0) == ""
-        assert check_buffer_sizes(replace(batches[0], rows=0), [-2, None], 0) != ""
+            assert check_batch_buffer_sizes(batch, counts, 0) == ""
+        assert "unpacks to 16000 bytes" in check_batch_buffer_sizes(replace(batches[0], rows=1999), counts, 0)
+        assert check_batch_buffer_sizes(replace(batches[0], rows=1999), [-2, -2, -3, 0, -2], 0) == ""
+        assert check_batch_buffer_sizes(replace(batches[0], rows=0), [-2, None], 0) != ""
 
     def test_any_cut_and_any_byte_end_quietly(self, tmp_path):
         path = tmp_path / "x.arrows"

@@ -52,7 +52,7 @@ from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
 from monitor.simulator import AMBIENT_C, WARM_UP_C, WARM_UP_S
-from monitor.simulator.demo_config import demo_config
+from monitor.simulator.demo_config import build_demo_config
 from tests.monitor.publishing.made import estimate, true_coefficients
 
 SIZE = (1600, 1000)
@@ -283,7 +283,7 @@ def view(out: Path, folder: Path) -> Path:
             )
             rest = f'[zenoh]\nlisten = ["{places[-1]}"]\nprefix = "fleet"\n[viewer]\nmode = "none"\n'
             file.write_text(devices + rest)
-            daemons.append(ending.enter_context(running(loading.load(file))))
+            daemons.append(ending.enter_context(running(loading.load_config(file))))
         detail = [f"fleet/{name}" for name in MEMBERS[:2]]
         viewer = RerunView(
             ViewerSettings("native", port), [DeviceInfo(key, "over zenoh") for key in detail], fleet=True
@@ -314,7 +314,7 @@ def view(out: Path, folder: Path) -> Path:
 def yesterday(out: Path, folder: Path) -> Path:
     """Show the viewer of a restarted daemon with the last day, of which one hour is missing."""
     path = out / "viewer-history.png"
-    config = demo_config()
+    config = build_demo_config()
     (device,) = config.devices
     write_history(folder / "kept" / FILE_NAME, device.name, time.time())
     zenoh = config.zenoh.model_copy(update={"mode": "none"})
@@ -369,7 +369,7 @@ def scale_estimate(scale: Floats, rng: np.random.Generator) -> Estimate:
 def effect(out: Path, _: Path) -> Path:
     """Show the demo after its sensor has begun to vibrate."""
     path = out / "demo-effect.png"
-    config = demo_config(effects=[VIBRATION])
+    config = build_demo_config(effects=[VIBRATION])
     zenoh = config.zenoh.model_copy(update={"mode": "none"})
     with window() as (port, shoot):
         viewer = config.viewer.model_copy(update={"mode": "native", "port": port})
@@ -535,7 +535,7 @@ def serving(folder: Path, devices: str, port: int) -> Iterator[Service]:
     viewer = f'[viewer]\nmode = "native"\nport = {port}\n'
     path = folder / "pictures.toml"
     path.write_text(f'{devices}\n[zenoh]\nlisten = ["tcp/127.0.0.1:{free_port()}"]\n\n{viewer}')
-    with running(loading.load(path)) as service:
+    with running(loading.load_config(path)) as service:
         yield service
 
 

@@ -82,7 +82,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def config(folder: Path, recording: Path, zenoh: str = 'mode = "none"', speed: float = 100.0) -> loading.Config:
     path = folder / "config.toml"
     path.write_text(CONFIG.format(recording=recording, zenoh=zenoh, speed=speed))
-    return loading.load(path)
+    return loading.load_config(path)
 
 
 def kept(folder: Path, step_s: int | None = 60) -> HistoryTable:

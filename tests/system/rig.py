@@ -72,7 +72,7 @@ class Running:
     """A service in a thread; ``prepare`` is called before it starts."""
 
     def __init__(self, path: Path, caught: Caught, prepare: Callable[[Service], None] | None = None) -> None:
-        self.service = Service(loading.load(path))
+        self.service = Service(loading.load_config(path))
         if prepare is not None:
             prepare(self.service)
         self.caught = caught

@@ -9,7 +9,7 @@ from drivers.data_types import Event
 from drivers.decoders import samples
 from monitor.daemon.service import Service
 from monitor.settings.loading import VirtualTable
-from monitor.simulator.demo_config import demo_config
+from monitor.simulator.demo_config import build_demo_config
 from tests.support.paced_sensor import follow_reader
 from tests.support.waiting import PATIENCE_S
 from tests.system.rig import Caught
@@ -31,7 +31,7 @@ class Watching(Caught):
 
 
 def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
-    config = demo_config(effects=[VIBRATION], effect_at_s=AT_S)
+    config = build_demo_config(effects=[VIBRATION], effect_at_s=AT_S)
     (device,) = config.devices
     assert isinstance(device.link, VirtualTable)
     # messages carry the sensor's own time, so that an event tells when it is by the sensor's clock

@@ -19,7 +19,7 @@ from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.service import Service
 from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.settings.loading import Config, VirtualTable, ZenohTable
-from monitor.simulator.demo_config import demo_config
+from monitor.simulator.demo_config import build_demo_config
 from tests.support.paced_sensor import follow_reader
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -37,7 +37,7 @@ VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
 
 def watched(zenoh_table: ZenohTable, effects: tuple[str, ...] = (), folder: Path | None = None) -> Config:
     """The demo, fifty times as fast, with its own model in force."""
-    config = demo_config(effects=effects, effect_at_s=AT_S)
+    config = build_demo_config(effects=effects, effect_at_s=AT_S)
     (device,) = config.devices
     assert isinstance(device.link, VirtualTable)
     fast = device.link.model_copy(update={"speed": SPEED})

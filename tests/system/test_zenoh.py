@@ -175,7 +175,7 @@ mode = "none"
             assert encoding == topic.encoding
             if topic.encoding == topics.JSON:
                 content = msgspec.json.decode(payload)
-                assert content["schema"] == topic.schema()
+                assert content["schema"] == topic.schema_name()
                 assert content["device"] == "bench-1"
                 assert content["t"] > 1.7e9
                 assert content["samples"] >= 0

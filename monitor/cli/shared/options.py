@@ -153,12 +153,12 @@ def parse_duration(option: str, text: str | None) -> float | None:
     ConfigError
         If the text is not a duration.
     """
-    from monitor.settings.loading import seconds
+    from monitor.settings.loading import parse_duration_s
 
     duration_s = None
     if text is not None:
         with name_option_in_config_errors(option):
-            duration_s = seconds(text)
+            duration_s = parse_duration_s(text)
     return duration_s
 
 

@@ -82,7 +82,7 @@ class DeviceStatus:
     def _missing_estimate_text(self) -> str:
         """Return the reason why coefficients are not possible; empty if they are possible."""
         clock = self._driver.clock
-        measured_hz = clock.contradicted_hz
+        measured_hz = clock.contradicting_rate_hz
         if measured_hz is not None:
             return (
                 f"measured rate {measured_hz:.4g} Hz differs from the configured "

@@ -230,7 +230,7 @@ class DeviceWorker:
         """Withhold the coefficients while the data contradict the configured rate, or have not confirmed it yet."""
         if drain:
             self.clock.compare_rates_at_end()
-        doubts = (self.clock.contradicted_hz is not None, self.clock.rate_check_pending)
+        doubts = (self.clock.contradicting_rate_hz is not None, self.clock.rate_check_pending)
         if doubts != self._rate_doubts:
             self._rate_doubts = doubts
             self.publisher.withholds_coefficients = any(doubts)

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Event, Floats, SampleBlock
 from drivers.errors import ConfigError
-from monitor.common.compiled import interpreted
+from monitor.common.compiled import interpret_uncompiled_kernels
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveCompensation
@@ -112,7 +112,7 @@ class DevicePipeline:
         """Return the context manager for calls of the kernels, which interprets kernels if necessary."""
         if rate_hz is not None and self.estimator is None:
             self.required_kernels_ready(rate_hz)
-        return interpreted() if self._interprets and not self.ready.all.is_set() else nullcontext()
+        return interpret_uncompiled_kernels() if self._interprets and not self.ready.all.is_set() else nullcontext()
 
     @property
     def awaits_thermal_model(self) -> bool:

@@ -65,7 +65,7 @@ class WindowRestore:
                 text = "the recording ends later than the present time of the host clock; the window starts empty"
             self._timeline.add_event_now("window_rebuilt", text)
             return
-        self._clock.resume(LastSample(t_ns, int(newest.ticks[-1]), rate_hz, state.tick_step))
+        self._clock.resume_after_restart(LastSample(t_ns, int(newest.ticks[-1]), rate_hz, state.tick_step))
         self._tail, self._state_before = tail, state
 
     def rebuild_window(self) -> None:

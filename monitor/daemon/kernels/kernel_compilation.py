@@ -24,7 +24,7 @@ from typing import IO, Final, NoReturn
 import numba
 from llvmlite import binding
 
-from monitor.common.compiled import cache_folder, source_hash
+from monitor.common.compiled import hash_module_with_imports, kernel_cache_folder
 from monitor.common.program import PROGRAM
 from monitor.daemon.kernels.kernel_parts import GROUPS, KernelGroup, KernelPart
 
@@ -98,7 +98,7 @@ def prepare_kernels(
             part.prepare()
             yield part.name
         return
-    folder = cache_folder()
+    folder = kernel_cache_folder()
     if folder is None:
         processes = 0
     elif processes is None:
@@ -115,7 +115,7 @@ def prepare_kernels(
 
 def is_warm(group: KernelGroup) -> bool:
     """Return True if all kernels of a group are cached on disk for the present program, Numba and processor."""
-    folder = cache_folder()
+    folder = kernel_cache_folder()
     return folder is not None and _stamp_file(folder, group).is_file()
 
 
@@ -255,5 +255,5 @@ def _stamp_file(folder: Path, group: KernelGroup) -> Path:
     """Return the path of the stamp file of a group. The name depends on all that affects the machine code."""
     machine = [binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()]
     parts = [part.name for part in group.parts]
-    everything = [*parts, source_hash(Path(__file__)), numba.__version__, sys.version, *machine]
+    everything = [*parts, hash_module_with_imports(Path(__file__)), numba.__version__, sys.version, *machine]
     return folder / f"{group.name}-{sha256(' '.join(everything).encode()).hexdigest()[:16]}.warm"

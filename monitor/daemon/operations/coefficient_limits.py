@@ -20,7 +20,7 @@ from typing import Final
 from drivers.data_types import AXES, Event
 from drivers.errors import ConfigError
 from monitor.common.distributions import Z95
-from monitor.common.units import COEFFICIENT_NAMES, sensor_kind, unit_of
+from monitor.common.units import COEFFICIENT_NAMES, coefficient_unit, sensor_kind
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
@@ -208,9 +208,9 @@ def _sigma(bound: Bound, seen: _Measured) -> float | None:
 
 def _text(bound: Bound, seen: _Measured, crossed: bool) -> str:
     """Return the message of the event."""
-    unit, name = unit_of(bound.letter, bound.axis), COEFFICIENT_NAMES[sensor_kind(bound.axis)][bound.letter]
-    measured = unit.text(seen.value) if isfinite(seen.value) else f"at most {unit.text(seen.hi)}"
-    limit = f"{unit.text(bound.limit)}, its {'upper' if bound.upper else 'lower'} limit"
+    unit, name = coefficient_unit(bound.letter, bound.axis), COEFFICIENT_NAMES[sensor_kind(bound.axis)][bound.letter]
+    measured = unit.format_si_value(seen.value) if isfinite(seen.value) else f"at most {unit.format_si_value(seen.hi)}"
+    limit = f"{unit.format_si_value(bound.limit)}, its {'upper' if bound.upper else 'lower'} limit"
     if bound.times_model is not None:
         limit += f" ({bound.times_model:g} times its model)"
     if crossed:

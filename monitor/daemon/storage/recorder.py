@@ -231,7 +231,7 @@ class Recorder:
         if self._lock_failure and time.monotonic() - self._lock_failed_s < RETRY_S:
             return False
         try:
-            holder = self._folder_lock.hold()
+            holder = self._folder_lock.ensure_held()
         except OSError as error:
             reason = stopped_text(self._storage.folder, error)
         else:

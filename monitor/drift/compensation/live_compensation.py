@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Event, Floats, SampleBlock, make_block
-from monitor.common.units import format_rate
+from monitor.common.units import format_axis_value
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensator import GYROS, Compensator, DriftInterval
 from monitor.drift.compensation.innovation_test import INTERVALS, InnovationTest
@@ -121,7 +121,8 @@ class LiveCompensation:
 
 
 def _step_event(axis: str, size: float, t_ns: int) -> Event:
-    text = f"{axis}: lasting step of the bias by {format_rate(axis, size, sign=True)}; the new bias is now compensated"
+    step = format_axis_value(axis, size, sign=True)
+    text = f"{axis}: lasting step of the bias by {step}; the new bias is now compensated"
     return Event(EVENT_KIND, t_ns, text, axis, {"bias": {"size": size}})
 
 

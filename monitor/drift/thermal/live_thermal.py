@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Event, SampleBlock
-from monitor.common.units import format_rate
+from monitor.common.units import format_axis_value
 from monitor.drift.thermal.interval_means import PARTS_PER_INTERVAL
 from monitor.drift.thermal.online_thermal_model import MAX_INTERVALS, OnlineThermalModel, PredictedAxisInterval
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
@@ -118,7 +118,7 @@ class LiveThermalModels:
         return ThermalIntervalResult(t_ns, self._interval_s, interval.temperature_c, axes)
 
     def _event(self, axis: str, found: UnexplainedChange) -> Event:
-        size = format_rate(axis, found.size, sign=True)
+        size = format_axis_value(axis, found.size, sign=True)
         text = (
             f"{axis} differs by {size} from the bias that its temperature predicts: {found.outside} of the last "
             f"{found.of} means were outside their prediction interval"

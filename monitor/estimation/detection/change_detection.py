@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import DAY_S
-from monitor.common.units import format_rate
+from monitor.common.units import format_axis_value
 from monitor.estimation.detection.change_kernel import (
     AFTER,
     BEFORE,
@@ -296,7 +296,7 @@ class ChangeDetector:
         # An outlier of size a contributes a²/2 to the sum of z².
         scale = sqrt(2.0 * max(after[0, UNIT_RAW] - after[0, UNIT_S], 0.0) / max(count, 1.0))
         what = {"count": (0.0, float(count)), "scale": (sqrt(variance), scale)}
-        text = f"{AXES[axis]} {count:.0f} outliers of about {format_rate(AXES[axis], scale)} within " + (
+        text = f"{AXES[axis]} {count:.0f} outliers of about {format_axis_value(AXES[axis], scale)} within " + (
             f"{(now - alarm[START]) / self.rate_hz:.1f} s"
         )
         sigma = sqrt(2.0 * alarm[EVIDENCE])
@@ -310,7 +310,7 @@ class ChangeDetector:
 
     def _report_step(self, axis: int, alarm: Floats) -> None:
         before, after = (float(x) for x in self._state.step[axis, [BEFORE, AFTER]])
-        text = f"{AXES[axis]} bias stepped by {format_rate(AXES[axis], after - before, sign=True)}"
+        text = f"{AXES[axis]} bias stepped by {format_axis_value(AXES[axis], after - before, sign=True)}"
         sigma = sqrt(2.0 * alarm[EVIDENCE])
         what = {"bias": (before, after)}
         self._found.append(Change("bias_stepped", axis, int(alarm[START]), int(alarm[FOUND]), sigma, what, text))

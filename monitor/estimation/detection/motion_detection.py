@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Ints, SampleBlock, make_block
-from monitor.common.units import format_rate
+from monitor.common.units import format_axis_value
 from monitor.estimation.detection.motion_kernel import (
     AXIS,
     BEGAN,
@@ -188,7 +188,7 @@ def _make_motion(episode: Floats, size: int, rate_hz: float) -> Motion:
     moving = last - first + 1
     seconds = moving * size / rate_hz
     kind: Kind = "handling/orientation" if episode[CHANGED] else "knock" if moving <= MAX_KNOCK_BLOCKS else "motion"
-    size_text = f"{axis} up to {format_rate(axis, peak)}"
+    size_text = f"{axis} up to {format_axis_value(axis, peak)}"
     verb = {"knock": "knocked", "motion": "moved", "handling/orientation": "handled, and left in another orientation,"}
     text = f"{verb[kind]} for {seconds:.1f} s: {size_text}"
     if kind == "knock":

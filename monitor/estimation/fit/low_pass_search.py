@@ -20,7 +20,7 @@ from typing import Final, Literal
 import numpy as np
 
 from drivers.data_types import Floats, Ints
-from monitor.common.minimization import golden_section
+from monitor.common.minimization import minimize_by_golden_section
 from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
 from monitor.estimation.allan.uncertainty import CovarianceTable
 from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit, replace_axis
@@ -270,7 +270,7 @@ def search_low_pass(
             return float(_fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
 
         least, log_cutoff = yield from _yield_after_several_steps(
-            golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
+            minimize_by_golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
         )
         found.append((least, LowPass(kind, order, float(np.exp(log_cutoff)))))
         yield

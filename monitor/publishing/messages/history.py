@@ -201,7 +201,7 @@ class PastEvent(
         return StoredEvent(**known)
 
 
-class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.schema()):
+class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.schema_name()):
     """Message ``imu/<device>/history`` with stored results. Parts that were not requested are absent."""
 
     topic = topics.HISTORY

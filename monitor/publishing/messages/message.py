@@ -85,7 +85,7 @@ def decode_message(message_type: type[M], payload: bytes, max_bytes: int = MAX_P
     except RecursionError as error:
         raise ValueError(str(error)) from error
     if not isinstance(found, message_type):
-        raise ValueError(f'schema "{Message.__name__}" instead of {message_type.topic.schema()}')
+        raise ValueError(f'schema "{Message.__name__}" instead of {message_type.topic.schema_name()}')
     return found
 
 

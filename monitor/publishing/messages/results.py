@@ -84,7 +84,7 @@ class WindowResultMessage(
     """Filled part of the window."""
 
 
-class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
+class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema_name()):
     """Message ``imu/<device>/allan`` with the Allan deviations of each measured axis."""
 
     topic = topics.ALLAN
@@ -144,7 +144,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         )
 
 
-class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
+class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema_name()):
     """Message ``imu/<device>/coefficients`` with Q, N, B, K and R of each measured axis."""
 
     topic = topics.COEFFICIENTS
@@ -200,7 +200,7 @@ class AxisModelGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     z: Floats | None = None
 
 
-class ModelGapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
+class ModelGapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema_name()):
     """Message ``imu/<device>/gap`` with the comparison of measured Allan deviations and noise model."""
 
     topic = topics.GAP
@@ -238,7 +238,7 @@ class ThermalMessage(
     Message,
     frozen=True,
     kw_only=True,
-    tag=topics.THERMAL.schema(),
+    tag=topics.THERMAL.schema_name(),
     rename={"interval_s": "interval", "temperature_c": "temperature"},
 ):
     """Message ``imu/<device>/thermal`` with measured and predicted mean biases of the interval that ends at ``t``."""
@@ -272,7 +272,7 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
 
-class TotalAndHadamardMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()):
+class TotalAndHadamardMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema_name()):
     """Message ``imu/<device>/total`` with total and Hadamard deviations."""
 
     topic = topics.TOTAL
@@ -287,7 +287,7 @@ class TotalAndHadamardMessage(Message, frozen=True, kw_only=True, tag=topics.TOT
         }
 
 
-class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()):
+class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_name()):
     """Message ``imu/<device>/event`` with a detected event."""
 
     topic = topics.EVENT
@@ -344,7 +344,7 @@ class StatusMessage(
     Message,
     frozen=True,
     kw_only=True,
-    tag=topics.STATUS.schema(),
+    tag=topics.STATUS.schema_name(),
     rename={"rate_hz": "rate", "memory_bytes": "memory", "uptime_s": "uptime"},
 ):
     """Message ``imu/<device>/status`` with the fields of ``Health``."""
@@ -398,7 +398,7 @@ class StatusMessage(
         return Health(**known, latency_p50_s=self.latency.p50, latency_p99_s=self.latency.p99)
 
 
-class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
+class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema_name()):
     """Reply to ``imu/<device>/command/reset`` with a text for the user."""
 
     topic = topics.RESET
@@ -409,7 +409,7 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
         return {"text": result}
 
 
-class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
+class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema_name()):
     """First keys of the reply to ``imu/<device>/command/reconcile``, which precede the keys of the report."""
 
     topic = topics.RECONCILE

@@ -19,10 +19,10 @@ from monitor.common.units import (
     NO_VALUE,
     Kind,
     axes_of,
+    coefficient_unit,
     format_number,
     format_utc,
     format_whole_duration,
-    unit_of,
 )
 from monitor.history.bucket import COUNTS, STATES
 from monitor.history.history_table import ColumnStatistics, HistoryTable
@@ -78,7 +78,7 @@ def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], 
     """
     table = plain_table("UTC")
     for symbol in symbols:
-        table.add_column(f"{symbol} {unit_of(symbol, axis).name}", justify="right", no_wrap=True)
+        table.add_column(f"{symbol} {coefficient_unit(symbol, axis).name}", justify="right", no_wrap=True)
     for name in ("°C", "lost", "state"):
         table.add_column(name, justify="right")
     temperature = past.select_column("temperature")
@@ -179,7 +179,7 @@ def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str
     middle_s = past.start_s + 0.5 * past.width_s
     for axis in axes:
         for symbol in symbols:
-            column, unit = past.select_column(f"{axis}.{symbol}"), unit_of(symbol, axis)
+            column, unit = past.select_column(f"{axis}.{symbol}"), coefficient_unit(symbol, axis)
             label = Text.assemble((f"{axis} {symbol}", "bold"), f"  {unit.name}")
             there = column.last[np.isfinite(column.last)]
             if not there.size:
@@ -191,7 +191,7 @@ def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str
 
 
 def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
-    bound, unit = past.select_column(f"{axis}.{symbol}.bound"), unit_of(symbol, axis)
+    bound, unit = past.select_column(f"{axis}.{symbol}.bound"), coefficient_unit(symbol, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
         return NO_VALUE, NO_VALUE, NO_VALUE
@@ -199,7 +199,7 @@ def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
 
 
 def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
-    column, unit = past.select_column(f"{axis}.{symbol}"), unit_of(symbol, axis)
+    column, unit = past.select_column(f"{axis}.{symbol}"), coefficient_unit(symbol, axis)
     low, high, last = (float(part[p]) * unit.factor for part in (column.low, column.high, column.last))
     if math.isfinite(last):
         alike = format_number(low) == format_number(high)

@@ -7,7 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 
-from monitor.common.units import DEVIATION_UNITS, format_duration, format_rate, sensor_kind
+from monitor.common.units import DEVIATION_UNITS, format_axis_value, format_duration, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
 from monitor.drift.thermal.thermal_fit import ThermalFit
@@ -108,7 +108,7 @@ def notes_on_hysteresis(report: ThermalFitReport) -> list[str]:
     """Return a note for each axis on which the bias differs significantly between heating and cooling."""
     return [
         f"{axis}: at one temperature the bias differs between heating and cooling by up to "
-        f"{format_rate(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
+        f"{format_axis_value(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
         for axis, one in report.fits.items()
         if one.hysteresis and one.hysteresis_p is not None
     ]
@@ -200,7 +200,7 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
 
 
 def _format_deviation(axis: str, si: float) -> str:
-    return DEVIATION_UNITS[sensor_kind(axis)].text(si)
+    return DEVIATION_UNITS[sensor_kind(axis)].format_si_value(si)
 
 
 def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from drivers.timing.duplicate_rows import MIN_NEW_KEYS, DuplicateDetector
 from drivers.timing.event_rate_limiter import MIN_EVENT_INTERVAL_S, EventRateLimiter
-from drivers.timing.sender_times import find_steady_order
+from drivers.timing.sender_times import find_evenly_spaced_order
 
 MS = 10**6
 
@@ -57,7 +57,7 @@ def test_a_clock_set_back_by_hours_does_not_slow_what_follows():
     ],
 )
 def test_only_a_steady_sequence_is_put_in_order(t, order):
-    result = find_steady_order(np.array(t) * MS, 0.01)
+    result = find_evenly_spaced_order(np.array(t) * MS, 0.01)
     assert (result if result is None else result.tolist()) == order
 
 

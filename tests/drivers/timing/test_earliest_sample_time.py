@@ -196,7 +196,9 @@ def test_the_last_sample_before_a_restart_may_have_been_read_late(
     last = np.array([250])
     step = 1.0 if counter.tick_s is None else 1e4
     clock = SampleClock(counter, 100.0)
-    clock.resume(LastSample(round((BEGUN_S + 6.0) * NS), int(ticks_of(last, counter, 100.0)[0]), 100.0, step))
+    clock.resume_after_restart(
+        LastSample(round((BEGUN_S + 6.0) * NS), int(ticks_of(last, counter, 100.0)[0]), 100.0, step)
+    )
     out = stamp(clock, 10.5, [1], ticks_of(last + away, counter, 100.0))
     assert len(told(clock)) == jumps
     if not jumps:

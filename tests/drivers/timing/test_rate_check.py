@@ -21,7 +21,7 @@ from drivers.timing.rate_check import RateCheck
 def test_which_rate_is_used(measured_hz: float, uncertainty: float, used_hz: float, contradicted: bool) -> None:
     check = RateCheck(100.0)
     assert (check.rate_hz, check.contradicted, check.measured_hz) == (100.0, False, None)
-    check.update(measured_hz, uncertainty)
+    check.compare_with_measured_rate(measured_hz, uncertainty)
     assert (check.rate_hz, check.contradicted, check.measured_hz) == (used_hz, contradicted, measured_hz)
 
 
@@ -29,7 +29,7 @@ def test_a_rate_that_drifts_about_the_limit_does_not_come_and_go() -> None:
     check = RateCheck(100.0)
     seen = []
     for measured_hz in (101.9, 102.1, 101.9, 102.1, 101.6, 101.4, 101.9):
-        check.update(measured_hz, 0.0)
+        check.compare_with_measured_rate(measured_hz, 0.0)
         seen.append(check.contradicted)
     assert seen == [False, True, True, True, True, False, False]
 
@@ -38,6 +38,6 @@ def test_a_rate_in_use_does_not_follow_every_breath_of_the_measurement() -> None
     check = RateCheck(100.0)
     used = []
     for measured_hz in (98.8, 98.81, 98.79, 98.6):
-        check.update(measured_hz, 0.0)
+        check.compare_with_measured_rate(measured_hz, 0.0)
         used.append(check.rate_hz)
     assert used == [98.8, 98.8, 98.8, 98.6]

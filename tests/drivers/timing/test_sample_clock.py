@@ -555,11 +555,11 @@ def test_a_device_clock_contradicts_the_rate_however_its_samples_arrive(tick_s):
         for i in range(0, 600, 5):
             for clock in (wrong, right):
                 feed(clock, arrived[i : i + 5], ticks[i : i + 5])
-            seen.append((wrong.rate_check_pending, wrong.contradicted_hz is not None))
-            assert right.contradicted_hz is None
+            seen.append((wrong.rate_check_pending, wrong.contradicting_rate_hz is not None))
+            assert right.contradicting_rate_hz is None
         # at no sample is the rate believed: not checked yet, then contradicted
         assert all(unchecked != contradicted for unchecked, contradicted in seen)
-        assert wrong.contradicted_hz == pytest.approx(100.0, rel=1e-3)
+        assert wrong.contradicting_rate_hz == pytest.approx(100.0, rel=1e-3)
         assert (wrong.rate_hz, right.rate_hz) == (100.0, 100.0)
         assert not right.rate_check_pending
 
@@ -569,7 +569,7 @@ def test_a_tick_too_coarse_for_single_steps_contradicts_nothing():
     clock = SampleClock(CounterTimedFormat(1 << 16, 1e-3), 416.0)
     feed(clock, jitter(T0 + np.arange(4160) / 416.0), ticks)
     assert not clock.rate_check_pending
-    assert (clock.rate_hz, clock.contradicted_hz) == (416.0, None)
+    assert (clock.rate_hz, clock.contradicting_rate_hz) == (416.0, None)
 
 
 @pytest.mark.parametrize("arrive", [jitter, burst, stall])
@@ -580,7 +580,7 @@ def test_jitter_of_arrivals_contradicts_no_rate_that_is_nearly_right(arrive, see
     arrived = arrive(taken) if arrive is burst else arrive(taken, seed=seed)
     for a in range(0, 3000, 10):
         feed(clock, arrived[a : a + 10])
-        assert clock.contradicted_hz is None
+        assert clock.contradicting_rate_hz is None
     assert not clock.rate_check_pending
     assert clock.rate_hz == 100.2
 
@@ -589,14 +589,14 @@ def test_jitter_of_arrivals_contradicts_no_rate_that_is_nearly_right(arrive, see
 def test_arrivals_contradict_a_rate_that_is_far_off(arrive):
     clock = SampleClock(ArrivalTimedFormat(), 200.0)
     feed(clock, arrive(T0 + np.arange(3000) / 100.0))
-    assert clock.contradicted_hz == pytest.approx(100.0, rel=0.02)
+    assert clock.contradicting_rate_hz == pytest.approx(100.0, rel=0.02)
 
 
 def test_how_fast_a_file_is_read_contradicts_nothing():
     clock = SampleClock(ArrivalTimedFormat(), 100.0, arrivals_are_timed=False)
     feed(clock, T0 + np.arange(6000) / 2000.0)
     assert not clock.rate_check_pending
-    assert (clock.rate_hz, clock.contradicted_hz) == (100.0, None)
+    assert (clock.rate_hz, clock.contradicting_rate_hz) == (100.0, None)
 
 
 def test_given_times_contradict_a_rate_also_where_there_are_few():
@@ -604,10 +604,10 @@ def test_given_times_contradict_a_rate_also_where_there_are_few():
     clock = SampleClock(SenderTimedFormat(), 200.0)
     clock.assign_times(make_block(times_ns, varied(150)))
     assert clock.rate_check_pending
-    assert clock.contradicted_hz is None
+    assert clock.contradicting_rate_hz is None
     clock.compare_rates_at_end()
     assert not clock.rate_check_pending
-    assert clock.contradicted_hz == pytest.approx(100.0)
+    assert clock.contradicting_rate_hz == pytest.approx(100.0)
 
 
 def test_times_that_never_show_a_rate_leave_the_configured_one():
@@ -616,7 +616,7 @@ def test_times_that_never_show_a_rate_leave_the_configured_one():
         assert clock.rate_check_pending == (i > 0)
         clock.assign_times(make_block(np.zeros(4000, np.int64), varied(4000) + i))
     assert not clock.rate_check_pending
-    assert (clock.rate_hz, clock.contradicted_hz) == (100.0, None)
+    assert (clock.rate_hz, clock.contradicting_rate_hz) == (100.0, None)
 
 
 def test_a_jump_of_given_times_does_not_begin_the_check_anew():
@@ -624,16 +624,16 @@ def test_a_jump_of_given_times_does_not_begin_the_check_anew():
     times_ns = np.arange(600) * 10_000_000
     for a in range(0, 600, 20):
         clock.assign_times(make_block(times_ns[a : a + 20].copy(), varied(20) + a))
-    assert clock.contradicted_hz == pytest.approx(100.0)
+    assert clock.contradicting_rate_hz == pytest.approx(100.0)
     clock.assign_times(make_block(times_ns[:20] - 10**12, varied(20)))
     assert not clock.rate_check_pending
-    assert clock.contradicted_hz == pytest.approx(100.0)
+    assert clock.contradicting_rate_hz == pytest.approx(100.0)
 
 
 def test_after_a_restart_the_rate_is_checked_before_it_is_believed():
     clock = SampleClock(ArrivalTimedFormat(), 200.0)
     assert not clock.rate_check_pending
-    clock.resume(LastSample(round(T0 * NS), NO_TICK, 200.0, None))
+    clock.resume_after_restart(LastSample(round(T0 * NS), NO_TICK, 200.0, None))
     assert clock.rate_check_pending
 
 

@@ -268,7 +268,7 @@ def test_configuration_keys(values: Sequence[str], tmp_path: Path) -> None:
         for written in (value, f"{{ gz = {value} }}") if key in ("scale", "signals") else (value,):
             path.write_text(text.replace("{}", f"{key} = {written}"))
             path.chmod(0o600)
-            wrong = loading.examine(path).wrong
+            wrong = loading.examine_config_file(path).wrong
             for line in wrong:
                 assert "\n" not in line
                 assert len(line) < 3000, (name, key, value[:60])

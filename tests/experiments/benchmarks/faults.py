@@ -228,7 +228,7 @@ def running(folder: Path, more: str = NO_ZENOH + NO_VIEWER) -> Iterator[Rig]:
     board, said = Board(folder), Said()
     path = folder / "faults.toml"
     path.write_text(DEVICE.format(rate=RATE, port=board.port) + more)
-    service = Service(loading.load(path), [said])
+    service = Service(loading.load_config(path), [said])
     thread = threading.Thread(target=service.run)
     thread.start()
     rig = Rig(folder, board, service, said)
@@ -314,7 +314,7 @@ def two_daemons(folder: Path, times: int) -> Outcome:
     with running(folder, both) as rig:
         wait_for(lambda: rig.service.output_states()["zenoh"] == "ok", "the session")
         said = Said()
-        second = Service(loading.load(folder / "faults.toml"), [said])
+        second = Service(loading.load_config(folder / "faults.toml"), [said])
         thread = threading.Thread(target=second.run)
         thread.start()
         try:
@@ -356,7 +356,7 @@ def can_bus(folder: Path, times: int) -> Outcome:
     channel = f"faults-{os.getpid()}"
     path, said = folder / "faults.toml", Said()
     path.write_text(CAN.format(rate=RATE, channel=channel) + NO_ZENOH + NO_VIEWER)
-    service = Service(loading.load(path), [said])
+    service = Service(loading.load_config(path), [said])
     station = service.workers[0]
     # python-can would sort a peer's error frames out by their identifier, as the kernel does not
     station.driver.link.set_address_filter([])  # type: ignore[attr-defined]

@@ -144,7 +144,7 @@ def main() -> None:
         path = Path(folder) / "soak.toml"
         path.write_text(CONFIG.format(rate=wanted.rate, folder=Path(folder) / "store", keep=wanted.keep))
         wire = Wire(wanted.rate, round(wanted.days * 86400 * wanted.rate))
-        config = loading.load(path)
+        config = loading.load_config(path)
         (one,) = config.devices
         device = one.model_copy(update={"driver": dataclasses.replace(one.driver, link=wire)})
         service = Service(dataclasses.replace(config, devices=(device,)))

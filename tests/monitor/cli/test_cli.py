@@ -27,7 +27,7 @@ from drivers.recordings import save_samples
 from monitor.cli import main, report_failed_thread
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.noise.model_loading import read_model
-from monitor.settings.loading import load
+from monitor.settings.loading import load_config
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
@@ -219,7 +219,7 @@ def test_check_tells_all_that_is_wrong_and_run_the_first(call: Call) -> None:
 def test_a_file_for_the_view_is_beside_the_configuration(tmp_path: Path) -> None:
     """As every relative path in it."""
     (tmp_path / "c.toml").write_text(VIRTUAL + '[viewer]\nmode = "live.rrd"\n')
-    assert load(tmp_path / "c.toml").viewer.mode == str(tmp_path / "live.rrd")
+    assert load_config(tmp_path / "c.toml").viewer.mode == str(tmp_path / "live.rrd")
 
 
 def test_check_reads_the_model_of_a_simulated_device_too(call: Call) -> None:
@@ -1341,7 +1341,7 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
     histories = Path(shutil.copytree(histories, tmp_path / "kept"))  # the daemon adds to it
     zenoh = f'[zenoh]\nlisten = ["{endpoint}"]\n[viewer]\nmode = "none"\n'
     (tmp_path / "c.toml").write_text(f'{VIRTUAL}{zenoh}[storage]\nrecord = false\nfolder = "{histories}"\n')
-    service = Service(load(tmp_path / "c.toml"))
+    service = Service(load_config(tmp_path / "c.toml"))
     thread = threading.Thread(target=service.run, args=(FOREVER_S,))
     thread.start()
     try:

@@ -28,7 +28,7 @@ from monitor.commands.doctor import (
     version_satisfies,
     worst_mark,
 )
-from monitor.common.compiled import cache_folder
+from monitor.common.compiled import kernel_cache_folder
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.storage.recorder import segment_metadata
@@ -246,7 +246,7 @@ def test_a_rate_that_is_not_configured_leaves_the_disk_unjudged(tmp_path: Path) 
     text = VIRTUAL.replace("rate = 100.0\n", "") + QUIET + '[storage]\nfolder = "kept"\n'
     found = examined(tmp_path, text)
     assert "disk use per day unknown" in str(of(found, "storage"))
-    config = loading.load(tmp_path / "c.toml")
+    config = loading.load_config(tmp_path / "c.toml")
     assert recorded_bytes_per_day(config) is None
 
 
@@ -308,8 +308,8 @@ def test_versions_are_compared_by_their_numbers(version: str, wanted: str, fits:
 
 @pytest.mark.long
 def test_kernels_that_cannot_be_kept_are_told(tmp_path: Path) -> None:
-    assert cache_folder() is not None
-    say = "from monitor.common.compiled import cache_folder; print(cache_folder())"
+    assert kernel_cache_folder() is not None
+    say = "from monitor.common.compiled import kernel_cache_folder; print(kernel_cache_folder())"
     copy = tmp_path / "copy"
     shutil.copytree(Path(doctor.__file__).parents[1], copy / "monitor", ignore=shutil.ignore_patterns("__pycache__"))
     (copy / "monitor" / "common" / "__pycache__").touch()  # no folder can be made there
@@ -393,7 +393,7 @@ def test_a_folder_that_another_process_uses_is_found(name: str, tmp_path: Path) 
     text = VIRTUAL + QUIET + f'[storage]\nfolder = "{tmp_path / "kept"}"\n'
     assert not [one for one in of(examined(tmp_path, text), "storage") if "in use" in one.text]
     lock = FolderLock(tmp_path / "kept", name)
-    assert lock.hold() == ""
+    assert lock.ensure_held() == ""
     (found,) = [one for one in of(examined(tmp_path, text), "storage") if "in use" in one.text]
     assert found.mark == "doubt"
     assert found.text == f"{tmp_path / 'kept'}: in use by process {os.getpid()}"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import monitor.common.compiled
-from monitor.common.compiled import IMPORT_STATEMENT, Kernel, compiled, source_hash
+from monitor.common.compiled import IMPORT_STATEMENT, Kernel, compiled, hash_module_with_imports
 from monitor.estimation.fit import fit_kernel
 from tests.support.waiting import PATIENCE_S
 
@@ -46,8 +46,8 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
     files["d"].write_text("x = 1\n")
 
     def now():
-        source_hash.cache_clear()
-        return source_hash(files["a"], tmp_path)
+        hash_module_with_imports.cache_clear()
+        return hash_module_with_imports(files["a"], tmp_path)
 
     before = now()
     files["d"].write_text("x = 2\n")
@@ -61,7 +61,9 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
 def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
     imported = [package for package, *_ in IMPORT_STATEMENT.findall(Path(inspect.getfile(fit_kernel)).read_text())]
     assert imported.count("monitor.estimation.fit.term_selection") == 1
-    assert fit_kernel.fit_axes._cache._cache_file._version.endswith(source_hash(Path(inspect.getfile(fit_kernel))))
+    assert fit_kernel.fit_axes._cache._cache_file._version.endswith(
+        hash_module_with_imports(Path(inspect.getfile(fit_kernel)))
+    )
 
 
 def test_a_cache_that_names_a_type_of_an_earlier_revision_is_replaced(tmp_path):

@@ -23,9 +23,9 @@ ROOT = Path(__file__).parents[3]
 RATE_HZ = 100.0
 INTERPRET = """
 import pickle, sys
-from monitor.common.compiled import interpreted
+from monitor.common.compiled import interpret_uncompiled_kernels
 from tests.monitor.common.test_interpreted import compiled_kernels, results
-with interpreted():
+with interpret_uncompiled_kernels():
     found = [results(seed) for seed in range(int(sys.argv[1]))]
 assert not compiled_kernels(), compiled_kernels()
 sys.stdout.buffer.write(pickle.dumps(found))

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize, rosen
 
 from drivers.data_types import Floats
-from monitor.common.minimization import golden_section, minimize_bfgs
+from monitor.common.minimization import minimize_bfgs, minimize_by_golden_section
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
@@ -43,7 +43,7 @@ def test_a_function_that_is_flat_or_infinite_elsewhere() -> None:
 
 @pytest.mark.parametrize("place", [-1.0, -0.3, 0.7, 2.0])
 def test_golden_section(place: float) -> None:
-    search = golden_section(lambda x: abs(x - place) ** 1.5, -1.0, 2.0, 1e-5)
+    search = minimize_by_golden_section(lambda x: abs(x - place) ** 1.5, -1.0, 2.0, 1e-5)
     calls = 0
     while True:
         try:

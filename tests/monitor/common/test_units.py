@@ -5,7 +5,7 @@ import math
 import pytest
 
 from drivers.data_types import AXES
-from monitor.common.units import format_rate
+from monitor.common.units import format_axis_value
 
 
 @pytest.mark.parametrize(
@@ -26,19 +26,23 @@ from monitor.common.units import format_rate
     ],
 )
 def test_units_and_digits(axis, si, said):
-    assert format_rate(axis, si) == said
+    assert format_axis_value(axis, si) == said
 
 
 @pytest.mark.parametrize("axis", AXES)
 def test_a_difference_has_its_sign(axis):
-    assert format_rate(axis, 0.01, sign=True) == "+" + format_rate(axis, 0.01)
-    assert format_rate(axis, -0.01, sign=True) == format_rate(axis, -0.01) == "-" + format_rate(axis, 0.01)
+    assert format_axis_value(axis, 0.01, sign=True) == "+" + format_axis_value(axis, 0.01)
+    assert (
+        format_axis_value(axis, -0.01, sign=True)
+        == format_axis_value(axis, -0.01)
+        == "-" + format_axis_value(axis, 0.01)
+    )
 
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("si", [1e-30, 1e30, math.inf, -math.inf, math.nan])
 def test_no_number_breaks_a_sentence(axis, si):
-    number, unit = format_rate(axis, si).split()
+    number, unit = format_axis_value(axis, si).split()
     assert math.isfinite(float(number)) == math.isfinite(si)
     assert "e" not in number.lower()
     assert unit in ("°/s", "mg", "m/s²")

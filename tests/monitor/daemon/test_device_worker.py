@@ -443,18 +443,18 @@ def test_captured_bytes_and_fast_simulations_have_no_times_of_arrival(tmp_path):
     link.close()
     stamp(rig, 600, 5000.0, np.random.default_rng(1))
     assert not rig.station.clock.rate_check_pending
-    assert rig.station.clock.contradicted_hz is None
+    assert rig.station.clock.contradicting_rate_hz is None
     config = tmp_path / "config.toml"
     config.write_text(
         '[[device]]\nname = "d"\nrate = 100.0\n[device.driver]\nlink = "virtual"\ndecoder = "text"\nspeed = 30\n'
         '[device.driver.decoder_options]\ncolumns = ["gx", "gy", "gz"]\n'
     )
-    (device,) = settings.load(config).devices
+    (device,) = settings.load_config(config).devices
     station = DeviceWorker(device, LoopbackLink(), [], threading.Event(), KernelReadiness())
     for i in range(9000):
         station.clock.assign_times(make_block(np.array([10**12 + i * 333_333]), np.zeros((1, 6))))
     assert not station.clock.rate_check_pending
-    assert station.clock.contradicted_hz is None
+    assert station.clock.contradicting_rate_hz is None
 
 
 def test_a_replay_has_ended_when_its_samples_are_fitted():

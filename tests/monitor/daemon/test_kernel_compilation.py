@@ -35,7 +35,7 @@ print([str(each.data["dispatcher"]) for _, each in recorder.buffer if each.is_st
 
 @pytest.fixture
 def _empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernel_compilation, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(kernel_compilation, "kernel_cache_folder", lambda: tmp_path)
 
 
 def group_of(calls: list[str], names: str) -> KernelGroup:
@@ -100,7 +100,7 @@ def test_a_program_that_cannot_be_started_leaves_the_compilation_to_this_process
 def test_without_a_folder_for_them_kernels_are_compiled_by_this_process_at_every_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(kernel_compilation, "cache_folder", lambda: None)
+    monkeypatch.setattr(kernel_compilation, "kernel_cache_folder", lambda: None)
     monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", ANSWERS_ALL))
     calls: list[str] = []
     told: list[Progress] = []
@@ -143,6 +143,6 @@ def kept_in(text: str) -> str:
 
 
 def test_the_command_says_where_kernels_cannot_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, "cache_folder", lambda: None)
+    monkeypatch.setattr(compiled, "kernel_cache_folder", lambda: None)
     with pytest.raises(ConfigError, match="no cache folder can be written; set NUMBA_CACHE_DIR"):
         warm_up()

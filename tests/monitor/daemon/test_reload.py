@@ -43,7 +43,7 @@ def device(name: str, extra: str = "", driver: str = "") -> str:
 def changed(folder: Path, before: str, after: str) -> reload.ConfigChange:
     path = folder / "c.toml"
     path.write_text(before)
-    config = loading.load(path)
+    config = loading.load_config(path)
     models = {one.name: None if one.model is None else read_model(one.model) for one in config.devices}
     path.write_text(after)
     return reload.compare_with_file(config, models)
@@ -67,7 +67,7 @@ def test_a_model_that_reads_otherwise_begins_its_device_anew(tmp_path: Path) -> 
     model.write_text("sample_rate = 100.0\n[gz.angle_random_walk]\nN = 1e-4\n")
     assert changed(tmp_path, text, text).text() == "no device changed"
     path = tmp_path / "c.toml"
-    config, models = loading.load(path), {"a": read_model(model)}
+    config, models = loading.load_config(path), {"a": read_model(model)}
     model.write_text("sample_rate = 100.0\n[gz.angle_random_walk]\nN = 2e-4\n")
     assert reload.compare_with_file(config, models).text() == "restarted: a"
 
@@ -122,7 +122,7 @@ class Gone(Output):
 
 @contextmanager
 def running(path: Path, *outputs: Output) -> Iterator[Service]:
-    service = Service(loading.load(path), outputs)
+    service = Service(loading.load_config(path), outputs)
     thread = threading.Thread(target=service.run)
     thread.start()
     try:

@@ -42,7 +42,7 @@ def config(folder: Path, driver: str, viewer: str) -> loading.Config:
     path = folder / "config.toml"
     device = f'[[device]]\nname = "d"\nrate = 100.0\ndriver = {{ {driver} }}\n'
     path.write_text(f'{device}[zenoh]\nmode = "none"\n[viewer]\n{viewer}')
-    return loading.load(path)
+    return loading.load_config(path)
 
 
 class Rounds(Output):
@@ -156,7 +156,7 @@ record = false
 """
     )
     told = Times()
-    service = Service(loading.load(path), [told])
+    service = Service(loading.load_config(path), [told])
     recording.rename(away)
     thread = threading.Thread(target=service.run, args=(PATIENCE_S,))
     thread.start()
@@ -237,7 +237,7 @@ record = false
 """
     )
     told, board = Estimates(), DeviceStates()
-    Service(loading.load(path), [told, TableOutput(board)]).run(60.0)
+    Service(loading.load_config(path), [told, TableOutput(board)]).run(60.0)
     with open_history(tmp_path / "kept" / FILE_NAME) as reader:
         kept = past.read_history(reader, "d", TimeRange(-math.inf, math.inf), step_s=60)
     (known,) = board.sorted_devices(time.monotonic())
@@ -271,7 +271,7 @@ def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
         '[[device]]\nname = "d"\ndriver = { link = "replay", path = "r.npz" }\n'
         '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
     )
-    service = Service(loading.load(path), [told])
+    service = Service(loading.load_config(path), [told])
     service.run(60.0)
     assert service.workers[0].publisher.published == 50
     assert told.all == []

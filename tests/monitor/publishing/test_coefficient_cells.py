@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES
-from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, axes_of, format_number, unit_of
+from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, axes_of, coefficient_unit, format_number
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.publishing.coefficient_cells import format_coefficient
 
@@ -27,14 +27,14 @@ from monitor.publishing.coefficient_cells import format_coefficient
     ],
 )
 def test_a_coefficient_in_the_units_of_a_data_sheet(axis, letter, si, field, name):
-    unit = unit_of(letter, axis)
+    unit = coefficient_unit(letter, axis)
     assert si * unit.factor == pytest.approx(field, rel=1e-5)
     assert unit.name == name
 
 
 def test_a_random_walk_grows_by_its_coefficient_in_one_hour():
     angle_deg = math.degrees(1.5e-4 * math.sqrt(3600.0))  # rms angle after an hour is N·√t
-    assert unit_of("N", "gx").factor * 1.5e-4 == pytest.approx(angle_deg)
+    assert coefficient_unit("N", "gx").factor * 1.5e-4 == pytest.approx(angle_deg)
 
 
 def test_deviation_has_the_unit_of_bias_instability():

@@ -11,7 +11,7 @@ from rich.console import Console
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings.formats import FORMATS
-from monitor.common.units import unit_of
+from monitor.common.units import coefficient_unit
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.history.bucket import STATES, HistoryRow
 from monitor.history.history_table import HistoryTable, build_table
@@ -60,10 +60,10 @@ def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
     text = printed(history_text.print_history, past, AXES, ("N", "R"))
     assert "bench-1: 2025-11-21 00:00 to 2025-11-22 00:00 UTC, 44 rows of 30 min, 7,920,000 samples" in text
     n = past.select_column("gz.N")
-    unit = unit_of("N", "gz")
+    unit = coefficient_unit("N", "gz")
     (line,) = [line for line in text.splitlines() if line.startswith("gz N")]
     for number in (n.last[0], n.last[-1], n.low.min(), n.high.max()):
-        assert unit.text(number).split()[0] in line.split()
+        assert unit.format_si_value(number).split()[0] in line.split()
     assert history_text.GAP in line
     assert "≤" in next(line for line in text.splitlines() if line.startswith("az R"))
     assert "temperature 19.8 … 135 °C" in text
@@ -78,7 +78,7 @@ def test_one_axis_over_time_has_a_line_a_bucket() -> None:
     text = printed(history_text.print_axis_history, made(), "gz", SYMBOLS)
     lines = [line for line in text.splitlines() if line.startswith("2025-11-21")]
     assert len(lines) == 44
-    assert lines[7].split()[3].startswith(f"{1e-4 * unit_of('N', 'gz').factor:.1f}")
+    assert lines[7].split()[3].startswith(f"{1e-4 * coefficient_unit('N', 'gz').factor:.1f}")
     assert "…" in lines[7]
     assert lines[9].split()[-2:] == ["12", "lost"]
 

@@ -32,7 +32,7 @@ def test_each_kind_and_each_message_stands_in_one_row() -> None:
 def test_the_schema_of_a_message_is_that_of_its_topic() -> None:
     for kind in RESULT_KINDS:
         for message in kind.messages:
-            assert message.__struct_config__.tag == message.topic.schema()
+            assert message.__struct_config__.tag == message.topic.schema_name()
             assert message.topic.encoding == topics.JSON
 
 

@@ -269,7 +269,7 @@ def test_a_link_as_client_without_the_certificate_is_told_why(by_certificate: Wo
 
 
 def test_the_shipped_daemon_reads_its_files(tmp_path: Path) -> None:
-    reading = loading.examine(SECURE / "daemon.toml")
+    reading = loading.examine_config_file(SECURE / "daemon.toml")
     config, wrong = reading.config, reading.wrong
     assert wrong == []
     assert config is not None

@@ -38,7 +38,7 @@ def test_usual_modes_are_well(folder: Path, mode: int) -> None:
     path = made(folder / "a.toml", VIRTUAL, mode)
     assert file_permissions.explain_untrusted_file(path) == ""
     assert file_permissions.describe_exposed_secret(path) == ""
-    reading = loading.examine(path)
+    reading = loading.examine_config_file(path)
     config, wrong = reading.config, reading.wrong
     assert wrong == []
     assert config is not None
@@ -48,9 +48,9 @@ def test_usual_modes_are_well(folder: Path, mode: int) -> None:
 def test_a_file_that_anyone_may_change_is_refused(folder: Path) -> None:
     path = made(folder / "a.toml", VIRTUAL, 0o646)
     with pytest.raises(ConfigError, match=rf"anyone on this machine may change it.*chmod o-w {path}$"):
-        loading.load(path)
+        loading.load_config(path)
     path.chmod(0o644)
-    loading.load(path)
+    loading.load_config(path)
 
 
 def test_a_link_is_judged_by_where_it_leads(folder: Path) -> None:
@@ -70,31 +70,31 @@ def test_a_folder_in_which_anyone_may_swap_the_file_is_refused_but_a_sticky_one_
 def test_a_secret_that_anyone_may_read_is_warned_of(folder: Path) -> None:
     zenoh = made(folder / "z.json5", SECRET, 0o644)
     path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
-    (warning,) = loading.load(path).warnings
+    (warning,) = loading.load_config(path).warnings
     assert warning == (
         f"{path}: zenoh.config: z.json5: holds a secret that anyone on this machine may read: chmod o-r {zenoh}"
     )
     zenoh.chmod(0o640)
-    assert loading.load(path).warnings == ()
+    assert loading.load_config(path).warnings == ()
     zenoh.chmod(0o644)
     folder.chmod(0o700)
-    assert loading.load(path).warnings == ()  # nobody else gets there
+    assert loading.load_config(path).warnings == ()  # nobody else gets there
 
 
 def test_a_private_key_that_a_zenoh_file_names_is_looked_at_too(folder: Path) -> None:
     key = made(folder / "nose.key", "-----BEGIN PRIVATE KEY-----", 0o644)
     made(folder / "z.json5", f'{{transport: {{link: {{tls: {{connect_private_key: "{key}"}}}}}}}}', 0o644)
     path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
-    (warning,) = loading.load(path).warnings
+    (warning,) = loading.load_config(path).warnings
     assert f"nose.key: holds a secret that anyone on this machine may read: chmod o-r {key}" in warning
 
 
 def test_a_zenoh_file_that_anyone_may_change_or_that_zenoh_refuses_is_wrong(folder: Path) -> None:
     zenoh = made(folder / "z.json5", SECRET, 0o602)
     path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
-    assert "zenoh.config: anyone on this machine may change it" in loading.examine(path).wrong[0]
+    assert "zenoh.config: anyone on this machine may change it" in loading.examine_config_file(path).wrong[0]
     with pytest.raises(ConfigError, match="anyone on this machine may change it"):
         client_configurations((), zenoh)
     made(zenoh, SECRET.replace('"hunter2"', '"hunter2" x'), 0o600)
-    (line,) = loading.examine(path).wrong
+    (line,) = loading.examine_config_file(path).wrong
     assert line == f"{path}: zenoh.config: {zenoh}: line 1, column 54: expected boolean or null"

@@ -11,16 +11,16 @@ from drivers import module_lookup as discovery
 from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from monitor.common.shipped_config_paths import CONFIG_FOLDER, model_path
+from monitor.common.shipped_config_paths import CONFIG_FOLDER, resolve_model_path
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings.loading import (
     WINDOW_SAMPLES,
     VirtualTable,
     check_viewer_mode,
-    examine,
-    load,
+    examine_config_file,
+    load_config,
+    parse_duration_s,
     parse_rate_as_period,
-    seconds,
 )
 
 DRIVER = 'driver = { link = "serial", port = "/dev/null", decoder = "vectornav_ascii" }'
@@ -29,7 +29,7 @@ DRIVER = 'driver = { link = "serial", port = "/dev/null", decoder = "vectornav_a
 def wrong(tmp_path, text):
     path = tmp_path / "my.toml"
     path.write_text(text, "utf-8")
-    reading = examine(path)
+    reading = examine_config_file(path)
     config, lines = reading.config, reading.wrong
     assert (config is None) == bool(lines)
     assert all(line.startswith(f"{path}: ") and "\n" not in line for line in lines)
@@ -43,7 +43,7 @@ def device(extra="", name="a", driver=DRIVER):
 def test_a_device_needs_its_name_and_driver_only(tmp_path):
     path = tmp_path / "my.toml"
     path.write_text(device())
-    (one,) = load(path).devices
+    (one,) = load_config(path).devices
     assert (one.name, one.rate_hz, one.window_s, one.tau) == ("a", None, 3600.0, "octave")
     assert (one.refit_s, one.publish_s, one.silence_s) == (0.1, 0.1, 3.0)
     assert one.axes == AxisMap()
@@ -318,7 +318,7 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path):
     ):
         assert any(part in line for line in lines), part
     with pytest.raises(ConfigError, match=rf"\(and {len(lines) - 1} more: imu-monitor check .*my.toml\)$"):
-        load(tmp_path / "my.toml")
+        load_config(tmp_path / "my.toml")
 
 
 RIGHT = {
@@ -511,7 +511,7 @@ def test_a_file_that_cannot_be_read(tmp_path, what):
     elif what == "binary":
         path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="no such file" if what == "missing" else "cannot be read"):
-        load(path)
+        load_config(path)
 
 
 def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
@@ -522,7 +522,7 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
     (folder / "z.json5").write_text("{}")
     path = folder / "my.toml"
     path.write_text(device(driver='driver = { link = "replay", path = "my.csv" }') + '[zenoh]\nconfig = "z.json5"')
-    config = load(path)
+    config = load_config(path)
     assert config.zenoh.config == folder / "z.json5"
     link = config.devices[0].link
     link.open()
@@ -534,7 +534,7 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("path", sorted(CONFIG_FOLDER.glob("*.toml")), ids=lambda path: path.name)
 def test_examples_are_right(path):
-    reading = examine(path)
+    reading = examine_config_file(path)
     config, lines = reading.config, reading.wrong
     assert [line for line in lines if "no such file" not in line] == []
     assert config is not None or lines
@@ -565,13 +565,13 @@ def test_every_link_can_be_named():
     ],
 )
 def test_durations(text, value):
-    assert seconds(text) == pytest.approx(value)
+    assert parse_duration_s(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize("text", ["", "h", "1w", "-1h", "0s", "1.2.3s", "1 h 3 min", "1H", "nan"])
 def test_words_that_are_no_durations(text):
     with pytest.raises(ConfigError, match="not a duration"):
-        seconds(text)
+        parse_duration_s(text)
 
 
 @pytest.mark.parametrize(("text", "value"), [("10 Hz", 0.1), ("0.5Hz", 2.0), ("always", 0.0)])
@@ -588,10 +588,10 @@ def test_words_that_are_no_rates(text):
 def test_the_viewer_opens_on_so_much_of_what_is_kept(tmp_path):
     path = tmp_path / "my.toml"
     path.write_text(device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\n')
-    assert load(path).viewer.history == 43_200.0
+    assert load_config(path).viewer.history == 43_200.0
     path.write_text(device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\nhistory = false\n')
     with pytest.raises(ConfigError, match="there is no history to show"):
-        load(path)
+        load_config(path)
 
 
 def test_viewer_modes():
@@ -605,7 +605,7 @@ def test_virtual_model_may_be_a_file_beside_the_configuration(tmp_path):
     (tmp_path / "mine.toml").write_text((CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text())
     path = tmp_path / "my.toml"
     path.write_text(device(driver='driver = { link = "virtual", model = "mine.toml", seed = 3 }'))
-    link = load(path).devices[0].link
+    link = load_config(path).devices[0].link
     assert isinstance(link, VirtualTable)
     assert Path(link.model) == tmp_path / "mine.toml"
 
@@ -619,13 +619,13 @@ def test_the_model_in_force_is_a_file_beside_the_configuration_or_a_name_of_the_
     }
     for text, found in given.items():
         path.write_text(device(text + '\nreconcile_folder = "reports"'))
-        (one,) = load(path).devices
+        (one,) = load_config(path).devices
         assert (one.model, one.reconcile_folder) == (found, tmp_path / "reports")
     path.write_text(device())
-    (one,) = load(path).devices
+    (one,) = load_config(path).devices
     assert (one.model, one.reconcile_folder) == (None, None)
     path.write_text(device('model = "bmi08"'))
-    assert examine(path).wrong[0].endswith('did you mean "bmi088"?')
+    assert examine_config_file(path).wrong[0].endswith('did you mean "bmi088"?')
 
 
 @pytest.mark.parametrize(
@@ -640,7 +640,7 @@ def test_the_model_in_force_is_a_file_beside_the_configuration_or_a_name_of_the_
 def test_the_interval_that_is_held_against_temperature(tmp_path, text, found):
     path = tmp_path / "my.toml"
     path.write_text(device(text))
-    assert load(path).devices[0].thermal_s == found
+    assert load_config(path).devices[0].thermal_s == found
 
 
 @pytest.mark.parametrize(
@@ -658,7 +658,7 @@ def test_the_interval_that_is_held_against_temperature(tmp_path, text, found):
 def test_an_interval_that_cannot_be_says_why(tmp_path, text, says):
     path = tmp_path / "my.toml"
     path.write_text(device(text))
-    (line,) = examine(path).wrong
+    (line,) = examine_config_file(path).wrong
     assert says in line
 
 
@@ -668,7 +668,7 @@ def test_an_interval_that_cannot_be_says_why(tmp_path, text, says):
 def test_a_virtual_device_speaks_any_wire_format(tmp_path, decoder, carrier):
     path = tmp_path / "my.toml"
     path.write_text(device(driver=f'driver = {{ link = "virtual", decoder = "{decoder}", faults = {{ lost = 0.1 }} }}'))
-    found = load(path).devices[0]
+    found = load_config(path).devices[0]
     assert found.decoder.carrier == carrier
     assert isinstance(found.link, VirtualTable)
     assert (found.link.faults.lost, found.link.faults.clock) == (0.1, 1.0)
@@ -681,4 +681,4 @@ def test_windows_that_are_accepted_are_those_that_the_estimator_can_hold():
 @pytest.mark.parametrize("name", ["a" * 300, "~nobody-of-that-name/x", "\0"])
 def test_a_name_that_no_file_can_have_is_no_file(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="neither a file nor one of those shipped"):
-        model_path(name, tmp_path)
+        resolve_model_path(name, tmp_path)

@@ -14,7 +14,7 @@ from drivers.errors import ConfigError
 from drivers.settings_model import SettingsModel, fields_by_key, find_settings_model
 from monitor.commands.check import check_configuration
 from monitor.settings import printed_defaults
-from monitor.settings.driver_settings import FaultsTable, link_names, link_settings
+from monitor.settings.driver_settings import FaultsTable, link_settings_class, list_link_names
 from monitor.settings.schema import (
     ConfigFile,
     Device,
@@ -28,7 +28,7 @@ from monitor.settings.schema import (
 )
 from tests.support.settings import read_settings
 
-LINKS = link_names()
+LINKS = list_link_names()
 DECODERS = discovery.list_modules(drivers.decoders)
 
 
@@ -39,7 +39,7 @@ def decoder_settings(name: str) -> type[SettingsModel]:
 
 MODELS = [
     *(ConfigFile, Device, Limit, Hook, ZenohTable, ViewerTable, Storage, MetricsTable, LogTable, FaultsTable),
-    *(SignalSettings, *map(link_settings, LINKS), *map(decoder_settings, DECODERS)),
+    *(SignalSettings, *map(link_settings_class, LINKS), *map(decoder_settings, DECODERS)),
 ]
 
 
@@ -118,17 +118,17 @@ def printed_keys(block: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("link", LINKS)
 def test_the_table_of_a_link_has_every_key_and_passes_the_check(folder: Path, link: str) -> None:
-    text = uncommented(printed_defaults.format_link(link))
+    text = uncommented(printed_defaults.format_link_defaults(link))
     first = text.split("[device.driver.faults]")[0]
-    assert set(printed_keys(first)) - {"link", "decoder"} == set(fields_by_key(link_settings(link))) - {"faults"}
+    assert set(printed_keys(first)) - {"link", "decoder"} == set(fields_by_key(link_settings_class(link))) - {"faults"}
     if link == "can":
-        text += "\n" + without(uncommented(printed_defaults.format_decoder("dbc")), "valid")
+        text += "\n" + without(uncommented(printed_defaults.format_decoder_defaults("dbc")), "valid")
     check_text(folder, text)
 
 
 @pytest.mark.parametrize("decoder", DECODERS)
 def test_the_table_of_a_decoder_has_every_key_and_passes_the_check(folder: Path, decoder: str) -> None:
-    text = uncommented(printed_defaults.format_decoder(decoder))
+    text = uncommented(printed_defaults.format_decoder_defaults(decoder))
     assert set(printed_keys(text)) == set(fields_by_key(decoder_settings(decoder)))
     # no shipped database with a counter has a signal for valid
     check_text(folder, f'[device.driver]\nlink = "virtual"\ndecoder = "{decoder}"\n{without(text, "valid")}')
@@ -147,6 +147,6 @@ def test_tables_that_may_be_repeated_pass_the_check(folder: Path) -> None:
 
 def test_an_unknown_name_is_answered_with_the_nearest_one() -> None:
     with pytest.raises(ConfigError, match='"seral"; possible are serial, '):
-        printed_defaults.format_link("seral")
+        printed_defaults.format_link_defaults("seral")
     with pytest.raises(ConfigError, match='"tekst"; possible are text, '):
-        printed_defaults.format_decoder("tekst")
+        printed_defaults.format_decoder_defaults("tekst")

@@ -6,21 +6,21 @@ import pytest
 
 from drivers.errors import ConfigError
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
-from monitor.settings.loading import WINDOW_SAMPLES, VirtualTable, load
-from monitor.simulator.demo_config import DEMO_CONFIG, demo_config
+from monitor.settings.loading import WINDOW_SAMPLES, VirtualTable, load_config
+from monitor.simulator.demo_config import DEMO_CONFIG, build_demo_config
 
 SHIPPED = sorted(path.stem for path in (CONFIG_FOLDER / "models").glob("*.toml"))
 
 
 def test_as_it_is_shipped_unless_told_otherwise() -> None:
-    config, (device,) = demo_config(), demo_config().devices
-    assert (config.zenoh, config.viewer) == (load(DEMO_CONFIG).zenoh, load(DEMO_CONFIG).viewer)
-    assert (device.link, device.rate_hz, device.window_s) == (load(DEMO_CONFIG).devices[0].link, 100.0, 600.0)
+    config, (device,) = build_demo_config(), build_demo_config().devices
+    assert (config.zenoh, config.viewer) == (load_config(DEMO_CONFIG).zenoh, load_config(DEMO_CONFIG).viewer)
+    assert (device.link, device.rate_hz, device.window_s) == (load_config(DEMO_CONFIG).devices[0].link, 100.0, 600.0)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_any_sensor_of_the_catalogue(name: str) -> None:
-    (device,) = demo_config(name).devices
+    (device,) = build_demo_config(name).devices
     assert isinstance(device.link, VirtualTable)
     assert Path(device.link.model).stem == name
     assert device.rate_hz
@@ -30,14 +30,14 @@ def test_any_sensor_of_the_catalogue(name: str) -> None:
 def test_a_model_file_at_its_own_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text("sample_rate = 400000.0\n[gz.angle_random_walk]\nN = 1e-4\n")
-    (device,) = demo_config("mine.toml").devices
+    (device,) = build_demo_config("mine.toml").devices
     assert (device.rate_hz, device.window_s) == (400_000.0, 25.0)
     Path("mine.toml").write_text("[gz.angle_random_walk]\nN = 1e-4\n")
-    assert demo_config("mine.toml").devices[0].rate_hz == 100.0
+    assert build_demo_config("mine.toml").devices[0].rate_hz == 100.0
 
 
 def test_effects_and_when_they_come() -> None:
-    (device,) = demo_config(None, ["gz.bias:value=1", "ax.bias:value=2"], 5.0).devices
+    (device,) = build_demo_config(None, ["gz.bias:value=1", "ax.bias:value=2"], 5.0).devices
     assert isinstance(device.link, VirtualTable)
     assert (device.link.effect, device.link.effect_at) == (("gz.bias:value=1", "ax.bias:value=2"), 5.0)
 
@@ -45,9 +45,9 @@ def test_effects_and_when_they_come() -> None:
 def test_what_cannot_be_is_said_of_the_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r'--sensor: no model "consumer-mem".*did you mean "consumer-mems"\?'):
-        demo_config("consumer-mem")
+        build_demo_config("consumer-mem")
     Path("bad.toml").write_text("[gz.angle_random_walk]\nM = 1.0\n")
     with pytest.raises(ConfigError, match=r"--sensor: .*bad\.toml: gz\.angle_random_walk: unknown parameter"):
-        demo_config("bad.toml")
+        build_demo_config("bad.toml")
     with pytest.raises(ConfigError, match=r'--effect: gz: unknown effect "sinusodal"; did you mean "sinusoidal"'):
-        demo_config(None, ["gz.sinusodal:amplitude=1,frequency=2"])
+        build_demo_config(None, ["gz.sinusodal:amplitude=1,frequency=2"])

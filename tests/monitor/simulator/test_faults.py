@@ -36,9 +36,9 @@ def test_the_same_however_samples_are_cut_into_bursts(cuts: tuple[int, ...]) -> 
     whole = Faults(SHARES, 5, "bytes").draw_faults(1000)
     faults = Faults(SHARES, 5, "bytes")
     parts = [faults.draw_faults(n) for n in np.diff((0, *cuts, 1000)).tolist()]
-    for name in ("kind", "where", "pulled"):
+    for name in ("kind", "position", "pulled"):
         assert np.array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
-    assert not np.array_equal(whole.where, Faults(SHARES, 6, "bytes").draw_faults(1000).where)
+    assert not np.array_equal(whole.position, Faults(SHARES, 6, "bytes").draw_faults(1000).position)
 
 
 def test_holding_back_bursts_changes_no_sample_fault() -> None:
@@ -50,7 +50,7 @@ def test_holding_back_bursts_changes_no_sample_fault() -> None:
     assert np.array_equal(faults.draw_faults(100).kind, calm.draw_faults(100).kind)
 
 
-@pytest.mark.parametrize("where", [0.0, 0.37, 1.0 - 2**-53])
+@pytest.mark.parametrize("position", [0.0, 0.37, 1.0 - 2**-53])
 def test_what_they_do_to_bytes(where: float) -> None:
     faults = Faults(SHARES, 1, "bytes")
     chunks = [Chunk(b"first", 7), Chunk(DATA, 7, address=3)]

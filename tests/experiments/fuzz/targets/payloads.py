@@ -53,7 +53,7 @@ WORDS: Final = (
 
 @cache
 def _payloads() -> tuple[bytes, ...]:
-    return tuple(msgspec.json.encode({"schema": topic.schema(), **HEADS, **m}) for topic, m in MESSAGES.items())
+    return tuple(msgspec.json.encode({"schema": topic.schema_name(), **HEADS, **m}) for topic, m in MESSAGES.items())
 
 
 def _messages() -> Iterator[bytes]:

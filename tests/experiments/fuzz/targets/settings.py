@@ -104,7 +104,7 @@ def configured(text: bytes) -> None:
     """Read a configuration, and look at all of it."""
     path = room() / "a.toml"
     path.write_bytes(text)
-    reading = loading.examine(path)
+    reading = loading.examine_config_file(path)
     config, wrong = reading.config, reading.wrong
     assert (config is None) == bool(wrong)
     assert len(wrong) < LINES_AT_MOST
@@ -113,7 +113,7 @@ def configured(text: bytes) -> None:
         assert len(line) < 5000
     if config is None:
         try:
-            loading.load(path)
+            loading.load_config(path)
         except ConfigError as error:
             one_line(error)
         else:

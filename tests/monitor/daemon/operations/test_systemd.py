@@ -143,7 +143,7 @@ def test_a_frozen_reader_ends_the_signs_of_life_and_nothing_else(tmp_path: Path)
     )
     with Listening(str(tmp_path / "notify")) as systemd:
         service = Service(
-            loading.load(tmp_path / "c.toml"),
+            loading.load_config(tmp_path / "c.toml"),
             unit=SystemdNotifier(str(tmp_path / "notify"), watchdog_s=1.5, stuck_s=3.0),
         )
         link = Freezing()
