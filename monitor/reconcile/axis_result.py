@@ -17,9 +17,9 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.null_distribution import AxisNull, measure_gaps
-from monitor.reconcile.likelihood.effect_roles import MOST_DIRECT_DIAGNOSTIC, SIZE_PARAMETERS, size
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, shape_interval, size_interval
+from monitor.reconcile.diagnostics.null_distribution import AxisNull, compute_diagnostic_gaps
+from monitor.reconcile.likelihood.effect_roles import MOST_DIRECT_DIAGNOSTIC, SIZE_PARAMETERS, effect_size
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, compute_shape_interval, compute_size_interval
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AxisResult,
@@ -50,7 +50,7 @@ MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence with which an alternative effect is reported."""
 
 
-def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> AxisResult:
+def build_axis_result(search: AxisSearchResult, null: AxisNull, final_null: AxisNull) -> AxisResult:
     """Return the result of one axis.
 
     Parameters
@@ -59,11 +59,11 @@ def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> 
         Search on the axis.
     null : AxisNull
         Null distributions under the model under test, for the diagnostics before and during the search.
-    final : AxisNull
+    final_null : AxisNull
         Null distributions under the extended model, which decide whether a remaining difference is significant.
     """
     snapshots = [_snapshot(one.before, null) for one in search.rounds]
-    end = _snapshot(search.final, final)
+    end = _snapshot(search.final, final_null)
     snapshots.append(end if search.before_withdrawal is None else _snapshot(search.before_withdrawal, null))
     steps = tuple(
         _describe_step(search, search.rounds[at], index, kind, snapshots[at], snapshots[at + 1])
@@ -76,7 +76,7 @@ def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> 
 
 def _snapshot(diagnostics: AxisDiagnostics, null: AxisNull) -> DiagnosticSnapshot:
     """Return the gaps and the plots of an axis."""
-    return DiagnosticSnapshot(measure_gaps(diagnostics.findings, null), diagnostics.plots)
+    return DiagnosticSnapshot(compute_diagnostic_gaps(diagnostics.findings, null), diagnostics.plots)
 
 
 def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKind]]:
@@ -220,8 +220,8 @@ def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
 
     The probability follows from the difference of the logarithms of both sizes, in standard errors.
     """
-    now, before = size(hypothesis.effects[index]), size(hypothesis.model[index])
-    error = hypothesis.fit.size_error(index)
+    now, before = effect_size(hypothesis.effects[index]), effect_size(hypothesis.model[index])
+    error = hypothesis.fit.size_standard_error(index)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
         return 1.0  # one of the sizes is zero
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
@@ -239,18 +239,18 @@ def _parameters_with_bounds(
         found["source"] = ParameterInterval(effect.source)
     size_name = SIZE_PARAMETERS.get(type(effect))
     if size_name is not None:
-        found[size_name] = size_interval(hypothesis.fit, index)
+        found[size_name] = compute_size_interval(hypothesis.fit, index)
     if isinstance(effect, TemperatureBias):
         found["reference"] = ParameterInterval(effect.reference)
         if effect.quadratic is not None:
             found["quadratic"] = _quadratic_bounds(hypothesis, index)
     for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
-        found[shape] = shape_interval(hypothesis.fit, index, shape)
+        found[shape] = compute_shape_interval(hypothesis.fit, index, shape)
     if isinstance(effect, BandwidthLimit):
         found["order"] = ParameterInterval(float(effect.order))
     if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
         # the frequency is fitted too, which doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
-        error = 2.0 * Z95 * hypothesis.fit.size_error(index) / effect.amplitude
+        error = 2.0 * Z95 * hypothesis.fit.size_standard_error(index) / effect.amplitude
         found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
     return found
 

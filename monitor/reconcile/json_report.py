@@ -29,18 +29,18 @@ SCHEMA: Final = "imu-monitor/reconcile/1"
 _JSON_ENCODER: Final = msgspec.json.Encoder()
 
 
-def encode_report(r: Reconciliation) -> bytes:
+def encode_report(result: Reconciliation) -> bytes:
     """Encode a reconciliation as JSON, with the axes in the order of ``AXES``."""
     return _JSON_ENCODER.encode({
         "schema": SCHEMA,
-        "verdict": r.verdict,
-        "rate": finite_or_none(r.rate_hz),
-        "samples": int(r.samples),
-        "seconds": finite_or_none(r.duration_s),
-        "seed": int(r.seed),
-        "fitted_first": bool(r.fitted_first),
-        "notes": r.notes,
-        "axes": {axis: _axis_entry(r.axes[axis]) for axis in AXES if axis in r.axes},
+        "verdict": result.verdict,
+        "rate": finite_or_none(result.rate_hz),
+        "samples": int(result.samples),
+        "seconds": finite_or_none(result.duration_s),
+        "seed": int(result.seed),
+        "fitted_first": bool(result.fitted_first),
+        "notes": result.notes,
+        "axes": {axis: _axis_entry(result.axes[axis]) for axis in AXES if axis in result.axes},
     })  # fmt: skip
 
 

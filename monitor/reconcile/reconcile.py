@@ -28,7 +28,7 @@ from monitor.noise.effects import (
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.standard_terms import UNIT_SOURCES
-from monitor.reconcile.axis_result import describe_axis
+from monitor.reconcile.axis_result import build_axis_result
 from monitor.reconcile.diagnostics.null_distribution import (
     AxisNull,
     Findings,
@@ -36,7 +36,7 @@ from monitor.reconcile.diagnostics.null_distribution import (
     run_diagnostics,
 )
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
-from monitor.reconcile.likelihood.effect_roles import with_size
+from monitor.reconcile.likelihood.effect_roles import with_effect_size
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.reconcile_input import Recording, select_usable_axes
@@ -54,10 +54,10 @@ from monitor.reconcile.search.candidates import PENALTY_NATS
 from monitor.reconcile.search.sample_rate_from_spectrum import (
     SAMPLE_RATE_PENALTY_NATS,
     SampleRateErrorEstimate,
-    convert_to_stated_time,
     detect_sample_rate_error,
+    rescale_effect_time,
 )
-from monitor.reconcile.search.search import AxisSearchResult, search_axis
+from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
 
 SIMULATED_RECORDINGS: Final = 6
 """Number of simulated recordings that determine a null distribution. With six axes, each diagnostic has 36 gains."""
@@ -125,7 +125,7 @@ def reconcile(
         If the recording has too few samples or no axis that can be compared with the model.
     """
     recording, notes = select_usable_axes(recording, model)
-    regressors = RegressorCache(recording.samples, recording.rate_hz, recording.temperature_c)
+    regressors = RegressorCache(recording.sample_count, recording.rate_hz, recording.temperature_c)
     run = RecordingContext(recording, seed, regressors, map_function)
     if model is None:
         report_stage("fitting the five terms")
@@ -143,7 +143,7 @@ def reconcile(
         simulated |= _diagnose_simulations(extended, run, seed + SIMULATED_RECORDINGS, changed)
         final = estimate_null_distributions(simulated)
     report_stage("describing the result")
-    axes = {name: describe_axis(one, null[name], final[name]) for name, one in found.searches.items()}
+    axes = {name: build_axis_result(one, null[name], final[name]) for name, one in found.searches.items()}
     if found.sample_rate_error is not None:
         axes = _add_sample_rate_step(axes, found.sample_rate_error, null)
     return Reconciliation(
@@ -153,8 +153,8 @@ def reconcile(
         model=extended,
         fitted_first=model is None,
         rate_hz=recording.rate_hz,
-        samples=recording.samples,
-        duration_s=recording.samples / recording.rate_hz,
+        samples=recording.sample_count,
+        duration_s=recording.sample_count / recording.rate_hz,
         seed=seed,
         notes=notes,
     )
@@ -170,8 +170,8 @@ def fit_five_terms(run: RecordingContext) -> NoiseModel:
 
 def _fit_terms(axis: Axis) -> Effects:
     """Fit the five terms to one axis and drop each term whose log-likelihood gain is too small."""
-    best = axis.fit([with_size(effect, axis.rms) for effect in UNIT_SOURCES[:4]])
-    with_ramp = axis.fit((*best.effects, RateRamp(R=axis.rms)))
+    best = axis.fit([with_effect_size(effect, axis.coefficient_rms) for effect in UNIT_SOURCES[:4]])
+    with_ramp = axis.fit((*best.effects, RateRamp(R=axis.coefficient_rms)))
     if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
         best = with_ramp
     for at in range(len(best.effects) - 1, -1, -1):
@@ -201,15 +201,15 @@ def _diagnose_simulations(
     template = run.recording
     effects = _effects_by_axis(model, template)
 
-    def diagnose(seed: int) -> dict[str, Findings]:
-        drawn = model.simulate(template.samples, template.rate_hz, seed, template.temperature_c)
+    def diagnose_simulation(seed: int) -> dict[str, Findings]:
+        drawn = model.simulate(template.sample_count, template.rate_hz, seed, template.temperature_c)
         simulated = replace(template, values={axis: drawn[:, AXES.index(axis)] for axis in template.values})
         axes = build_repaired_axes(simulated, effects, run.regressors, np.random.default_rng(seed))
         return {
             name: run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[name], effects[name]).fit)) for name in names
         }
 
-    findings = list(run.map_function(diagnose, range(first_seed, first_seed + SIMULATED_RECORDINGS)))
+    findings = list(run.map_function(diagnose_simulation, range(first_seed, first_seed + SIMULATED_RECORDINGS)))
     return {axis: [one[axis] for one in findings] for axis in names}
 
 
@@ -224,17 +224,17 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
     error = detect_sample_rate_error(axes, effects)
     if error is not None:
         ratio = float(error.ratio.value)
-        effects = {name: tuple(convert_to_stated_time(effect, ratio) for effect in of) for name, of in effects.items()}
+        effects = {name: tuple(rescale_effect_time(effect, ratio) for effect in of) for name, of in effects.items()}
 
-    def search(name: str) -> AxisSearchResult:
+    def search_named_axis(name: str) -> AxisSearchResult:
         rng = np.random.default_rng([run.seed, AXES.index(name)])
-        return search_axis(axes[name], effects[name], null[name], rng)
+        return search_missing_effects(axes[name], effects[name], null[name], rng)
 
-    found = dict(zip(axes, run.map_function(search, axes), strict=True))
+    found = dict(zip(axes, run.map_function(search_named_axis, axes), strict=True))
     for name, wrong in _reversed_leak_sources(found, null).items():
         leak_sources = {source: one for source, one in axes[name].leak_sources.items() if source not in wrong}
         axes[name] = replace(axes[name], leak_sources=leak_sources)
-        found[name] = search(name)
+        found[name] = search_named_axis(name)
     return _AxesSearchResult(found, error)
 
 
@@ -266,9 +266,7 @@ def _add_found_effects(model: NoiseModel, found: _AxesSearchResult) -> NoiseMode
     effects = dict(model.effects)
     for name, search in found.searches_that_changed_model.items():
         bias = tuple(effect for effect in model.effects.get(name, ()) if isinstance(effect, Bias))
-        effects[name] = bias + tuple(
-            convert_to_stated_time(effect, 1.0 / ratio) for effect in search.hypothesis.effects
-        )
+        effects[name] = bias + tuple(rescale_effect_time(effect, 1.0 / ratio) for effect in search.hypothesis.effects)
     if error is not None:
         effects[error.axis] = (*effects[error.axis], SampleRateError(ratio=ratio))
     return NoiseModel(effects, model.sample_rate_hz, model.temperature)

@@ -5,7 +5,7 @@ stretches of ``ROWS`` samples, spread over the recording. The step is the smalle
 values. The noise is computed from the mean absolute difference of successive samples. This mean does not depend on the
 step size, and a few outliers or a slow drift hardly affect it.
 
-``reconcile`` also detects steps that are far smaller than the noise (``value_statistics.detect_quantization``). It
+``reconcile`` also detects steps that are far smaller than the noise (``value_artifacts.detect_quantization``). It
 searches for the common divisor of all differences and compares the divisor with the resolution of the number format.
 """
 

@@ -5,7 +5,7 @@ measurement repeats all axes at the same time. The noise may change during a rec
 median of the shares in up to ``MAX_STRETCHES`` stretches of ``ROWS`` rows, spread over the recording. With fewer than
 two measured axes, the share is 0.
 
-``reconcile`` tests each axis separately (``value_statistics.detect_repeats``), because it needs the positions of the
+``reconcile`` tests each axis separately (``value_artifacts.detect_repeats``), because it needs the positions of the
 repeats and the gain in log-likelihood for a single axis.
 """
 

@@ -35,7 +35,7 @@ def describe_agreement(seen: MatchedEffect) -> str:
     """Return a text on whether the sizes of an effect agree between the recordings, with the p-value."""
     if seen.p is None:
         return "nothing to compare"
-    return f"sizes {'agree' if seen.consistent else 'differ'} ({_format_p_value(seen.p)})"
+    return f"sizes {'agree' if seen.sizes_agree else 'differ'} ({_format_p_value(seen.p)})"
 
 
 def _format_p_value(p: float) -> str:

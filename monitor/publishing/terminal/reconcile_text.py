@@ -144,7 +144,8 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
         for seen in one.common:
             said = _effect(c, axis, seen)
             said.append(
-                f"; {comparison_sentences.describe_agreement(seen)}", style="yellow" if seen.consistent is False else ""
+                f"; {comparison_sentences.describe_agreement(seen)}",
+                style="yellow" if seen.sizes_agree is False else "",
             )
             found.append((axis, said))
     return found
@@ -166,6 +167,6 @@ def _single(c: Comparison) -> list[tuple[str, Text]]:
 
 def _effect(c: Comparison, axis: str, seen: MatchedEffect) -> Text:
     """Return the description of an effect, with its name in bold."""
-    said = Text(f"{seen.kind} {words.describe_step(seen.pooled_step(), axis, c.baseline)}")
+    said = Text(f"{seen.kind} {words.describe_step(seen.step_with_pooled_parameters(), axis, c.baseline)}")
     said.highlight_words([words.readable_name(seen.effect)], "bold")
     return said

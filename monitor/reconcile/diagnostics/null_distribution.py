@@ -77,7 +77,7 @@ def _tail_quantiles(gains: Floats, axis_count: int) -> NullDistribution:
     return NullDistribution(quartile + scale * log(UPPER_QUANTILE / 0.05), quartile + scale * log(UPPER_QUANTILE / p))
 
 
-def measure_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:
+def compute_diagnostic_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:
     """Return the gaps of an axis, in the order of the diagnostics.
 
     Parameters

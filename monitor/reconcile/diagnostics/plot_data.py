@@ -14,8 +14,8 @@ from drivers.data_types import Floats, Ints
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 from monitor.noise.spectrum import allan_of_density
-from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, autocorrelation
-from monitor.reconcile.likelihood.whitening import WhitenedAxis, noise_deviation_over_time
+from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, compute_autocorrelation
+from monitor.reconcile.likelihood.whitening import WhitenedAxis, relative_noise_deviation_over_time
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import PlotData
 
@@ -26,7 +26,7 @@ LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
 """Unit of the samples by the first letter of the axis."""
 
 
-def plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
+def build_plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
     """Return the plot data of every diagnostic that has a plot."""
     fitted = _deterministic_series(whitened)
     plots = [
@@ -45,7 +45,9 @@ def plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
 def _deterministic_series(whitened: WhitenedAxis) -> Floats:
     """Return the sum of the fitted deterministic effects, shape (n,), without its mean."""
     repaired = whitened.axis.repaired
-    return np.asarray(repaired - repaired.mean() - inverse_cosine_transform(whitened.fit.residual_coefficients()))
+    return np.asarray(
+        repaired - repaired.mean() - inverse_cosine_transform(whitened.fit.coefficients_without_deterministic_effects())
+    )
 
 
 def _plot_psd(whitened: WhitenedAxis) -> PlotData:
@@ -131,7 +133,7 @@ def _plot_variance(whitened: WhitenedAxis) -> PlotData:
     """Return the plot of the noise standard deviation over time."""
     axis = whitened.axis
     length = max(1, axis.n // TIME_BLOCKS)
-    deviation = noise_deviation_over_time(whitened.fit)
+    deviation = relative_noise_deviation_over_time(whitened.fit)
     measured = np.sqrt(_block_means((whitened.flat_series * deviation) ** 2, length))
     expected = np.sqrt(_block_means(deviation**2, length))
     lo, hi = np.sqrt(_chi2_band(np.array([float(length)])))
@@ -160,7 +162,7 @@ def _plot_autocorrelation(whitened: WhitenedAxis) -> PlotData:
     lag_s = np.arange(1, MAX_LAG_SAMPLES + 1) / whitened.axis.rate_hz
     zero, band = np.zeros(MAX_LAG_SAMPLES), np.full(MAX_LAG_SAMPLES, Z95 / whitened.series.size**0.5)
     names = ("autocorrelation", "lag", "s", "autocorrelation", "1")
-    return PlotData(*names, False, lag_s, autocorrelation(whitened.series), zero, -band, band)
+    return PlotData(*names, False, lag_s, compute_autocorrelation(whitened.series), zero, -band, band)
 
 
 def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, temperature_c: Floats) -> PlotData:
@@ -171,14 +173,16 @@ def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, tempera
     count = np.bincount(cell, minlength=TEMPERATURE_BINS)
     filled = count > 0
 
-    def means(series: Floats) -> Floats:
+    def temperature_bin_means(series: Floats) -> Floats:
         return np.asarray(np.bincount(cell, weights=series, minlength=TEMPERATURE_BINS)[filled] / count[filled])
 
-    expected = means(fitted) + axis.repaired.mean()
+    expected = temperature_bin_means(fitted) + axis.repaired.mean()
     spread = np.array([_level_spread(whitened, length_s) for length_s in count[filled] / axis.rate_hz])
     names = ("temperature", "temperature", "°C", "level", _level_unit(whitened))
     middle = 0.5 * (edges[1:] + edges[:-1])[filled]
-    return PlotData(*names, False, middle, means(axis.repaired), expected, expected - spread, expected + spread)
+    return PlotData(
+        *names, False, middle, temperature_bin_means(axis.repaired), expected, expected - spread, expected + spread
+    )
 
 
 def _level_unit(whitened: WhitenedAxis) -> str:

@@ -29,14 +29,14 @@ from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 from monitor.reconcile.likelihood.effect_roles import (
     DETERMINISTIC_SIZE_PARAMETERS,
     NOISE_SIZE_PARAMETERS,
-    size,
-    unit_regressors,
+    build_unit_regressors,
+    effect_size,
+    with_effect_size,
     with_regressor_factors,
-    with_size,
 )
-from monitor.reconcile.likelihood.whittle_fit import BinSums, WhittleFit, maximise_whittle
-from monitor.reconcile.preparation.cosine_bins import Bins, cosine_transform
-from monitor.reconcile.preparation.value_statistics import Clipping, QuantizationGrid, RepeatedSamples
+from monitor.reconcile.likelihood.whittle_fit import BinnedProductSums, WhittleFit, maximise_whittle_likelihood
+from monitor.reconcile.preparation.cosine_bins import FrequencyBins, cosine_transform
+from monitor.reconcile.preparation.value_artifacts import Clipping, QuantizationGrid, RepeatedSamples
 
 MIN_BIN_POWER_RATIO: Final = 1e-4
 """Smallest power of a bin that is used, relative to the median bin. Weaker bins lie in the stop band of a filter, and
@@ -63,7 +63,7 @@ CURVATURE: Final[Regressor] = (Bias(value=1.0), 0)
 
 
 @dataclass(frozen=True, slots=True)
-class ValueStatistics:
+class ValueArtifacts:
     """Quantization, clipping and repeated samples of the measured values of an axis. None: not detected."""
 
     quantization: QuantizationGrid | None
@@ -85,16 +85,18 @@ class RegressorCache:
     """
 
     def __init__(self, n: int, rate_hz: float, temperature_c: Floats | None) -> None:
-        def transform_regressors(effect: Effect) -> list[Floats]:
-            return [cosine_transform(series) for series in unit_regressors(effect, n, rate_hz, temperature_c)]
+        def compute_regressor_transforms(effect: Effect) -> list[Floats]:
+            return [cosine_transform(series) for series in build_unit_regressors(effect, n, rate_hz, temperature_c)]
 
         self.curvature = cosine_transform(np.linspace(-1.0, 1.0, n) ** 2)
         """Cosine transform of t², shape (n − 1,)."""
         self.step_power = 0.25 / n / np.sin(0.5 * np.pi * np.arange(1, n) / n) ** 2
         """Mean square of each coefficient of a unit step, averaged over all step times, shape (n − 1,)."""
-        self._transform_regressors = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * n)))(transform_regressors)
+        self._transform_regressors = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * n)))(
+            compute_regressor_transforms
+        )
 
-    def regressor_transforms(self, effect: Effect) -> list[Floats]:
+    def regressor_cosine_transforms(self, effect: Effect) -> list[Floats]:
         """Return the cosine transform of each regressor of a deterministic effect, each of shape (n − 1,)."""
         return self._transform_regressors(with_regressor_factors(effect, np.ones(2)))
 
@@ -116,10 +118,10 @@ class Axis:
     raw: Floats  # [n] rad/s or m/s² as measured; NaN = missing
     repaired: Floats  # [n] rad/s or m/s², repaired
     coefficients: Floats  # [n − 1] cosine transform of ``repaired``
-    bins: Bins
+    bins: FrequencyBins
     leak_sources: Mapping[str, Floats]  # [n − 1] transforms of the axes that may leak into this axis
     temperature_c: Floats | None  # [n] °C
-    value_statistics: ValueStatistics
+    value_artifacts: ValueArtifacts
     regressors: RegressorCache  # shared by all axes of a recording and of its simulations
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     _products: dict[tuple[object, ...], Floats] = field(init=False, default_factory=dict)
@@ -145,19 +147,19 @@ class Axis:
         return self.n / self.rate_hz
 
     @property
-    def rms(self) -> float:
+    def coefficient_rms(self) -> float:
         """Root mean square of the coefficients, in the unit of the axis."""
         return float(np.sqrt(np.mean(self.coefficients**2)))
 
-    def with_samples(self, repaired: Floats) -> "Axis":
+    def with_repaired_samples(self, repaired: Floats) -> "Axis":
         """Return a copy of the axis with the given samples, shape (n,), in place of the repaired samples."""
         return replace(self, repaired=repaired, coefficients=cosine_transform(repaired))
 
-    def regressor_transforms(self, effect: Effect) -> list[Floats]:
+    def regressor_cosine_transforms(self, effect: Effect) -> list[Floats]:
         """Return the cosine transform of each regressor of a deterministic effect, each of shape (n − 1,)."""
         if isinstance(effect, Leak):
             return [self.leak_sources[effect.source]]
-        return self.regressors.regressor_transforms(effect)
+        return self.regressors.regressor_cosine_transforms(effect)
 
     def fit(
         self,
@@ -188,7 +190,7 @@ class Axis:
         AxisFit
             Effects with fitted sizes and the log-likelihood.
         """
-        transforms = _spectral_transforms(effects, self.value_statistics)
+        transforms = _spectral_transforms(effects, self.value_artifacts)
         noise_floor = noise_floor and any(isinstance(one, BandwidthLimit) for one in transforms)
         noise = self._noise_variances(effects, fixed_noise, transforms)
         unnamed = [(np.ones_like(noise.constant), INITIAL_FLOOR_RATIO)] if noise_floor else []
@@ -196,9 +198,9 @@ class Axis:
         bases = [*noise.bases, *(basis for basis, _ in unnamed)]
         start = [*noise.start, *(ratio * self._full_power_theta(basis) for basis, ratio in unnamed)]
         slices, columns = self._regressors_of(effects)
-        fitted = maximise_whittle(
+        fitted = maximise_whittle_likelihood(
             self.bins.count * self.used_bins,
-            self.binned_sums([*columns, CURVATURE] if curvature else columns),
+            self.sum_products_over_bins([*columns, CURVATURE] if curvature else columns),
             np.asarray(bases).reshape(len(bases), self.bins.count.size),
             noise.constant,
             np.asarray(start, np.float64),
@@ -225,22 +227,22 @@ class Axis:
                 continue
             basis = self._variance_basis(effect, effects, transforms)
             if at in fixed_noise:
-                constant += size(effect) ** 2 * basis
+                constant += effect_size(effect) ** 2 * basis
             else:
                 found.fitted.append(at)
                 found.bases.append(basis)
-                found.start.append(min(size(effect) ** 2, self._full_power_theta(basis)))
+                found.start.append(min(effect_size(effect) ** 2, self._full_power_theta(basis)))
         return found
 
-    def binned_sums(self, columns: Sequence[Regressor]) -> BinSums:
+    def sum_products_over_bins(self, regressors: Sequence[Regressor]) -> BinnedProductSums:
         """Return the sums over bins of the products of the axis and the regressors."""
-        q, m = len(columns), self.bins.count.size
+        q, m = len(regressors), self.bins.count.size
         cross, gram = np.empty((q, m)), np.empty((q, q, m))
-        for i, column in enumerate(columns):
+        for i, column in enumerate(regressors):
             cross[i] = self._binned_product(column, None)
             for j in range(i + 1):
-                gram[i, j] = gram[j, i] = self._binned_product(column, columns[j])
-        return BinSums(self._binned_product(None, None), cross, gram)
+                gram[i, j] = gram[j, i] = self._binned_product(column, regressors[j])
+        return BinnedProductSums(self._binned_product(None, None), cross, gram)
 
     def _regressors_of(self, effects: Sequence[Effect]) -> tuple[tuple[tuple[int, slice], ...], list[Regressor]]:
         """Return the index and the slice of β of each deterministic effect, and all regressors."""
@@ -248,7 +250,7 @@ class Axis:
         columns: list[Regressor] = []
         for at, effect in enumerate(effects):
             if type(effect) in DETERMINISTIC_SIZE_PARAMETERS:
-                count = len(self.regressor_transforms(effect))
+                count = len(self.regressor_cosine_transforms(effect))
                 slices.append((at, slice(len(columns), len(columns) + count)))
                 columns += [(effect, i) for i in range(count)]
         return tuple(slices), columns
@@ -261,7 +263,7 @@ class Axis:
                 if isinstance(other, NoiseStep):
                     later = 1.0 - min(other.time * self.rate_hz / self.n, 1.0)
                     factor *= 1.0 + later * (other.ratio**2 - 1.0)  # mean variance over the recording
-        tau0_s, unit = 1.0 / self.rate_hz, with_size(effect, 1.0)
+        tau0_s, unit = 1.0 / self.rate_hz, with_effect_size(effect, 1.0)
         assert isinstance(unit, Source)
         source = Spectrum(lambda f: factor * unit.psd(f, tau0_s), None, tau0_s)
         density = _density_after(transforms, source, self.bins) - _density_after(transforms, None, self.bins)
@@ -288,7 +290,7 @@ class Axis:
         return (
             self.regressors.curvature
             if regressor is CURVATURE
-            else self.regressor_transforms(regressor[0])[regressor[1]]
+            else self.regressor_cosine_transforms(regressor[0])[regressor[1]]
         )
 
 
@@ -305,22 +307,22 @@ class AxisFit:
     regressor_slices: tuple[tuple[int, slice], ...]  # index in ``effects`` and slice of β of each deterministic effect
     noise_floor_variance: float = 0.0  # variance of a coefficient due to the white noise floor after a low-pass filter
 
-    def size_error(self, index: int) -> float:
+    def size_standard_error(self, effect_index: int) -> float:
         """Return the standard error of the size of the effect with the given index, or NaN for a fixed size."""
-        if index in self.fitted_noise:
-            noise = self.fitted_noise.index(index)
+        if effect_index in self.fitted_noise:
+            noise = self.fitted_noise.index(effect_index)
             covariance = np.linalg.pinv(self.whittle.theta_information)
             theta = float(self.whittle.theta[noise])
             return 0.5 * float(np.sqrt(covariance[noise, noise] / theta)) if theta > 0.0 else float("nan")
         for at, place in self.regressor_slices:
-            if at == index:  # the two regressors of a sinusoid have equal errors
+            if at == effect_index:  # the two regressors of a sinusoid have equal errors
                 return float(np.sqrt(np.diag(self.whittle.beta_covariance)[place].mean()))
         return float("nan")
 
     def with_regressor_sizes(self, beta: Floats) -> "AxisFit":
         """Return the fit with the given sizes of the regressors, shape (q,), and the same noise."""
         axis, whittle = self.axis, self.whittle
-        sums = axis.binned_sums(
+        sums = axis.sum_products_over_bins(
             [(self.effects[at], i) for at, p in self.regressor_slices for i in range(p.stop - p.start)]
         )
         residual = sums.power - 2.0 * beta @ sums.cross + np.einsum("i,j,ijb->b", beta, beta, sums.gram)
@@ -329,18 +331,18 @@ class AxisFit:
         changed = replace(whittle, beta=beta, residual=np.maximum(residual, 0.0), log_likelihood=value)
         return replace(self, whittle=changed, log_likelihood=value)
 
-    def residual_coefficients(self) -> Floats:
+    def coefficients_without_deterministic_effects(self) -> Floats:
         """Return the coefficients, shape (n − 1,), less all fitted deterministic effects."""
         left = self.axis.coefficients.copy()
         for at, place in self.regressor_slices:
             for factor, column in zip(
-                self.whittle.beta[place], self.axis.regressor_transforms(self.effects[at]), strict=True
+                self.whittle.beta[place], self.axis.regressor_cosine_transforms(self.effects[at]), strict=True
             ):
                 left -= factor * column
         return left
 
 
-def _spectral_transforms(effects: Sequence[Effect], statistics: ValueStatistics) -> list[Transform]:
+def _spectral_transforms(effects: Sequence[Effect], statistics: ValueArtifacts) -> list[Transform]:
     """Return the transforms that change the spectrum, in the order in which the transforms act.
 
     Repeated samples at known positions were replaced, so that they do not change the spectrum.
@@ -360,13 +362,13 @@ def _with_fitted_sizes(
     """Return the effects with their fitted sizes."""
     found = list(effects)
     for theta, at in zip(fitted.theta, noises, strict=False):  # additional bases follow the bases of the effects
-        found[at] = with_size(found[at], float(theta) ** 0.5)
+        found[at] = with_effect_size(found[at], float(theta) ** 0.5)
     for at, place in slices:
         found[at] = with_regressor_factors(found[at], fitted.beta[place])
     return tuple(found)
 
 
-def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bins: Bins) -> Floats:
+def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bins: FrequencyBins) -> Floats:
     """Return the spectral density, shape (m,), of a source after the transforms of an axis.
 
     If the source is None, the result is the noise that the transforms add. Rounding adds white noise, even if the
@@ -386,4 +388,7 @@ def _regressor_key(regressor: Regressor | None) -> tuple[object, int] | None:
     if regressor is None or regressor is CURVATURE:
         return regressor
     effect, at = regressor
-    return (with_size(effect, 1.0) if isinstance(effect, Leak) else with_regressor_factors(effect, np.ones(2)), at)
+    return (
+        with_effect_size(effect, 1.0) if isinstance(effect, Leak) else with_regressor_factors(effect, np.ones(2)),
+        at,
+    )

@@ -82,29 +82,29 @@ MOST_DIRECT_DIAGNOSTIC: Final = {effect: lens for lens, effects in _EFFECTS_BY_D
 """For each effect, the diagnostic that shows the effect most directly."""
 
 
-def size(effect: Effect) -> float:
+def effect_size(effect: Effect) -> float:
     """Return the size of a noise effect or of a deterministic effect."""
     return float(getattr(effect, SIZE_PARAMETERS[type(effect)]))
 
 
-def with_size(effect: Effect, value: float) -> Effect:
+def with_effect_size(effect: Effect, size: float) -> Effect:
     """Return the effect with the given size.
 
-    The sizes of noise effects, ramps and sinusoids are never negative, so the sign of the value is ignored for them.
+    The sizes of noise effects, ramps and sinusoids are never negative, so the sign of the new size is ignored for them.
 
     Parameters
     ----------
     effect : Effect
         Noise effect or deterministic effect.
-    value : float
+    size : float
         New size, in the unit of the size parameter.
     """
     name = SIZE_PARAMETERS[type(effect)]
     unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or type(effect) in NOISE_SIZE_PARAMETERS
-    return replace(effect, **{name: abs(value) if unsigned else value})  # type: ignore[type-var]
+    return replace(effect, **{name: abs(size) if unsigned else size})  # type: ignore[type-var]
 
 
-def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
+def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
     """Return the regressors of a deterministic effect.
 
     A sinusoid has one regressor for each of two phases. A quadratic temperature effect has one regressor for the linear
@@ -142,7 +142,7 @@ def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Float
             replace(effect, coefficient=0.0, quadratic=1.0),
         ]
     else:
-        variants = [with_size(effect, 1.0)]
+        variants = [with_effect_size(effect, 1.0)]
     return [_series_of(one, n, rate_hz, temperature_c) for one in variants]
 
 
@@ -160,7 +160,7 @@ def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
         return replace(effect, amplitude=hypot(*factors), phase=atan2(factors[1], factors[0]) % (2.0 * pi))
     if isinstance(effect, TemperatureBias) and effect.quadratic is not None:
         return replace(effect, coefficient=float(factors[0]), quadratic=float(factors[1]))
-    return with_size(effect, float(factors[0]))
+    return with_effect_size(effect, float(factors[0]))
 
 
 def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
-from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, size
+from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, effect_size
 from monitor.reconcile.result import ParameterInterval
 
 RESIZE_PENALTY_NATS: Final = 5.0
@@ -63,7 +63,7 @@ class Hypothesis:
         return RESIZE_PENALTY_NATS * self.refitted_size_count
 
     @property
-    def score(self) -> float:
+    def penalised_log_likelihood(self) -> float:
         """Log-likelihood less the penalties for fitted sizes of the model, in nats."""
         return self.fit.log_likelihood - self.resize_penalty
 
@@ -84,7 +84,7 @@ def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    return Hypothesis(model, axis.fit(model, noise_indices(model)))
+    return Hypothesis(model, axis.fit(model, noise_effect_indices(model)))
 
 
 def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects) -> Hypothesis:
@@ -100,7 +100,7 @@ def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects)
         Effects of the axis in the model under test.
     """
     effects = (*model, *added)
-    fixed_noise = noise_indices(model)
+    fixed_noise = noise_effect_indices(model)
     best = Hypothesis(model, axis.fit(effects, fixed_noise))
     if not fixed_noise:
         return best
@@ -109,31 +109,33 @@ def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects)
         return best
     while fixed_noise:
         trials = [Hypothesis(model, axis.fit(effects, fixed_noise - {at})) for at in sorted(fixed_noise)]
-        better = max(trials, key=lambda one: one.score)
-        if better.score <= best.score:
+        better = max(trials, key=lambda one: one.penalised_log_likelihood)
+        if better.penalised_log_likelihood <= best.penalised_log_likelihood:
             break
         best, fixed_noise = better, better.fit.fixed_noise
     # the loop fits one more size at a time and cannot find two sizes that improve the fit only together
-    return free if free.score > best.score else best
+    return free if free.penalised_log_likelihood > best.penalised_log_likelihood else best
 
 
-def noise_indices(effects: Sequence[Effect]) -> frozenset[int]:
+def noise_effect_indices(effects: Sequence[Effect]) -> frozenset[int]:
     """Return the indices of the noise effects."""
     return frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE_SIZE_PARAMETERS)
 
 
-def refine_shape(axis: Axis, others: Effects, effect: Effect, name: str, search_factor: float = 1.5) -> Effect:
+def fit_shape_parameter(
+    axis: Axis, other_effects: Effects, effect: Effect, parameter_name: str, search_factor: float = 1.5
+) -> Effect:
     """Maximise the likelihood over one shape parameter of an effect, with all sizes fitted.
 
     Parameters
     ----------
     axis : Axis
         Axis to fit.
-    others : tuple of Effect
+    other_effects : tuple of Effect
         Other effects of the axis.
     effect : Effect
         Effect whose shape parameter is varied.
-    name : str
+    parameter_name : str
         Name of the shape parameter.
     search_factor : float, optional
         Largest factor between the result and the present value, in either direction.
@@ -144,15 +146,18 @@ def refine_shape(axis: Axis, others: Effects, effect: Effect, name: str, search_
         The effect with the best shape and the same size.
     """
 
-    def with_shape(log_value: float) -> Effect:
-        changed: Effect = replace(effect, **{name: exp(log_value)})  # type: ignore[type-var]
+    def with_shape_parameter(log_value: float) -> Effect:
+        changed: Effect = replace(effect, **{parameter_name: exp(log_value)})  # type: ignore[type-var]
         return changed
 
-    middle, width = log(getattr(effect, name)), log(search_factor)
+    middle, width = log(getattr(effect, parameter_name)), log(search_factor)
     best = find_maximum_by_golden_section(
-        lambda x: axis.fit((*others, with_shape(x))).log_likelihood, middle - width, middle + width, SHAPE_ITERATIONS
+        lambda x: axis.fit((*other_effects, with_shape_parameter(x))).log_likelihood,
+        middle - width,
+        middle + width,
+        SHAPE_ITERATIONS,
     )
-    return with_shape(best)
+    return with_shape_parameter(best)
 
 
 def find_maximum_by_golden_section(function: Callable[[float], float], lo: float, hi: float, iterations: int) -> float:
@@ -181,7 +186,7 @@ def find_maximum_by_golden_section(function: Callable[[float], float], lo: float
     return 0.5 * (lo + hi)
 
 
-def size_interval(fit: AxisFit, index: int) -> ParameterInterval:
+def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
     """Return the size of an effect with the 95 % interval.
 
     The error of the logarithm is Gaussian for the size of a noise effect. The error of the size itself is Gaussian for
@@ -191,11 +196,11 @@ def size_interval(fit: AxisFit, index: int) -> ParameterInterval:
     ----------
     fit : AxisFit
         Fit that contains the effect.
-    index : int
+    effect_index : int
         Index of the effect.
     """
-    value, error = size(fit.effects[index]), fit.size_error(index)
-    if type(fit.effects[index]) in DETERMINISTIC_SIZE_PARAMETERS:
+    value, error = effect_size(fit.effects[effect_index]), fit.size_standard_error(effect_index)
+    if type(fit.effects[effect_index]) in DETERMINISTIC_SIZE_PARAMETERS:
         return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
         return ParameterInterval(value)
@@ -208,7 +213,7 @@ def _with_shape(effects: Effects, index: int, name: str, value: float) -> Effect
     return (*effects[:index], changed, *effects[index + 1 :])
 
 
-def shape_interval(fit: AxisFit, index: int, name: str) -> ParameterInterval:
+def compute_shape_interval(fit: AxisFit, effect_index: int, parameter_name: str) -> ParameterInterval:
     """Return a shape parameter with the 95 % interval from the profile likelihood.
 
     At each end of the interval, the log-likelihood is ``HALF_CHI2_95`` below the maximum.
@@ -217,25 +222,25 @@ def shape_interval(fit: AxisFit, index: int, name: str) -> ParameterInterval:
     ----------
     fit : AxisFit
         Fit that contains the effect.
-    index : int
+    effect_index : int
         Index of the effect.
-    name : str
+    parameter_name : str
         Name of the shape parameter.
     """
-    value = float(getattr(fit.effects[index], name))
+    value = float(getattr(fit.effects[effect_index], parameter_name))
 
-    def fall(factor: float) -> float:
-        changed = _with_shape(fit.effects, index, name, value * factor)
+    def log_likelihood_loss(factor: float) -> float:
+        changed = _with_shape(fit.effects, effect_index, parameter_name, value * factor)
         return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_noise).log_likelihood
 
     ends = []
     for sign in (-1.0, 1.0):
         step = 1e-6
-        while step < 2.0 and fall(exp(sign * step)) < HALF_CHI2_95:
+        while step < 2.0 and log_likelihood_loss(exp(sign * step)) < HALF_CHI2_95:
             step *= 2.0
         lo, hi = 0.5 * step, step
         for _ in range(8):
             middle = 0.5 * (lo + hi)
-            lo, hi = (middle, hi) if fall(exp(sign * middle)) < HALF_CHI2_95 else (lo, middle)
+            lo, hi = (middle, hi) if log_likelihood_loss(exp(sign * middle)) < HALF_CHI2_95 else (lo, middle)
         ends.append(value * exp(sign * hi))
     return ParameterInterval(value, ends[0], ends[1])

@@ -21,7 +21,7 @@ from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import NORMAL_QUARTILE, Z95
-from monitor.reconcile.preparation.value_statistics import Mask, ValueWithInterval
+from monitor.reconcile.preparation.value_artifacts import Mask, ValueWithInterval
 
 LINEAR_BINS: Final = 240
 LINEAR_RANGE_SIGMA: Final = 6.0
@@ -62,12 +62,12 @@ class OutlierFit:
     misfit_z: float  # z of the misfit between the magnitudes and the mixture
 
 
-def fit_outliers(w: Floats) -> OutlierFit | None:
+def fit_outliers(residuals: Floats) -> OutlierFit | None:
     """Fit a mixture of two Gaussians to white residuals.
 
     Parameters
     ----------
-    w : ndarray of float64, shape (n,)
+    residuals : ndarray of float64, shape (n,)
         White residuals. NaN values are ignored.
 
     Returns
@@ -84,13 +84,13 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     >>> print(f"{found.fraction.value:.4f} {found.scale.value:.1f}", found.gain > 100.0, found.gain_over_student > 5.0)
     0.0023 7.2 True True
     """
-    good = np.isfinite(w)
+    good = np.isfinite(residuals)
     n = int(good.sum())
-    some = np.abs(w[good][:: max(1, n // 20_000)])
+    some = np.abs(residuals[good][:: max(1, n // 20_000)])
     unit = float(np.median(some)) / NORMAL_QUARTILE if n >= 100 else 0.0
     if not unit > 0.0:
         return None
-    counts, squares = _bin_magnitudes(w, unit)
+    counts, squares = _bin_magnitudes(residuals, unit)
     kept = np.flatnonzero(counts)
     counts, squares = counts[kept], squares[kept] / counts[kept]
     narrow, wide, share, best = _fit_mixture(counts, squares, START_WIDTHS)
@@ -98,7 +98,11 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     if not (gain > MIN_MIXTURE_GAIN_NATS and wide > narrow):
         return None
     far = _outlier_threshold(narrow, wide, share)
-    mask = np.asarray(np.abs(w) > far * unit) & good if np.isfinite(far) else np.zeros(w.size, dtype=np.bool_)
+    mask = (
+        np.asarray(np.abs(residuals) > far * unit) & good
+        if np.isfinite(far)
+        else np.zeros(residuals.size, dtype=np.bool_)
+    )
     fraction, scale = _parameter_intervals(counts, squares, narrow, wide, share)
     return OutlierFit(
         fraction=fraction,
@@ -107,7 +111,7 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
         count=int(mask.sum()),
         gain=float(gain),
         gain_over_student=float(best - _student_log_likelihood(counts, squares)),
-        clustering_z=_clustering_z(np.flatnonzero(mask), w.size),
+        clustering_z=_clustering_z(np.flatnonzero(mask), residuals.size),
         misfit_z=_misfit_z(counts, kept, narrow, wide, share),
     )
 
@@ -238,7 +242,7 @@ def _parameter_intervals(
     """
     at = np.array([0.5 * np.log(narrow), 0.5 * np.log(max(wide - narrow, 1e-12)), np.log(share) - np.log1p(-share)])
 
-    def like(x: Floats) -> float:
+    def log_likelihood(x: Floats) -> float:
         inner, f = np.exp(2.0 * x[0]), 1.0 / (1.0 + np.exp(-x[2]))
         return float(np.dot(counts, _mixture_log_density(squares, inner, inner + np.exp(2.0 * x[1]), f)))
 
@@ -247,9 +251,12 @@ def _parameter_intervals(
     for i in range(3):
         for j in range(3):
             a, b = step[i], step[j]
-            curve[i, j] = (like(at + a - b) + like(at - a + b) - like(at + a + b) - like(at - a - b)) / (
-                4.0 * a[i] * b[j]
-            )
+            curve[i, j] = (
+                log_likelihood(at + a - b)
+                + log_likelihood(at - a + b)
+                - log_likelihood(at + a + b)
+                - log_likelihood(at - a - b)
+            ) / (4.0 * a[i] * b[j])
     variance = np.diag(np.linalg.pinv(curve))
     half = np.where(variance > 0.0, Z95 * np.sqrt(np.maximum(variance, 0.0)), 700.0)
     with np.errstate(over="ignore"):

@@ -24,15 +24,15 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     EventProcessComparison,
     EventProcessFit,
     StateSpaceNoise,
-    block_means,
+    build_state_space_noise,
+    compute_block_means,
     fit_event_process,
-    initial_covariance,
+    initial_state_covariance,
     innovation_of_block,
     kalman_log_likelihood,
     maximise_log_likelihood,
     predict_block_mean_variance,
     prior_level_variance,
-    state_space_noise,
 )
 
 BLOCKS_PER_CROSSING_TIME: Final = 3.0
@@ -75,17 +75,19 @@ def compare_poisson_with_random_walk(
     ValueError
         If the series is too short or the background contains no white noise.
     """
-    means, block_s = block_means(y, tau0_s, block_length_s(y.size * tau0_s, background, K))
+    means, block_s = compute_block_means(y, tau0_s, choose_block_length_s(y.size * tau0_s, background, K))
     level_variance, duration_s = prior_level_variance(means), means.size * block_s
 
-    def walk(K: float) -> float:
-        noise = state_space_noise(replace(background, walk=background.walk + K * K), block_s, duration_s)
+    def random_walk_log_likelihood(K: float) -> float:
+        noise = build_state_space_noise(replace(background, walk=background.walk + K * K), block_s, duration_s)
         return float(kalman_log_likelihood(means, noise, level_variance))
 
-    return fit_jumps(means, block_s, background, K).compare_with_effect(maximise_log_likelihood(walk, (K,))[0])
+    return fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
+        maximise_log_likelihood(random_walk_log_likelihood, (K,))[0]
+    )
 
 
-def block_length_s(duration_s: float, background: BackgroundNoise, K: float) -> float:
+def choose_block_length_s(duration_s: float, background: BackgroundNoise, K: float) -> float:
     """Return the length of a block in seconds.
 
     Parameters
@@ -101,7 +103,7 @@ def block_length_s(duration_s: float, background: BackgroundNoise, K: float) -> 
     return min(crossing_s / BLOCKS_PER_CROSSING_TIME, duration_s / TARGET_BLOCKS)
 
 
-def fit_jumps(means: Floats, block_s: float, background: BackgroundNoise, K: float) -> EventProcessFit:
+def fit_poisson_jumps(means: Floats, block_s: float, background: BackgroundNoise, K: float) -> EventProcessFit:
     """Maximise the likelihood over the rate and the height of the jumps.
 
     The search starts from the likeliest of several rates. The height at the start gives the same second moments as a
@@ -119,16 +121,16 @@ def fit_jumps(means: Floats, block_s: float, background: BackgroundNoise, K: flo
         Random walk coefficient in unit/√s.
     """
     duration_s, level_variance = means.size * block_s, prior_level_variance(means)
-    noise = state_space_noise(background, block_s, duration_s)
+    noise = build_state_space_noise(background, block_s, duration_s)
 
-    def poisson(rate: float, height: float, odds: float = 1.0) -> float:
+    def poisson_log_likelihood(rate: float, height: float, odds: float = 1.0) -> float:
         return _log_likelihood(means, noise, level_variance, rate * block_s, height, odds)
 
     rates = np.geomspace(
         2.0 / duration_s, max(MAX_START_JUMPS * K / background.white**0.5, 4.0 / duration_s), START_RATES
     )
-    rate = max(rates, key=lambda rate: poisson(rate, K / rate**0.5))
-    return fit_event_process(poisson, {"rate": rate, "height": K / rate**0.5})
+    rate = max(rates, key=lambda rate: poisson_log_likelihood(rate, K / rate**0.5))
+    return fit_event_process(poisson_log_likelihood, {"rate": rate, "height": K / rate**0.5})
 
 
 def _log_likelihood(
@@ -171,7 +173,7 @@ def _jump_log_likelihood(
     # entries 0 to JUMP_AGES − 1 have no jump in this block, the other entries have a jump
     branches = _GaussianMixture(np.empty(2 * JUMP_AGES), np.zeros((2 * JUMP_AGES, d)), np.zeros((2 * JUMP_AGES, d, d)))
     by_age.weight[JUMP_AGES - 1] = 1.0
-    by_age.covariance[JUMP_AGES - 1] = initial_covariance(noise, level_variance)
+    by_age.covariance[JUMP_AGES - 1] = initial_state_covariance(noise, level_variance)
     total: float = -0.5 * means.size * np.log(2.0 * np.pi)
     for block_mean in means:
         for age in range(JUMP_AGES):

@@ -24,12 +24,12 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     BackgroundNoise,
     EventProcessComparison,
     StateSpaceNoise,
-    block_means,
+    build_state_space_noise,
+    compute_block_means,
     innovation_variances,
     innovations_of_series,
     kalman_log_likelihood,
     prior_level_variance,
-    state_space_noise,
 )
 
 TIMES_PER_BLOCK: Final = 8
@@ -70,9 +70,13 @@ def compare_poisson_with_single_steps(
     ValueError
         If the series is too short or the background contains no white noise.
     """
-    means, block_s = block_means(y, tau0_s, poisson_steps.block_length_s(y.size * tau0_s, background, K))
-    single = _fit_single_steps(means, state_space_noise(background, block_s, means.size * block_s), max_single_steps)
-    return poisson_steps.fit_jumps(means, block_s, background, K).compare_with_effect(single.score, single.times.size)
+    means, block_s = compute_block_means(y, tau0_s, poisson_steps.choose_block_length_s(y.size * tau0_s, background, K))
+    single = _fit_single_steps(
+        means, build_state_space_noise(background, block_s, means.size * block_s), max_single_steps
+    )
+    return poisson_steps.fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
+        single.score, single.times.size
+    )
 
 
 def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: int) -> _SingleStepsFit:

@@ -83,21 +83,23 @@ class EventProcessFit(NamedTuple):
     parameters: dict[str, ParameterInterval]
     events: float  # expected number of events, given the data
 
-    def compare_with_effect(self, other_log_likelihood: float, single_steps: int = 0) -> EventProcessComparison:
+    def compare_with_other_effect(
+        self, other_log_likelihood: float, single_step_count: int = 0
+    ) -> EventProcessComparison:
         """Compare the process with another effect.
 
         Parameters
         ----------
         other_log_likelihood : float
             Maximum log-likelihood of the other effect for the same data.
-        single_steps : int, optional
+        single_step_count : int, optional
             Number of steps if the other effect consists of single steps.
         """
         gain = self.log_likelihood - other_log_likelihood
-        return EventProcessComparison(gain, self.parameters, round(self.events), single_steps)
+        return EventProcessComparison(gain, self.parameters, round(self.events), single_step_count)
 
 
-def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
+def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
     """Return the means of consecutive blocks, less the mean of the series, and the length of a block.
 
     Parameters
@@ -123,7 +125,8 @@ def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float
 
     Examples
     --------
-    >>> block_means(np.arange(48.0), 0.5, 1.4)[0][:3].tolist(), block_means(np.arange(48.0), 0.5, 1.4)[1]
+    >>> means, block_s = compute_block_means(np.arange(48.0), 0.5, 1.4)
+    >>> means[:3].tolist(), block_s
     ([-22.5, -19.5, -16.5], 1.5)
     """
     size = max(1, round(block_s / tau0_s))
@@ -134,7 +137,7 @@ def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float
     return means - means.mean(), size * tau0_s
 
 
-def state_space_noise(background: BackgroundNoise, block_s: float, duration_s: float) -> StateSpaceNoise:
+def build_state_space_noise(background: BackgroundNoise, block_s: float, duration_s: float) -> StateSpaceNoise:
     """Return the state-space model of noise in block means.
 
     Parameters
@@ -156,13 +159,15 @@ def state_space_noise(background: BackgroundNoise, block_s: float, duration_s: f
     walk = background.walk * block_s
     rows, white = [(1.0, 1.0, walk, 0.5 * walk)], background.white / block_s + walk / 3.0
     for sigma, time_s in (*background.correlated, *_flicker_processes(background, block_s, duration_s)):
-        row, own = block_markov_noise(sigma, time_s, block_s)
+        row, own = correlated_noise_of_block_means(sigma, time_s, block_s)
         rows.append(row)
         white += own
     return StateSpaceNoise(np.array(rows), white)
 
 
-def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tuple[float, float, float, float], float]:
+def correlated_noise_of_block_means(
+    sigma: float, correlation_time_s: float, block_s: float
+) -> tuple[tuple[float, float, float, float], float]:
     """Return the state-space model of exponentially correlated noise in block means.
 
     Let σ be the standard deviation of the noise and x the ratio of block length to correlation time. The mean of a
@@ -173,7 +178,7 @@ def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tup
     ----------
     sigma : float
         Standard deviation, in the unit of the axis.
-    time_s : float
+    correlation_time_s : float
         Correlation time in seconds.
     block_s : float
         Length of a block in seconds.
@@ -185,7 +190,7 @@ def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tup
     variance : float
         Variance of the block mean given the noise at the start of the block.
     """
-    x = block_s / time_s
+    x = block_s / correlation_time_s
     decay, mean_share = exp(-x), -float(np.expm1(-x)) / x
     own = x * (2.0 / 3.0 - x * (0.5 - x * 7.0 / 30.0)) if x < 0.01 else 2.0 * (x - 1.0 + decay) / x**2 - mean_share**2
     return (
@@ -214,14 +219,16 @@ def _flicker_processes(background: BackgroundNoise, block_s: float, duration_s: 
     return [(sigma, slowest * exp(-k * spacing)) for k in range(count)]
 
 
-def maximise_log_likelihood(log_likelihood: Callable[..., float], start: Sequence[float]) -> tuple[float, Floats]:
+def maximise_log_likelihood(
+    log_likelihood: Callable[..., float], start_values: Sequence[float]
+) -> tuple[float, Floats]:
     """Maximise a log-likelihood over the logarithms of positive parameters by the Nelder-Mead method.
 
     Parameters
     ----------
     log_likelihood : callable
         Function of the parameters.
-    start : sequence of float
+    start_values : sequence of float
         Starting values of the parameters.
 
     Returns
@@ -233,7 +240,7 @@ def maximise_log_likelihood(log_likelihood: Callable[..., float], start: Sequenc
     """
     from scipy.optimize import minimize
 
-    origin = np.log(np.asarray(start, np.float64))
+    origin = np.log(np.asarray(start_values, np.float64))
     found = minimize(
         lambda at: -log_likelihood(*np.exp(at)),
         origin,
@@ -250,7 +257,7 @@ def maximise_log_likelihood(log_likelihood: Callable[..., float], start: Sequenc
 
 
 def fit_event_process(
-    likelihood: Callable[[float, float, float], float], start: Mapping[str, float]
+    log_likelihood: Callable[[float, float, float], float], start_values: Mapping[str, float]
 ) -> EventProcessFit:
     """Maximise the likelihood of a process of random events over its two parameters.
 
@@ -259,17 +266,17 @@ def fit_event_process(
 
     Parameters
     ----------
-    likelihood : callable
+    log_likelihood : callable
         Function of the two parameters and of a factor on the odds of an event.
-    start : mapping of str to float
+    start_values : mapping of str to float
         Names and starting values of the two parameters.
     """
-    height, at = maximise_log_likelihood(lambda a, b: likelihood(a, b, 1.0), list(start.values()))
-    deviations = _log_deviations(lambda x: likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height)
+    height, at = maximise_log_likelihood(lambda a, b: log_likelihood(a, b, 1.0), list(start_values.values()))
+    deviations = _log_deviations(lambda x: log_likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height)
     first, second = np.exp(at).tolist()
-    events = (likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
+    events = (log_likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
     bounds = [_log_interval(*one) for one in zip((first, second), deviations.tolist(), strict=True)]
-    return EventProcessFit(height, dict(zip(start, bounds, strict=True)), events)
+    return EventProcessFit(height, dict(zip(start_values, bounds, strict=True)), events)
 
 
 def _log_interval(value: float, deviation: float) -> ParameterInterval:
@@ -310,7 +317,7 @@ def prior_level_variance(means: Floats) -> float:
 
 
 @compiled
-def initial_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
+def initial_state_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
     """Return the state covariance, shape (d, d), before the first block.
 
     The prior variance of the level is ``level_variance``. The other processes are stationary.
@@ -362,7 +369,7 @@ def innovation_variances(
     table = noise.table
     d, m = table.shape[0], extra_level_variance.size
     variances, state_covariances = np.empty(m), np.empty((m, d))
-    covariance = initial_covariance(noise, level_variance)
+    covariance = initial_state_covariance(noise, level_variance)
     for k in range(m):
         covariance[0, 0] += extra_level_variance[k]
         variances[k] = predict_block_mean_variance(noise, covariance, state_covariances[k])

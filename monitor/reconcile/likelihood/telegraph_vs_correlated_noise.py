@@ -22,16 +22,16 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     EventProcessComparison,
     EventProcessFit,
     StateSpaceNoise,
-    block_markov_noise,
-    block_means,
+    build_state_space_noise,
+    compute_block_means,
+    correlated_noise_of_block_means,
     fit_event_process,
-    initial_covariance,
+    initial_state_covariance,
     innovation_of_block,
     kalman_log_likelihood,
     maximise_log_likelihood,
     predict_block_mean_variance,
     prior_level_variance,
-    state_space_noise,
 )
 
 BLOCKS_PER_CORRELATION_TIME: Final = 8.0
@@ -80,21 +80,26 @@ def compare_telegraph_with_correlated_noise(
     ValueError
         If the series is too short or the background contains no white noise.
     """
-    means, block_s = block_means(
-        y, tau0_s, _block_length_s(y.size * tau0_s, tau0_s, correlation_time, background.white / sigma**2)
+    means, block_s = compute_block_means(
+        y, tau0_s, _choose_block_length_s(y.size * tau0_s, tau0_s, correlation_time, background.white / sigma**2)
     )
-    noise, level_variance = state_space_noise(background, block_s, means.size * block_s), prior_level_variance(means)
+    noise, level_variance = (
+        build_state_space_noise(background, block_s, means.size * block_s),
+        prior_level_variance(means),
+    )
 
-    def correlated(sigma: float, time_s: float) -> float:
-        row, own = block_markov_noise(sigma, time_s, block_s)
+    def correlated_noise_log_likelihood(sigma: float, time_s: float) -> float:
+        row, own = correlated_noise_of_block_means(sigma, time_s, block_s)
         both = StateSpaceNoise(np.vstack([noise.table, row]), noise.white + own)
         return float(kalman_log_likelihood(means, both, level_variance))
 
     telegraph = _fit_telegraph(means, block_s, noise, sigma, correlation_time)
-    return telegraph.compare_with_effect(maximise_log_likelihood(correlated, (sigma, correlation_time))[0])
+    return telegraph.compare_with_other_effect(
+        maximise_log_likelihood(correlated_noise_log_likelihood, (sigma, correlation_time))[0]
+    )
 
 
-def _block_length_s(duration_s: float, tau0_s: float, correlation_time: float, equal_noise_s: float) -> float:
+def _choose_block_length_s(duration_s: float, tau0_s: float, correlation_time: float, equal_noise_s: float) -> float:
     """Return the length of a block in seconds.
 
     In a block of ``equal_noise_s`` seconds, the white noise of the block mean is half of the amplitude. Shorter blocks
@@ -113,7 +118,7 @@ def _fit_telegraph(
     """Maximise the likelihood over amplitude and dwell time, from several starting values."""
     level_variance = prior_level_variance(means)
 
-    def two_levels(amplitude: float, dwell_s: float, odds: float) -> float:
+    def telegraph_log_likelihood(amplitude: float, dwell_s: float, odds: float) -> float:
         return _log_likelihood(means, noise, level_variance, amplitude, block_s / dwell_s, odds)
 
     starts = [
@@ -121,8 +126,8 @@ def _fit_telegraph(
         for a in START_AMPLITUDE_FACTORS.tolist()
         for d in START_DWELL_FACTORS
     ]
-    amplitude, dwell_s = max(starts, key=lambda start: two_levels(start[0], start[1], 1.0))
-    return fit_event_process(two_levels, {"amplitude": amplitude, "dwell_time": dwell_s})
+    amplitude, dwell_s = max(starts, key=lambda start: telegraph_log_likelihood(start[0], start[1], 1.0))
+    return fit_event_process(telegraph_log_likelihood, {"amplitude": amplitude, "dwell_time": dwell_s})
 
 
 def _log_likelihood(
@@ -174,7 +179,7 @@ def _initial_state(noise: StateSpaceNoise, level_variance: float, first_level: i
     d = noise.table.shape[0]
     state = _SwitchingFilterState(np.zeros(2), np.zeros((2, d)), np.empty((2, d, d)))
     state.probability[first_level] = 1.0
-    state.covariance[:] = initial_covariance(noise, level_variance)
+    state.covariance[:] = initial_state_covariance(noise, level_variance)
     return state
 
 

@@ -4,7 +4,7 @@
 periodic variation and a slow random variation. The alternatives are fitted to the mean squares of blocks, which have a
 χ² distribution. Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable.
 
-``find_least_constant_tiles`` divides the recording into pieces and computes the Fourier transform of each piece at the
+``find_spectrogram_change`` divides the recording into pieces and computes the Fourier transform of each piece at the
 frequencies (k + ½)/piece. At these frequencies, the coefficients of white noise are independent, and the power of a
 steady line is the same in each piece. A **tile** is a rectangle of 2^a pieces by 2^b frequencies. A **row** consists of
 all tiles at the same frequencies. Each tile is compared with the other tiles of the same row, so that a steady line or
@@ -26,7 +26,7 @@ from scipy.special import gammaincc, gammaln, polygamma, psi
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
-from monitor.reconcile.preparation.value_statistics import ValueWithInterval
+from monitor.reconcile.preparation.value_artifacts import ValueWithInterval
 
 MIN_SEGMENT_SAMPLES: Final = 16
 """Smallest number of samples on each side of a step."""
@@ -74,7 +74,7 @@ class VarianceChangeFit:
 
 
 @dataclass(frozen=True, slots=True)
-class LeastConstantTiles:
+class SpectrogramChange:
     """Tile that differs most from its row, and row whose power is least constant in time."""
 
     gain: float  # log-likelihood gain of a separate power for the tile, nats
@@ -84,12 +84,12 @@ class LeastConstantTiles:
     row: tuple[float, float]  # frequency range of the row, Hz
 
 
-def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
+def fit_variance_changes(residuals: Floats, tau0_s: float) -> VarianceChangeFit:
     """Fit steps and other variations of the variance of white residuals.
 
     Parameters
     ----------
-    w : ndarray of float64, shape (n,)
+    residuals : ndarray of float64, shape (n,)
         White residuals without missing samples.
     tau0_s : float
         Sample period in seconds.
@@ -108,10 +108,10 @@ def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
-    _check_sample_count(w, MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES)
-    squares = w * w
-    length = max(MIN_BLOCK_SAMPLES, -(-w.size // MAX_VARIANCE_BLOCKS))
-    count = w.size // length
+    _check_sample_count(residuals, MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES)
+    squares = residuals * residuals
+    length = max(MIN_BLOCK_SAMPLES, -(-residuals.size // MAX_VARIANCE_BLOCKS))
+    count = residuals.size // length
     energy = squares[: count * length].reshape(count, length).mean(axis=1)
     scores = energy / energy.mean() - 1.0
     time = np.linspace(-1.0, 1.0, count)
@@ -123,12 +123,12 @@ def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
     )
 
 
-def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
+def find_spectrogram_change(residuals: Floats, tau0_s: float) -> SpectrogramChange:
     """Find the tile and the row of the spectrogram whose power is least constant in time.
 
     Parameters
     ----------
-    w : ndarray of float64, shape (n,)
+    residuals : ndarray of float64, shape (n,)
         White residuals without missing samples.
     tau0_s : float
         Sample period in seconds.
@@ -143,16 +143,16 @@ def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
     >>> rng = np.random.default_rng(0)
     >>> w, t = rng.standard_normal(60_000), 0.01 * np.arange(60_000)
     >>> w[30_000:40_000] += 0.3 * np.sin(2.0 * np.pi * 17.3 * t[30_000:40_000])
-    >>> found = find_least_constant_tiles(w, 0.01)
+    >>> found = find_spectrogram_change(w, 0.01)
     >>> found.gain > 50.0, found.frequency[0] < 17.3 < found.frequency[1]
     (True, True)
     """
-    _check_sample_count(w, MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0])
-    pieces = [piece for piece in PIECE_SAMPLES if w.size >= MIN_VARIANCE_BLOCKS * piece]
-    tiles, rows = zip(*(_best_tiles(_piece_spectra(w, piece), piece) for piece in pieces), strict=True)
+    _check_sample_count(residuals, MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0])
+    pieces = [piece for piece in PIECE_SAMPLES if residuals.size >= MIN_VARIANCE_BLOCKS * piece]
+    tiles, rows = zip(*(_best_tiles(_piece_spectra(residuals, piece), piece) for piece in pieces), strict=True)
     best, row = max(tiles), max(rows)
-    return LeastConstantTiles(
-        best.gain, best.time_s(tau0_s), best.frequency_hz(tau0_s), row.gain, row.frequency_hz(tau0_s)
+    return SpectrogramChange(
+        best.gain, best.time_range_s(tau0_s), best.frequency_range_hz(tau0_s), row.gain, row.frequency_range_hz(tau0_s)
     )
 
 
@@ -257,12 +257,12 @@ class _TileScore(NamedTuple):
     frequencies: int  # number of frequencies in the tile
     frequency_index: int
 
-    def time_s(self, tau0_s: float) -> tuple[float, float]:
+    def time_range_s(self, tau0_s: float) -> tuple[float, float]:
         """Return the time range in seconds for a sample period of ``tau0_s`` seconds."""
         length = self.pieces * self.piece_samples
         return self.time_index * length * tau0_s, (self.time_index + 1) * length * tau0_s
 
-    def frequency_hz(self, tau0_s: float) -> tuple[float, float]:
+    def frequency_range_hz(self, tau0_s: float) -> tuple[float, float]:
         """Return the frequency range in Hz for a sample period of ``tau0_s`` seconds."""
         first, step = self.frequency_index, self.piece_samples * tau0_s
         return first * self.frequencies / step, (first + 1) * self.frequencies / step

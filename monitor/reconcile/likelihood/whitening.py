@@ -16,9 +16,9 @@ from monitor.noise.effects import NoiseStep
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.outlier_fit import OutlierFit, fit_outliers
 from monitor.reconcile.likelihood.variance_history import (
-    LeastConstantTiles,
+    SpectrogramChange,
     VarianceChangeFit,
-    find_least_constant_tiles,
+    find_spectrogram_change,
     fit_variance_changes,
 )
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
@@ -58,7 +58,7 @@ class WhitenedAxis:
         return self.fit.effects
 
     @property
-    def types(self) -> set[type[Effect]]:
+    def effect_types(self) -> set[type[Effect]]:
         """Types of the fitted effects."""
         return {type(effect) for effect in self.effects}
 
@@ -68,13 +68,13 @@ class WhitenedAxis:
         return fit_variance_changes(self.flat_series, 1.0 / self.axis.rate_hz)
 
     @cached_property
-    def least_constant_tiles(self) -> LeastConstantTiles:
+    def spectrogram_change(self) -> SpectrogramChange:
         """Least constant tile and row of the spectrogram, after the noise steps of the model are removed."""
-        series = self.series / noise_deviation_over_time(self.fit)
-        return find_least_constant_tiles(series, 1.0 / self.axis.rate_hz)
+        series = self.series / relative_noise_deviation_over_time(self.fit)
+        return find_spectrogram_change(series, 1.0 / self.axis.rate_hz)
 
     @cached_property
-    def outliers(self) -> OutlierFit | None:
+    def outlier_fit(self) -> OutlierFit | None:
         """Outliers of the flattened series, or None if a Gaussian fits as well as a mixture."""
         return fit_outliers(self.flat_series)
 
@@ -83,7 +83,7 @@ def whiten_axis(fit: AxisFit) -> WhitenedAxis:
     """Whiten an axis by a fitted model."""
     axis = fit.axis
     weight = axis.bins.expand_to_coefficients(axis.used_bins / np.sqrt(fit.whittle.variance))
-    whitened = fit.residual_coefficients() * weight
+    whitened = fit.coefficients_without_deterministic_effects() * weight
     _replace_by_noise(whitened, np.flatnonzero(weight == 0.0))  # a diagnostic would detect a gap in the spectrum
     return WhitenedAxis(fit, whitened, weight, inverse_cosine_transform(whitened), _flattened_series(fit, whitened))
 
@@ -104,7 +104,7 @@ def _flattened_series(fit: AxisFit, whitened: Floats) -> Floats:
         flat, np.flatnonzero(axis.bins.expand_to_coefficients(density) < MIN_DENSITY_RATIO * np.median(density))
     )
     _replace_by_noise(flat, np.arange(int(SLOW_BAND_FRACTION * axis.n)))
-    return inverse_cosine_transform(flat) / noise_deviation_over_time(fit)
+    return inverse_cosine_transform(flat) / relative_noise_deviation_over_time(fit)
 
 
 def _replace_by_noise(coefficients: Floats, at: Ints) -> None:
@@ -112,7 +112,7 @@ def _replace_by_noise(coefficients: Floats, at: Ints) -> None:
     coefficients[at] = np.random.default_rng(at.size).standard_normal(at.size)
 
 
-def noise_deviation_over_time(fit: AxisFit) -> Floats:
+def relative_noise_deviation_over_time(fit: AxisFit) -> Floats:
     """Return the relative standard deviation over time, shape (n,), of white noise with the noise steps of a fit."""
     deviation = np.ones(fit.axis.n)
     for effect in fit.effects:

@@ -32,7 +32,7 @@ MIN_VARIANCE_RATIO: Final = 1e-20
 
 
 @dataclass(frozen=True, slots=True)
-class BinSums:
+class BinnedProductSums:
     """Sums over bins of products of the axis Y and the regressors R."""
 
     power: Floats  # [m] Σ Y²
@@ -53,25 +53,27 @@ class WhittleFit:
     beta_covariance: Floats  # [q, q] covariance of β
 
 
-def maximise_whittle(count: Floats, sums: BinSums, bases: Floats, constant: Floats, start: Floats) -> WhittleFit:
+def maximise_whittle_likelihood(
+    count: Floats, sums: BinnedProductSums, variance_bases: Floats, fixed_variance: Floats, start_theta: Floats
+) -> WhittleFit:
     """Return the θ and β with the largest likelihood.
 
     Parameters
     ----------
     count : ndarray of float64, shape (m,)
         Number of coefficients in each bin.
-    sums : BinSums
+    sums : BinnedProductSums
         Sums over bins of the products of the axis and the regressors.
-    bases : ndarray of float64, shape (p, m)
+    variance_bases : ndarray of float64, shape (p, m)
         Variance of a coefficient for θ_j = 1.
-    constant : ndarray of float64, shape (m,)
+    fixed_variance : ndarray of float64, shape (m,)
         Variance that is not fitted.
-    start : ndarray of float64, shape (p,)
+    start_theta : ndarray of float64, shape (p,)
         Starting values of θ.
     """
     floor = MIN_VARIANCE_RATIO * float((sums.power / np.maximum(count, 1.0)).max(initial=0.0)) or MIN_VARIANCE_RATIO
     theta, beta, variance, residual, likelihood, information, normal = _maximise(
-        count, sums.power, sums.cross, sums.gram, bases, constant + floor, np.maximum(start, 0.0)
+        count, sums.power, sums.cross, sums.gram, variance_bases, fixed_variance + floor, np.maximum(start_theta, 0.0)
     )
     covariance = np.linalg.pinv(normal) if beta.size else np.zeros((0, 0))
     return WhittleFit(theta, beta, variance, residual, float(likelihood), information, covariance)

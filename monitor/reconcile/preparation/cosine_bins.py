@@ -34,7 +34,7 @@ PEAK_REACH_HALF_WIDTHS: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Bins:
+class FrequencyBins:
     """Assignment of transform coefficients to frequency bins."""
 
     first: Ints  # [m] k of the first coefficient of each bin, minus 1
@@ -51,7 +51,7 @@ class Bins:
         return np.repeat(bin_values, self.count.astype(np.int64))
 
 
-def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> Bins:
+def build_frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> FrequencyBins:
     """Return the frequency bins of a series.
 
     Parameters
@@ -65,12 +65,12 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
 
     Returns
     -------
-    Bins
+    FrequencyBins
         Bins that together contain all n − 1 coefficients.
 
     Examples
     --------
-    >>> found = frequency_bins(360_000, 100.0)
+    >>> found = build_frequency_bins(360_000, 100.0)
     >>> int(found.count.sum()), 700 < found.count.size < 1000
     (359999, True)
     """
@@ -92,7 +92,7 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
     k = np.unique(np.concatenate(parts))
     first = k[(k >= 1) & (k < n)]
     last = np.append(first[1:], n)
-    return Bins(first - 1, (last - first).astype(np.float64), np.sqrt(first * (last - 1.0)) * step_hz, rate_hz)
+    return FrequencyBins(first - 1, (last - first).astype(np.float64), np.sqrt(first * (last - 1.0)) * step_hz, rate_hz)
 
 
 def cosine_transform(y: Floats) -> Floats:

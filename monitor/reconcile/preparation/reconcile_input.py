@@ -28,7 +28,7 @@ class Recording:
     temperature_c: Floats | None = None  # [n] °C; NaN = missing
 
     @property
-    def samples(self) -> int:
+    def sample_count(self) -> int:
         """Number of samples of each axis."""
         return next(iter(self.values.values())).size
 
@@ -55,9 +55,9 @@ def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[
     NotReady
         If the recording has too few samples or no usable axis.
     """
-    if recording.samples < MIN_SAMPLES:
+    if recording.sample_count < MIN_SAMPLES:
         raise NotReady(
-            f"the recording has {recording.samples} samples; at least {MIN_SAMPLES} are needed "
+            f"the recording has {recording.sample_count} samples; at least {MIN_SAMPLES} are needed "
             f"({MIN_SAMPLES / recording.rate_hz:.0f} s at {recording.rate_hz:g} Hz)"
         )
     notes, kept = [], {}

@@ -1,14 +1,15 @@
 """Replacement of missing, wrong and clipped samples by plausible random draws.
 
-``fill_missing`` replaces each missing sample by the mean of good neighbours plus a random deviation. The deviation is
-that of a randomly chosen good sample, the **donor**, from the mean around the donor. Level, drift and white noise
-therefore continue through a gap. The neighbourhood is as wide as the drift allows. The mean contains the noise of the
-averaged samples. If p percent of the samples are missing and the noise is white, the spectral density below the inverse
-of the neighbourhood length is therefore 2p percent too high. Other frequencies are not affected. A long gap is filled
-along a line between the levels at both ends, with a random walk as strong as the drift of the recording.
+``fill_missing_samples`` replaces each missing sample by the mean of good neighbours plus a random deviation. The
+deviation is that of a randomly chosen good sample, the **donor**, from the mean around the donor. Level, drift and
+white noise therefore continue through a gap. The neighbourhood is as wide as the drift allows. The mean contains the
+noise of the averaged samples. If p percent of the samples are missing and the noise is white, the spectral density
+below the inverse of the neighbourhood length is therefore 2p percent too high. Other frequencies are not affected. A
+long gap is filled along a line between the levels at both ends, with a random walk as strong as the drift of the
+recording.
 
-``restore_clipped`` replaces each clipped sample by a draw from the tail of a Gaussian beyond the limit. The mean of the
-Gaussian is the local mean of the restored series.
+``restore_clipped_samples`` replaces each clipped sample by a draw from the tail of a Gaussian beyond the limit. The
+mean of the Gaussian is the local mean of the restored series.
 
 The functions do not change the input arrays, and good samples keep the measured values.
 """
@@ -20,7 +21,7 @@ from scipy.special import log_ndtr, ndtr, ndtri
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.reconcile.preparation.value_statistics import Mask
+from monitor.reconcile.preparation.value_artifacts import Mask
 
 NEIGHBOURHOOD_WIDTHS: Final = (1024, 256, 64, 16, 4)
 """Possible numbers of neighbours on each side, widest first."""
@@ -42,14 +43,14 @@ CLIP_TOLERANCE_SIGMA: Final = 1e-2
 """Largest change of a sample, in standard deviations, that ends the iterations."""
 
 
-def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
+def fill_missing_samples(y: Floats, replace_mask: Mask, rng: np.random.Generator) -> Floats:
     """Return a copy of the series with masked and non-finite samples replaced.
 
     Parameters
     ----------
     y : ndarray of float64, shape (n,)
         Series in the unit of the axis.
-    mask : ndarray of bool, shape (n,)
+    replace_mask : ndarray of bool, shape (n,)
         True for each sample to replace.
     rng : numpy.random.Generator
         Generator for the replacement samples.
@@ -68,11 +69,11 @@ def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     --------
     >>> rng = np.random.default_rng(0)
     >>> y = 5.0 + rng.standard_normal(100_000)
-    >>> new = fill_missing(y, rng.random(100_000) < 0.3, rng)
+    >>> new = fill_missing_samples(y, rng.random(100_000) < 0.3, rng)
     >>> print(f"{new.mean():.2f} {new.std():.2f}")
     5.00 1.00
     """
-    good = np.isfinite(y) & ~mask
+    good = np.isfinite(y) & ~replace_mask
     missing = np.flatnonzero(~good)
     new = y.copy()
     if not missing.size:
@@ -95,7 +96,7 @@ def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     return new
 
 
-def restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
+def restore_clipped_samples(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
     """Return a copy of the series with clipped samples replaced by draws from beyond the limit.
 
     Parameters
@@ -118,7 +119,7 @@ def restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Genera
     --------
     >>> rng = np.random.default_rng(0)
     >>> x = 0.5 + rng.standard_normal(100_000)
-    >>> new = restore_clipped(np.clip(x, -1.0, 1.0), 1.0, 1.0, rng)
+    >>> new = restore_clipped_samples(np.clip(x, -1.0, 1.0), 1.0, 1.0, rng)
     >>> print(f"{new.mean():.2f} {new.std():.2f}")
     0.50 1.00
     """

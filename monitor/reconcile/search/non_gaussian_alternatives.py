@@ -21,7 +21,7 @@ from monitor.noise.effects import (
     RateRandomWalk,
 )
 from monitor.reconcile.likelihood.axis_fit import AxisFit, Effects
-from monitor.reconcile.likelihood.effect_roles import size
+from monitor.reconcile.likelihood.effect_roles import effect_size
 from monitor.reconcile.likelihood.hypothesis import Hypothesis
 from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
 from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
@@ -117,7 +117,7 @@ def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | N
     bare, fixed_noise = _with_original_walks(hypothesis)
     for noise in fit_correlated_noise(hypothesis.axis, hypothesis.axis.fit(bare, fixed_noise).effects):
         other = Hypothesis(hypothesis.model, hypothesis.axis.fit((*bare, noise), fixed_noise))
-        if size(other.added[-1]) == 0.0:
+        if effect_size(other.added[-1]) == 0.0:
             continue
         telegraph = fit_telegraph_alternative(other, len(other.effects) - 1)
         if telegraph is None or telegraph.event_count < MIN_SWITCHES:
@@ -159,7 +159,7 @@ def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussian
     """
     noise = hypothesis.effects[index]
     assert isinstance(noise, ExponentiallyCorrelated)
-    background = background_noise((*hypothesis.effects[:index], *hypothesis.effects[index + 1 :]))
+    background = build_background_noise((*hypothesis.effects[:index], *hypothesis.effects[index + 1 :]))
     if not background.white > 0.0:
         return None
     series, tau0_s = _residual_series(hypothesis.fit), 1.0 / hypothesis.axis.rate_hz
@@ -182,10 +182,10 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
         return None
     effects, fixed_noise = _with_original_walks(hypothesis)
     without = hypothesis.axis.fit(effects, fixed_noise)
-    known = max((size(effects[at]) for at in walks if at < hypothesis.given_count), default=0.0)
+    known = max((effect_size(effects[at]) for at in walks if at < hypothesis.given_count), default=0.0)
     walk = hypothesis.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), fixed_noise)
-    excess = size(walk.effects[-1])
-    background = background_noise(without.effects)
+    excess = effect_size(walk.effects[-1])
+    background = build_background_noise(without.effects)
     if not (excess > 0.0 and background.white > 0.0):
         return None
     series, tau0_s = _residual_series(without), 1.0 / hypothesis.axis.rate_hz
@@ -205,10 +205,10 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
 
 def _residual_series(fit: AxisFit) -> Floats:
     """Return the series, shape (n,), less all fitted deterministic effects."""
-    return inverse_cosine_transform(fit.residual_coefficients())
+    return inverse_cosine_transform(fit.coefficients_without_deterministic_effects())
 
 
-def background_noise(effects: Effects) -> BackgroundNoise:
+def build_background_noise(effects: Effects) -> BackgroundNoise:
     """Return the noise of all given effects as a ``BackgroundNoise``."""
     white = walk = flicker = 0.0
     correlated: list[tuple[float, float]] = []

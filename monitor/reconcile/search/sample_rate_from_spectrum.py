@@ -16,7 +16,7 @@ from drivers.data_types import Floats
 from monitor.common.distributions import HALF_CHI2_95
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
-from monitor.reconcile.diagnostics.diagnostics import periodogram
+from monitor.reconcile.diagnostics.diagnostics import compute_periodogram
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.hypothesis import find_maximum_by_golden_section, fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
@@ -66,23 +66,23 @@ class SampleRateErrorEstimate:
     frequency: tuple[float, float]  # frequency of the feature in the model and in the recording, Hz
 
 
-def convert_to_stated_time(effect: Effect, ratio: float) -> Effect:
+def rescale_effect_time(effect: Effect, rate_ratio: float) -> Effect:
     """Return the effect as it appears in a recording with a wrong sample rate.
 
     Parameters
     ----------
     effect : Effect
         Effect with parameters in true time.
-    ratio : float
+    rate_ratio : float
         True rate over stated rate.
 
     Examples
     --------
-    >>> convert_to_stated_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
+    >>> rescale_effect_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
     10.0
     """
     changed: dict[str, Any] = {
-        name: getattr(effect, name) * ratio**power
+        name: getattr(effect, name) * rate_ratio**power
         for name, power in RATIO_EXPONENTS.items()
         if getattr(effect, name, None)
     }
@@ -111,23 +111,25 @@ def detect_sample_rate_error(
         return None
     before = {name: _log_likelihood(axes[name], effects[name]) for name in axes}
 
-    def gains(x: float) -> dict[str, float]:
-        changed = {name: tuple(convert_to_stated_time(effect, exp(x)) for effect in effects[name]) for name in axes}
+    def gain_by_axis(log_ratio: float) -> dict[str, float]:
+        changed = {
+            name: tuple(rescale_effect_time(effect, exp(log_ratio)) for effect in effects[name]) for name in axes
+        }
         return {name: _log_likelihood(axes[name], changed[name]) - before[name] for name in axes}
 
-    def gain(x: float) -> float:
-        return sum(gains(x).values())
+    def total_gain(log_ratio: float) -> float:
+        return sum(gain_by_axis(log_ratio).values())
 
-    ratio, width = max(trials, key=lambda one: gain(log(one[0])))
-    x = find_maximum_by_golden_section(gain, log(ratio) - width, log(ratio) + width, SEARCH_ITERATIONS)
-    top = gain(x)
+    ratio, width = max(trials, key=lambda one: total_gain(log(one[0])))
+    x = find_maximum_by_golden_section(total_gain, log(ratio) - width, log(ratio) + width, SEARCH_ITERATIONS)
+    top = total_gain(x)
     if top < SAMPLE_RATE_PENALTY_NATS:
         return None
     alone = _gain_per_feature(axes, effects, before, exp(x))
     if top - max(alone) < MIN_OTHER_GAIN_NATS or min(alone) < -MIN_OTHER_GAIN_NATS:
         return None
-    ends = [_interval_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
-    of_axes = gains(x)
+    ends = [_interval_end(total_gain, x, top, sign * width) for sign in (-1.0, 1.0)]
+    of_axes = gain_by_axis(x)
     strongest = max(of_axes, key=lambda one: of_axes[one])
     features = _features(effects[strongest])
     stated = features[0].frequency if features else 0.0
@@ -160,7 +162,7 @@ def _gain_per_feature(
     for group in groups:
         gain = 0.0
         for name, of in effects.items():
-            moved = tuple(convert_to_stated_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
+            moved = tuple(rescale_effect_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
             if moved != of:
                 gain += _log_likelihood(axes[name], moved) - before[name]
         gains.append(gain)
@@ -190,7 +192,7 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
 def _line_power(whitened: WhitenedAxis, features: list[Feature], factors: Floats) -> Floats:
     """Return, for each factor, the total power at the frequencies of all lines times the factor."""
     power = np.zeros(factors.size)
-    spectrum = periodogram(whitened.series)
+    spectrum = compute_periodogram(whitened.series)
     spacing_hz = whitened.axis.rate_hz / (2 * (spectrum.size - 1))
     for line in features:
         if isinstance(line, Sinusoidal):

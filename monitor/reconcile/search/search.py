@@ -16,28 +16,28 @@ from monitor.noise.effect import Effect, Leak
 from monitor.noise.effects import BiasStep, Outliers, RandomSampleHold, Saturation
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
-from monitor.reconcile.diagnostics.plot_data import plot_data
+from monitor.reconcile.diagnostics.plot_data import build_plot_data
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.effect_roles import (
     MOST_DIRECT_DIAGNOSTIC,
     NOISE_SIZE_PARAMETERS,
     ONE_TIME_EFFECTS,
     SIZE_PARAMETERS,
-    size,
+    effect_size,
 )
 from monitor.reconcile.likelihood.hypothesis import Hypothesis, fit_with_fewest_changes, fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
-from monitor.reconcile.preparation.cosine_bins import frequency_bins
+from monitor.reconcile.preparation.cosine_bins import build_frequency_bins
 from monitor.reconcile.result import PlotData
 from monitor.reconcile.search.axis_repair import repair_axis_again
 from monitor.reconcile.search.candidates import PENALTY_NATS, find_spectral_peaks
-from monitor.reconcile.search.cross_validation import CrossValidation, cross_validate, not_validated
+from monitor.reconcile.search.cross_validation import CrossValidationResult, accept_without_validation, cross_validate
 from monitor.reconcile.search.non_gaussian_alternatives import (
     MIN_ALTERNATIVE_GAIN_NATS,
     choose_distribution,
     compare_jump_processes,
 )
-from monitor.reconcile.search.trials import UNNAMED, Trial, alternatives_to_resizing, trial_groups
+from monitor.reconcile.search.trials import UNNAMED, Trial, generate_trial_groups, try_alternatives_to_resizing
 from monitor.reconcile.search.withdrawal import SMOOTH_SPECTRA, keep_supported_effects
 
 MAX_ROUNDS: Final = 8
@@ -66,7 +66,7 @@ class SearchRound:
     before: AxisDiagnostics
     trials: tuple[Trial, ...]  # the selected trial, then the other trials in descending order of the score
     hypothesis: Hypothesis  # after the round
-    validation: CrossValidation
+    validation: CrossValidationResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +87,12 @@ class _DiagnosedHypothesis:
     whitened: WhitenedAxis
     findings: Findings
 
-    def diagnostics(self) -> AxisDiagnostics:
+    def findings_and_plots(self) -> AxisDiagnostics:
         """Return the findings and the plots."""
-        return AxisDiagnostics(self.findings, plot_data(self.whitened))
+        return AxisDiagnostics(self.findings, build_plot_data(self.whitened))
 
 
-def search_axis(axis: Axis, model: Effects, null: AxisNull, rng: np.random.Generator) -> AxisSearchResult:
+def search_missing_effects(axis: Axis, model: Effects, null: AxisNull, rng: np.random.Generator) -> AxisSearchResult:
     """Search for the effects that explain one axis.
 
     Parameters
@@ -117,10 +117,10 @@ def search_axis(axis: Axis, model: Effects, null: AxisNull, rng: np.random.Gener
     kept = keep_supported_effects(current.hypothesis.added, _gains_by_type(rounds), current.findings, null)
     kept, before_withdrawal = _without_zero_sizes(kept), None
     while kept != current.hypothesis.added:
-        before_withdrawal = before_withdrawal or current.diagnostics()
+        before_withdrawal = before_withdrawal or current.findings_and_plots()
         current = _diagnose(current.hypothesis.refit_with_added_effects(kept))
         kept = _without_zero_sizes(current.hypothesis.added)
-    return AxisSearchResult(tuple(rounds), current.hypothesis, current.diagnostics(), before_withdrawal)
+    return AxisSearchResult(tuple(rounds), current.hypothesis, current.findings_and_plots(), before_withdrawal)
 
 
 def _diagnose(hypothesis: Hypothesis) -> _DiagnosedHypothesis:
@@ -139,11 +139,11 @@ def _next_round(
     """
     hypothesis, whitened = current.hypothesis, current.whitened
     agrees = not any(one.gain > null[lens].threshold for lens, one in current.findings.items())
-    better = alternatives_to_resizing(hypothesis, whitened) if agrees and hypothesis.refitted_size_count else []
+    better = try_alternatives_to_resizing(hypothesis, whitened) if agrees and hypothesis.refitted_size_count else []
     if agrees and not better:
         return current, _replace_random_walk(current) if later and _is_gaussian_and_stationary(whitened, null) else None
     current = _with_finer_bins(current)
-    for trials in [better] if better else trial_groups(current.hypothesis, current.whitened):
+    for trials in [better] if better else generate_trial_groups(current.hypothesis, current.whitened):
         done = _select_trial(current, trials, null, rng)
         if done is not None:
             return current, done
@@ -157,15 +157,15 @@ def _replace_random_walk(current: _DiagnosedHypothesis) -> SearchRound | None:
     jumps = compare_jump_processes(current.hypothesis)
     if jumps is None or jumps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return None
-    validation = not_validated("the replaced effect has the same spectrum and was validated")
+    validation = accept_without_validation("the replaced effect has the same spectrum and was validated")
     hypothesis = current.hypothesis.refit_with_added_effects(jumps.added)
-    return SearchRound(current.diagnostics(), jumps.as_trials(0.0), hypothesis, validation)
+    return SearchRound(current.findings_and_plots(), jumps.as_trials(0.0), hypothesis, validation)
 
 
 def _with_finer_bins(current: _DiagnosedHypothesis) -> _DiagnosedHypothesis:
     """Return the hypothesis, fitted with finer bins around narrow peaks, and the same findings."""
     axis, hypothesis = current.hypothesis.axis, current.hypothesis
-    finer = frequency_bins(axis.n, axis.rate_hz, find_spectral_peaks(current.whitened))
+    finer = build_frequency_bins(axis.n, axis.rate_hz, find_spectral_peaks(current.whitened))
     if finer.count.size <= axis.bins.count.size + MIN_FINER_BINS:
         return current
     hypothesis = Hypothesis(
@@ -196,7 +196,7 @@ def _select_trial(
             after, tried = choose_distribution(after, tried)
         validation = cross_validate(current.hypothesis, after, added, lens, null[lens], rng)
         if validation.kept:
-            return SearchRound(current.diagnostics(), tuple(tried), after, validation)
+            return SearchRound(current.findings_and_plots(), tuple(tried), after, validation)
     return None
 
 
@@ -221,7 +221,9 @@ def drop_unneeded_effects(hypothesis: Hypothesis) -> Hypothesis:
         if type(effect) not in SIZE_PARAMETERS:
             continue
         less = hypothesis.refit_with_added_effects(hypothesis.added[:at] + hypothesis.added[at + 1 :])
-        if hypothesis.score - less.score < 0.5 * PENALTY_NATS.get(effect.name, 0.0):
+        if hypothesis.penalised_log_likelihood - less.penalised_log_likelihood < 0.5 * PENALTY_NATS.get(
+            effect.name, 0.0
+        ):
             hypothesis = less
     return hypothesis
 
@@ -248,4 +250,4 @@ def _without_zero_sizes(effects: Effects) -> Effects:
 
 def _has_zero_size(effect: Effect) -> bool:
     """Return True for a noise effect with the size zero."""
-    return type(effect) in NOISE_SIZE_PARAMETERS and size(effect) == 0.0
+    return type(effect) in NOISE_SIZE_PARAMETERS and effect_size(effect) == 0.0

@@ -1,7 +1,7 @@
 """Trials of candidate effects: each candidate is added to a hypothesis and fitted together with the other effects.
 
 The **score** of a trial is the gain in log-likelihood, less the penalty of the effect and the penalties for changed
-sizes of the model. ``trial_groups`` yields the trials in groups:
+sizes of the model. ``generate_trial_groups`` yields the trials in groups:
 
 1. Quantization, clipping and repeated samples come first, then outliers and a step of the noise. The evidence for these
    effects is either strong or absent.
@@ -39,16 +39,16 @@ from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.hypothesis import (
     Hypothesis,
     find_maximum_by_golden_section,
-    noise_indices,
+    noise_effect_indices,
 )
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
-from monitor.reconcile.preparation.value_statistics import ValueWithInterval
+from monitor.reconcile.preparation.value_artifacts import ValueWithInterval
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidates import (
     DETERMINISTIC_CANDIDATES,
     NOISE_CANDIDATES,
     PENALTY_NATS,
-    initial_size,
+    initial_effect_size,
     propose_correlated_noise,
 )
 
@@ -96,7 +96,7 @@ class Trial:
     event_count: int = 0  # number of events that were detected
 
 
-def trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[list[Trial]]:
+def generate_trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[list[Trial]]:
     """Yield the groups of trials, each in descending order of the score.
 
     Parameters
@@ -118,7 +118,7 @@ def trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[lis
         yield deterministic
 
 
-def alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
+def try_alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Return trials of effects that explain the data better than the changed sizes of the model.
 
     Parameters
@@ -140,17 +140,17 @@ def _best_first(trials: Sequence[Trial]) -> list[Trial]:
 
 def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
     """Try quantization, clipping and repeats."""
-    statistics = whitened.axis.value_statistics
+    statistics = whitened.axis.value_artifacts
     found: list[Trial] = []
-    if statistics.quantization and Resolution not in whitened.types:
+    if statistics.quantization and Resolution not in whitened.effect_types:
         grid = statistics.quantization
         resolution = Resolution(step=grid.step.value)
         found.append(_penalised_trial(resolution, grid.gain, {"step": _scaled_bounds(grid.step)}, grid.levels))
-    if statistics.clipping and statistics.clipping.symmetric and Saturation not in whitened.types:
+    if statistics.clipping and statistics.clipping.symmetric and Saturation not in whitened.effect_types:
         ends = statistics.clipping
         saturation = Saturation(limit=ends.limit.value)
         found.append(_penalised_trial(saturation, ends.gain, {"limit": _scaled_bounds(ends.limit)}, ends.count))
-    if statistics.repeats and RandomSampleHold not in whitened.types:
+    if statistics.repeats and RandomSampleHold not in whitened.effect_types:
         twice = statistics.repeats
         hold = RandomSampleHold(fraction=min(twice.fraction.value, 0.999))
         intervals = {"fraction": _scaled_bounds(twice.fraction)}
@@ -160,8 +160,8 @@ def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
 
 def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Try outliers. The list is empty if another cause of heavy tails is as likely."""
-    far = whitened.outliers
-    if far is None or Outliers in whitened.types or far.gain_over_student <= MIN_STUDENT_GAIN_NATS:
+    far = whitened.outlier_fit
+    if far is None or Outliers in whitened.effect_types or far.gain_over_student <= MIN_STUDENT_GAIN_NATS:
         return []
     if max(far.clustering_z, far.misfit_z) >= MAX_OUTLIER_Z:
         return []
@@ -176,7 +176,7 @@ def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
     changes, length_s = whitened.variance_changes, whitened.axis.length_s
     step = changes.step
     inside = STEP_MARGIN_FRACTION * length_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
-    if AngleRandomWalk not in whitened.types or not inside:
+    if AngleRandomWalk not in whitened.effect_types or not inside:
         return []
     if step.gain <= max(changes.largest_alternative_gain, _band_gain(whitened)) - ALTERNATIVE_MARGIN_NATS:
         return []
@@ -189,7 +189,7 @@ def _band_gain(whitened: WhitenedAxis) -> float:
 
     A step of white noise changes all frequencies, so a change within a narrow band has another cause.
     """
-    found = whitened.least_constant_tiles
+    found = whitened.spectrogram_change
     return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * whitened.axis.rate_hz else 0.0
 
 
@@ -217,17 +217,24 @@ def _scaled_bounds(found: ValueWithInterval, unit: float = 1.0) -> ParameterInte
 
 def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
     """Try one noise effect."""
-    score = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).score
-    return Trial(effect.name, effect, score - hypothesis.score - PENALTY_NATS[effect.name])
+    score = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).penalised_log_likelihood
+    return Trial(effect.name, effect, score - hypothesis.penalised_log_likelihood - PENALTY_NATS[effect.name])
 
 
 def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Try noise effects, changed sizes, a common factor and a power law without a name."""
     resized = hypothesis.refit_with_added_effects(hypothesis.added)
-    found = [Trial(RETUNE, None, resized.score - hypothesis.score - MIN_RESIZE_GAIN_NATS)]
+    found = [
+        Trial(
+            RETUNE, None, resized.penalised_log_likelihood - hypothesis.penalised_log_likelihood - MIN_RESIZE_GAIN_NATS
+        )
+    ]
     found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
     found = _best_first([*found, _scale_factor_trial(hypothesis, resized)])
-    value = max(_score_with_power_law(hypothesis, hypothesis.effects, one) for one in EXPONENTS) - hypothesis.score
+    value = (
+        max(_score_with_power_law(hypothesis, hypothesis.effects, one) for one in EXPONENTS)
+        - hypothesis.penalised_log_likelihood
+    )
     if value > max(found[0].score, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in POWER_LAW_RIVALS:
         return [Trial(UNNAMED, None, value), *found]
     return found
@@ -260,18 +267,18 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
         return []
     slow_noises = _slow_noise_scores(hypothesis)
     resized = hypothesis.refit_with_added_effects(hypothesis.added)
-    without = max(resized.score, *(score(hypothesis.effects) for score in slow_noises))
+    without = max(resized.penalised_log_likelihood, *(score(hypothesis.effects) for score in slow_noises))
     trials = []
     for effect in kept:
-        alone = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).score
+        alone = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).penalised_log_likelihood
         gain = max(alone, *(score((*hypothesis.effects, effect)) for score in slow_noises)) - without
         quadratic = getattr(effect, "quadratic", None) is not None
         penalty = PENALTY_NATS[effect.name] + (QUADRATIC_PENALTY_NATS if quadratic else 0.0)
-        trials.append(Trial(effect.name, effect, gain - penalty, alone - hypothesis.score - penalty))
+        trials.append(Trial(effect.name, effect, gain - penalty, alone - hypothesis.penalised_log_likelihood - penalty))
     trials = _best_first(trials)
     curved = _curved_drift_score(hypothesis) - without
     if curved > max(0.0, trials[0].score) + UNNAMED_MARGIN_NATS:
-        return [Trial(UNNAMED, None, curved, curved + without - hypothesis.score), *trials]
+        return [Trial(UNNAMED, None, curved, curved + without - hypothesis.penalised_log_likelihood), *trials]
     return trials
 
 
@@ -292,7 +299,7 @@ def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
 
 def _curved_drift_score(hypothesis: Hypothesis) -> float:
     """Return the score with an additional drift that is a quadratic function of time, less the penalty."""
-    effects = (*hypothesis.effects, RateRamp(R=initial_size(hypothesis.axis)))
+    effects = (*hypothesis.effects, RateRamp(R=initial_effect_size(hypothesis.axis)))
     fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, curvature=True)
     return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS["rate_ramp"] - QUADRATIC_PENALTY_NATS
 
@@ -303,20 +310,20 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     The list contains one function for each slow noise that may resemble a deterministic effect. The sizes of the model
     are not changed.
     """
-    axis, small = hypothesis.axis, initial_size(hypothesis.axis)
+    axis, small = hypothesis.axis, initial_effect_size(hypothesis.axis)
     fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
 
-    def with_noise(noise: Effect) -> Callable[[Effects], float]:
+    def make_noise_score(noise: Effect) -> Callable[[Effects], float]:
         return lambda effects: axis.fit((*effects, noise), fixed_noise).log_likelihood - cost - PENALTY_NATS[noise.name]
 
-    def with_power_law(exponent: float) -> Callable[[Effects], float]:
+    def make_power_law_score(exponent: float) -> Callable[[Effects], float]:
         return lambda effects: _score_with_power_law(hypothesis, effects, exponent)
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
     noises: list[Effect] = [ExponentiallyCorrelated(sigma=small, correlation_time=float(t)) for t in times_s]
     if not any(isinstance(effect, RateRandomWalk) for effect in hypothesis.effects):
         noises.append(RateRandomWalk(K=small))
-    return [*(with_noise(one) for one in noises), *(with_power_law(exponent) for exponent in EXPONENTS)]
+    return [*(make_noise_score(one) for one in noises), *(make_power_law_score(exponent) for exponent in EXPONENTS)]
 
 
 def _score_with_power_law(hypothesis: Hypothesis, effects: Effects, exponent: float) -> float:
@@ -333,14 +340,19 @@ def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     If only one size of the model is wrong, changing this size has the larger score. If two or more sizes are wrong and
     a common factor fits nearly as well as separate sizes, the factor has at least the same score.
     """
-    effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_indices(hypothesis.model)
+    effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_effect_indices(hypothesis.model)
 
-    def value(x: float) -> float:
-        return hypothesis.axis.fit((*effects, ScaleFactor(factor=float(np.exp(x)))), fixed_noise).log_likelihood
+    def log_likelihood_with_factor(log_factor: float) -> float:
+        return hypothesis.axis.fit(
+            (*effects, ScaleFactor(factor=float(np.exp(log_factor)))), fixed_noise
+        ).log_likelihood
 
-    start = float(max(np.linspace(-3.0, 3.0, 13), key=value))
-    x = find_maximum_by_golden_section(value, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS)
-    gain = value(x) - hypothesis.score - PENALTY_NATS["scale_factor"]
-    if resized.refitted_size_count > 1 and value(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS:
-        gain = max(gain, resized.score - hypothesis.score)
+    start = float(max(np.linspace(-3.0, 3.0, 13), key=log_likelihood_with_factor))
+    x = find_maximum_by_golden_section(log_likelihood_with_factor, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS)
+    gain = log_likelihood_with_factor(x) - hypothesis.penalised_log_likelihood - PENALTY_NATS["scale_factor"]
+    if (
+        resized.refitted_size_count > 1
+        and log_likelihood_with_factor(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS
+    ):
+        gain = max(gain, resized.penalised_log_likelihood - hypothesis.penalised_log_likelihood)
     return Trial("scale_factor", ScaleFactor(factor=float(np.exp(x))), gain)

@@ -66,11 +66,11 @@ def keep_supported_effects(
         Null distribution of each diagnostic.
     """
 
-    def remaining(lens: str) -> float:
+    def significant_gain(lens: str) -> float:
         gain = findings[lens].gain
         return gain if gain > null[lens].threshold else 0.0
 
-    def contradicted(kinds: type[Effect] | tuple[type[Effect], ...], gain: float, share: float) -> set[int]:
+    def contradicted_effects(kinds: type[Effect] | tuple[type[Effect], ...], gain: float, share: float) -> set[int]:
         return {
             at
             for at, e in enumerate(added)
@@ -81,11 +81,13 @@ def keep_supported_effects(
     for lens in FREQUENCY_DIAGNOSTICS:
         place = findings[lens].where.frequency
         if place is not None:
-            candidates = contradicted(Effect, remaining(lens), MAX_REMAINING_SHARE)
+            candidates = contradicted_effects(Effect, significant_gain(lens), MAX_REMAINING_SHARE)
             withdrawn |= {at for at in candidates if _overlaps(added[at], place)}
-    withdrawn |= contradicted(Leak, remaining("other_axes"), MAX_REMAINING_LEAK_SHARE)
-    withdrawn |= contradicted(BiasStep, remaining("level"), MAX_REMAINING_SHARE)
-    withdrawn |= contradicted(SMOOTH_SPECTRA, max(map(remaining, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO)
+    withdrawn |= contradicted_effects(Leak, significant_gain("other_axes"), MAX_REMAINING_LEAK_SHARE)
+    withdrawn |= contradicted_effects(BiasStep, significant_gain("level"), MAX_REMAINING_SHARE)
+    withdrawn |= contradicted_effects(
+        SMOOTH_SPECTRA, max(map(significant_gain, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO
+    )
     return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)
 
 

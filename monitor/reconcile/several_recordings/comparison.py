@@ -31,12 +31,12 @@ from monitor.reconcile.result import (
 from monitor.reconcile.several_recordings.absence import Absence, ClearestOccurrence, explain_absence
 from monitor.reconcile.several_recordings.effect_matching import (
     SAMPLE_RATE_EFFECT,
+    effect_parameters,
     find_closest_effect,
     find_effect_of_step,
-    identifying_parameter,
+    find_identifying_parameter,
     identifying_parameter_distance,
     identifying_parameter_name,
-    parameters_of,
 )
 from monitor.reconcile.several_recordings.pooled_parameters import (
     MIN_AGREEMENT_PROBABILITY,
@@ -70,11 +70,11 @@ class MatchedEffect:
     absent: tuple[Absence, ...] = ()
 
     @property
-    def consistent(self) -> bool | None:
+    def sizes_agree(self) -> bool | None:
         """True if the sizes in all recordings agree, or None if there is nothing to compare."""
         return None if self.p is None else self.p >= MIN_AGREEMENT_PROBABILITY
 
-    def pooled_step(self) -> AddedOrResizedEffect:
+    def step_with_pooled_parameters(self) -> AddedOrResizedEffect:
         """Return the effect of the first recording with the pooled parameters."""
         first = next(iter(self.steps.values()))
         return replace(first, parameters={name: one.bounds for name, one in self.parameters.items()})
@@ -148,7 +148,7 @@ def _add_common_effects(
             if matched.kind == "added":
                 effects[axis] = (*known, made)
             else:
-                old = find_closest_effect(known, matched.effect, parameters_of(made))
+                old = find_closest_effect(known, matched.effect, effect_parameters(made))
                 effects[axis] = tuple(made if effect is old else effect for effect in known)
     return NoiseModel(effects, baseline.sample_rate_hz, baseline.temperature)
 
@@ -202,13 +202,15 @@ def _add_to_group(
 ) -> None:
     """Add an effect to the group with the closest matching effect, or start a new group."""
     models = {one.name: one.result.model for one in runs}
-    here = identifying_parameter(step, axis, models[run])
+    here = find_identifying_parameter(step, axis, models[run])
     best: tuple[float, dict[str, AddedOrResizedEffect]] | None = None
     for group in groups:
         other, first = next(iter(group.items()))
         if run in group or (first.effect, first.kind) != (step.effect, step.kind):
             continue
-        apart = identifying_parameter_distance(step.effect, here, identifying_parameter(first, axis, models[other]))
+        apart = identifying_parameter_distance(
+            step.effect, here, find_identifying_parameter(first, axis, models[other])
+        )
         if apart is not None and (best is None or apart < best[0]):
             best = apart, group
     if best is None:
@@ -250,7 +252,7 @@ def _gap_of_effect(step: AddedOrResizedEffect, axis: str, result: Reconciliation
     if step.kind == "added":
         return sqrt(max(step.before.gap**2 - step.after.gap**2, 0.0))
     given = find_closest_effect(
-        result.baseline.effects[axis], step.effect, parameters_of(find_effect_of_step(result.model, axis, step))
+        result.baseline.effects[axis], step.effect, effect_parameters(find_effect_of_step(result.model, axis, step))
     )
     return max(distance_in_sigma(one, getattr(given, name)) for name, one in step.parameters.items())
 

@@ -18,18 +18,21 @@ from monitor.reconcile.several_recordings.comparison import AxisComparison, Comp
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
 
 
-def encode_comparison(c: Comparison) -> bytes:
+def encode_comparison(comparison: Comparison) -> bytes:
     """Encode a comparison as JSON."""
     return msgspec.json.encode({
         "schema": SCHEMA,
-        "verdict": c.verdict,
-        "seed": int(c.seed),
-        "fitted_to": c.fitted_to,
+        "verdict": comparison.verdict,
+        "seed": int(comparison.seed),
+        "fitted_to": comparison.fitted_to,
         "recordings": [
-            *(_run_entry(run) for run in c.runs),
-            *({"name": name, "folder": name, "verdict": None, "why": why} for name, why in c.without_result.items()),
+            *(_run_entry(run) for run in comparison.runs),
+            *(
+                {"name": name, "folder": name, "verdict": None, "why": why}
+                for name, why in comparison.without_result.items()
+            ),
         ],
-        "axes": {axis: _axis_entry(one) for axis, one in c.axes.items()},
+        "axes": {axis: _axis_entry(one) for axis, one in comparison.axes.items()},
     })  # fmt: skip
 
 
@@ -67,10 +70,10 @@ def _effect_entry(matched: MatchedEffect) -> dict[str, Any]:
         "kind": matched.kind,
         "recordings": list(matched.steps),
         "parameters": {
-            name: {**parameter_entry(one.bounds), **({} if one.p is None else {"p": finite_or_none(one.p)})}
+            name: {**parameter_entry(one.bounds), **({} if one.p_value is None else {"p": finite_or_none(one.p_value)})}
             for name, one in matched.parameters.items()
         },
-        "consistent": matched.consistent,
+        "consistent": matched.sizes_agree,
         "p": finite_or_none(matched.p),
         "each": {run: _step_entry(step) for run, step in matched.steps.items()},
     }

@@ -42,7 +42,7 @@ def identifying_parameter_name(effect: str) -> str:
     return IDENTIFYING_PARAMETERS.get(effect, ("", 0.0))[0]
 
 
-def identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseModel) -> ParameterInterval | None:
+def find_identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseModel) -> ParameterInterval | None:
     """Return the parameter that identifies an effect among effects of the same name.
 
     A resized effect contains only the size. The identifying parameter is then read from the model of the recording.
@@ -133,7 +133,7 @@ def find_closest_effect(effects: Sequence[Effect], name: str, parameters: Mappin
     return min((effect for effect in effects if effect.name == name), key=parameter_distance)
 
 
-def parameters_of(effect: Effect) -> dict[str, Any]:
+def effect_parameters(effect: Effect) -> dict[str, Any]:
     """Return all parameters of an effect by name."""
     return {f.name: getattr(effect, f.name) for f in fields(effect)}  # type: ignore[arg-type]
 

@@ -35,7 +35,7 @@ class PooledParameter:
     freedom: int = 0  # degrees of freedom: number of recordings with an interval, less one
 
     @property
-    def p(self) -> float | None:
+    def p_value(self) -> float | None:
         """Probability of a larger χ² if the true value is the same in all recordings. None: too few values."""
         return agreement_probability([self])
 
@@ -47,7 +47,7 @@ def agreement_probability(parameters: Iterable[PooledParameter]) -> float | None
     return float(chdtrc(freedom, sum(one.chi2 for one in every))) if freedom else None
 
 
-def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
+def pool_parameter(intervals: Sequence[ParameterInterval]) -> PooledParameter:
     """Return the mean of one parameter over one or more recordings.
 
     Examples
@@ -56,9 +56,9 @@ def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
     >>> print(round(both.bounds.value, 3), round(both.chi2, 3), both.freedom)
     11.0 2.0 1
     """
-    known = [one for one in found if _finite_interval(one) is not None]
+    known = [one for one in intervals if _finite_interval(one) is not None]
     if len(known) < 2:
-        return PooledParameter(known[0] if known else found[0])
+        return PooledParameter(known[0] if known else intervals[0])
     ends, factors = _symmetric_scale(np.array([_finite_interval(one) for one in known]))
     x, deviation = ends[:, 1], 0.5 * (ends[:, 2] - ends[:, 0]) / Z95
     weight = np.maximum(deviation, MIN_RELATIVE_ERROR * (1.0 if factors else np.abs(x))) ** -2

@@ -494,13 +494,13 @@ def _fit_difference_spread(counts: Floats, first: int) -> tuple[float, float]:
     """
     kept = counts[first:]
 
-    def cost(log_spread: float) -> float:
+    def negative_log_likelihood(log_spread: float) -> float:
         form = _step_difference_probabilities(float(np.exp(log_spread)), counts.size - 1)[first:]
         return -float(xlogy(kept, form / form.sum()).sum())
 
     from scipy.optimize import minimize_scalar
 
-    best = minimize_scalar(cost, bounds=(np.log(0.2), np.log(4.0 * counts.size)), method="bounded")
+    best = minimize_scalar(negative_log_likelihood, bounds=(np.log(0.2), np.log(4.0 * counts.size)), method="bounded")
     return -float(best.fun), float(np.exp(best.x))
 
 
