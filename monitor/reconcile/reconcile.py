@@ -1,14 +1,8 @@
-"""Compare a recording with a noise model and return a ``Reconciliation``.
+"""Comparison of a recording with a noise model, and search for the effects that the model lacks.
 
-The procedure has these steps:
-
-1. Simulate recordings of the model and run all diagnostics on them. The results give the thresholds.
-2. Run the same diagnostics on the measured recording.
-3. On each axis with a significant difference, try candidate effects and keep the best one. Repeat this until no
-   significant difference remains or no candidate is accepted.
-4. Simulate the extended model and compare the recording with the new thresholds.
-
-Each axis has its own search. Only the sample rate error is common to all axes.
+Simulated recordings of the model define the threshold of each diagnostic. If a diagnostic of the measured recording
+exceeds the threshold, the search adds effects to the model. Each axis has a separate search. The extended model is then
+simulated and compared with the recording.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -60,9 +54,9 @@ from monitor.reconcile.search.sample_rate_from_spectrum import (
 from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
 
 SIMULATED_RECORDINGS: Final = 6
-"""Number of simulated recordings that determine a null distribution. With six axes, each diagnostic has 36 gains."""
+"""Number of simulated recordings that determine a null distribution."""
 MIN_TERM_GAIN_NATS: Final = 3.0
-"""Log-likelihood gain in nats that a term of the first fit must reach to be kept."""
+"""Smallest log-likelihood gain, in nats, of a term that the fit of the five terms keeps."""
 ProgressCallback = Callable[[str], None]
 """Function that receives the name of each stage."""
 MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -71,7 +65,7 @@ MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 @dataclass(frozen=True, slots=True)
 class RecordingContext:
-    """Recording that is reconciled, with the seed, the cached regressors and the worker threads."""
+    """Recording to compare, with the data that all stages of the comparison share."""
 
     recording: Recording
     seed: int
@@ -81,14 +75,12 @@ class RecordingContext:
 
 @dataclass(frozen=True, slots=True)
 class _AxesSearchResult:
-    """Result of the search on all axes of one recording."""
-
     searches: dict[str, AxisSearchResult]
     sample_rate_error: SampleRateErrorEstimate | None
 
     @property
     def searches_that_changed_model(self) -> dict[str, AxisSearchResult]:
-        """Results of the searches that changed the model."""
+        """Searches that added or resized an effect."""
         return {name: search for name, search in self.searches.items() if search.rounds}
 
 
@@ -106,7 +98,7 @@ def reconcile(
     recording : Recording
         Recording with at least ``MIN_SAMPLES`` samples for each axis.
     model : NoiseModel or None
-        Model under test. If None, the five terms Q, N, B, K and R are fitted first.
+        Noise model to test. If None, a model with the five terms Q, N, B, K and R is fitted to the recording.
     seed : int
         Seed of all simulations and random draws. The same seed gives the same result.
     map_function : callable, optional
@@ -117,7 +109,7 @@ def reconcile(
     Returns
     -------
     Reconciliation
-        Decision, added and resized effects, and remaining differences of each axis.
+        For each axis, the decision, the added and resized effects, and the remaining differences.
 
     Raises
     ------
@@ -161,7 +153,7 @@ def reconcile(
 
 
 def fit_five_terms(run: RecordingContext) -> NoiseModel:
-    """Fit the terms Q, N, B, K and R to each axis and keep the significant terms."""
+    """Fit the noise terms Q, N, B, K and R to each axis, and keep the significant terms."""
     axes = build_repaired_axes(
         run.recording, dict.fromkeys(run.recording.values, ()), run.regressors, np.random.default_rng(run.seed)
     )
@@ -169,7 +161,6 @@ def fit_five_terms(run: RecordingContext) -> NoiseModel:
 
 
 def _fit_terms(axis: Axis) -> Effects:
-    """Fit the five terms to one axis and drop each term whose log-likelihood gain is too small."""
     best = axis.fit([with_effect_size(effect, axis.coefficient_rms) for effect in UNIT_SOURCES[:4]])
     with_ramp = axis.fit((*best.effects, RateRamp(R=axis.coefficient_rms)))
     if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
@@ -184,7 +175,7 @@ def _fit_terms(axis: Axis) -> Effects:
 
 
 def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
-    """Return the effects of each recorded axis without constant biases, because the mean of an axis is always free."""
+    """Return the effects of each recorded axis without constant biases, because the mean is always fitted."""
     return {
         axis: tuple(effect for effect in model.effects.get(axis, ()) if not isinstance(effect, Bias))
         for axis in recording.values
@@ -194,10 +185,7 @@ def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effec
 def _diagnose_simulations(
     model: NoiseModel, run: RecordingContext, first_seed: int, names: Collection[str]
 ) -> dict[str, list[Findings]]:
-    """Return, for each of the named axes, the findings on each of several simulated recordings of a model.
-
-    The simulations have the axes, the length and the temperature of the measured recording.
-    """
+    """Run the diagnostics on simulated recordings of a model, and return the findings of each named axis."""
     template = run.recording
     effects = _effects_by_axis(model, template)
 
@@ -214,10 +202,9 @@ def _diagnose_simulations(
 
 
 def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str, AxisNull]) -> _AxesSearchResult:
-    """Search every axis for missing effects.
+    """Search every axis for missing effects, after a test of the sample rate.
 
-    The sample rate is tested first. If two axes appear to leak into each other, the search is repeated on one of them,
-    and leaks from the other axis are not tried.
+    If two axes appear to leak into each other, the search on one axis is repeated without this leak.
     """
     effects = _effects_by_axis(model, run.recording)
     axes = build_repaired_axes(run.recording, effects, run.regressors, np.random.default_rng(run.seed))
@@ -241,7 +228,7 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
 def _reversed_leak_sources(
     found: Mapping[str, AxisSearchResult], null: Mapping[str, AxisNull]
 ) -> dict[str, frozenset[str]]:
-    """Return, for each axis, the sources of leaks whose true direction is the opposite."""
+    """Return the leaks that are more likely in the opposite direction, as the leak sources of each axis."""
     gains = {
         (name, effect.source): step.trials[0].score
         for name, one in found.items()
@@ -260,7 +247,6 @@ def _reversed_leak_sources(
 
 
 def _add_found_effects(model: NoiseModel, found: _AxesSearchResult) -> NoiseModel:
-    """Return the model with the added and resized effects of all axes."""
     error = found.sample_rate_error
     ratio = float(error.ratio.value) if error else 1.0
     effects = dict(model.effects)

@@ -1,12 +1,8 @@
-"""Diagnostics: functions that measure how far an axis differs from a model.
+"""Diagnostic tests for departures of a whitened axis from white noise.
 
-Measured and simulated recordings pass through the same diagnostics. Each diagnostic takes a ``WhitenedAxis`` and tests
-one kind of departure from white noise. The result is a ``Finding``: the location of the strongest departure, and the
-log-likelihood gain of a model with this departure over white noise. If the model is true, the gains have nearly the
-same distribution for every model and every length of the recording. The thresholds in ``null_distribution`` require
-this.
-
-The diagnostics are deterministic and do not change their input.
+Each diagnostic returns a ``Finding``, which contains the location and the log-likelihood gain of the strongest
+departure. If the noise model is true, the gain has nearly the same distribution for every model and recording length.
+The thresholds in ``null_distribution`` rely on this property.
 """
 
 from collections.abc import Callable
@@ -38,29 +34,28 @@ MAX_LAG_SAMPLES: Final = 64
 TRANSIENT_TIME_FRACTIONS: Final = 0.3 / 3.0 ** np.arange(6)
 TEMPERATURE_DELAYS_S: Final = (10.0, 30.0, 90.0, 270.0, 810.0)
 STEP_MARGIN_FRACTION: Final = 0.001
-"""Fraction of the recording at each end in which no step is detected, because the ends of a recording affect the
-spectrum.
+"""Fraction of the recording, at each end, in which steps are not detected.
 """
 CURVE_PENALTY_NATS: Final = 1.0
-"""Penalty in nats for a quadratic term, which has one more parameter than a straight line."""
+"""Penalty for the additional parameter of a quadratic term, in nats."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Strongest departure that a diagnostic detects."""
+    """Strongest departure from white noise that a diagnostic finds."""
 
     gain: float  # log-likelihood gain, nats
     where: Location
 
 
 NO_FINDING: Final = Finding(0.0, Location())
-"""Finding of a diagnostic that has nothing to test."""
+"""Finding of a diagnostic that cannot be applied to an axis."""
 Diagnostic = Callable[[WhitenedAxis], Finding]
-"""Function that detects one kind of departure."""
+"""Function that tests a whitened axis for one kind of departure from white noise."""
 
 
 def diagnose_psd(whitened: WhitenedAxis) -> Finding:
-    """Find the range of frequency bins, of any width, whose power differs most from the expected power."""
+    """Find the frequency range in which the power differs most from the noise model."""
     bins = build_frequency_bins(
         whitened.axis.n, whitened.axis.rate_hz
     )  # the same bins for recordings with and without peaks
@@ -81,7 +76,7 @@ def diagnose_psd(whitened: WhitenedAxis) -> Finding:
 
 
 def fitted_variance_gain_nats(mean_square: Floats, count: Floats) -> Floats:
-    """Return the log-likelihood gain of a fitted variance over the variance one: n/2 (ρ − 1 − ln ρ).
+    """Return the log-likelihood gain n/2 (ρ − 1 − ln ρ) of a fitted variance over a variance of one.
 
     Parameters
     ----------
@@ -100,7 +95,7 @@ def fitted_variance_gain_nats(mean_square: Floats, count: Floats) -> Floats:
 
 
 def diagnose_spectral_lines(whitened: WhitenedAxis) -> Finding:
-    """Find a steady oscillation at the largest value of the periodogram."""
+    """Find the strongest spectral line in the periodogram of the whitened series."""
     found = find_periodogram_peaks(whitened.series, whitened.axis.rate_hz, 1)
     gain, f_hz = found[0]
     half = whitened.axis.rate_hz / whitened.axis.n
@@ -108,7 +103,7 @@ def diagnose_spectral_lines(whitened: WhitenedAxis) -> Finding:
 
 
 def find_periodogram_peaks(whitened_series: Floats, rate_hz: float, max_peaks: int) -> list[tuple[float, float]]:
-    """Return the largest separate peaks of the periodogram, strongest first.
+    """Find the largest separate peaks of the periodogram, in descending order.
 
     Parameters
     ----------
@@ -137,9 +132,10 @@ def find_periodogram_peaks(whitened_series: Floats, rate_hz: float, max_peaks: i
 
 
 def compute_periodogram(whitened_series: Floats) -> Floats:
-    """Return the gain in nats of a line at frequencies from 0 to half the sample rate, shape (m + 1,).
+    """Compute the periodogram of a whitened series, with zero padding to at least twice the length.
 
-    The frequencies are at least twice as dense as in a transform without zero padding.
+    Each value is the log-likelihood gain, in nats, of a spectral line. The m + 1 frequencies range from 0 to half the
+    sample rate.
     """
     n = whitened_series.size
     size = next_fast_len(2 * n, real=True)
@@ -152,9 +148,9 @@ def compute_periodogram(whitened_series: Floats) -> Floats:
 
 
 def diagnose_mean_level_change(whitened: WhitenedAxis) -> Finding:
-    """Find a change of the level: a step at any time, a slope, or a transient after the start.
+    """Find a change of the mean level: a step, a slope, or a transient at the start.
 
-    If the model contains jumps, nothing is reported, because whitening does not remove jumps of the model.
+    A model with random jumps is not tested, because whitening does not remove the jumps.
     """
     if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in whitened.effects):
         return NO_FINDING
@@ -177,11 +173,10 @@ def diagnose_mean_level_change(whitened: WhitenedAxis) -> Finding:
 
 
 def compute_level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
-    """Return the gain of a step of the level at each time.
+    """Compute the log-likelihood gain of a step of the mean level at each time.
 
-    A unit step at sample s has the coefficients X_k = −√(2/n) sin(πks/n)/(2 sin(πk/2n)). With the weights W_k, the
-    weighted sum of squares is Σ W_k X_k² = Σ W_k (1 − cos(2πks/n))/(4n sin²(πk/2n)), which a Fourier transform computes
-    for all s. The weighted sum of the products of X_k and the data is a running sum of the data over time.
+    A unit step at sample s has the cosine transform X_k = −√(2/n) sin(πks/n)/(2 sin(πk/2n)). A Fourier transform
+    computes the weighted sums Σ W_k X_k² = Σ W_k (1 − cos(2πks/n))/(4n sin²(πk/2n)) for all s.
 
     Returns
     -------
@@ -205,7 +200,6 @@ def compute_level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
 
 
 def _regressor_gain(whitened: WhitenedAxis, columns: list[Floats]) -> float:
-    """Return the log-likelihood gain in nats of regressors, each of shape (n − 1,), with fitted sizes."""
     stacked = np.stack([column * whitened.weights for column in columns])
     normal, right = stacked @ stacked.T, stacked @ whitened.coefficients
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -222,7 +216,7 @@ def diagnose_autocorrelation(whitened: WhitenedAxis) -> Finding:
 
 
 def compute_autocorrelation(whitened_series: Floats) -> Floats:
-    """Return the autocorrelation of a whitened series at lags of 1 to ``MAX_LAG_SAMPLES`` samples."""
+    """Compute the autocorrelation of a whitened series at lags from 1 to ``MAX_LAG_SAMPLES`` samples."""
     size = next_fast_len(whitened_series.size + MAX_LAG_SAMPLES, real=True)
     transform = rfft(whitened_series, size)
     products = irfft(transform.real**2 + transform.imag**2, size)
@@ -230,7 +224,7 @@ def compute_autocorrelation(whitened_series: Floats) -> Floats:
 
 
 def diagnose_temperature_dependence(whitened: WhitenedAxis) -> Finding:
-    """Find a dependence of the level on the temperature, with and without delay."""
+    """Find an immediate or delayed dependence of the mean level on the temperature."""
     temperature_c = whitened.axis.temperature_c
     if temperature_c is None:
         return NO_FINDING
@@ -252,7 +246,7 @@ def diagnose_temperature_dependence(whitened: WhitenedAxis) -> Finding:
 
 
 def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> Finding:
-    """Find the axis that leaks most strongly into this axis."""
+    """Find the other axis with the strongest influence on this axis."""
     best = NO_FINDING
     for name, coefficients in whitened.axis.leak_sources.items():
         gain = _regressor_gain(whitened, [coefficients])
@@ -262,14 +256,14 @@ def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> Finding:
 
 
 def diagnose_variance_change(whitened: WhitenedAxis) -> Finding:
-    """Find a variation of the noise variance in time: a step, a trend, a period or a slow random variation."""
+    """Find a change of the noise variance over time."""
     found = whitened.variance_changes
     gain = max(found.step.gain, found.largest_alternative_gain)
     return Finding(gain, Location(time=(found.step.time.lo, found.step.time.hi)))
 
 
 def diagnose_spectrogram_change(whitened: WhitenedAxis) -> Finding:
-    """Find the tile or the row of the spectrogram whose power is least constant in time."""
+    """Find the part of the spectrogram with the largest change of power over time."""
     found = whitened.spectrogram_change
     if found.gain >= found.row_gain:
         return Finding(found.gain, Location(time=found.time, frequency=found.frequency))
@@ -277,13 +271,13 @@ def diagnose_spectrogram_change(whitened: WhitenedAxis) -> Finding:
 
 
 def diagnose_outliers(whitened: WhitenedAxis) -> Finding:
-    """Find outliers in the distribution of the samples."""
+    """Find outliers among the samples of the whitened series."""
     found = whitened.outlier_fit
     return Finding(found.gain if found else 0.0, Location())
 
 
 def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> Finding:
-    """Find quantization, clipping or repeats of the measured values, if the model does not contain this effect."""
+    """Find quantization, clipping or repeated samples that the noise model does not contain."""
     statistics = whitened.axis.value_artifacts
     best = NO_FINDING
     for kind, found in (

@@ -1,11 +1,8 @@
-"""Role of each effect in the likelihood of an axis: noise variance, regressor or transform.
+"""Role of each effect in the likelihood of an axis: noise, deterministic regressor or spectral transform.
 
-The **size** of an effect is the parameter that scales the effect. All other parameters are **shape parameters**. A
-noise effect adds variance to each frequency bin. The variance is the **variance basis**, which is the variance for size
-one, multiplied by the square of the size. A deterministic effect adds a series. The series is the **regressor**, which
-is the series for size one, multiplied by the size. The simulation uses the same series, so fit and simulation agree.
-The regressor of a ``Leak`` is another axis. A transform, such as a low-pass filter, changes the variance bases of all
-noise effects that act before the transform.
+The **size** of an effect is the scaling parameter, and all other parameters are **shape parameters**. A noise effect
+adds variance to each frequency bin, in proportion to the square of the size. A deterministic effect adds a series,
+which is the size times the **regressor**. The regressor of a ``Leak`` is another axis.
 """
 
 from dataclasses import replace
@@ -63,7 +60,7 @@ SIZE_PARAMETERS: Final = NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS
 """For each effect with a size, the name of the size parameter."""
 
 ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
-"""Names of the effects that happen once. One part of a recording contains no information about another part."""
+"""Names of the effects that happen at most once in a recording."""
 
 _EFFECTS_BY_DIAGNOSTIC: Final = {
     "psd": (
@@ -79,18 +76,18 @@ _EFFECTS_BY_DIAGNOSTIC: Final = {
     "values": ("resolution", "saturation", "sample_hold"),
 }
 MOST_DIRECT_DIAGNOSTIC: Final = {effect: lens for lens, effects in _EFFECTS_BY_DIAGNOSTIC.items() for effect in effects}
-"""For each effect, the diagnostic that shows the effect most directly."""
+"""Diagnostic that is most sensitive to each effect."""
 
 
 def effect_size(effect: Effect) -> float:
-    """Return the size of a noise effect or of a deterministic effect."""
+    """Return the size parameter of a noise effect or a deterministic effect."""
     return float(getattr(effect, SIZE_PARAMETERS[type(effect)]))
 
 
 def with_effect_size(effect: Effect, size: float) -> Effect:
-    """Return the effect with the given size.
+    """Return a copy of an effect with a new size.
 
-    The sizes of noise effects, ramps and sinusoids are never negative, so the sign of the new size is ignored for them.
+    The sizes of noise effects, ramps and sinusoids are never negative, and the sign of a new size is ignored.
 
     Parameters
     ----------
@@ -105,10 +102,10 @@ def with_effect_size(effect: Effect, size: float) -> Effect:
 
 
 def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
-    """Return the regressors of a deterministic effect.
+    """Build the regressors of a deterministic effect.
 
-    A sinusoid has one regressor for each of two phases. A quadratic temperature effect has one regressor for the linear
-    term and one for the quadratic term. All other effects have one regressor.
+    A sinusoid has a regressor for each of two phases. A quadratic temperature effect has a linear and a quadratic
+    regressor. Other effects have one regressor.
 
     Parameters
     ----------
@@ -129,7 +126,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     Raises
     ------
     TypeError
-        If the effect is a leak, because the regressor of a leak is another axis.
+        If the effect is a leak from another axis.
     """
     if isinstance(effect, Leak):
         raise TypeError("the series of a leak is another axis")
@@ -147,7 +144,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
 
 
 def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
-    """Return the effect with sizes such that the effect is the sum of the regressors times the given factors.
+    """Return a copy of an effect that equals the sum of the regressors times the given factors.
 
     Parameters
     ----------
@@ -164,7 +161,6 @@ def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
 
 
 def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:
-    """Return the series of a deterministic effect."""
     values = np.zeros(n)
     known_c = np.full(n, np.nan) if temperature_c is None else temperature_c
     # a deterministic effect draws no random numbers, but the interface requires a generator

@@ -1,9 +1,7 @@
-"""Hypotheses about one axis: the effects of the model under test, some with a changed size, and added effects.
+"""Hypotheses about one axis: effects of a noise model, some with a new size, and added effects.
 
-The size of a noise effect of the model is fitted only if this gains more than ``RESIZE_PENALTY_NATS`` nats.
-Otherwise the size in the model is kept. If N in the model is 5 % wrong, N is therefore changed, and no effect is added.
-A correct K is kept although other effects may resemble a random walk. The sizes of added effects and of all
-deterministic effects (lines, slopes, temperature dependence) are always fitted.
+A noise effect of the model has a new size only if the log-likelihood gain exceeds ``RESIZE_PENALTY_NATS``. The sizes of
+added effects and of deterministic effects are always fitted.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,14 +18,14 @@ from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMET
 from monitor.reconcile.result import ParameterInterval
 
 RESIZE_PENALTY_NATS: Final = 5.0
-"""Log-likelihood gain in nats that justifies a change of the size of a noise effect of the model."""
+"""Smallest log-likelihood gain, in nats, for a new size of a noise effect of the model."""
 GOLDEN: Final = 0.6180339887498949
 SHAPE_ITERATIONS: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Fitted effects of one axis."""
+    """Effects of a noise model and added effects, fitted to one axis."""
 
     model: Effects  # effects of the model under test with the original sizes; the first entries of ``effects``
     fit: AxisFit
@@ -39,43 +37,43 @@ class Hypothesis:
 
     @property
     def given_count(self) -> int:
-        """Number of effects in the model under test."""
+        """Number of effects in the original noise model."""
         return len(self.model)
 
     @property
     def added(self) -> Effects:
-        """Effects that are not in the model under test."""
+        """Effects that were added to the noise model."""
         return self.fit.effects[self.given_count :]
 
     @property
     def effects(self) -> Effects:
-        """All effects with fitted sizes."""
+        """All fitted effects: the effects of the noise model, then the added effects."""
         return self.fit.effects
 
     @property
     def refitted_size_count(self) -> int:
-        """Number of noise effects of the model whose size was fitted instead of kept."""
+        """Number of noise effects of the model with a fitted size."""
         return sum(at < self.given_count for at in self.fit.fitted_noise)
 
     @property
     def resize_penalty(self) -> float:
-        """Penalty for the fitted sizes of the model, in nats."""
+        """Penalty in nats for the fitted sizes of the noise model."""
         return RESIZE_PENALTY_NATS * self.refitted_size_count
 
     @property
     def penalised_log_likelihood(self) -> float:
-        """Log-likelihood less the penalties for fitted sizes of the model, in nats."""
+        """Log-likelihood less the penalty for fitted sizes of the noise model, in nats."""
         return self.fit.log_likelihood - self.resize_penalty
 
     def refit_with_added_effects(self, added: Sequence[Effect]) -> "Hypothesis":
-        """Return the fit of the same model with the given added effects, by ``fit_with_fewest_changes``."""
+        """Fit the same noise model with another set of added effects."""
         return fit_with_fewest_changes(self.axis, added, self.model)
 
 
 def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
-    """Fit the deterministic effects of a model and keep the sizes of the noise effects.
+    """Fit the deterministic effects of a noise model and keep the sizes of the noise effects.
 
-    Deterministic effects are fitted because the sizes differ between recordings.
+    The sizes of deterministic effects differ between recordings.
 
     Parameters
     ----------
@@ -88,7 +86,7 @@ def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
 
 
 def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects) -> Hypothesis:
-    """Fit added effects together with a model, and change only those sizes of the model that the data contradict.
+    """Fit added effects together with a noise model, and change as few sizes of the model as possible.
 
     Parameters
     ----------
@@ -125,7 +123,7 @@ def noise_effect_indices(effects: Sequence[Effect]) -> frozenset[int]:
 def fit_shape_parameter(
     axis: Axis, other_effects: Effects, effect: Effect, parameter_name: str, search_factor: float = 1.5
 ) -> Effect:
-    """Maximise the likelihood over one shape parameter of an effect, with all sizes fitted.
+    """Fit one shape parameter of an effect by maximum likelihood, together with all sizes.
 
     Parameters
     ----------
@@ -143,7 +141,7 @@ def fit_shape_parameter(
     Returns
     -------
     Effect
-        The effect with the best shape and the same size.
+        Effect with the fitted shape parameter and the original size.
     """
 
     def with_shape_parameter(log_value: float) -> Effect:
@@ -161,7 +159,7 @@ def fit_shape_parameter(
 
 
 def find_maximum_by_golden_section(function: Callable[[float], float], lo: float, hi: float, iterations: int) -> float:
-    """Return the position of the maximum of a function that has a single maximum in an interval.
+    """Find the maximum of a function with a single maximum in an interval, by golden-section search.
 
     Parameters
     ----------
@@ -170,7 +168,7 @@ def find_maximum_by_golden_section(function: Callable[[float], float], lo: float
     lo, hi : float
         Ends of the interval.
     iterations : int
-        Number of iterations. Each iteration calls the function once and shortens the interval by the golden ratio.
+        Number of iterations. Each iteration evaluates the function once.
     """
     a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
     at_a, at_b = function(a), function(b)
@@ -187,10 +185,9 @@ def find_maximum_by_golden_section(function: Callable[[float], float], lo: float
 
 
 def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
-    """Return the size of an effect with the 95 % interval.
+    """Compute the 95 % interval of the size of an effect.
 
-    The error of the logarithm is Gaussian for the size of a noise effect. The error of the size itself is Gaussian for
-    a deterministic effect.
+    The interval is Gaussian for a deterministic effect, and Gaussian in the logarithm for a noise effect.
 
     Parameters
     ----------
@@ -208,15 +205,12 @@ def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
 
 
 def _with_shape(effects: Effects, index: int, name: str, value: float) -> Effects:
-    """Return the effects with a changed parameter of the effect with the given index."""
     changed: Any = replace(effects[index], **{name: value})  # type: ignore[type-var]
     return (*effects[:index], changed, *effects[index + 1 :])
 
 
 def compute_shape_interval(fit: AxisFit, effect_index: int, parameter_name: str) -> ParameterInterval:
-    """Return a shape parameter with the 95 % interval from the profile likelihood.
-
-    At each end of the interval, the log-likelihood is ``HALF_CHI2_95`` below the maximum.
+    """Compute the 95 % interval of a shape parameter from the profile likelihood.
 
     Parameters
     ----------

@@ -1,14 +1,11 @@
-"""Comparison of a process of random events with an effect that has the same spectrum: parts that the pairs share.
+"""State-space likelihoods that compare a process of random events with an effect of the same spectrum.
 
-A random telegraph has the same second moments as exponentially correlated noise. Poisson steps have the same second
-moments as a random walk. Only the distributions differ. The full likelihood of both effects is therefore computed for
-the same data and the same background noise. The gain of an ``EventProcessComparison`` is the logarithm of the ratio of
-the two maximum likelihoods. The caller subtracts penalties for parameters and prior odds.
+A random telegraph has the same second moments as exponentially correlated noise, and Poisson steps have the same second
+moments as a random walk. Only the full likelihood distinguishes the distributions. Both likelihoods use the same block
+means and the same background noise.
 
-The data are block means. The background noise consists of white noise, random walk, flicker noise and exponentially
-correlated noise. It is modelled as a sum of independent first-order processes. The distribution of a block mean, given
-the state at the start of the block, is known exactly. One step of a Kalman filter per block is therefore sufficient.
-The first level has a nearly flat prior, which is the same for both effects.
+The background noise is a sum of independent first-order processes. The distribution of a block mean, given the state at
+the start of the block, is exact. A Kalman filter therefore needs one step per block.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,27 +23,26 @@ from monitor.reconcile.result import ParameterInterval
 MAX_BLOCKS: Final = 1 << 15
 """Largest number of blocks. The end of a longer recording is not used."""
 TARGET_BLOCKS: Final = 200.0
-"""Smallest number of blocks in a recording with sufficiently many samples."""
+"""Smallest number of blocks in a recording with enough samples."""
 MIN_BLOCKS: Final = 16
 INITIAL_VARIANCE_RATIO: Final = 100.0
-"""Prior variance of the first level relative to the variance of the data. This prior is effectively flat."""
+"""Prior variance of the first level, relative to the variance of the data."""
 FLICKER_TIME_RATIO: Final = 10.0
-"""Ratio of successive correlation times of the processes that approximate flicker noise. With this ratio, the spectrum
-deviates by 5 % from 1/f.
+"""Ratio of successive correlation times in the approximation of flicker noise. The spectrum deviates by 5 % from 1/f.
 """
 FLICKER_CUTOFF_RATIO: Final = 20.0
 """Highest modelled frequency of flicker noise, relative to the frequency at which flicker and white noise are equal."""
 CURVATURE_STEP: Final = 0.1
 """Step in the logarithm of a parameter for the numerical curvature at the maximum."""
 ODDS_STEP: Final = 1e-3
-"""Relative change of the odds for the numerical derivative that gives the number of events."""
+"""Relative change of the odds for the numerical derivative."""
 MAX_LOG_PARAMETER_RANGE: Final = log(30.0)
-"""Largest distance of the logarithm of a parameter from its starting value."""
+"""Largest change of the logarithm of a parameter during a search."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventProcessComparison:
-    """Comparison of a process of random events with an effect that has the same spectrum, on one axis."""
+    """Comparison of a process of random events with an effect of the same spectrum."""
 
     gain: float  # log-likelihood of the process less the log-likelihood of the other effect, nats
     parameters: Mapping[str, ParameterInterval]  # of the process at the maximum, SI, 95 %
@@ -56,7 +52,7 @@ class EventProcessComparison:
 
 @dataclass(frozen=True, slots=True)
 class BackgroundNoise:
-    """Noise of an axis besides the compared effects. All spectral densities S(f) are two-sided."""
+    """Background noise of an axis, with two-sided spectral densities S(f)."""
 
     white: float  # N²: S(f) = N², unit² s
     walk: float = 0.0  # K²: S(f) = K²/(2πf)², unit²/s
@@ -65,11 +61,10 @@ class BackgroundNoise:
 
 
 class StateSpaceNoise(NamedTuple):
-    """Noise of block means as a sum of independent first-order processes and of white noise.
+    """State-space model of the noise in block means, as a sum of first-order processes and white noise.
 
-    From the start of one block to the start of the next block, the state x of a process changes to a·x + w. The process
-    contributes c·x + v to the block mean. The random terms w and v are Gaussian. The first process is the level,
-    including the random walk.
+    In each block, the state x of a process changes to a·x + w, and the process adds c·x + v to the block mean. The
+    random terms w and v are Gaussian. The first process is the mean level with the random walk.
     """
 
     table: Floats  # [d, 4] a, c, variance of w and covariance of v and w, for each process
@@ -77,7 +72,7 @@ class StateSpaceNoise(NamedTuple):
 
 
 class EventProcessFit(NamedTuple):
-    """Fit of a process of random events at the maximum of the likelihood."""
+    """Maximum-likelihood fit of a process of random events."""
 
     log_likelihood: float
     parameters: dict[str, ParameterInterval]
@@ -86,7 +81,7 @@ class EventProcessFit(NamedTuple):
     def compare_with_other_effect(
         self, other_log_likelihood: float, single_step_count: int = 0
     ) -> EventProcessComparison:
-        """Compare the process with another effect.
+        """Compare the process of random events with another effect.
 
         Parameters
         ----------
@@ -100,7 +95,7 @@ class EventProcessFit(NamedTuple):
 
 
 def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
-    """Return the means of consecutive blocks, less the mean of the series, and the length of a block.
+    """Compute the means of consecutive blocks, less the mean of the series.
 
     Parameters
     ----------
@@ -138,7 +133,7 @@ def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Float
 
 
 def build_state_space_noise(background: BackgroundNoise, block_s: float, duration_s: float) -> StateSpaceNoise:
-    """Return the state-space model of noise in block means.
+    """Build the state-space model of the background noise in block means.
 
     Parameters
     ----------
@@ -170,9 +165,9 @@ def correlated_noise_of_block_means(
 ) -> tuple[tuple[float, float, float, float], float]:
     """Return the state-space model of exponentially correlated noise in block means.
 
-    Let σ be the standard deviation of the noise and x the ratio of block length to correlation time. The mean of a
-    block then has the variance σ² 2(x − 1 + e^−x)/x². The covariance of the mean with the noise at either end of the
-    block is σ² (1 − e^−x)/x. The variance and the covariance are integrals of the autocovariance σ² e^−|t|/T_c.
+    Let σ be the standard deviation of the noise, and x the ratio of block length to correlation time. The variance of a
+    block mean is σ² 2(x − 1 + e^−x)/x². The covariance of a block mean with the noise at either end of the block is σ²
+    (1 − e^−x)/x.
 
     Parameters
     ----------
@@ -202,12 +197,11 @@ def correlated_noise_of_block_means(
 
 
 def _flicker_processes(background: BackgroundNoise, block_s: float, duration_s: float) -> list[tuple[float, float]]:
-    """Return the standard deviation and correlation time of each of several processes whose sum is flicker noise.
+    """Return the standard deviations and correlation times of processes whose sum is flicker noise.
 
-    Flicker noise has the spectral density B²/(2πf). The sum has this density from the inverse of the recording length
-    up to the frequency above which white noise dominates. The processes have the same variance s, and successive
-    correlation times have the ratio ρ. The sum of the processes has the spectral density (s π/ln ρ)/(2πf) (Keshner,
-    "1/f noise", Proc. IEEE 70, 1982). The variance is therefore s = B² ln ρ/π.
+    The sum has the spectral density B²/(2πf) from the inverse of the recording length up to the frequency at which
+    white noise dominates. For processes of equal variance s and correlation times of ratio ρ, the sum has the density
+    (s π/ln ρ)/(2πf) (Keshner, "1/f noise", Proc. IEEE 70, 1982). The variance is therefore s = B² ln ρ/π.
     """
     if background.flicker <= 0.0:
         return []
@@ -259,10 +253,10 @@ def maximise_log_likelihood(
 def fit_event_process(
     log_likelihood: Callable[[float, float, float], float], start_values: Mapping[str, float]
 ) -> EventProcessFit:
-    """Maximise the likelihood of a process of random events over its two parameters.
+    """Fit the two parameters of a process of random events by maximum likelihood.
 
-    The expected number of events is the derivative of the log-likelihood with respect to the logarithm of the odds of
-    an event (Fisher's identity).
+    The expected number of events is the derivative of the log-likelihood with respect to the log-odds of an event
+    (Fisher's identity).
 
     Parameters
     ----------
@@ -280,10 +274,6 @@ def fit_event_process(
 
 
 def _log_interval(value: float, deviation: float) -> ParameterInterval:
-    """Return a parameter with the 95 % interval, or without an interval that is wider than the search range.
-
-    ``deviation`` is the standard deviation of the logarithm.
-    """
     wide = Z95 * deviation
     if not wide < MAX_LOG_PARAMETER_RANGE:
         return ParameterInterval(value)
@@ -291,7 +281,6 @@ def _log_interval(value: float, deviation: float) -> ParameterInterval:
 
 
 def _log_deviations(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
-    """Return the standard deviations of the logarithms of the parameters, or NaN if the curvature shows no maximum."""
     curvature = _curvature(function, at, height)
     if (np.linalg.eigvalsh(curvature) < 0.0).all():
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(-curvature))))
@@ -299,7 +288,6 @@ def _log_deviations(function: Callable[[Floats], float], at: Floats, height: flo
 
 
 def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
-    """Return the second derivatives, shape (k, k), from finite differences with the step ``CURVATURE_STEP``."""
     k = at.size
     steps = CURVATURE_STEP * np.eye(k)
     curvature = np.empty((k, k))
@@ -312,16 +300,13 @@ def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -
 
 
 def prior_level_variance(means: Floats) -> float:
-    """Return the prior variance of the first level."""
+    """Return the prior variance of the mean level in the first block."""
     return INITIAL_VARIANCE_RATIO * float(means.var())
 
 
 @compiled
 def initial_state_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
-    """Return the state covariance, shape (d, d), before the first block.
-
-    The prior variance of the level is ``level_variance``. The other processes are stationary.
-    """
+    """Return the state covariance, shape (d, d), before the first block."""
     table = noise.table
     d = table.shape[0]
     covariance = np.zeros((d, d))
@@ -333,9 +318,9 @@ def initial_state_covariance(noise: StateSpaceNoise, level_variance: float) -> F
 
 @compiled
 def predict_block_mean_variance(noise: StateSpaceNoise, covariance: Floats, state_covariance_out: Floats) -> float:
-    """Return the predicted variance of a block mean from the state covariance, shape (d, d), at the start of the block.
+    """Predict the variance of a block mean from the state covariance, shape (d, d), at the start of the block.
 
-    The covariance of the block mean with the next state is written to ``state_covariance_out``, shape (d,).
+    The covariance of the block mean with the next state, shape (d,), is written to ``state_covariance_out``.
     """
     table = noise.table
     d = table.shape[0]
@@ -351,7 +336,7 @@ def predict_block_mean_variance(noise: StateSpaceNoise, covariance: Floats, stat
 
 @compiled
 def innovation_of_block(block_mean: float, noise: StateSpaceNoise, state: Floats) -> float:
-    """Return the block mean less the prediction from the state, shape (d,), at the start of the block."""
+    """Return the difference between a block mean and the prediction from the state, shape (d,)."""
     innovation = block_mean
     for i in range(noise.table.shape[0]):
         innovation -= noise.table[i, 1] * state[i]
@@ -362,9 +347,9 @@ def innovation_of_block(block_mean: float, noise: StateSpaceNoise, state: Floats
 def innovation_variances(
     extra_level_variance: Floats, noise: StateSpaceNoise, level_variance: float
 ) -> tuple[Floats, Floats]:
-    """Return the variances of the innovations, shape (m,), and the covariances with the next state, shape (m, d).
+    """Return the innovation variances, shape (m,), and the covariances with the next state, shape (m, d).
 
-    ``extra_level_variance``, shape (m,), is added to the variance of the level at the start of each block.
+    The variance of the mean level increases by ``extra_level_variance``, shape (m,), at the start of each block.
     """
     table = noise.table
     d, m = table.shape[0], extra_level_variance.size
@@ -385,7 +370,7 @@ def innovation_variances(
 def innovations_of_series(
     series: Floats, noise: StateSpaceNoise, variances: Floats, state_covariances: Floats
 ) -> Floats:
-    """Return the innovations, shape (m,): the block means less the predictions of the Kalman filter."""
+    """Return the innovations of a Kalman filter, shape (m,), for a series of block means."""
     table = noise.table
     d = table.shape[0]
     state, innovations = np.zeros(d), np.empty(series.size)

@@ -1,7 +1,6 @@
-"""Whitening of an axis by a fitted model.
+"""Whitening of an axis by a fitted noise model.
 
-If the model is true, the whitened coefficients are independent with variance one, and so are the samples of the
-whitened series. All diagnostics work on a ``WhitenedAxis``.
+If the model is true, the whitened coefficients are independent and have a variance of one.
 """
 
 from dataclasses import dataclass
@@ -24,22 +23,20 @@ from monitor.reconcile.likelihood.variance_history import (
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 
 SLOW_BAND_FRACTION: Final = 0.01
-"""Fraction of the frequency range, from zero, that the tests of tails and variance ignore. A model describes low
-frequencies less accurately, and they contain little information about single samples.
+"""Fraction of the frequency range, from zero, that the tests for outliers and variance changes ignore.
 """
 MIN_COEFFICIENTS_PER_BIN: Final = 64
-"""Number of coefficients whose mean power has a standard error of 18 %. The power of smaller bins is averaged over
-``SMOOTHING_BINS`` bins.
+"""Smallest number of coefficients in a bin whose power is not smoothed. The standard error is 18 %.
 """
 SMOOTHING_BINS: Final = 9
-"""Number of bins over which the power of a small bin is averaged."""
+"""Number of neighbouring bins over which the power of a small bin is averaged."""
 MIN_DENSITY_RATIO: Final = 1e-3
-"""Smallest density of a bin relative to the median. Bins with less are stop bands without information about samples."""
+"""Smallest spectral density of a bin relative to the median. Bins below this limit are stop bands."""
 
 
 @dataclass(frozen=True, eq=False)
 class WhitenedAxis:
-    """Axis whitened by a model."""
+    """Axis whitened by a fitted noise model."""
 
     fit: AxisFit
     coefficients: Floats  # [n − 1] coefficients divided by the standard deviation; random draws in stop bands
@@ -49,12 +46,12 @@ class WhitenedAxis:
 
     @property
     def axis(self) -> Axis:
-        """Axis that was whitened."""
+        """Axis before whitening."""
         return self.fit.axis
 
     @property
     def effects(self) -> Effects:
-        """Fitted effects by which the axis was whitened."""
+        """Effects of the fitted noise model."""
         return self.fit.effects
 
     @property
@@ -64,23 +61,23 @@ class WhitenedAxis:
 
     @cached_property
     def variance_changes(self) -> VarianceChangeFit:
-        """Changes of the variance of the flattened series over time."""
+        """Changes of the variance of the flattened series."""
         return fit_variance_changes(self.flat_series, 1.0 / self.axis.rate_hz)
 
     @cached_property
     def spectrogram_change(self) -> SpectrogramChange:
-        """Least constant tile and row of the spectrogram, after the noise steps of the model are removed."""
+        """Largest change of power in the spectrogram that no noise step of the model explains."""
         series = self.series / relative_noise_deviation_over_time(self.fit)
         return find_spectrogram_change(series, 1.0 / self.axis.rate_hz)
 
     @cached_property
     def outlier_fit(self) -> OutlierFit | None:
-        """Outliers of the flattened series, or None if a Gaussian fits as well as a mixture."""
+        """Fit of outliers to the flattened series, or None if a Gaussian fits equally well."""
         return fit_outliers(self.flat_series)
 
 
 def whiten_axis(fit: AxisFit) -> WhitenedAxis:
-    """Whiten an axis by a fitted model."""
+    """Whiten an axis by a fitted noise model."""
     axis = fit.axis
     weight = axis.bins.expand_to_coefficients(axis.used_bins / np.sqrt(fit.whittle.variance))
     whitened = fit.coefficients_without_deterministic_effects() * weight
@@ -89,9 +86,9 @@ def whiten_axis(fit: AxisFit) -> WhitenedAxis:
 
 
 def _flattened_series(fit: AxisFit, whitened: Floats) -> Floats:
-    """Return the whitened series, rescaled to unit power in each bin.
+    """Return the whitened series with unit power in each frequency bin.
 
-    The result has the tails and the variance of white noise, even if the spectrum of the model is wrong.
+    The flattened series shows heavy tails and variance changes even if the spectrum of the model is wrong.
     """
     axis = fit.axis
     count, window = axis.bins.count, np.ones(SMOOTHING_BINS)
@@ -108,12 +105,11 @@ def _flattened_series(fit: AxisFit, whitened: Floats) -> Floats:
 
 
 def _replace_by_noise(coefficients: Floats, at: Ints) -> None:
-    """Replace the coefficients at the given indices by white noise. The seed is the number of indices."""
     coefficients[at] = np.random.default_rng(at.size).standard_normal(at.size)
 
 
 def relative_noise_deviation_over_time(fit: AxisFit) -> Floats:
-    """Return the relative standard deviation over time, shape (n,), of white noise with the noise steps of a fit."""
+    """Return the standard deviation of the white noise over time, shape (n,), relative to the root mean square."""
     deviation = np.ones(fit.axis.n)
     for effect in fit.effects:
         if isinstance(effect, NoiseStep):

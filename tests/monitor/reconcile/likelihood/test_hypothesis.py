@@ -52,7 +52,7 @@ def test_a_wrong_size_is_another_size_and_the_right_one_stays(wrong, at):
     assert state.effects[1 - at] == given[1 - at]
     found = (state.effects[0].N / N, state.effects[1].K / 3e-5)[at]
     assert found == pytest.approx(1.0, abs=0.4 if at else 0.02)
-    assert state.penalised_log_likelihood > fit_with_fixed_noise(one, given).score
+    assert state.penalised_log_likelihood > fit_with_fixed_noise(one, given).penalised_log_likelihood
 
 
 def test_both_wrong_sizes_are_found():
