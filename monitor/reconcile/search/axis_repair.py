@@ -1,9 +1,7 @@
-"""Replacement of the samples of an axis that are missing or that effects of the model have altered.
+"""Repair of the samples of an axis, by replacement of missing and altered samples.
 
-``sample_repair`` draws the replacement samples. Missing samples are always replaced. Repeated, outlying and clipped
-samples are replaced only if the model contains the effect. The positions of repeats of continuous values are known.
-Outliers are detected in the whitened axis. Measured and simulated recordings are repaired in the same way. The spectrum
-of a repaired axis depends only on the other effects.
+Missing samples are always replaced. Repeated, outlying and clipped samples are replaced if the effects of the axis
+include the cause. Measured and simulated recordings are repaired in the same way.
 """
 
 from collections.abc import Mapping
@@ -23,7 +21,7 @@ from monitor.reconcile.preparation.sample_repair import fill_missing_samples, re
 from monitor.reconcile.preparation.value_artifacts import detect_clipping, detect_quantization, detect_repeats
 
 CLIP_RELATIVE_TOLERANCE: Final = 1e-9
-"""Relative distance to the limit below which a sample counts as clipped."""
+"""Relative distance from the limit within which a sample is clipped."""
 MAX_SIGMA_ITERATIONS: Final = 40
 SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
 
@@ -31,12 +29,12 @@ SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
 def build_repaired_axes(
     recording: Recording, effects: Mapping[str, Effects], regressors: RegressorCache, rng: np.random.Generator
 ) -> dict[str, Axis]:
-    """Build the axes of one recording, with repaired samples.
+    """Build the axes of one recording with repaired samples.
 
     Parameters
     ----------
     recording : Recording
-        Measured or simulated recording. The temperature must not have missing samples.
+        Measured or simulated recording without missing temperatures.
     effects : mapping of str to tuple of Effect
         Effects of each axis in the model.
     regressors : RegressorCache
@@ -68,7 +66,7 @@ def build_repaired_axes(
 
 
 def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
-    """Return the axis with the measured samples repaired again, for a different set of effects.
+    """Repair the measured samples of an axis again for another set of effects.
 
     Parameters
     ----------
@@ -85,15 +83,12 @@ def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) ->
 
 
 def _may_leak(source: str, axis: str) -> bool:
-    """Return True if one axis may leak into another.
-
-    Any axis may leak into a gyroscope axis. Only accelerometer axes may leak into an accelerometer axis.
-    """
+    """Return True if one axis may leak into another axis: accelerometers into all axes, gyroscopes into gyroscopes."""
     return source != axis and (axis.startswith("g") or source.startswith("a"))
 
 
 def detect_value_artifacts(y: Floats) -> ValueArtifacts:
-    """Return the quantization, clipping and repeats of measured samples ``y``, shape (n,), in rad/s or m/s²."""
+    """Detect quantization, clipping and repeats in measured samples, shape (n,), in rad/s or m/s²."""
     grid = detect_quantization(y)
     step = grid.step.value if grid else 0.0
     ends = detect_clipping(y, step)
@@ -101,10 +96,7 @@ def detect_value_artifacts(y: Floats) -> ValueArtifacts:
 
 
 def _repair_samples(y: Floats, statistics: ValueArtifacts, effects: Effects, rng: np.random.Generator) -> Floats:
-    """Return the samples ``y``, shape (n,), with missing, repeated and clipped samples replaced.
-
-    Repeated and clipped samples are replaced only if the effects include ``RandomSampleHold`` or ``Saturation``.
-    """
+    """Return the samples with missing samples replaced, and repeated or clipped samples if the effects require it."""
     missing = ~np.isfinite(y)
     types = {type(effect) for effect in effects}
     if RandomSampleHold in types and statistics.repeats:
@@ -116,7 +108,7 @@ def _repair_samples(y: Floats, statistics: ValueArtifacts, effects: Effects, rng
 
 
 def _restore_clipped_samples(y: Floats, limit: float, rng: np.random.Generator) -> Floats:
-    """Replace the clipped samples repeatedly, until the standard deviation of the noise converges."""
+    """Restore the clipped samples repeatedly until the standard deviation of the noise converges."""
     inside = np.abs(y) < limit * (1.0 - CLIP_RELATIVE_TOLERANCE)
     sigma = float(np.std(np.diff(y)[inside[1:] & inside[:-1]])) / 2.0**0.5
     whole = y
@@ -129,7 +121,6 @@ def _restore_clipped_samples(y: Floats, limit: float, rng: np.random.Generator) 
 
 
 def _replace_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
-    """Return the axis with the outliers replaced, if the effects include outliers."""
     if not any(isinstance(effect, Outliers) for effect in effects):
         return axis
     found = fit_outliers(whiten_axis(fit_with_fixed_noise(axis, effects).fit).flat_series)

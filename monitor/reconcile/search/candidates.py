@@ -1,10 +1,8 @@
 """Candidate effects for one axis, with starting values from the data.
 
-Each function takes a whitened axis and proposes effects of one kind. The shape parameters of a proposed effect are
-fitted together with the effects by which the axis was whitened. The caller fits the sizes. The log-likelihood gain of
-an effect must exceed the penalty in ``PENALTY_NATS``. The penalty is the gain that an effect reaches by chance if the
-model is true. The penalty is larger for effects that can occur at many frequencies or times, and for effects with
-fitted shape parameters. The values are empirical.
+Each function proposes effects of one kind for a whitened axis. Shape parameters are fitted here, and the caller fits
+the sizes. ``PENALTY_NATS`` contains the log-likelihood gain that an effect reaches by chance. The penalties are
+empirical, and larger for effects that can occur at many frequencies or times.
 """
 
 from collections.abc import Callable, Sequence
@@ -71,13 +69,13 @@ PENALTY_NATS: Final[dict[str, float]] = {
 SHAPES_PER_DECADE: Final = 4
 """Number of shape values per decade in the first search."""
 MAX_CORRELATION_FRACTION: Final = 0.1
-"""Longest correlation time as a fraction of the recording. With a longer one, the noise resembles a random walk."""
+"""Longest correlation time, as a fraction of the recording length."""
 MAX_TIME_CONSTANT_FRACTION: Final = 0.4
-"""Longest time constant of a transient or delay as a fraction of the recording. Longer transients resemble a slope."""
+"""Longest time constant of a transient or delay, as a fraction of the recording length."""
 PEAK_SEPARATION_STEPS: Final = 24
-"""Distance, in quarters of the window width, within which two windows contain the same peak."""
+"""Smallest distance between two peaks, in quarters of the window width."""
 MIN_DELAY_FRACTION: Final = 0.002
-"""Shortest temperature delay as a fraction of the recording. The noise of the thermometer hides shorter delays."""
+"""Shortest temperature delay, as a fraction of the recording length."""
 MAX_PEAKS: Final = 2
 FILTER_ORDERS: Final = (1, 2, 3, 4)
 
@@ -86,19 +84,19 @@ CandidateFunction = Callable[[WhitenedAxis], list[Effect]]
 
 
 def propose_allan_terms(whitened: WhitenedAxis) -> list[Effect]:
-    """Return those terms of Q, N, B and K that the hypothesis does not contain."""
+    """Propose the noise terms Q, N, B and K that the current hypothesis lacks."""
     small = initial_effect_size(whitened.axis)
     every = (QuantizationNoise(Q=small), AngleRandomWalk(N=small), BiasInstability(B=small), RateRandomWalk(K=small))
     return [effect for effect in every if type(effect) not in whitened.effect_types]
 
 
 def propose_correlated_noise(whitened: WhitenedAxis) -> list[Effect]:
-    """Return the best exponentially correlated noise. The list is empty if the correlation time is out of range."""
+    """Propose exponentially correlated noise, if a suitable correlation time is found."""
     return fit_correlated_noise(whitened.axis, whitened.effects)
 
 
 def fit_correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
-    """Return the best exponentially correlated noise. The list is empty if the correlation time is out of range.
+    """Fit exponentially correlated noise. The list is empty if the correlation time is out of range.
 
     Parameters
     ----------
@@ -122,7 +120,7 @@ def fit_correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
 
 
 def propose_resonances(whitened: WhitenedAxis) -> list[Effect]:
-    """Return resonances at the peaks of the whitened spectrum."""
+    """Propose resonances at the peaks of the whitened spectrum."""
     axis, found = whitened.axis, list[Effect]()
     for middle, width in find_spectral_peaks(whitened):
         trials = [
@@ -140,7 +138,7 @@ def propose_resonances(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def find_spectral_peaks(whitened: WhitenedAxis, max_peaks: int = MAX_PEAKS) -> list[tuple[float, float]]:
-    """Return the peaks of the whitened spectrum that are wider than a line, strongest first.
+    """Find the peaks of the whitened spectrum that are wider than a spectral line, in descending order.
 
     Parameters
     ----------
@@ -179,7 +177,7 @@ def find_spectral_peaks(whitened: WhitenedAxis, max_peaks: int = MAX_PEAKS) -> l
 
 
 def propose_sinusoids(whitened: WhitenedAxis) -> list[Effect]:
-    """Return sinusoids at the lines of the spectrum."""
+    """Propose sinusoids at the strongest spectral lines."""
     return [
         Sinusoidal(amplitude=initial_effect_size(whitened.axis), frequency=_line_frequency(whitened, f_hz), phase=0.0)
         for gain, f_hz in find_periodogram_peaks(whitened.series, whitened.axis.rate_hz, MAX_PEAKS)
@@ -188,7 +186,7 @@ def propose_sinusoids(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def _line_frequency(whitened: WhitenedAxis, f_hz: float) -> float:
-    """Return the frequency of the maximum of the periodogram near ``f_hz``."""
+    """Return the frequency, near ``f_hz``, with the largest value of the periodogram."""
     t = np.arange(whitened.axis.n) / whitened.axis.rate_hz
     half = 0.5 * whitened.axis.rate_hz / whitened.axis.n
 
@@ -203,10 +201,7 @@ def _line_frequency(whitened: WhitenedAxis, f_hz: float) -> float:
 
 
 def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
-    """Return the best low-pass filter.
-
-    The list is empty if the hypothesis contains a low-pass filter, or if the best cut-off is half the sample rate.
-    """
+    """Propose a low-pass filter, if the current hypothesis contains none."""
     if BandwidthLimit in whitened.effect_types:
         return []
     axis = whitened.axis
@@ -223,7 +218,7 @@ def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def propose_drifts(whitened: WhitenedAxis) -> list[Effect]:
-    """Return effects that depend on time: a ramp, a transient after the start, and a step."""
+    """Propose a ramp, a transient at the start, and a step of the bias."""
     found: list[Effect] = []
     if RateRamp not in whitened.effect_types:
         found.append(RateRamp(R=initial_effect_size(whitened.axis)))
@@ -238,7 +233,7 @@ def propose_drifts(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
-    """Return linear, quadratic and delayed temperature effects."""
+    """Propose linear, quadratic and delayed temperature effects."""
     temperature_c = whitened.axis.temperature_c
     if temperature_c is None or np.ptp(temperature_c) == 0.0:
         return []
@@ -258,7 +253,7 @@ def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
 def _best_time_constant(
     whitened: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], search_factor: float, shortest_s: float
 ) -> list[Effect]:
-    """Return the best effect with a fitted time constant. The list is empty if the time constant is out of range."""
+    """Return the most likely effect with a fitted time constant, or an empty list if it is out of range."""
     best = _most_likely(whitened.axis, whitened.effects, trials)
     refined = fit_shape_parameter(whitened.axis, whitened.effects, best, "time_constant", search_factor)
     assert isinstance(refined, (TurnOnTransient, TemperatureLag))
@@ -267,7 +262,7 @@ def _best_time_constant(
 
 
 def propose_leaks_from_other_axes(whitened: WhitenedAxis) -> list[Effect]:
-    """Return a leak from each axis that the hypothesis does not already contain as a source."""
+    """Propose a leak from each other axis that is not yet a leak source."""
     known = {getattr(effect, "source", None) for effect in whitened.effects}
     found: list[Effect] = []
     for source in whitened.axis.leak_sources:
@@ -295,10 +290,9 @@ DETERMINISTIC_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
 
 
 def _most_likely(axis: Axis, effects: Effects, trials: Sequence[Effect]) -> Effect:
-    """Return the effect with the largest likelihood when all sizes are fitted."""
     return max(trials, key=lambda one: axis.fit((*effects, one)).log_likelihood)
 
 
 def initial_effect_size(axis: Axis) -> float:
-    """Return a starting value for a size, which is small compared with the standard deviation of the samples."""
+    """Return a small starting value for the size of an effect, relative to the noise of the axis."""
     return 1e-3 * axis.coefficient_rms

@@ -1,10 +1,8 @@
 """Cross-validation of a new effect on the two halves of a recording.
 
-The hypotheses before and after the step are fitted to one half of the recording. Both fits are then tested on the other
-half with the diagnostic that detected the difference. The test is repeated with the halves exchanged. The effect is
-kept if the gap decreases and the likelihood of the test halves increases. An effect that happens once cannot be
-validated. An effect with an expected gain below ``MIN_HALF_GAIN_NATS`` in one half cannot be validated either. These
-effects are kept, and the reason is reported.
+The hypotheses with and without the effect are fitted to one half and tested on the other half. The effect is kept if
+the likelihood of the other half increases and the gap of the diagnostic decreases. An effect that happens once, or with
+too little evidence in one half, is kept without cross-validation.
 """
 
 from collections.abc import Collection
@@ -27,7 +25,7 @@ from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosi
 from monitor.reconcile.search.axis_repair import detect_value_artifacts, repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
-"""Smallest gain in nats of an effect in one half of the recording."""
+"""Smallest log-likelihood gain of an effect in one half of the recording, in nats."""
 SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers)
 """Effects that alter single samples."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
@@ -35,7 +33,7 @@ TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too littl
 
 @dataclass(frozen=True, slots=True)
 class CrossValidationResult:
-    """Result of the cross-validation of one step."""
+    """Result of the cross-validation of one search step."""
 
     before: float  # gap without the step, standard deviations
     after: float  # gap with the step, standard deviations
@@ -44,7 +42,7 @@ class CrossValidationResult:
 
 
 def accept_without_validation(reason: str) -> CrossValidationResult:
-    """Return the result for a step that cannot be validated and is kept."""
+    """Return a result that accepts a search step without cross-validation."""
     return CrossValidationResult(float("nan"), float("nan"), True, reason)
 
 
@@ -56,15 +54,14 @@ def cross_validate(
     null: NullDistribution,
     rng: np.random.Generator,
 ) -> CrossValidationResult:
-    """Cross-validate a step on the two halves of an axis.
+    """Cross-validate a search step on the two halves of an axis.
 
     Parameters
     ----------
     before, after : Hypothesis
-        Effects before and after the step, fitted to the whole axis. The axis of ``after`` is repaired with the effects
-        of ``after``.
+        Hypotheses before and after the step, fitted to the whole axis.
     added_effect : Effect or None
-        Effect that was added, or None if only sizes of the model were changed.
+        Added effect, or None if the step changed only sizes.
     diagnostic : str
         Name of the diagnostic that detected the difference.
     null : NullDistribution
@@ -92,19 +89,17 @@ def cross_validate(
 
 
 def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
-    """Fit the effects of a hypothesis to one half. Sizes that are fixed in the hypothesis stay fixed."""
     return half.fit(hypothesis.effects, hypothesis.fit.fixed_noise)
 
 
 def _summed_gap(halves: list[Axis], hypothesis: Hypothesis, diagnostic: str) -> float:
-    """Return the combined gap of a diagnostic in both halves. The hypothesis is fitted to each half separately."""
+    """Return the combined gap of a diagnostic after separate fits to both halves."""
     return sqrt(sum(DIAGNOSTICS[diagnostic](whiten_axis(_fit_half(half, hypothesis))).gain for half in halves))
 
 
 def _exchange_halves(
     halves: list[Axis], before: Hypothesis, after: Hypothesis, diagnostic: str, null: NullDistribution
 ) -> CrossValidationResult:
-    """Fit each half, with and without the step, and test the fit on the other half."""
     gaps = np.zeros(2)
     better = 0.0
     for learn, test in ((0, 1), (1, 0)):
@@ -118,7 +113,6 @@ def _exchange_halves(
 
 
 def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[str], rng: np.random.Generator) -> Axis:
-    """Return one half of an axis as a new axis."""
     raw, y = axis.raw[part], axis.repaired[part]
     temperature_c = None if axis.temperature_c is None else axis.temperature_c[part]
     others = {
@@ -141,9 +135,9 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
 
 
 def _expected_gain(fit: AxisFit, effect: Effect) -> float:
-    """Return the expected gain in nats of a deterministic effect with its present size.
+    """Return the expected log-likelihood gain, in nats, of a deterministic effect.
 
-    The gain is ½ Σ s²/v with the transform s of the series of the effect and the variance v of the fitted noise.
+    The gain is ½ Σ s²/v with the transform s of the effect and the variance v of the noise.
     """
     half = fit.axis
     columns = half.regressor_cosine_transforms(effect)
@@ -156,12 +150,12 @@ def _expected_gain(fit: AxisFit, effect: Effect) -> float:
 
 
 def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
-    """Apply the fit of one half of an axis, ``learned``, to the other half.
+    """Apply the fit of one half of an axis to the other half.
 
-    Noise effects have the learned sizes. Let β₁ be the learned sizes of the deterministic effects with the covariance
-    C₁, and β₂ the sizes fitted to the other half with the covariance C₂. The result has the weighted mean of β₁ and β₂.
-    The log-likelihood is the value for β₂, less a penalty for the difference Δ = β₂ − β₁. The penalty is
-    ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln(|C₁ + C₂|/|C₂|). A line has the learned amplitude and a fitted phase.
+    Noise effects keep the learned sizes. Let β₁ be the learned regressor sizes with the covariance C₁, and β₂ the sizes
+    fitted to the other half with the covariance C₂. The prediction uses the weighted mean of β₁ and β₂. With the
+    difference Δ = β₂ − β₁, the log-likelihood for β₂ is reduced by ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln(|C₁ + C₂|/|C₂|). A sinusoid
+    keeps the learned amplitude and has a fitted phase.
     """
     effects = learned.effects
     free = half.fit(effects, noise_effect_indices(effects))
@@ -187,5 +181,5 @@ def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
 
 
 def _regularised(covariance: Floats) -> Floats:
-    """Add a small value to the diagonal of a covariance, so that the determinant is positive."""
+    """Add a small value to the diagonal of a covariance matrix, so that the determinant is positive."""
     return covariance + np.diag(1e-9 * np.diag(covariance) + 1e-300)

@@ -1,17 +1,15 @@
-"""Trials of candidate effects: each candidate is added to a hypothesis and fitted together with the other effects.
+"""Trials of candidate effects, in which an effect is added to a hypothesis and the fit is repeated.
 
-The **score** of a trial is the gain in log-likelihood, less the penalty of the effect and the penalties for changed
-sizes of the model. ``generate_trial_groups`` yields the trials in groups:
+The **score** of a trial is the gain in log-likelihood less the penalties. ``generate_trial_groups`` yields the trials
+in this order:
 
-1. Quantization, clipping and repeated samples come first, then outliers and a step of the noise. The evidence for these
-   effects is either strong or absent.
-2. Deterministic effects usually come before noise effects, because an added noise effect would absorb a drift
-   permanently. Slow noise can resemble a deterministic effect. The score is therefore the gain over the best slow
-   noise: a random walk, a correlated noise or a power law.
-3. Noise effects and a common factor for all noise effects of the model follow.
+1. Quantization, clipping and repeated samples.
+2. Outliers and a step of the noise.
+3. Deterministic effects, with the gain over the best slow noise. Slow noise can resemble a deterministic effect.
+4. Noise effects and a common factor for all noise effects of the model.
 
-Two alternatives have no name. A power law with any exponent competes with the noise effects, and a curved drift with
-the deterministic effects. If such an alternative has the largest score, no effect is added.
+A power law competes with the noise effects, and a curved drift competes with the deterministic effects. If one of these
+has the largest score, no effect is added, because no known effect explains the difference.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,38 +51,37 @@ from monitor.reconcile.search.candidates import (
 )
 
 UNNAMED: Final = "power_law"
-"""Name of a trial that corresponds to no known effect."""
+"""Name of a trial without a known effect."""
 RETUNE: Final = "retuned"
-"""Name of a trial that adds no effect and changes sizes of the model."""
+"""Name of a trial that only changes sizes of the noise model."""
 EXPONENTS: Final = (0.5, 1.5, 2.5, 3.0)
 MIN_RESIZE_GAIN_NATS: Final = 1.0
 SCALE_FACTOR_MARGIN_NATS: Final = 3.0
-"""Gain in nats by which separately fitted sizes may exceed a common factor, which has fewer parameters."""
+"""Largest advantage of separate sizes over a common factor, in nats."""
 SCALE_SEARCH_ITERATIONS: Final = 16
 FREQUENCY_BANDS: Final = 8
-"""Number of frequency bands in which a leak must have the same coefficient."""
+"""Number of frequency bands in the test for a constant leak coefficient."""
 MIN_LEAK_PROBABILITY: Final = 1e-5
-"""Smallest probability of the differences of a leak coefficient between frequency bands. If the probability is smaller,
-vibration acts on both axes.
+"""Smallest probability of the scatter of a leak coefficient between frequency bands.
 """
 QUADRATIC_PENALTY_NATS: Final = 2.5
 MIN_STUDENT_GAIN_NATS: Final = 2.0
-"""Smallest gain in nats of outliers over Student's t."""
+"""Smallest log-likelihood gain of outliers over Student's t, in nats."""
 MAX_OUTLIER_Z: Final = 4.0
-"""Largest z value of the clustering and of the misfit of outliers."""
+"""Largest z value of outlier clusters and of the misfit."""
 ALTERNATIVE_MARGIN_NATS: Final = 1.0
-"""Gain in nats by which the alternatives to a step of the noise may exceed the step, which has fewer parameters."""
+"""Largest advantage of another variance change over a step of the noise, in nats."""
 MAX_BAND_FRACTION: Final = 0.25
-"""Largest width of a frequency band, as a fraction of the sample rate. Wider ranges count as all frequencies."""
+"""Largest width of a narrow frequency band, as a fraction of the sample rate."""
 NOISE_PRIORITY_NATS: Final = 5.0
-"""Difference of the scores, in nats, from which noise effects are tried before deterministic effects."""
+"""Score advantage, in nats, with which noise effects are tried before deterministic effects."""
 UNNAMED_MARGIN_NATS: Final = 2.0
-"""Difference of the scores, in nats, from which an alternative without a name is preferred."""
+"""Score advantage, in nats, with which a power law or a curved drift is preferred."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Candidate with its score."""
+    """Candidate effect with the score of the fit."""
 
     name: str  # name of the effect, ``UNNAMED`` or ``RETUNE``
     effect: Effect | None  # None if no effect is added
@@ -97,7 +94,7 @@ class Trial:
 
 
 def generate_trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[list[Trial]]:
-    """Yield the groups of trials, each in descending order of the score.
+    """Yield groups of trials, each in descending order of the score.
 
     Parameters
     ----------
@@ -119,7 +116,7 @@ def generate_trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Ite
 
 
 def try_alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Return trials of effects that explain the data better than the changed sizes of the model.
+    """Return the trials of effects that explain the data better than new sizes of the noise model.
 
     Parameters
     ----------
@@ -134,12 +131,10 @@ def try_alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis)
 
 
 def _best_first(trials: Sequence[Trial]) -> list[Trial]:
-    """Return the trials in descending order of the score."""
     return sorted(trials, key=lambda one: -one.score)
 
 
 def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
-    """Try quantization, clipping and repeats."""
     statistics = whitened.axis.value_artifacts
     found: list[Trial] = []
     if statistics.quantization and Resolution not in whitened.effect_types:
@@ -159,7 +154,7 @@ def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
 
 
 def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try outliers. The list is empty if another cause of heavy tails is as likely."""
+    """Try outliers, unless another cause of heavy tails is as likely."""
     far = whitened.outlier_fit
     if far is None or Outliers in whitened.effect_types or far.gain_over_student <= MIN_STUDENT_GAIN_NATS:
         return []
@@ -172,7 +167,7 @@ def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial
 
 
 def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
-    """Try a step of the noise. The list is empty if the variance changes in another way."""
+    """Try a step of the noise, unless another change of the variance is as likely."""
     changes, length_s = whitened.variance_changes, whitened.axis.length_s
     step = changes.step
     inside = STEP_MARGIN_FRACTION * length_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
@@ -185,19 +180,16 @@ def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
 
 
 def _band_gain(whitened: WhitenedAxis) -> float:
-    """Return the gain of the least constant tile of the spectrogram, or 0 if the tile covers most frequencies.
+    """Return the gain of a power change within a narrow frequency band, otherwise 0.
 
-    A step of white noise changes all frequencies, so a change within a narrow band has another cause.
+    A step of white noise changes the power at all frequencies.
     """
     found = whitened.spectrogram_change
     return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * whitened.axis.rate_hz else 0.0
 
 
 def _whitened_unit(hypothesis: Hypothesis) -> float:
-    """Return the standard deviation of the residuals in the upper half of the bins.
-
-    This value converts the whitened series to the unit of the axis.
-    """
+    """Return the factor that converts the whitened series to the unit of the axis."""
     half = hypothesis.axis.bins.count.size // 2
     count, variance = hypothesis.axis.bins.count[half:], hypothesis.fit.whittle.residual[half:]
     return float(np.sqrt(variance.sum() / count.sum()))
@@ -206,23 +198,20 @@ def _whitened_unit(hypothesis: Hypothesis) -> float:
 def _penalised_trial(
     effect: Effect, gain: float, intervals: Mapping[str, ParameterInterval], event_count: int = 0
 ) -> Trial:
-    """Return a trial whose score is the gain less the penalty of the effect."""
     return Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], intervals=intervals, event_count=event_count)
 
 
 def _scaled_bounds(found: ValueWithInterval, unit: float = 1.0) -> ParameterInterval:
-    """Return the value and the interval multiplied by ``unit``."""
     return ParameterInterval(unit * found.value, unit * found.lo, unit * found.hi)
 
 
 def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
-    """Try one noise effect."""
     score = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).penalised_log_likelihood
     return Trial(effect.name, effect, score - hypothesis.penalised_log_likelihood - PENALTY_NATS[effect.name])
 
 
 def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try noise effects, changed sizes, a common factor and a power law without a name."""
+    """Try noise effects, new sizes of the model, a common factor, and a power law."""
     resized = hypothesis.refit_with_added_effects(hypothesis.added)
     found = [
         Trial(
@@ -250,11 +239,11 @@ POWER_LAW_RIVALS: Final = frozenset(
         "scale_factor",
     }
 )
-"""Effects that compete with a power law."""
+"""Names of the effects that compete with a power law."""
 
 
 def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try effects that depend on time, temperature or another axis, and a curved drift without a name."""
+    """Try effects that depend on time, temperature or another axis, and a curved drift."""
     free = hypothesis.axis.fit(hypothesis.effects).log_likelihood
     proposed = [effect for propose in DETERMINISTIC_CANDIDATES for effect in propose(whitened)]
     kept = [
@@ -285,9 +274,9 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
 def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
     """Return True if one coefficient describes a leak at all frequencies.
 
-    If vibration acts on both axes, the coefficient of the leak depends on the frequency. The coefficient is fitted in
-    ``FREQUENCY_BANDS`` bands of equal width, and a χ² test compares the results. With the transform X of the source and
-    the variance v of the axis, the variance of a coefficient is 1/Σ(X²/v).
+    Vibration that acts on both axes has a coefficient that depends on the frequency. The coefficients of several
+    frequency bands are compared by a χ² test. With the source transform X and the noise variance v, the variance of a
+    coefficient is 1/Σ(X²/v).
     """
     column = whitened.axis.leak_sources[leak.source] * whitened.weights
     edges = np.linspace(0, column.size, FREQUENCY_BANDS + 1).astype(np.int64)[:-1]
@@ -298,17 +287,16 @@ def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
 
 
 def _curved_drift_score(hypothesis: Hypothesis) -> float:
-    """Return the score with an additional drift that is a quadratic function of time, less the penalty."""
+    """Return the penalised log-likelihood with an additional quadratic drift."""
     effects = (*hypothesis.effects, RateRamp(R=initial_effect_size(hypothesis.axis)))
     fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, curvature=True)
     return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS["rate_ramp"] - QUADRATIC_PENALTY_NATS
 
 
 def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float]]:
-    """Return functions that add a slow noise to given effects and return the score.
+    """Return functions that compute the score of given effects with an additional slow noise.
 
-    The list contains one function for each slow noise that may resemble a deterministic effect. The sizes of the model
-    are not changed.
+    Each function adds one slow noise that can resemble a deterministic effect.
     """
     axis, small = hypothesis.axis, initial_effect_size(hypothesis.axis)
     fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
@@ -327,7 +315,6 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
 
 
 def _score_with_power_law(hypothesis: Hypothesis, effects: Effects, exponent: float) -> float:
-    """Return the score of the effects with an additional power-law noise."""
     f_hz = hypothesis.axis.bins.f_hz
     basis = np.asarray((f_hz / f_hz[0]) ** -exponent)[None, :]
     fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, basis)
@@ -337,8 +324,8 @@ def _score_with_power_law(hypothesis: Hypothesis, effects: Effects, exponent: fl
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     """Try a common factor for all noise effects of the model.
 
-    If only one size of the model is wrong, changing this size has the larger score. If two or more sizes are wrong and
-    a common factor fits nearly as well as separate sizes, the factor has at least the same score.
+    If two or more sizes changed, and the factor fits nearly as well as separate sizes, the factor has at least the
+    score of the separate sizes.
     """
     effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_effect_indices(hypothesis.model)
 

@@ -1,10 +1,8 @@
 """JSON report of a comparison of several recordings: schema imu-monitor/reconcile-runs/1.
 
-Equal comparisons give equal bytes. Numbers are in SI units, and a number that is not finite becomes null. The
-``parameters`` of an effect are pooled over the recordings that show the effect. The entry ``p`` of a parameter is the
-probability of an equal or larger scatter if the true value is the same in all recordings. The entries ``consistent``
-and ``p`` of an effect refer to the size. ``each`` contains the values of each recording. The file ``report.json`` in
-``folder`` contains the complete result of a recording.
+Equal comparisons are encoded as equal bytes. All numbers are in SI units. A number that is not finite is encoded as
+null. The parameters of an effect are averaged over the recordings. ``p`` is the probability of an equal or larger
+scatter if the true value is the same in all recordings. ``each`` contains the values of each recording.
 """
 
 from typing import Any, Final
@@ -19,7 +17,7 @@ SCHEMA: Final = "imu-monitor/reconcile-runs/1"
 
 
 def encode_comparison(comparison: Comparison) -> bytes:
-    """Encode a comparison as JSON."""
+    """Encode a comparison of several recordings as JSON."""
     return msgspec.json.encode({
         "schema": SCHEMA,
         "verdict": comparison.verdict,
@@ -37,7 +35,6 @@ def encode_comparison(comparison: Comparison) -> bytes:
 
 
 def _run_entry(run: NamedResult) -> dict[str, Any]:
-    """Return the report entry of one recording."""
     return {
         "name": run.name,
         "folder": run.name,
@@ -49,7 +46,6 @@ def _run_entry(run: NamedResult) -> dict[str, Any]:
 
 
 def _axis_entry(one: AxisComparison) -> dict[str, Any]:
-    """Return the report entry of one axis."""
     return {
         "verdicts": {run: result.verdict for run, result in one.results.items()},
         "common": [_effect_entry(matched) for matched in one.common],
@@ -64,7 +60,6 @@ def _axis_entry(one: AxisComparison) -> dict[str, Any]:
 
 
 def _effect_entry(matched: MatchedEffect) -> dict[str, Any]:
-    """Return the report entry of one effect."""
     return {
         "effect": matched.effect,
         "kind": matched.kind,
@@ -80,7 +75,6 @@ def _effect_entry(matched: MatchedEffect) -> dict[str, Any]:
 
 
 def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
-    """Return the report entry of one effect in one recording."""
     return {
         "parameters": {name: parameter_entry(one) for name, one in step.parameters.items()},
         "confidence": finite_or_none(step.confidence),
