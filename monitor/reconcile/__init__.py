@@ -1,6 +1,6 @@
-"""Search for the noise effects that a noise model lacks, by comparing a recording with simulations of the model.
+"""Search for the noise effects that a noise model lacks, by comparison of a recording with simulations of the model.
 
-The packages form a pipeline, and a module imports only from its own package and from earlier packages:
+Data flow through the packages:
 
 1. ``preparation`` selects the usable axes and repairs missing or altered samples.
 2. ``likelihood`` fits effects to one axis and whitens the axis by the fitted model.

@@ -79,7 +79,7 @@ def _snapshot(diagnostics: AxisDiagnostics, null: AxisNull) -> DiagnosticSnapsho
 
 
 def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKind]]:
-    """Return the index of the search round, the index of the effect and the kind of each change that was kept."""
+    """Return the changes that the search kept: index of the search round, index of the effect, and kind of change."""
     hypothesis = search.hypothesis
     found: list[tuple[int, int, StepKind]] = []
     left = list(range(hypothesis.given_count, len(hypothesis.effects)))
@@ -98,9 +98,9 @@ def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKin
 
 
 def _noise_floor_gap(search: AxisSearchResult, end: DiagnosticSnapshot) -> tuple[DiagnosticGap, ...]:
-    """Return the gap that white noise behind an added low-pass filter would close, if the gap is significant.
+    """Return the difference in the spectrum due to white noise behind an added low-pass filter, if significant.
 
-    The gap is at most the largest gap of the spectrum during the search.
+    The difference is limited to the largest difference in the spectrum during the search.
     """
     hypothesis, axis = search.hypothesis, search.hypothesis.axis
     limit = next((effect for effect in hypothesis.added if isinstance(effect, BandwidthLimit)), None)
@@ -169,10 +169,10 @@ def _held_out_gaps(
 
 
 def _triggering_gap(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) -> DiagnosticGap:
-    """Return the gap that led to an effect.
+    """Return the difference between recording and model that led to an effect.
 
-    A significant gap in the most direct diagnostic of the effect takes precedence. Otherwise, the largest ratio of gap
-    to threshold decides.
+    A significant difference in the most sensitive diagnostic of the effect is preferred. Otherwise, the difference with
+    the largest ratio to the threshold is returned.
     """
     significant = [gap for gap in before.gaps if gap.is_significant] or list(before.gaps)
     most_direct = MOST_DIRECT_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
@@ -183,7 +183,7 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) 
 
 
 def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[RunnerUp, ...]]:
-    """Return the probability of an effect and of the most probable alternatives.
+    """Return the probability of the selected effect, and the most probable alternative effects.
 
     Each probability is proportional to exp(score). The hypothesis without any effect has the score 0.
     """

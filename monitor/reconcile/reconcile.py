@@ -1,8 +1,8 @@
 """Comparison of a recording with a noise model, and search for the effects that the model lacks.
 
-Simulated recordings of the model define the threshold of each diagnostic. If a diagnostic of the measured recording
-exceeds the threshold, the search adds effects to the model. Each axis has a separate search. The extended model is then
-simulated and compared with the recording.
+Simulated recordings of the noise model define the threshold of each diagnostic. On each axis, the search adds effects
+to the model until no diagnostic exceeds the threshold. The extended model is then simulated and compared with the
+recording.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -65,7 +65,7 @@ MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 @dataclass(frozen=True, slots=True)
 class RecordingContext:
-    """Recording to compare, with the data that all stages of the comparison share."""
+    """Recording to compare with a noise model, and the data that all stages share."""
 
     recording: Recording
     seed: int
@@ -228,7 +228,7 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
 def _reversed_leak_sources(
     found: Mapping[str, AxisSearchResult], null: Mapping[str, AxisNull]
 ) -> dict[str, frozenset[str]]:
-    """Return the leaks that are more likely in the opposite direction, as the leak sources of each axis."""
+    """Return the leak sources of each axis for which a leak in the opposite direction is more likely."""
     gains = {
         (name, effect.source): step.trials[0].score
         for name, one in found.items()

@@ -15,7 +15,7 @@ StepKind = Literal["added", "retuned"]
 
 @dataclass(frozen=True, slots=True)
 class Location:
-    """Location of a difference between recording and model. Dimensions that are not resolved are None."""
+    """Location of a difference between recording and noise model."""
 
     frequency: tuple[float, float] | None = None  # Hz
     tau: tuple[float, float] | None = None  # s
@@ -47,7 +47,7 @@ class DiagnosticGap:
 
 @dataclass(frozen=True, slots=True)
 class ParameterInterval:
-    """Value of a parameter with the 95 % interval, or with None as both ends."""
+    """Value of a parameter, with the 95 % interval if known."""
 
     value: float | str
     lo: float | None = None
@@ -56,7 +56,7 @@ class ParameterInterval:
 
 @dataclass(frozen=True, slots=True)
 class RunnerUp:
-    """Less likely effect that would explain the same difference."""
+    """Less likely effect that explains the same difference."""
 
     effect: str
     confidence: float
@@ -81,7 +81,7 @@ class PlotData:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticSnapshot:
-    """Gaps and plots of all diagnostics, for one axis and one noise model."""
+    """Differences and plots of all diagnostics, for one axis and one noise model."""
 
     gaps: tuple[DiagnosticGap, ...]  # one for each diagnostic
     plots: tuple[PlotData, ...]  # one for each diagnostic that has a plot

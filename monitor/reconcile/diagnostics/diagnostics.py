@@ -2,7 +2,6 @@
 
 Each diagnostic returns a ``Finding``, which contains the location and the log-likelihood gain of the strongest
 departure. If the noise model is true, the gain has nearly the same distribution for every model and recording length.
-The thresholds in ``null_distribution`` rely on this property.
 """
 
 from collections.abc import Callable
@@ -88,7 +87,7 @@ def fitted_variance_gain_nats(mean_square: Floats, count: Floats) -> Floats:
     Returns
     -------
     ndarray of float64, shape (k,)
-        Gain in nats.
+        Log-likelihood gain in nats.
     """
     safe = np.maximum(mean_square, 1e-300)
     return np.asarray(0.5 * count * (safe - 1.0 - np.log(safe)))
@@ -117,7 +116,7 @@ def find_periodogram_peaks(whitened_series: Floats, rate_hz: float, max_peaks: i
     Returns
     -------
     list of tuple of float
-        Gain in nats and frequency in Hz of each peak.
+        Log-likelihood gain in nats and frequency in Hz of each peak.
     """
     power = compute_periodogram(whitened_series)
     size = 2 * (power.size - 1)
@@ -134,8 +133,8 @@ def find_periodogram_peaks(whitened_series: Floats, rate_hz: float, max_peaks: i
 def compute_periodogram(whitened_series: Floats) -> Floats:
     """Compute the periodogram of a whitened series, with zero padding to at least twice the length.
 
-    Each value is the log-likelihood gain, in nats, of a spectral line. The m + 1 frequencies range from 0 to half the
-    sample rate.
+    Each value is the log-likelihood gain, in nats, of a spectral line. The m + 1 frequencies are equally spaced from 0
+    to half the sample rate.
     """
     n = whitened_series.size
     size = next_fast_len(2 * n, real=True)
@@ -180,8 +179,8 @@ def compute_level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
 
     Returns
     -------
-    gains : ndarray of float64, shape (k,)
-        Gain in nats.
+        gains : ndarray of float64, shape (k,)
+        Log-likelihood gain of a step at each time, in nats.
     times_s : ndarray of float64, shape (k,)
         Time of the step in seconds from the start.
     """
@@ -224,7 +223,7 @@ def compute_autocorrelation(whitened_series: Floats) -> Floats:
 
 
 def diagnose_temperature_dependence(whitened: WhitenedAxis) -> Finding:
-    """Find an immediate or delayed dependence of the mean level on the temperature."""
+    """Find an immediate or delayed dependence of the sensor output on the temperature."""
     temperature_c = whitened.axis.temperature_c
     if temperature_c is None:
         return NO_FINDING
@@ -246,7 +245,7 @@ def diagnose_temperature_dependence(whitened: WhitenedAxis) -> Finding:
 
 
 def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> Finding:
-    """Find the other axis with the strongest influence on this axis."""
+    """Find the axis that leaks most strongly into the whitened axis."""
     best = NO_FINDING
     for name, coefficients in whitened.axis.leak_sources.items():
         gain = _regressor_gain(whitened, [coefficients])

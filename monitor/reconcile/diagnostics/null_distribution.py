@@ -2,11 +2,10 @@
 
 The gap of a diagnostic is √(2 × gain), the size of the strongest departure in standard deviations. Let q be the upper
 quartile of the simulated gains of all axes. Above q, the density of a gain g is modelled as exp(−(g − q)/s). The scale
-s is the mean excess over q, limited to the range from 1 to 1.3. This range is typical of the maximum of many χ²/2
-variables.
+s is the mean excess over q, limited to the range from 1 to 1.3, which is typical of the maximum of many χ²/2 variables.
 
-If the noise model is true, 1 % of all recordings exceed the threshold in any diagnostic on any axis. Coarse or clipped
-values can cause larger gains on one axis, and this axis then has a larger threshold.
+If the noise model is true, 1 % of all recordings exceed a threshold in any diagnostic on any axis. An axis with coarse
+or clipped values can have a larger threshold.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +34,7 @@ Findings = Mapping[str, Finding]
 
 @dataclass(frozen=True, slots=True)
 class NullDistribution:
-    """Quantiles of the log-likelihood gain of one diagnostic if the noise model is true."""
+    """Quantiles of the log-likelihood gain of one diagnostic under a true noise model."""
 
     null95: float  # 95 % quantile of the gain, nats
     threshold: float  # gain above which a departure is significant, nats
@@ -74,7 +73,7 @@ def _tail_quantiles(gains: Floats, axis_count: int) -> NullDistribution:
 
 
 def compute_diagnostic_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:
-    """Compute the gaps of all diagnostics on one axis.
+    """Compute the differences between recording and model (gaps) in all diagnostics on one axis.
 
     Parameters
     ----------

@@ -1,7 +1,6 @@
 """Plot data that compare an axis with the expectation and the 95 % band of a noise model.
 
-The band is computed from the spectrum of the noise model. If the model is true, each measured point lies in the band
-with a probability of 95 %.
+If the noise model is true, each measured point lies in the band with a probability of 95 %.
 """
 
 from collections.abc import Callable
@@ -118,7 +117,7 @@ def _plot_level(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
 
 
 def _level_spread(whitened: WhitenedAxis, length_s: float) -> float:
-    """Return half the width of the 95 % band of a mean over ``length_s`` seconds, in the unit of the axis."""
+    """Return half the width of the 95 % band of a mean over ``length_s`` seconds."""
     bins = whitened.axis.bins
     weight = np.sinc(bins.f_hz * length_s) ** 2
     return Z95 * float(np.sqrt((bins.count * whitened.fit.whittle.variance * weight).sum() / whitened.axis.n))
@@ -190,5 +189,5 @@ def _block_times_s(count: int, length: int, rate_hz: float) -> Floats:
 
 
 def _chi2_band(freedom: Floats) -> tuple[Floats, Floats]:
-    """Return the 95 % band of a mean square, relative to the expected value."""
+    """Return the 95 % band of a mean square relative to the expected value."""
     return np.asarray(chdtri(freedom, 0.975) / freedom), np.asarray(chdtri(freedom, 0.025) / freedom)

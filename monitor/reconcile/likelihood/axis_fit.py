@@ -60,7 +60,7 @@ CURVATURE: Final[Regressor] = (Bias(value=1.0), 0)
 
 @dataclass(frozen=True, slots=True)
 class ValueArtifacts:
-    """Quantization, clipping and repeated samples of an axis, each None if not detected."""
+    """Quantization, clipping and repeated samples of an axis."""
 
     quantization: QuantizationGrid | None
     clipping: Clipping | None
@@ -248,7 +248,7 @@ class Axis:
         return tuple(slices), columns
 
     def _variance_basis(self, effect: Effect, effects: Sequence[Effect], transforms: Sequence[Transform]) -> Floats:
-        """Return the variance of each frequency bin, shape (m,), for a noise effect of size one."""
+        """Return the variance that a noise effect of size one adds to each frequency bin, shape (m,)."""
         factor = 1.0
         if isinstance(effect, AngleRandomWalk):
             for other in effects:
@@ -262,7 +262,7 @@ class Axis:
         return np.asarray(density / tau0_s)
 
     def _full_power_theta(self, basis: Floats) -> float:
-        """Return the squared size θ for which a noise effect has the total power of the axis."""
+        """Return the squared size for which a noise effect alone would explain the total power of the axis."""
         power = self._binned_product(None, None).sum()
         return float(power / max((self.bins.count * self.used_bins * basis).sum(), 1e-300))
 
@@ -355,9 +355,9 @@ def _with_fitted_sizes(
 
 
 def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bins: FrequencyBins) -> Floats:
-    """Return the spectral density, shape (m,), of a noise source after the signal chain of an axis.
+    """Return the spectral density, shape (m,), of a noise source behind the signal chain of an axis.
 
-    If the source is None, only the noise of the signal chain is returned. Saturation has no influence, because clipped
+    If the source is None, only the noise of the signal chain is returned. Saturation is ignored, because clipped
     samples were replaced.
     """
     spectrum = source or Spectrum(np.zeros_like, np.zeros_like, 1.0 / bins.rate_hz)

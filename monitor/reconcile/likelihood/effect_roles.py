@@ -1,8 +1,8 @@
 """Role of each effect in the likelihood of an axis: noise, deterministic regressor or spectral transform.
 
 The **size** of an effect is the scaling parameter, and all other parameters are **shape parameters**. A noise effect
-adds variance to each frequency bin, in proportion to the square of the size. A deterministic effect adds a series,
-which is the size times the **regressor**. The regressor of a ``Leak`` is another axis.
+adds variance to each frequency bin, proportional to the square of the size. A deterministic effect adds a series, which
+is the product of size and **regressor**. The regressor of a ``Leak`` is another axis.
 """
 
 from dataclasses import replace
@@ -87,7 +87,7 @@ def effect_size(effect: Effect) -> float:
 def with_effect_size(effect: Effect, size: float) -> Effect:
     """Return a copy of an effect with a new size.
 
-    The sizes of noise effects, ramps and sinusoids are never negative, and the sign of a new size is ignored.
+    The sizes of noise effects, ramps and sinusoids are never negative.
 
     Parameters
     ----------

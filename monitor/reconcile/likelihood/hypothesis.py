@@ -1,6 +1,6 @@
 """Hypotheses about one axis: effects of a noise model, some with a new size, and added effects.
 
-A noise effect of the model has a new size only if the log-likelihood gain exceeds ``RESIZE_PENALTY_NATS``. The sizes of
+A noise effect of the model is resized only if the log-likelihood gain exceeds ``RESIZE_PENALTY_NATS``. The sizes of
 added effects and of deterministic effects are always fitted.
 """
 
@@ -187,7 +187,7 @@ def find_maximum_by_golden_section(function: Callable[[float], float], lo: float
 def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
     """Compute the 95 % interval of the size of an effect.
 
-    The interval is Gaussian for a deterministic effect, and Gaussian in the logarithm for a noise effect.
+    The interval is symmetric for a deterministic effect, and symmetric on a logarithmic scale for a noise effect.
 
     Parameters
     ----------

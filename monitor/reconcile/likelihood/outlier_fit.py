@@ -1,11 +1,10 @@
 """Fit of outliers to white residuals, and comparison with other causes of heavy tails.
 
-The magnitudes of the residuals are fitted by a Gaussian, by Student's t, and by a mixture of two Gaussians (Tukey
-1960). The mixture is (1−f) N(0, s²) + f N(0, s² + scale²) with the outlier fraction f. True outliers fit the mixture
-best and are equally likely at all times.
+The magnitudes of the residuals are fitted by a Gaussian, Student's t and a mixture of two Gaussians (Tukey 1960). The
+mixture is (1−f) N(0, s²) + f N(0, s² + scale²) with the outlier fraction f. True outliers fit the mixture best and are
+equally likely at all times.
 
-The magnitudes are collected in bins, so that the fit time does not grow with the recording length. Each bin also stores
-the mean square.
+The magnitudes are collected in bins, so that the fit time does not grow with the recording length.
 """
 
 from dataclasses import dataclass
@@ -158,7 +157,7 @@ def _em_step(
 ) -> tuple[float, float, float, float]:
     """Update the mixture by one EM step, and return the log-likelihood before the step.
 
-    The wide variance is not updated if ``held`` is True.
+    If ``held`` is True, the wide variance stays fixed.
     """
     outside, outside_squares, inside_squares, like = 0.0, 0.0, 0.0, 0.0
     log_narrow = np.log1p(-share) - 0.5 * np.log(narrow)
@@ -257,9 +256,9 @@ def _parameter_intervals(
 def _clustering_z(positions: Ints, n: int) -> float:
     """Return the z value of the strongest of several tests for clusters of outliers.
 
-    The first test counts the pairs of outliers within ``NEIGHBOUR_SAMPLES`` samples, which have a Poisson distribution
-    without clusters. The other tests count the outliers in 4, 8, … parts of the recording and compare the dispersion
-    with χ² (Cochran 1954). The smallest probability is multiplied by the number of tests.
+    The first test compares the number of pairs of outliers within ``NEIGHBOUR_SAMPLES`` samples with a Poisson
+    distribution. The other tests count the outliers in 4, 8, … parts of the recording and compare the dispersion with
+    χ² (Cochran 1954). The smallest probability is multiplied by the number of tests.
     """
     if positions.size < 2:
         return 0.0
@@ -284,14 +283,14 @@ def _clustering_z(positions: Ints, n: int) -> float:
 
 
 def _z_of_probability(probability: float) -> float:
-    """Return the z value that a standard Gaussian exceeds with a given probability, but at least 0."""
+    """Return the z value of a one-sided tail probability, but at least 0."""
     if probability > 0.5:
         return 0.0
     return -float(ndtri(probability)) if probability > 1e-300 else MAX_Z
 
 
 def _misfit_z(counts: Floats, kept: NDArray[np.intp], narrow: float, wide: float, share: float) -> float:
-    """Return the z value of a χ² test of the fitted mixture, with bins of about equal expected count."""
+    """Return the z value of a χ² goodness-of-fit test of the fitted mixture."""
     below = (1.0 - share) * ndtr(BIN_EDGES / narrow**0.5) + share * ndtr(BIN_EDGES / wide**0.5)
     total = counts.sum()
     expected = 2.0 * total * np.diff(below)

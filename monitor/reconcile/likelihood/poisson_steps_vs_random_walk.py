@@ -1,12 +1,12 @@
 """Likelihood comparison of Poisson steps and a random walk, which have the same second moments.
 
-In the model of Poisson steps, each block may contain a jump of Gaussian height. The filter has one hypothesis for each
-possible time since the last jump (Fearnhead & Liu, "On-line inference for multiple changepoint problems", J. R.
-Statist. Soc. B 69, 2007). Each hypothesis is one Gaussian distribution with the mean and covariance of all merged
-branches (Harrison & Stevens, "Bayesian forecasting", J. R. Statist. Soc. B 38, 1976).
+In the model of Poisson steps, each block may contain a jump of Gaussian height. The filter tracks one hypothesis for
+each possible time since the last jump (Fearnhead & Liu, "On-line inference for multiple changepoint problems", J. R.
+Statist. Soc. B 69, 2007). Each hypothesis is approximated by one Gaussian distribution with the same mean and
+covariance (Harrison & Stevens, "Bayesian forecasting", J. R. Statist. Soc. B 38, 1976).
 
-A random walk is the limit of many small jumps. Poisson steps therefore fit at least nearly as well, and only a large
-gain indicates jumps.
+A random walk is the limit of many small jumps. Poisson steps therefore never fit much worse than a random walk, and
+only a large gain indicates jumps.
 """
 
 from dataclasses import replace
@@ -86,7 +86,7 @@ def compare_poisson_with_random_walk(
 
 
 def choose_block_length_s(duration_s: float, background: BackgroundNoise, K: float) -> float:
-    """Choose the block length, in seconds, of the comparison with a random walk.
+    """Choose the length, in seconds, of the blocks over which samples are averaged.
 
     Parameters
     ----------
@@ -186,8 +186,8 @@ def _branch(
 ) -> None:
     """Update one hypothesis with a block mean, once with and once without a jump in the block.
 
-    The time of a jump is uniformly distributed in the block. The jump therefore changes the block mean by half of the
-    height on average, and one third of the height variance is added to the variance of the block mean.
+    The time of a jump is uniformly distributed in the block. On average, the jump changes the block mean by half of the
+    height. The variance of the block mean increases by one third of the height variance.
     """
     branches.weight[age] = branches.weight[JUMP_AGES + age] = -np.inf
     if by_age.weight[age] < MIN_HYPOTHESIS_PROBABILITY:
@@ -216,7 +216,7 @@ def _branch(
 
 @compiled
 def _normalise(weight: Floats) -> float:
-    """Normalise log-probabilities in place to probabilities, and return the logarithm of their sum."""
+    """Normalise probabilities, given as logarithms, in place. Return the logarithm of the sum before normalisation."""
     highest = weight[0]
     for k in range(1, weight.size):
         highest = max(highest, weight[k])

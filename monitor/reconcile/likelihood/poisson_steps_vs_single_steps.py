@@ -1,11 +1,11 @@
 """Likelihood comparison of Poisson steps, which are a random process, and a few single steps at fitted times.
 
-The single steps are found one at a time. A Kalman smoother computes the gain of a step in each block, and the new step
-is placed in the block with the largest gain (de Jong & Penzer, "Diagnosing shocks in time series", JASA 93, 1998).
+A new step is placed in the block with the largest log-likelihood gain, which a Kalman smoother computes (de Jong &
+Penzer, "Diagnosing shocks in time series", JASA 93, 1998).
 
-The times and heights of single steps are fitted. Each single step therefore has a penalty for time and height,
-following the minimum description length of Rissanen (1978). The time penalty is the logarithm of the number of blocks.
-The height penalty is ½ ln(1 + h²/Var h) for the height h.
+The fitted time and height of each single step have a penalty, following the minimum description length of Rissanen
+(1978). The time penalty is the logarithm of the number of blocks. The height penalty is ½ ln(1 + h²/Var h) for the
+height h.
 """
 
 from math import log
@@ -74,7 +74,7 @@ def compare_poisson_with_single_steps(
 
 
 def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: int) -> _SingleStepsFit:
-    """Return the fit with the largest score among fits of 0 to ``max_single_steps`` single steps."""
+    """Return the best fit with 0 to ``max_single_steps`` single steps."""
     blocks: list[int] = []
     best = _SingleStepsFit(kalman_log_likelihood(means, noise, prior_level_variance(means)), np.empty(0))
     for _ in range(max_single_steps):
@@ -88,7 +88,7 @@ def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: i
 
 
 def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Floats:
-    """Return twice the log-likelihood gain of one more step at the start of each block, shape (m,)."""
+    """Return twice the log-likelihood gain of an additional step at the start of each block, shape (m,)."""
     shock_variances = np.zeros(means.size)
     shock_variances[blocks] = prior_level_variance(means)
     gains = _shock_statistics(means, noise, prior_level_variance(means), shock_variances)
@@ -110,7 +110,7 @@ def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> _
 
 
 def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
-    """Fit the heights of steps at given times. Return the log-likelihood, the heights and the standard deviations."""
+    """Fit the heights of steps at given times. Return the log-likelihood, the heights and the standard errors."""
     # fraction of each block that lies after the step
     columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
     columns = np.column_stack([means, columns])
@@ -124,7 +124,7 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
 
 @compiled
 def _whiten(columns: Floats, noise: StateSpaceNoise, level_variance: float) -> float:
-    """Whiten columns, shape (m, c), in place. Return Σ ln 2πS over the innovation variances S."""
+    """Whiten columns, shape (m, c), in place. Return the sum of ln 2πS over all innovation variances S."""
     variances, state_covariances = innovation_variances(np.zeros(columns.shape[0]), noise, level_variance)
     total = 0.0
     for c in range(columns.shape[1]):

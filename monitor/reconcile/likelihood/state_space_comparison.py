@@ -1,11 +1,10 @@
 """State-space likelihoods that compare a process of random events with an effect of the same spectrum.
 
 A random telegraph has the same second moments as exponentially correlated noise, and Poisson steps have the same second
-moments as a random walk. Only the full likelihood distinguishes the distributions. Both likelihoods use the same block
-means and the same background noise.
+moments as a random walk. Only the full likelihood distinguishes the two effects.
 
-The background noise is a sum of independent first-order processes. The distribution of a block mean, given the state at
-the start of the block, is exact. A Kalman filter therefore needs one step per block.
+The background noise is modelled as a sum of independent first-order processes. Each step of the Kalman filter processes
+the mean of one block of samples.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -64,7 +63,7 @@ class StateSpaceNoise(NamedTuple):
     """State-space model of the noise in block means, as a sum of first-order processes and white noise.
 
     In each block, the state x of a process changes to a·x + w, and the process adds c·x + v to the block mean. The
-    random terms w and v are Gaussian. The first process is the mean level with the random walk.
+    random terms w and v are Gaussian. The first process is the mean level, which includes the random walk.
     """
 
     table: Floats  # [d, 4] a, c, variance of w and covariance of v and w, for each process
@@ -181,7 +180,7 @@ def correlated_noise_of_block_means(
     Returns
     -------
     row : tuple of float
-        Row of ``StateSpaceNoise.table``.
+        Coefficients of one row of ``StateSpaceNoise.table``.
     variance : float
         Variance of the block mean given the noise at the start of the block.
     """

@@ -1,6 +1,6 @@
 """Likelihood comparison of a random telegraph and exponentially correlated noise, which have the same second moments.
 
-The random telegraph is modelled by a switching Kalman filter with two levels. Within a block, the level stays the same,
+The random telegraph is modelled by a switching Kalman filter with two levels. Within a block, the level stays constant,
 changes once, or changes and returns. After each block, all cases with the same final level are merged into one Gaussian
 by the GPB2 algorithm (Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
 section 11.6.4).
@@ -98,8 +98,7 @@ def compare_telegraph_with_correlated_noise(
 def _choose_block_length_s(duration_s: float, tau0_s: float, correlation_time: float, equal_noise_s: float) -> float:
     """Choose the block length in seconds.
 
-    In a block of ``equal_noise_s`` seconds, the standard deviation of the white noise is half of the amplitude. Shorter
-    blocks do not resolve the switches better.
+    Blocks shorter than ``equal_noise_s`` do not improve the resolution of the switches, because of the white noise.
     """
     return min(
         correlation_time / BLOCKS_PER_CORRELATION_TIME,
@@ -156,7 +155,7 @@ class _SwitchingFilterState(NamedTuple):
 
 
 class _BlockFilterUpdate(NamedTuple):
-    """Update of the switching Kalman filter with one block mean, for each level and each case."""
+    """Update of the switching Kalman filter with one block mean."""
 
     weight: Floats  # [2, 3] probability
     scaled_innovation: Floats  # [2, 3] innovation divided by its variance
@@ -202,8 +201,9 @@ def _switching_log_likelihood(
 def _weigh_cases(
     block_mean: float, noise: StateSpaceNoise, cases: Floats, state: _SwitchingFilterState, update: _BlockFilterUpdate
 ) -> tuple[float, float]:
-    """Compute the update for each level and case. Return the sum of the weights and the logarithm of a common
-    factor."""
+    """Compute the filter update for each level and case. Return the sum of the weights and the logarithm of a scale
+    factor.
+    """
     weight, pull, known = update.weight, update.scaled_innovation, update.inverse_variance
     for level in range(2):
         variance = predict_block_mean_variance(noise, state.covariance[level], update.state_covariance[level])
@@ -225,7 +225,7 @@ def _weigh_cases(
 
 @compiled
 def _merge_returning_case(weight: Floats, pull: Floats, known: Floats) -> None:
-    """Merge the case with a level change and return into the case without a level change."""
+    """Merge the case of a level change and return into the case of a constant level."""
     back = weight[1] / (weight[0] + weight[1])
     apart = pull[1] - pull[0]
     pull[0] += back * apart
@@ -243,7 +243,7 @@ def _merge_into_level(
     moved: Floats,
     merged: Floats,
 ) -> None:
-    """Merge all cases with the final level ``level`` into one Gaussian with the given mean and covariance arrays."""
+    """Merge all cases with the final level ``level`` into one Gaussian, and write the mean and covariance in place."""
     d, other = table.shape[0], 1 - level
     state_covariance, pull, known, at, covariance = (
         update.state_covariance,

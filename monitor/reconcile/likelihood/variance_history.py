@@ -3,10 +3,9 @@
 ``fit_variance_changes`` fits a step, a trend, a periodic variation and a slow random variation of the variance.
 ``find_spectrogram_change`` searches the spectrogram for a change of power.
 
-The spectrogram consists of Fourier transforms of short pieces at the frequencies (k + ½)/piece. A **tile** is a
-rectangle of 2^a pieces by 2^b frequencies, and a **row** contains all tiles of the same frequencies. Each tile is
-compared with the other tiles of the row, so that a coloured spectrum has no influence. Each row is also tested for
-constant power.
+The spectrogram consists of Fourier transforms of short pieces of the recording. A **tile** is a rectangle of 2^a pieces
+by 2^b frequencies, and a **row** contains all tiles of the same frequencies. Each tile is compared with the other tiles
+of the row, so that a coloured spectrum has no influence. Bartlett's test detects rows with a varying power.
 
 Outliers must be replaced before these tests, because outliers change the null distributions.
 """
@@ -71,7 +70,7 @@ class VarianceChangeFit:
 
 @dataclass(frozen=True, slots=True)
 class SpectrogramChange:
-    """Largest change of power in a spectrogram: of one tile, and of one row of tiles."""
+    """Tile and row of a spectrogram with the largest change of power over time."""
 
     gain: float  # log-likelihood gain of a separate power for the tile, nats
     time: tuple[float, float]  # time range of the tile, s from the first sample
@@ -195,10 +194,9 @@ def _step_gains(sums: Floats, k: Ints) -> Floats:
 
 
 def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
-    """Return the log-likelihood gain of the model ln σ² = a + Σ b_i row_i over a constant variance.
+    """Return the log-likelihood gain of the variance model ln σ² = a + Σ b_i row_i over a constant variance.
 
-    The model is fitted to means of ``length`` squares by Fisher scoring of a Gamma model with logarithmic link
-    (McCullagh & Nelder 1989).
+    Fisher scoring fits a Gamma model with logarithmic link to means of ``length`` squares (McCullagh & Nelder 1989).
     """
     x = np.vstack([np.ones(energy.size), rows])
     normal = np.linalg.inv(x @ x.T)
@@ -229,8 +227,8 @@ def _periodic_gain(energy: Floats, scores: Floats, length: int) -> float:
 def _slow_variation_gain(scores: Floats, length: int) -> float:
     """Return the log-likelihood gain of a slow random variation of the variance.
 
-    If the K lowest frequencies have the mean power p, a separate variance for these frequencies has the gain K (p − 1 −
-    ln p). The result is the largest gain of all K = 2^j with p > 1.
+    Let p be the mean power of the K lowest frequencies. A separate variance for these frequencies has the gain K (p − 1
+    − ln p). The result is the largest gain of all K = 2^j with p > 1.
     """
     ordinates = np.abs(np.fft.rfft(scores)[1 : scores.size // 2]) ** 2 * length / (2.0 * scores.size)
     ends = 2 ** np.arange(2, int(np.log2(max(ordinates.size, 4))) + 1)
@@ -240,7 +238,7 @@ def _slow_variation_gain(scores: Floats, length: int) -> float:
 
 
 class _TileScore(NamedTuple):
-    """Spectrogram tile and the log-likelihood gain of a separate power for the tile."""
+    """Spectrogram tile with the log-likelihood gain of a separate power."""
 
     gain: float  # nats
     piece_samples: int
@@ -289,7 +287,7 @@ def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:
 
 @compiled
 def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]:
-    """Return the minimum and maximum of each column, their positions, and the sum of the logarithms.
+    """Return the minimum and maximum of each column, the positions, and the sum of the logarithms.
 
     For speed, the logarithm is computed for products of eight values.
     """
@@ -317,7 +315,7 @@ def _best_contrast(x: Floats, total: Floats, inside: int, whole: int) -> tuple[f
     """Return the largest gain of a separate power for one tile of each row, and the index of the row.
 
     Let x be the sum of c squares in the tile, and R the sum of the other d squares of the row. The gain is (c+d)/2
-    ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d). A low power of a few squares is ignored.
+    ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d). A low power of only a few squares is ignored.
     """
     outside = whole - inside
     best, place = -1.0, 0

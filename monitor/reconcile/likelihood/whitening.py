@@ -88,7 +88,7 @@ def whiten_axis(fit: AxisFit) -> WhitenedAxis:
 def _flattened_series(fit: AxisFit, whitened: Floats) -> Floats:
     """Return the whitened series with unit power in each frequency bin.
 
-    The flattened series shows heavy tails and variance changes even if the spectrum of the model is wrong.
+    The flattened series has the tails and the variance of white noise, even if the spectrum of the model is wrong.
     """
     axis = fit.axis
     count, window = axis.bins.count, np.ones(SMOOTHING_BINS)

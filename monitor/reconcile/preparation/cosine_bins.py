@@ -1,7 +1,7 @@
 """Orthonormal cosine transform (DCT-II) of an axis, and sums of coefficients over frequency bins.
 
 A stationary series of n samples has nearly independent coefficients Y_k at the frequencies k·rate/2n. The variance of
-Y_k is nearly S(f_k)/τ0. The transform continues the series as a mirror image, so that a slope or a step does not leak
+Y_k is nearly S(f_k)/τ0. The transform continues the series as a mirror image. A slope or a step therefore does not leak
 into other frequencies. The coefficient of the mean is not used, because the mean of an axis is always fitted.
 
 The spectrum is nearly constant within a bin. The bins are finer around narrow peaks and near half the sample rate.

@@ -1,8 +1,8 @@
 """Replacement of missing, wrong and clipped samples by random samples with the same statistics.
 
-``fill_missing_samples`` adds a random deviation to the mean of neighbouring samples. The deviation is copied from a
-randomly chosen valid sample, the **donor**. Mean level, drift and white noise therefore continue through missing
-samples. A long run of missing samples is filled by a random walk with the drift of the recording.
+``fill_missing_samples`` adds a random deviation to the mean of neighbouring samples. The deviation is taken from a
+randomly chosen valid sample (**donor**). Mean level, drift and white noise therefore continue through missing samples.
+A long run of missing samples is filled by a random walk with the drift of the recording.
 
 ``restore_clipped_samples`` replaces each clipped sample by a random sample from the tail of a Gaussian.
 """
@@ -89,7 +89,7 @@ def fill_missing_samples(y: Floats, replace_mask: Mask, rng: np.random.Generator
 
 
 def restore_clipped_samples(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
-    """Return a copy of a series with random samples beyond the limit in place of clipped samples.
+    """Return a copy of a series with each clipped sample replaced by a random sample beyond the limit.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def restore_clipped_samples(y: Floats, limit: float, sigma: float, rng: np.rando
     Returns
     -------
     ndarray of float64, shape (n,)
-        Series with restored samples beyond the limit.
+        Series with random samples beyond the limit.
 
     Examples
     --------
@@ -145,7 +145,7 @@ def _local_means(y: Floats, good: Mask, at: Ints) -> Floats:
 
 @compiled
 def _running_sums(y: Floats, good: Mask, middle: float) -> tuple[Floats, Ints]:
-    """Return the running sum of (sample − ``middle``) and the running count of the valid samples."""
+    """Return running sums and running counts of the valid samples, after subtraction of ``middle``."""
     sums, counts = np.empty(y.size + 1), np.empty(y.size + 1, np.int64)
     total, count = 0.0, 0
     for k in range(y.size):

@@ -3,9 +3,9 @@
 Each function returns the detected artifact, or None. The evidence is the log-likelihood gain, in nats, over a series
 without the artifact.
 
-A quantization step can be much smaller than the noise. A grid that the number format explains, such as float32 or
-decimal text, is reported only if the step is at least a tenth of the noise. Repeated samples cannot be detected if the
-step exceeds the noise. Clipping cannot be detected if the step exceeds two standard deviations.
+A quantization step can be much smaller than the noise. A step of the number format, such as float32 or decimal text, is
+reported only if the step is at least a tenth of the noise. Repeated samples cannot be detected if the step exceeds the
+noise. Clipping cannot be detected if the step exceeds two standard deviations.
 """
 
 from dataclasses import dataclass
@@ -67,7 +67,7 @@ class QuantizationGrid:
 
 @dataclass(frozen=True, slots=True)
 class Clipping:
-    """Clipping of the values at the end of the measuring range."""
+    """Clipping of the values at an end of the measuring range."""
 
     limit: ValueWithInterval
     count: int  # number of clipped samples
@@ -88,7 +88,7 @@ class RepeatedSamples:
 def detect_quantization(y: Floats) -> QuantizationGrid | None:
     """Detect the quantization grid of the values.
 
-    A grid that the number format explains is not reported.
+    A fine grid due to the number format is not reported.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
     Returns
     -------
     Clipping or None
-        Detected clipping, or None.
+        Detected clipping, or None if no clipping is detected.
 
     Examples
     --------
@@ -233,7 +233,7 @@ def _float_spacing(values: Floats) -> float:
 
 
 def _last_decimal(levels: Floats) -> float:
-    """Return the value of the last digit of decimal numbers in SI units, or 0 for other numbers."""
+    """Return the unit of the last decimal place, in SI units, or 0 if the values are not decimal numbers."""
     some = levels[np.linspace(0, levels.size - 1, min(256, levels.size)).astype(np.int64)]
     some = np.abs(some[some != 0.0])
     if not some.size:
@@ -347,13 +347,13 @@ def _excess_over_parabola(counts: Floats) -> float:
 
 
 def _count_difference_gain(one: float, other: float) -> float:
-    """Return the log-likelihood gain of a larger first count over equal expected counts, or 0."""
+    """Return the log-likelihood gain of two different expected counts over equal expected counts, or 0."""
     half = 0.5 * (one + other)
     return float(xlogy(one, one / half) + xlogy(other, other / half)) if one > other else 0.0
 
 
 def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
-    """Return a linear prediction of every sample from ``PREDICTOR_TAPS`` neighbours on each side, and the error."""
+    """Return a linear prediction of every sample from neighbouring samples, and the standard deviation of the error."""
     z = values - values.mean()
     lags = np.array([np.dot(z[: z.size - k], z[k:]) for k in range(2 * PREDICTOR_TAPS + 1)]) / z.size
     k = np.arange(1, PREDICTOR_TAPS + 1)
@@ -365,10 +365,9 @@ def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
 
 
 def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: float) -> RepeatedSamples | None:
-    """Return the repeated samples of values without a detected grid.
+    """Return the repeated samples in values without a detected grid.
 
-    Equal samples at a distance of two indicate an unknown grid. The share of chance repeats is then estimated from the
-    equal samples at a distance of two.
+    If samples at a distance of two are equal, the values lie on an unknown grid, and some repeats are due to chance.
     """
     mask = np.zeros(y.size, dtype=np.bool_)
     mask[1:] = pairs & (y[1:] == y[:-1])
@@ -396,10 +395,10 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: f
 
 
 def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: int) -> RepeatedSamples | None:
-    """Return the repeated samples of values on a grid.
+    """Return the repeated samples in values on a grid.
 
-    Repeats, outliers and modulated noise increase the number of zero differences between neighbours. At a distance of
-    two samples, a share h of repeats has only the effect h². The result has the smaller gain of both tests.
+    Repeats, outliers and modulated noise all increase the number of zero differences between neighbours. Only repeats
+    have little influence on the differences over two samples. The result has the smaller gain of both tests.
     """
     most = int(np.clip(np.ceil(SIGMA_PER_MEAN_DISTANCE * 2.0**0.5 * differences.mean()), 2, 64))
     counts, chance, gain = _zero_difference_excess(differences, most)
@@ -480,7 +479,7 @@ def _step_difference_probabilities(spread: float, most: int) -> Floats:
 
 
 def _share_difference_gain(counts: Floats, trials: Floats) -> float:
-    """Return the log-likelihood gain of a larger first share over a common share, or 0."""
+    """Return the log-likelihood gain of two different shares over a common share, or 0."""
     share, same = counts / trials, counts.sum() / trials.sum()
     if share[0] <= share[1]:
         return 0.0

@@ -83,7 +83,7 @@ def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) ->
 
 
 def _may_leak(source: str, axis: str) -> bool:
-    """Return True if one axis may leak into another axis: accelerometers into all axes, gyroscopes into gyroscopes."""
+    """Return True if one axis can leak into another axis. A gyroscope never leaks into an accelerometer."""
     return source != axis and (axis.startswith("g") or source.startswith("a"))
 
 
@@ -96,7 +96,7 @@ def detect_value_artifacts(y: Floats) -> ValueArtifacts:
 
 
 def _repair_samples(y: Floats, statistics: ValueArtifacts, effects: Effects, rng: np.random.Generator) -> Floats:
-    """Return the samples with missing samples replaced, and repeated or clipped samples if the effects require it."""
+    """Replace missing samples, and repeated or clipped samples if the effects include the cause."""
     missing = ~np.isfinite(y)
     types = {type(effect) for effect in effects}
     if RandomSampleHold in types and statistics.repeats:

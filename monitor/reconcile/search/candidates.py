@@ -2,7 +2,7 @@
 
 Each function proposes effects of one kind for a whitened axis. Shape parameters are fitted here, and the caller fits
 the sizes. ``PENALTY_NATS`` contains the log-likelihood gain that an effect reaches by chance. The penalties are
-empirical, and larger for effects that can occur at many frequencies or times.
+empirical. Effects that can occur at many frequencies or times have larger penalties.
 """
 
 from collections.abc import Callable, Sequence
@@ -253,7 +253,7 @@ def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
 def _best_time_constant(
     whitened: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], search_factor: float, shortest_s: float
 ) -> list[Effect]:
-    """Return the most likely effect with a fitted time constant, or an empty list if it is out of range."""
+    """Return the most likely effect, or an empty list if the fitted time constant is out of range."""
     best = _most_likely(whitened.axis, whitened.effects, trials)
     refined = fit_shape_parameter(whitened.axis, whitened.effects, best, "time_constant", search_factor)
     assert isinstance(refined, (TurnOnTransient, TemperatureLag))
@@ -262,7 +262,7 @@ def _best_time_constant(
 
 
 def propose_leaks_from_other_axes(whitened: WhitenedAxis) -> list[Effect]:
-    """Propose a leak from each other axis that is not yet a leak source."""
+    """Propose a leak from each other axis that is not yet a source of a leak."""
     known = {getattr(effect, "source", None) for effect in whitened.effects}
     found: list[Effect] = []
     for source in whitened.axis.leak_sources:

@@ -1,8 +1,8 @@
 """Cross-validation of a new effect on the two halves of a recording.
 
 The hypotheses with and without the effect are fitted to one half and tested on the other half. The effect is kept if
-the likelihood of the other half increases and the gap of the diagnostic decreases. An effect that happens once, or with
-too little evidence in one half, is kept without cross-validation.
+the likelihood of the other half increases and the gap of the diagnostic decreases. One-time effects, and effects with
+too little evidence in one half, are kept without cross-validation.
 """
 
 from collections.abc import Collection
@@ -93,7 +93,7 @@ def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
 
 
 def _summed_gap(halves: list[Axis], hypothesis: Hypothesis, diagnostic: str) -> float:
-    """Return the combined gap of a diagnostic after separate fits to both halves."""
+    """Return the combined difference in a diagnostic after separate fits to both halves."""
     return sqrt(sum(DIAGNOSTICS[diagnostic](whiten_axis(_fit_half(half, hypothesis))).gain for half in halves))
 
 
@@ -155,7 +155,7 @@ def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
     Noise effects keep the learned sizes. Let β₁ be the learned regressor sizes with the covariance C₁, and β₂ the sizes
     fitted to the other half with the covariance C₂. The prediction uses the weighted mean of β₁ and β₂. With the
     difference Δ = β₂ − β₁, the log-likelihood for β₂ is reduced by ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln(|C₁ + C₂|/|C₂|). A sinusoid
-    keeps the learned amplitude and has a fitted phase.
+    keeps the learned amplitude, and the phase is fitted again.
     """
     effects = learned.effects
     free = half.fit(effects, noise_effect_indices(effects))

@@ -105,7 +105,7 @@ def choose_distribution(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hy
 
 
 def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
-    """Return the likelier of Poisson steps and a slow random telegraph, or None if neither applies."""
+    """Return the more likely of Poisson steps and a slow random telegraph, or None if neither process applies."""
     steps = fit_poisson_alternative(hypothesis)
     if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps

@@ -1,8 +1,8 @@
 """Search for missing effects on one axis, by forward selection.
 
-In each round, the axis is whitened by the current hypothesis and all diagnostics are run. The search ends if no gap is
-significant. Otherwise, the search adds the best candidate effect that passes cross-validation, and drops added effects
-that no longer contribute. After the last round, effects that the diagnostics contradict are withdrawn.
+In each round, the axis is whitened by the current hypothesis and all diagnostics are run. The search ends if no
+difference is significant. Otherwise, the best candidate effect that passes cross-validation is added. Added effects
+that no longer contribute are dropped. After the last round, effects that the diagnostics contradict are withdrawn.
 """
 
 from dataclasses import dataclass, replace
@@ -127,7 +127,9 @@ def _diagnose(hypothesis: Hypothesis) -> _DiagnosedHypothesis:
 def _next_round(
     current: _DiagnosedHypothesis, later: bool, null: AxisNull, rng: np.random.Generator
 ) -> tuple[_DiagnosedHypothesis, SearchRound | None]:
-    """Run one search round. Return the hypothesis before the round, and the round or None at the end of the search."""
+    """Run one search round. Return the hypothesis before the round, and the round, which is None at the end of the
+    search.
+    """
     hypothesis, whitened = current.hypothesis, current.whitened
     agrees = not any(one.gain > null[lens].threshold for lens, one in current.findings.items())
     better = try_alternatives_to_resizing(hypothesis, whitened) if agrees and hypothesis.refitted_size_count else []
@@ -192,7 +194,7 @@ def _select_trial(
 
 
 def _add_effect(hypothesis: Hypothesis, trial: Trial, rng: np.random.Generator) -> Hypothesis:
-    """Add the effect of a trial to the hypothesis, after a new repair of the axis if the effect alters samples."""
+    """Add the effect of a trial to the hypothesis. If the effect alters samples, the axis is repaired again first."""
     added = hypothesis.added if trial.effect is None else (*hypothesis.added, trial.effect)
     axis = hypothesis.axis
     if type(trial.effect) in REPAIRED_EFFECTS:

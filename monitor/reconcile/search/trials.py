@@ -8,8 +8,8 @@ in this order:
 3. Deterministic effects, with the gain over the best slow noise. Slow noise can resemble a deterministic effect.
 4. Noise effects and a common factor for all noise effects of the model.
 
-A power law competes with the noise effects, and a curved drift competes with the deterministic effects. If one of these
-has the largest score, no effect is added, because no known effect explains the difference.
+A power law competes with the noise effects, and a curved drift competes with the deterministic effects. If the power
+law or the curved drift has the largest score, no effect is added.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -180,7 +180,7 @@ def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
 
 
 def _band_gain(whitened: WhitenedAxis) -> float:
-    """Return the gain of a power change within a narrow frequency band, otherwise 0.
+    """Return the gain of a power change within a narrow frequency band, or 0 for a wide band.
 
     A step of white noise changes the power at all frequencies.
     """
@@ -211,7 +211,7 @@ def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
 
 
 def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try noise effects, new sizes of the model, a common factor, and a power law."""
+    """Try noise effects, new sizes of the noise model, a common factor, and a power law."""
     resized = hypothesis.refit_with_added_effects(hypothesis.added)
     found = [
         Trial(
@@ -274,9 +274,9 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
 def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
     """Return True if one coefficient describes a leak at all frequencies.
 
-    Vibration that acts on both axes has a coefficient that depends on the frequency. The coefficients of several
-    frequency bands are compared by a χ² test. With the source transform X and the noise variance v, the variance of a
-    coefficient is 1/Σ(X²/v).
+    If vibration acts on both axes, the coefficient depends on the frequency. A χ² test compares the coefficients of
+    several frequency bands. With the source transform X and the noise variance v, the variance of a coefficient is
+    1/Σ(X²/v).
     """
     column = whitened.axis.leak_sources[leak.source] * whitened.weights
     edges = np.linspace(0, column.size, FREQUENCY_BANDS + 1).astype(np.int64)[:-1]
@@ -287,17 +287,14 @@ def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
 
 
 def _curved_drift_score(hypothesis: Hypothesis) -> float:
-    """Return the penalised log-likelihood with an additional quadratic drift."""
+    """Return the penalised log-likelihood of the hypothesis with an additional quadratic drift."""
     effects = (*hypothesis.effects, RateRamp(R=initial_effect_size(hypothesis.axis)))
     fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, curvature=True)
     return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS["rate_ramp"] - QUADRATIC_PENALTY_NATS
 
 
 def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float]]:
-    """Return functions that compute the score of given effects with an additional slow noise.
-
-    Each function adds one slow noise that can resemble a deterministic effect.
-    """
+    """Return functions that compute the score of given effects with an additional slow noise."""
     axis, small = hypothesis.axis, initial_effect_size(hypothesis.axis)
     fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
 
@@ -324,8 +321,7 @@ def _score_with_power_law(hypothesis: Hypothesis, effects: Effects, exponent: fl
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     """Try a common factor for all noise effects of the model.
 
-    If two or more sizes changed, and the factor fits nearly as well as separate sizes, the factor has at least the
-    score of the separate sizes.
+    If several sizes changed and the factor fits nearly as well, the factor has at least the score of separate sizes.
     """
     effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_effect_indices(hypothesis.model)
 

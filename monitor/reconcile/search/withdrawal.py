@@ -1,15 +1,15 @@
 """Withdrawal of added effects that the final diagnostics contradict.
 
-Lines and resonances can fit an oscillation with a varying amplitude or frequency, although the model is wrong. Lines,
+Lines and resonances can fit an oscillation with a varying frequency, although the fitted model is wrong. Lines,
 resonances and low-pass filters are withdrawn in these cases:
 
 - Several lines or resonances overlap.
 - ``MIN_COMB_LINES`` or more lines are harmonics of one frequency.
 - A significant difference remains at the frequency of the effect.
 
-A leak is withdrawn if more than half of the dependence on other axes remains, because the cause is then vibration. A
-step is withdrawn if the mean level still changes. A smooth spectrum is withdrawn if the noise is mainly non-Gaussian,
-non-stationary or common to several axes.
+A leak is withdrawn if more than half of the dependence on other axes remains. A step is withdrawn if the mean level
+still changes. A smooth spectrum is withdrawn if the noise is mainly non-Gaussian, non-stationary or common to several
+axes.
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,8 @@
 """Explanation why one recording does not show an effect that another recording of the same sensor shows.
 
-The gap of a permanent effect grows with the square root of the recording length, and the gap of a temperature effect
-also grows with the temperature range. If the expected gap clearly exceeds the threshold, the absence is a
-contradiction. Otherwise, the recording is not sensitive enough.
+The difference due to a permanent effect grows with the square root of the recording length. The difference due to a
+temperature effect also grows with the temperature range. If the expected difference clearly exceeds the threshold, the
+absence is a contradiction.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ TEMPERATURE_EFFECTS: Final = ("temperature_bias", "temperature_lag")
 
 @dataclass(frozen=True, slots=True)
 class Absence:
-    """Recording that does not show an effect, with an explanation."""
+    """Recording that does not show an effect, with the explanation."""
 
     run: str  # name of the recording
     meaning: Meaning
@@ -38,7 +38,7 @@ class Absence:
 
 @dataclass(frozen=True, slots=True)
 class ClearestOccurrence:
-    """Effect in the recording with the clearest evidence for the effect."""
+    """Effect in the recording with the clearest evidence."""
 
     step: AddedOrResizedEffect
     axis_result: AxisResult  # result of the axis in this recording
@@ -84,7 +84,7 @@ def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[M
 
 
 def _compare_expected_gap(expected: float, growth: float, gap: DiagnosticGap, seconds: float) -> tuple[Meaning, str]:
-    """Compare the expected gap with the threshold, and return the meaning with a sentence."""
+    """Compare the expected difference with the threshold, and return the meaning with an explanation."""
     said = (
         f"with the size in the other recording, {seconds:.6g} s of data would show a gap of about {expected:.1f} "
         f"({gap.lens}), and the threshold of {gap.threshold:.1f} is not passed"
@@ -95,7 +95,7 @@ def _compare_expected_gap(expected: float, growth: float, gap: DiagnosticGap, se
 
 
 def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, gap: DiagnosticGap) -> float | None:
-    """Return the expected gap in the other recording over the gap in this recording, or None without a temperature
+    """Return the ratio of the expected gap in the other recording to the observed gap, or None without a temperature
     change.
     """
     longer = other_s / seconds

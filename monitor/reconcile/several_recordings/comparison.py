@@ -178,7 +178,7 @@ def _sample_rate_steps(run: NamedResult) -> list[AddedOrResizedEffect]:
 
 
 def _sample_rate_axis(runs: Sequence[NamedResult]) -> str:
-    """Return the first axis with a sample rate error in any recording, or ""."""
+    """Return the first axis with a sample rate error in any recording, or an empty string."""
     results = [(axis, run.result.axes.get(axis)) for axis in AXES for run in runs]
     return next((axis for axis, one in results if one and any(s.effect == SAMPLE_RATE_EFFECT for s in one.steps)), "")
 
@@ -233,7 +233,7 @@ def _summarise_group(
 
 
 def _gap_of_effect(step: AddedOrResizedEffect, axis: str, result: Reconciliation) -> float:
-    """Return the gap that an effect causes. For a resized effect, return the change of size in standard deviations."""
+    """Return the difference that an effect causes, in standard deviations."""
     if step.kind == "added":
         return sqrt(max(step.before.gap**2 - step.after.gap**2, 0.0))
     given = find_closest_effect(

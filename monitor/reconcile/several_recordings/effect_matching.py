@@ -35,7 +35,7 @@ SAMPLE_RATE_EFFECT: Final = "sample_rate_error"
 
 
 def identifying_parameter_name(effect: str) -> str:
-    """Return the name of the identifying parameter of an effect, or "" without an identifying parameter."""
+    """Return the name of the identifying parameter of an effect, or an empty string."""
     return IDENTIFYING_PARAMETERS.get(effect, ("", 0.0))[0]
 
 
@@ -136,7 +136,7 @@ def effect_parameters(effect: Effect) -> dict[str, Any]:
 
 
 def _relative_difference(a: Any, b: Any) -> float:
-    """Return a relative difference from 0 for equal values to 1 for different signs or names."""
+    """Return a relative difference between 0 (equal) and 1 (different signs or names)."""
     if isinstance(a, str) or isinstance(b, str) or a is None or b is None:
         return float(a != b)
     return min(abs(a - b) / (abs(a) + abs(b)), 1.0) if a != b else 0.0

@@ -34,7 +34,7 @@ class PooledParameter:
 
     @property
     def p_value(self) -> float | None:
-        """Probability of a larger χ² if the true value is the same in all recordings, or None."""
+        """Probability of a larger χ² if the true value is the same in all recordings."""
         return agreement_probability([self])
 
 
