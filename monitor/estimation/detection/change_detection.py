@@ -26,8 +26,9 @@ since the last change. The detector returns a ``Change`` of one of three kinds.
   burst, the samples of the burst are removed from the reference.
 
 ``analyze`` and the live service share this detector. ``reconcile`` tests steps of the level and of the noise by the
-likelihood ratio of the fitted model of the axis (``diagnostics.compute_level_step_gains``, ``single_steps``,
-``variance_history``). The gain of a step must be comparable with the gains of all other effects.
+likelihood ratio of the fitted model of the axis (``diagnostics.compute_level_step_gains``,
+``poisson_steps_vs_single_steps``, ``variance_history``). The gain of a step must be comparable with the gains of all
+other effects.
 """
 
 from collections.abc import Mapping
