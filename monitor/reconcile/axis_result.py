@@ -1,4 +1,4 @@
-"""Conversion of a search into the result of an axis: effects with parameters, confidence and justification."""
+"""Conversion of the search on one axis into an ``AxisResult`` with parameters, confidence and justification."""
 
 from math import erf, exp, inf, log
 from typing import Final
@@ -17,9 +17,9 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.null_distribution import AxisNull, measure_gaps
-from monitor.reconcile.likelihood.effect_roles import MOST_DIRECT_DIAGNOSTIC, SIZE_PARAMETERS, size
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, shape_interval, size_interval
+from monitor.reconcile.diagnostics.null_distribution import AxisNull, compute_diagnostic_gaps
+from monitor.reconcile.likelihood.effect_roles import MOST_DIRECT_DIAGNOSTIC, SIZE_PARAMETERS, effect_size
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, compute_shape_interval, compute_size_interval
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AxisResult,
@@ -50,20 +50,20 @@ MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence with which an alternative effect is reported."""
 
 
-def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> AxisResult:
-    """Return the result of one axis.
+def build_axis_result(search: AxisSearchResult, null: AxisNull, final_null: AxisNull) -> AxisResult:
+    """Build the result of one axis from the search for missing effects.
 
     Parameters
     ----------
     search : AxisSearchResult
-        Search on the axis.
+        Result of the search on the axis.
     null : AxisNull
-        Null distributions under the model under test, for the diagnostics before and during the search.
-    final : AxisNull
-        Null distributions under the extended model, which decide whether a remaining difference is significant.
+        Null distributions of the diagnostics under the original model.
+    final_null : AxisNull
+        Null distributions of the diagnostics under the extended model.
     """
     snapshots = [_snapshot(one.before, null) for one in search.rounds]
-    end = _snapshot(search.final, final)
+    end = _snapshot(search.final, final_null)
     snapshots.append(end if search.before_withdrawal is None else _snapshot(search.before_withdrawal, null))
     steps = tuple(
         _describe_step(search, search.rounds[at], index, kind, snapshots[at], snapshots[at + 1])
@@ -75,15 +75,11 @@ def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> 
 
 
 def _snapshot(diagnostics: AxisDiagnostics, null: AxisNull) -> DiagnosticSnapshot:
-    """Return the gaps and the plots of an axis."""
-    return DiagnosticSnapshot(measure_gaps(diagnostics.findings, null), diagnostics.plots)
+    return DiagnosticSnapshot(compute_diagnostic_gaps(diagnostics.findings, null), diagnostics.plots)
 
 
 def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKind]]:
-    """Return the round, the effect and the kind of each change that remains at the end of the search.
-
-    The round and the effect are indices.
-    """
+    """Return the changes that the search kept: index of the search round, index of the effect, and kind of change."""
     hypothesis = search.hypothesis
     found: list[tuple[int, int, StepKind]] = []
     left = list(range(hypothesis.given_count, len(hypothesis.effects)))
@@ -102,10 +98,9 @@ def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKin
 
 
 def _noise_floor_gap(search: AxisSearchResult, end: DiagnosticSnapshot) -> tuple[DiagnosticGap, ...]:
-    """Return the gap of the white noise floor after an added low-pass filter, if the gap is significant.
+    """Return the difference in the spectrum due to white noise behind an added low-pass filter, if significant.
 
-    No effect describes this noise, so a significant noise floor is reported as an unexplained difference. The gap
-    follows from the gain of the noise floor. It is limited to the largest gap of the spectrum during the search.
+    The difference is limited to the largest difference in the spectrum during the search.
     """
     hypothesis, axis = search.hypothesis, search.hypothesis.axis
     limit = next((effect for effect in hypothesis.added if isinstance(effect, BandwidthLimit)), None)
@@ -121,15 +116,10 @@ def _noise_floor_gap(search: AxisSearchResult, end: DiagnosticSnapshot) -> tuple
 
 
 def _gap_of(lens: str, snapshot: DiagnosticSnapshot) -> DiagnosticGap:
-    """Return the gap of one diagnostic."""
     return next(gap for gap in snapshot.gaps if gap.lens == lens)
 
 
 def _axis_decision(changed: bool, left_over: bool) -> Decision:
-    """Return the decision for an axis.
-
-    ``changed`` is True if effects were added or resized. ``left_over`` is True if a significant difference remains.
-    """
     if left_over:
         return "partly_explained" if changed else "unexplained"
     return "explained" if changed else "agrees"
@@ -143,7 +133,6 @@ def _describe_step(
     before: DiagnosticSnapshot,
     after: DiagnosticSnapshot,
 ) -> AddedOrResizedEffect:
-    """Return the description of one effect that was added or resized."""
     effect, trial = search.hypothesis.effects[index], done.trials[0]
     gap = _triggering_gap(effect, kind, before)
     later = _gap_of(gap.lens, after)
@@ -170,7 +159,6 @@ def _describe_step(
 def _held_out_gaps(
     done: SearchRound, gap: DiagnosticGap, later: DiagnosticGap
 ) -> tuple[DiagnosticGap | None, DiagnosticGap | None]:
-    """Return the gaps of the cross-validation before and after a round, or None without cross-validation."""
     validation = done.validation
     if validation.reason:
         return None, None
@@ -181,10 +169,10 @@ def _held_out_gaps(
 
 
 def _triggering_gap(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) -> DiagnosticGap:
-    """Return the gap that led to an effect.
+    """Return the difference between recording and model that led to an effect.
 
-    If the most direct diagnostic of the effect has a significant gap, this gap is returned. Otherwise, the result is
-    the gap that is largest relative to its threshold.
+    A significant difference in the most sensitive diagnostic of the effect is preferred. Otherwise, the difference with
+    the largest ratio to the threshold is returned.
     """
     significant = [gap for gap in before.gaps if gap.is_significant] or list(before.gaps)
     most_direct = MOST_DIRECT_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
@@ -195,10 +183,9 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) 
 
 
 def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[RunnerUp, ...]]:
-    """Return the probability of an effect and of the most probable alternatives.
+    """Return the probability of the selected effect, and the most probable alternative effects.
 
-    The probabilities are proportional to the exponentials of the trial scores. One alternative is the absence of any
-    effect, with the score 0.
+    Each probability is proportional to exp(score). The hypothesis without any effect has the score 0.
     """
     best: dict[str, float] = {"": 0.0}
     for trial in trials:
@@ -216,12 +203,9 @@ def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[fl
 
 
 def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
-    """Return the probability that the true size of an effect differs from the size in the model.
-
-    The probability follows from the difference of the logarithms of both sizes, in standard errors.
-    """
-    now, before = size(hypothesis.effects[index]), size(hypothesis.model[index])
-    error = hypothesis.fit.size_error(index)
+    """Return the probability that the true size of an effect differs from the size in the model."""
+    now, before = effect_size(hypothesis.effects[index]), effect_size(hypothesis.model[index])
+    error = hypothesis.fit.size_standard_error(index)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
         return 1.0  # one of the sizes is zero
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
@@ -230,7 +214,6 @@ def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
 def _parameters_with_bounds(
     hypothesis: Hypothesis, index: int, trial: Trial, kind: StepKind
 ) -> dict[str, ParameterInterval]:
-    """Return the parameters of an effect with 95 % intervals."""
     effect = hypothesis.effects[index]
     if kind == "added" and trial.intervals and trial.name == effect.name:
         return dict(trial.intervals)
@@ -239,24 +222,23 @@ def _parameters_with_bounds(
         found["source"] = ParameterInterval(effect.source)
     size_name = SIZE_PARAMETERS.get(type(effect))
     if size_name is not None:
-        found[size_name] = size_interval(hypothesis.fit, index)
+        found[size_name] = compute_size_interval(hypothesis.fit, index)
     if isinstance(effect, TemperatureBias):
         found["reference"] = ParameterInterval(effect.reference)
         if effect.quadratic is not None:
             found["quadratic"] = _quadratic_bounds(hypothesis, index)
     for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
-        found[shape] = shape_interval(hypothesis.fit, index, shape)
+        found[shape] = compute_shape_interval(hypothesis.fit, index, shape)
     if isinstance(effect, BandwidthLimit):
         found["order"] = ParameterInterval(float(effect.order))
     if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
         # the frequency is fitted too, which doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
-        error = 2.0 * Z95 * hypothesis.fit.size_error(index) / effect.amplitude
+        error = 2.0 * Z95 * hypothesis.fit.size_standard_error(index) / effect.amplitude
         found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
     return found
 
 
 def _quadratic_bounds(hypothesis: Hypothesis, index: int) -> ParameterInterval:
-    """Return the quadratic temperature coefficient with the 95 % interval."""
     fitted = hypothesis.fit.whittle
     column = next(place for at, place in hypothesis.fit.regressor_slices if at == index).start + 1
     value = float(fitted.beta[column])
@@ -287,7 +269,6 @@ def _justification(
     others: tuple[RunnerUp, ...],
     trial: Trial,
 ) -> str:
-    """Return the sentences that justify an effect."""
     gaps = f"the gap is {gap.gap:.1f}, and a true model stays below {gap.threshold:.1f}"
     sentences = [f"{EVIDENCE_TEXT[gap.lens]}{_location_text(gap)}: {gaps}."]
     if kind == "retuned":
@@ -303,12 +284,10 @@ def _justification(
 
 
 def _comparison_phrase(confidence: float) -> str:
-    """Return a phrase that compares an alternative with the chosen effect."""
     return "nearly as well" if confidence > 0.2 else "less well" if confidence > 0.01 else "clearly less well"
 
 
 def _location_text(gap: DiagnosticGap) -> str:
-    """Return a phrase for the location of a gap, or an empty string."""
     place = gap.where
     if place.frequency is not None:
         lo, hi = place.frequency

@@ -1,13 +1,10 @@
 """JSON report of a reconciliation: ``report.json``, schema imu-monitor/reconcile/1.
 
-Equal reconciliations give equal bytes. Numbers are in SI units, and times are in seconds from the start of the
-recording. A number that is not finite becomes null, because JSON cannot represent it. A parameter that names an axis
-has a value and no interval.
+Equal reconciliations are encoded as equal bytes. All numbers are in SI units. Times are in seconds from the start of
+the recording. A number that is not finite is encoded as null.
 
-``steps`` contains one entry for each effect that was added or resized. In each entry, ``found`` is the difference that
-led to the step, with the threshold of the model before the step. ``gap`` contains the gap of the same diagnostic before
-and after the step, with the threshold of the model after the step. ``scores`` contains all diagnostics. For an axis,
-``scores`` is the comparison with the model under test. For a step, ``scores`` is the comparison after the step.
+Each entry of ``steps`` describes one effect that was added or resized. ``found`` is the difference that led to the
+step. ``gap`` compares the same diagnostic before and after the step. ``scores`` lists the gaps of all diagnostics.
 """
 
 from math import isfinite
@@ -29,23 +26,22 @@ SCHEMA: Final = "imu-monitor/reconcile/1"
 _JSON_ENCODER: Final = msgspec.json.Encoder()
 
 
-def encode_report(r: Reconciliation) -> bytes:
-    """Encode a reconciliation as JSON, with the axes in the order of ``AXES``."""
+def encode_report(result: Reconciliation) -> bytes:
+    """Encode a reconciliation as JSON."""
     return _JSON_ENCODER.encode({
         "schema": SCHEMA,
-        "verdict": r.verdict,
-        "rate": finite_or_none(r.rate_hz),
-        "samples": int(r.samples),
-        "seconds": finite_or_none(r.duration_s),
-        "seed": int(r.seed),
-        "fitted_first": bool(r.fitted_first),
-        "notes": r.notes,
-        "axes": {axis: _axis_entry(r.axes[axis]) for axis in AXES if axis in r.axes},
+        "verdict": result.verdict,
+        "rate": finite_or_none(result.rate_hz),
+        "samples": int(result.samples),
+        "seconds": finite_or_none(result.duration_s),
+        "seed": int(result.seed),
+        "fitted_first": bool(result.fitted_first),
+        "notes": result.notes,
+        "axes": {axis: _axis_entry(result.axes[axis]) for axis in AXES if axis in result.axes},
     })  # fmt: skip
 
 
 def _axis_entry(result: AxisResult) -> dict[str, Any]:
-    """Return the report entry of one axis."""
     return {
         "verdict": result.verdict,
         "steps": [_step_entry(step) for step in result.steps],
@@ -55,7 +51,6 @@ def _axis_entry(result: AxisResult) -> dict[str, Any]:
 
 
 def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
-    """Return the report entry of one effect that was added or resized."""
     held_out = _gap_entry(step.held_out_before, step.held_out_after)
     return {
         "found": _gap_and_location_entry(step.before),
@@ -73,7 +68,6 @@ def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
 
 
 def _gap_entry(before: DiagnosticGap | None, after: DiagnosticGap | None) -> dict[str, float | None] | None:
-    """Return the gaps before and after a step, or None if one of them is unknown."""
     if before is None or after is None:
         return None
     return {
@@ -85,7 +79,6 @@ def _gap_entry(before: DiagnosticGap | None, after: DiagnosticGap | None) -> dic
 
 
 def _gap_and_location_entry(gap: DiagnosticGap) -> dict[str, Any]:
-    """Return the report entry of one gap of a diagnostic."""
     return {
         "lens": gap.lens,
         "where": _where_entry(gap.where),
@@ -96,7 +89,6 @@ def _gap_and_location_entry(gap: DiagnosticGap) -> dict[str, Any]:
 
 
 def _where_entry(where: Location) -> dict[str, Any]:
-    """Return the report entry of a location."""
     return {
         name: place if isinstance(place, str) else [finite_or_none(end) for end in place]
         for name, place in where.resolved_dimensions().items()
@@ -104,12 +96,12 @@ def _where_entry(where: Location) -> dict[str, Any]:
 
 
 def parameter_entry(bounds: ParameterInterval) -> dict[str, Any]:
-    """Return the report entry of a parameter."""
+    """Return the JSON entry of a parameter."""
     if isinstance(bounds.value, str):
         return {"value": bounds.value}
     return {"value": finite_or_none(bounds.value), "lo": finite_or_none(bounds.lo), "hi": finite_or_none(bounds.hi)}
 
 
 def finite_or_none(value: float | None) -> float | None:
-    """Return the value as a Python float, which the encoder accepts, or None if the value is not finite."""
+    """Convert a finite value to a Python float. Return None for any other value."""
     return None if value is None or not isfinite(value) else float(value)

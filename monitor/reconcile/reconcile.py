@@ -1,14 +1,8 @@
-"""Compare a recording with a noise model and return a ``Reconciliation``.
+"""Comparison of a recording with a noise model, and search for the effects that the model lacks.
 
-The procedure has these steps:
-
-1. Simulate recordings of the model and run all diagnostics on them. The results give the thresholds.
-2. Run the same diagnostics on the measured recording.
-3. On each axis with a significant difference, try candidate effects and keep the best one. Repeat this until no
-   significant difference remains or no candidate is accepted.
-4. Simulate the extended model and compare the recording with the new thresholds.
-
-Each axis has its own search. Only the sample rate error is common to all axes.
+Simulated recordings of the noise model define the threshold of each diagnostic. On each axis, the search adds effects
+to the model until no diagnostic exceeds the threshold. The extended model is then simulated and compared with the
+recording.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -28,7 +22,7 @@ from monitor.noise.effects import (
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.standard_terms import UNIT_SOURCES
-from monitor.reconcile.axis_result import describe_axis
+from monitor.reconcile.axis_result import build_axis_result
 from monitor.reconcile.diagnostics.null_distribution import (
     AxisNull,
     Findings,
@@ -36,7 +30,7 @@ from monitor.reconcile.diagnostics.null_distribution import (
     run_diagnostics,
 )
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
-from monitor.reconcile.likelihood.effect_roles import with_size
+from monitor.reconcile.likelihood.effect_roles import with_effect_size
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.reconcile_input import Recording, select_usable_axes
@@ -54,15 +48,15 @@ from monitor.reconcile.search.candidates import PENALTY_NATS
 from monitor.reconcile.search.sample_rate_from_spectrum import (
     SAMPLE_RATE_PENALTY_NATS,
     SampleRateErrorEstimate,
-    convert_to_stated_time,
     detect_sample_rate_error,
+    rescale_effect_time,
 )
-from monitor.reconcile.search.search import AxisSearchResult, search_axis
+from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
 
 SIMULATED_RECORDINGS: Final = 6
-"""Number of simulated recordings that determine a null distribution. With six axes, each diagnostic has 36 gains."""
+"""Number of simulated recordings that determine a null distribution."""
 MIN_TERM_GAIN_NATS: Final = 3.0
-"""Log-likelihood gain in nats that a term of the first fit must reach to be kept."""
+"""Smallest log-likelihood gain, in nats, of a term that the fit of the five terms keeps."""
 ProgressCallback = Callable[[str], None]
 """Function that receives the name of each stage."""
 MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -71,7 +65,7 @@ MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 @dataclass(frozen=True, slots=True)
 class RecordingContext:
-    """Recording that is reconciled, with the seed, the cached regressors and the worker threads."""
+    """Recording to compare with a noise model, and the data that all stages share."""
 
     recording: Recording
     seed: int
@@ -81,14 +75,12 @@ class RecordingContext:
 
 @dataclass(frozen=True, slots=True)
 class _AxesSearchResult:
-    """Result of the search on all axes of one recording."""
-
     searches: dict[str, AxisSearchResult]
     sample_rate_error: SampleRateErrorEstimate | None
 
     @property
     def searches_that_changed_model(self) -> dict[str, AxisSearchResult]:
-        """Results of the searches that changed the model."""
+        """Searches that added or resized an effect."""
         return {name: search for name, search in self.searches.items() if search.rounds}
 
 
@@ -106,7 +98,7 @@ def reconcile(
     recording : Recording
         Recording with at least ``MIN_SAMPLES`` samples for each axis.
     model : NoiseModel or None
-        Model under test. If None, the five terms Q, N, B, K and R are fitted first.
+        Noise model to test. If None, a model with the five terms Q, N, B, K and R is fitted to the recording.
     seed : int
         Seed of all simulations and random draws. The same seed gives the same result.
     map_function : callable, optional
@@ -117,7 +109,7 @@ def reconcile(
     Returns
     -------
     Reconciliation
-        Decision, added and resized effects, and remaining differences of each axis.
+        For each axis, the decision, the added and resized effects, and the remaining differences.
 
     Raises
     ------
@@ -125,7 +117,7 @@ def reconcile(
         If the recording has too few samples or no axis that can be compared with the model.
     """
     recording, notes = select_usable_axes(recording, model)
-    regressors = RegressorCache(recording.samples, recording.rate_hz, recording.temperature_c)
+    regressors = RegressorCache(recording.sample_count, recording.rate_hz, recording.temperature_c)
     run = RecordingContext(recording, seed, regressors, map_function)
     if model is None:
         report_stage("fitting the five terms")
@@ -143,7 +135,7 @@ def reconcile(
         simulated |= _diagnose_simulations(extended, run, seed + SIMULATED_RECORDINGS, changed)
         final = estimate_null_distributions(simulated)
     report_stage("describing the result")
-    axes = {name: describe_axis(one, null[name], final[name]) for name, one in found.searches.items()}
+    axes = {name: build_axis_result(one, null[name], final[name]) for name, one in found.searches.items()}
     if found.sample_rate_error is not None:
         axes = _add_sample_rate_step(axes, found.sample_rate_error, null)
     return Reconciliation(
@@ -153,15 +145,15 @@ def reconcile(
         model=extended,
         fitted_first=model is None,
         rate_hz=recording.rate_hz,
-        samples=recording.samples,
-        duration_s=recording.samples / recording.rate_hz,
+        samples=recording.sample_count,
+        duration_s=recording.sample_count / recording.rate_hz,
         seed=seed,
         notes=notes,
     )
 
 
 def fit_five_terms(run: RecordingContext) -> NoiseModel:
-    """Fit the terms Q, N, B, K and R to each axis and keep the significant terms."""
+    """Fit the noise terms Q, N, B, K and R to each axis, and keep the significant terms."""
     axes = build_repaired_axes(
         run.recording, dict.fromkeys(run.recording.values, ()), run.regressors, np.random.default_rng(run.seed)
     )
@@ -169,9 +161,8 @@ def fit_five_terms(run: RecordingContext) -> NoiseModel:
 
 
 def _fit_terms(axis: Axis) -> Effects:
-    """Fit the five terms to one axis and drop each term whose log-likelihood gain is too small."""
-    best = axis.fit([with_size(effect, axis.rms) for effect in UNIT_SOURCES[:4]])
-    with_ramp = axis.fit((*best.effects, RateRamp(R=axis.rms)))
+    best = axis.fit([with_effect_size(effect, axis.coefficient_rms) for effect in UNIT_SOURCES[:4]])
+    with_ramp = axis.fit((*best.effects, RateRamp(R=axis.coefficient_rms)))
     if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
         best = with_ramp
     for at in range(len(best.effects) - 1, -1, -1):
@@ -184,7 +175,7 @@ def _fit_terms(axis: Axis) -> Effects:
 
 
 def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
-    """Return the effects of each recorded axis without constant biases, because the mean of an axis is always free."""
+    """Return the effects of each recorded axis without constant biases, because the mean is always fitted."""
     return {
         axis: tuple(effect for effect in model.effects.get(axis, ()) if not isinstance(effect, Bias))
         for axis in recording.values
@@ -194,54 +185,50 @@ def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effec
 def _diagnose_simulations(
     model: NoiseModel, run: RecordingContext, first_seed: int, names: Collection[str]
 ) -> dict[str, list[Findings]]:
-    """Return, for each of the named axes, the findings on each of several simulated recordings of a model.
-
-    The simulations have the axes, the length and the temperature of the measured recording.
-    """
+    """Run the diagnostics on simulated recordings of a model, and return the findings of each named axis."""
     template = run.recording
     effects = _effects_by_axis(model, template)
 
-    def diagnose(seed: int) -> dict[str, Findings]:
-        drawn = model.simulate(template.samples, template.rate_hz, seed, template.temperature_c)
+    def diagnose_simulation(seed: int) -> dict[str, Findings]:
+        drawn = model.simulate(template.sample_count, template.rate_hz, seed, template.temperature_c)
         simulated = replace(template, values={axis: drawn[:, AXES.index(axis)] for axis in template.values})
         axes = build_repaired_axes(simulated, effects, run.regressors, np.random.default_rng(seed))
         return {
             name: run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[name], effects[name]).fit)) for name in names
         }
 
-    findings = list(run.map_function(diagnose, range(first_seed, first_seed + SIMULATED_RECORDINGS)))
+    findings = list(run.map_function(diagnose_simulation, range(first_seed, first_seed + SIMULATED_RECORDINGS)))
     return {axis: [one[axis] for one in findings] for axis in names}
 
 
 def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str, AxisNull]) -> _AxesSearchResult:
-    """Search every axis for missing effects.
+    """Search every axis for missing effects, after a test of the sample rate.
 
-    The sample rate is tested first. If two axes appear to leak into each other, the search is repeated on one of them,
-    and leaks from the other axis are not tried.
+    If two axes appear to leak into each other, the search on one axis is repeated without this leak.
     """
     effects = _effects_by_axis(model, run.recording)
     axes = build_repaired_axes(run.recording, effects, run.regressors, np.random.default_rng(run.seed))
     error = detect_sample_rate_error(axes, effects)
     if error is not None:
         ratio = float(error.ratio.value)
-        effects = {name: tuple(convert_to_stated_time(effect, ratio) for effect in of) for name, of in effects.items()}
+        effects = {name: tuple(rescale_effect_time(effect, ratio) for effect in of) for name, of in effects.items()}
 
-    def search(name: str) -> AxisSearchResult:
+    def search_named_axis(name: str) -> AxisSearchResult:
         rng = np.random.default_rng([run.seed, AXES.index(name)])
-        return search_axis(axes[name], effects[name], null[name], rng)
+        return search_missing_effects(axes[name], effects[name], null[name], rng)
 
-    found = dict(zip(axes, run.map_function(search, axes), strict=True))
+    found = dict(zip(axes, run.map_function(search_named_axis, axes), strict=True))
     for name, wrong in _reversed_leak_sources(found, null).items():
         leak_sources = {source: one for source, one in axes[name].leak_sources.items() if source not in wrong}
         axes[name] = replace(axes[name], leak_sources=leak_sources)
-        found[name] = search(name)
+        found[name] = search_named_axis(name)
     return _AxesSearchResult(found, error)
 
 
 def _reversed_leak_sources(
     found: Mapping[str, AxisSearchResult], null: Mapping[str, AxisNull]
 ) -> dict[str, frozenset[str]]:
-    """Return, for each axis, the sources of leaks whose true direction is the opposite."""
+    """Return the leak sources of each axis for which a leak in the opposite direction is more likely."""
     gains = {
         (name, effect.source): step.trials[0].score
         for name, one in found.items()
@@ -260,15 +247,12 @@ def _reversed_leak_sources(
 
 
 def _add_found_effects(model: NoiseModel, found: _AxesSearchResult) -> NoiseModel:
-    """Return the model with the added and resized effects of all axes."""
     error = found.sample_rate_error
     ratio = float(error.ratio.value) if error else 1.0
     effects = dict(model.effects)
     for name, search in found.searches_that_changed_model.items():
         bias = tuple(effect for effect in model.effects.get(name, ()) if isinstance(effect, Bias))
-        effects[name] = bias + tuple(
-            convert_to_stated_time(effect, 1.0 / ratio) for effect in search.hypothesis.effects
-        )
+        effects[name] = bias + tuple(rescale_effect_time(effect, 1.0 / ratio) for effect in search.hypothesis.effects)
     if error is not None:
         effects[error.axis] = (*effects[error.axis], SampleRateError(ratio=ratio))
     return NoiseModel(effects, model.sample_rate_hz, model.temperature)

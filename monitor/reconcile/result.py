@@ -1,9 +1,4 @@
-"""Result types of ``reconcile``, as used by the report, the JSON output and the viewer.
-
-A ``Reconciliation`` contains one ``AxisResult`` for each axis. An ``AxisResult`` contains one ``AddedOrResizedEffect``
-for each effect that was added or whose size was changed. It also contains one ``DiagnosticGap`` for each significant
-difference that remains. All values are in SI units. Times are in seconds from the start of the recording.
-"""
+"""Result types of ``reconcile``, in SI units. Times are in seconds from the start of the recording."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -15,12 +10,12 @@ from monitor.noise.model import NoiseModel
 Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]
 """Decision for an axis or a recording."""
 StepKind = Literal["added", "retuned"]
-"""Kind of a change of the model: an effect was added, or the size of an effect was changed."""
+"""Kind of change: an effect was added, or the size of an effect was changed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Location:
-    """Location of a difference in up to six dimensions. None: the diagnostic does not resolve the dimension."""
+    """Location of a difference between recording and noise model."""
 
     frequency: tuple[float, float] | None = None  # Hz
     tau: tuple[float, float] | None = None  # s
@@ -30,19 +25,19 @@ class Location:
     source: str | None = None  # another axis
 
     def resolved_dimensions(self) -> dict[str, tuple[float, float] | str]:
-        """Return the dimensions that are not None, by name."""
+        """Return the dimensions that the diagnostic resolves, by name."""
         return {name: place for name, place in asdict(self).items() if place is not None}
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticGap:
-    """Difference between measurement and model in one diagnostic, with the location of the largest difference."""
+    """Difference between recording and model (gap) in one diagnostic."""
 
     lens: str  # name of the diagnostic
     where: Location
     gap: float  # size of the difference in standard deviations
-    null95: float  # gap that 95 of 100 recordings of a true model do not exceed in this diagnostic on one axis
-    threshold: float  # gap that 99 of 100 recordings of a true model do not exceed in any diagnostic on any axis
+    null95: float  # 95 % quantile of the gap of a true model, for one diagnostic and one axis
+    threshold: float  # 99 % quantile of the largest gap of a true model, over all diagnostics and axes
 
     @property
     def is_significant(self) -> bool:
@@ -52,7 +47,7 @@ class DiagnosticGap:
 
 @dataclass(frozen=True, slots=True)
 class ParameterInterval:
-    """Value of a parameter with the 95 % interval. The ends are None for a parameter without an interval."""
+    """Value of a parameter, with the 95 % interval if known."""
 
     value: float | str
     lo: float | None = None
@@ -61,7 +56,7 @@ class ParameterInterval:
 
 @dataclass(frozen=True, slots=True)
 class RunnerUp:
-    """Alternative effect for the same difference."""
+    """Less likely effect that explains the same difference."""
 
     effect: str
     confidence: float
@@ -69,7 +64,7 @@ class RunnerUp:
 
 @dataclass(frozen=True, slots=True)
 class PlotData:
-    """Plot of one axis: the measurement and the expectation of a model."""
+    """Data of one plot that compares a recorded axis with the expectation of a noise model."""
 
     lens: str  # name of the diagnostic
     x_name: str  # quantity on the x axis: "frequency", "averaging time", "time", …
@@ -86,7 +81,7 @@ class PlotData:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticSnapshot:
-    """Comparison of an axis with one model in all diagnostics."""
+    """Differences and plots of all diagnostics, for one axis and one noise model."""
 
     gaps: tuple[DiagnosticGap, ...]  # one for each diagnostic
     plots: tuple[PlotData, ...]  # one for each diagnostic that has a plot
@@ -94,7 +89,7 @@ class DiagnosticSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class AddedOrResizedEffect:
-    """Effect that was added to the model, or effect of the model whose size was changed."""
+    """Effect that the search added to the noise model, or effect of the noise model with a new size."""
 
     kind: StepKind
     effect: str
@@ -105,14 +100,14 @@ class AddedOrResizedEffect:
     after: DiagnosticGap  # the same diagnostic after the change
     held_out_before: DiagnosticGap | None
     held_out_after: DiagnosticGap | None
-    held_out_reason: str  # reason why no held-out gap exists, or empty
+    held_out_reason: str  # reason for the missing held-out gap, or empty
     because: str  # justification in sentences
     snapshot_after: DiagnosticSnapshot
 
 
 @dataclass(frozen=True, slots=True)
 class AxisResult:
-    """Result of the search on one axis."""
+    """Result of the search for missing effects on one axis."""
 
     axis: str
     verdict: Decision
@@ -124,7 +119,7 @@ class AxisResult:
 
 @dataclass(frozen=True, slots=True)
 class Reconciliation:
-    """Result of the comparison of one recording with a model."""
+    """Result of the comparison of one recording with a noise model."""
 
     verdict: Decision
     axes: Mapping[str, AxisResult]  # in AXES order
@@ -139,7 +134,7 @@ class Reconciliation:
 
 
 def combine_decisions(verdicts: Iterable[Decision]) -> Decision:
-    """Combine the decisions of all axes into the decision for the recording."""
+    """Combine the decisions for all axes into one decision for the recording."""
     every = set(verdicts)
     if every <= {"agrees"}:
         return "agrees"

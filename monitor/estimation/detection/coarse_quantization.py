@@ -3,7 +3,7 @@
 The quantization step is the smallest distance between two different values of an axis. The noise is computed from the
 mean absolute difference of successive samples, which outliers and slow drift hardly affect.
 
-``reconcile`` uses another method, which also detects steps far below the noise (``value_statistics``).
+``reconcile`` uses another method, which also detects steps far below the noise (``value_artifacts``).
 """
 
 from dataclasses import dataclass

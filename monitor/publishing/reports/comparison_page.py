@@ -39,7 +39,7 @@ def render_page(c: Comparison) -> str:
 
 
 def _rows(seen: MatchedEffect) -> list[tuple[str, AddedOrResizedEffect]]:
-    return [*seen.steps.items(), ("all together", seen.pooled_step())]
+    return [*seen.steps.items(), ("all together", seen.step_with_pooled_parameters())]
 
 
 def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) -> dict[str, FormattedParameter]:

@@ -35,7 +35,7 @@ def describe_size_agreement(effect: MatchedEffect) -> str:
     """Describe whether the sizes of an effect agree between recordings, with the p-value."""
     if effect.p is None:
         return "nothing to compare"
-    return f"sizes {'agree' if effect.consistent else 'differ'} ({_format_p_value(effect.p)})"
+    return f"sizes {'agree' if effect.sizes_agree else 'differ'} ({_format_p_value(effect.p)})"
 
 
 def _format_p_value(p: float) -> str:

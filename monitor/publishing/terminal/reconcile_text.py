@@ -135,7 +135,7 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
             said = _effect(c, axis, seen)
             said.append(
                 f"; {comparison_sentences.describe_size_agreement(seen)}",
-                style="yellow" if seen.consistent is False else "",
+                style="yellow" if seen.sizes_agree is False else "",
             )
             found.append((axis, said))
     return found
@@ -155,6 +155,6 @@ def _single(c: Comparison) -> list[tuple[str, Text]]:
 
 
 def _effect(c: Comparison, axis: str, seen: MatchedEffect) -> Text:
-    said = Text(f"{seen.kind} {words.describe_step(seen.pooled_step(), axis, c.baseline)}")
+    said = Text(f"{seen.kind} {words.describe_step(seen.step_with_pooled_parameters(), axis, c.baseline)}")
     said.highlight_words([words.readable_name(seen.effect)], "bold")
     return said

@@ -1,1 +1,1 @@
-"""Diagnostics of the difference between an axis and a model, their null distributions, and the plots of the report."""
+"""Diagnostic tests of a whitened axis, the null distributions of the tests, and the data for plots."""

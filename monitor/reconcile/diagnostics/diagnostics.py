@@ -1,12 +1,7 @@
-"""Diagnostics: functions that measure how far an axis differs from a model.
+"""Diagnostic tests for departures of a whitened axis from white noise.
 
-Measured and simulated recordings pass through the same diagnostics. Each diagnostic takes a ``WhitenedAxis`` and tests
-one kind of departure from white noise. The result is a ``Finding``: the location of the strongest departure, and the
-log-likelihood gain of a model with this departure over white noise. If the model is true, the gains have nearly the
-same distribution for every model and every length of the recording. The thresholds in ``null_distribution`` require
-this.
-
-The diagnostics are deterministic and do not change their input.
+Each diagnostic returns a ``Finding``, which contains the location and the log-likelihood gain of the strongest
+departure. If the noise model is true, the gain has nearly the same distribution for every model and recording length.
 """
 
 from collections.abc import Callable
@@ -30,7 +25,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
-from monitor.reconcile.preparation.cosine_bins import frequency_bins, inverse_cosine_transform
+from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, inverse_cosine_transform
 from monitor.reconcile.result import Location
 
 MAX_LAG_SAMPLES: Final = 64
@@ -38,30 +33,31 @@ MAX_LAG_SAMPLES: Final = 64
 TRANSIENT_TIME_FRACTIONS: Final = 0.3 / 3.0 ** np.arange(6)
 TEMPERATURE_DELAYS_S: Final = (10.0, 30.0, 90.0, 270.0, 810.0)
 STEP_MARGIN_FRACTION: Final = 0.001
-"""Fraction of the recording at each end in which no step is detected, because the ends of a recording affect the
-spectrum.
+"""Fraction of the recording, at each end, in which steps are not detected.
 """
 CURVE_PENALTY_NATS: Final = 1.0
-"""Penalty in nats for a quadratic term, which has one more parameter than a straight line."""
+"""Penalty for the additional parameter of a quadratic term, in nats."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Strongest departure that a diagnostic detects."""
+    """Strongest departure from white noise that a diagnostic finds."""
 
     gain: float  # log-likelihood gain, nats
     where: Location
 
 
 NO_FINDING: Final = Finding(0.0, Location())
-"""Finding of a diagnostic that has nothing to test."""
+"""Finding of a diagnostic that cannot be applied to an axis."""
 Diagnostic = Callable[[WhitenedAxis], Finding]
-"""Function that detects one kind of departure."""
+"""Function that tests a whitened axis for one kind of departure from white noise."""
 
 
 def diagnose_psd(whitened: WhitenedAxis) -> Finding:
-    """Find the range of frequency bins, of any width, whose power differs most from the expected power."""
-    bins = frequency_bins(whitened.axis.n, whitened.axis.rate_hz)  # the same bins for recordings with and without peaks
+    """Find the frequency range in which the power differs most from the noise model."""
+    bins = build_frequency_bins(
+        whitened.axis.n, whitened.axis.rate_hz
+    )  # the same bins for recordings with and without peaks
     power = np.concatenate([[0.0], np.cumsum(bins.sum_over_bins(whitened.coefficients**2))])
     count = np.concatenate([[0.0], np.cumsum(bins.count)])
     best, place = 0.0, (0, 1)
@@ -69,7 +65,7 @@ def diagnose_psd(whitened: WhitenedAxis) -> Finding:
     while width <= bins.count.size:
         first = np.arange(0, bins.count.size - width + 1, max(1, width // 4))
         c = count[first + width] - count[first]
-        gains = free_variance_gain_nats((power[first + width] - power[first]) / c, c)
+        gains = fitted_variance_gain_nats((power[first + width] - power[first]) / c, c)
         at = int(np.argmax(gains))
         if gains[at] > best:
             best, place = float(gains[at]), (int(first[at]), int(first[at]) + width)
@@ -78,12 +74,12 @@ def diagnose_psd(whitened: WhitenedAxis) -> Finding:
     return Finding(best, Location(frequency=(float(lo), float(hi))))
 
 
-def free_variance_gain_nats(ratio: Floats, count: Floats) -> Floats:
-    """Return the log-likelihood gain of a fitted variance over the variance one: n/2 (ρ − 1 − ln ρ).
+def fitted_variance_gain_nats(mean_square: Floats, count: Floats) -> Floats:
+    """Return the log-likelihood gain n/2 (ρ − 1 − ln ρ) of a fitted variance over a variance of one.
 
     Parameters
     ----------
-    ratio : ndarray of float64, shape (k,)
+    mean_square : ndarray of float64, shape (k,)
         Mean square ρ of the coefficients.
     count : ndarray of float64, shape (k,)
         Number n of coefficients.
@@ -91,26 +87,26 @@ def free_variance_gain_nats(ratio: Floats, count: Floats) -> Floats:
     Returns
     -------
     ndarray of float64, shape (k,)
-        Gain in nats.
+        Log-likelihood gain in nats.
     """
-    safe = np.maximum(ratio, 1e-300)
+    safe = np.maximum(mean_square, 1e-300)
     return np.asarray(0.5 * count * (safe - 1.0 - np.log(safe)))
 
 
-def diagnose_lines(whitened: WhitenedAxis) -> Finding:
-    """Find a steady oscillation at the largest value of the periodogram."""
-    found = find_line_peaks(whitened.series, whitened.axis.rate_hz, 1)
+def diagnose_spectral_lines(whitened: WhitenedAxis) -> Finding:
+    """Find the strongest spectral line in the periodogram of the whitened series."""
+    found = find_periodogram_peaks(whitened.series, whitened.axis.rate_hz, 1)
     gain, f_hz = found[0]
     half = whitened.axis.rate_hz / whitened.axis.n
     return Finding(gain, Location(frequency=(f_hz - half, f_hz + half)))
 
 
-def find_line_peaks(white: Floats, rate_hz: float, max_peaks: int) -> list[tuple[float, float]]:
-    """Return the largest separate peaks of the periodogram, strongest first.
+def find_periodogram_peaks(whitened_series: Floats, rate_hz: float, max_peaks: int) -> list[tuple[float, float]]:
+    """Find the largest separate peaks of the periodogram, in descending order.
 
     Parameters
     ----------
-    white : ndarray of float64, shape (n,)
+    whitened_series : ndarray of float64, shape (n,)
         Whitened series.
     rate_hz : float
         Sample rate in Hz.
@@ -120,9 +116,9 @@ def find_line_peaks(white: Floats, rate_hz: float, max_peaks: int) -> list[tuple
     Returns
     -------
     list of tuple of float
-        Gain in nats and frequency in Hz of each peak.
+        Log-likelihood gain in nats and frequency in Hz of each peak.
     """
-    power = periodogram(white)
+    power = compute_periodogram(whitened_series)
     size = 2 * (power.size - 1)
     found = []
     for _ in range(max_peaks):
@@ -134,56 +130,57 @@ def find_line_peaks(white: Floats, rate_hz: float, max_peaks: int) -> list[tuple
     return found
 
 
-def periodogram(white: Floats) -> Floats:
-    """Return the gain in nats of a line at frequencies from 0 to half the sample rate, shape (m + 1,).
+def compute_periodogram(whitened_series: Floats) -> Floats:
+    """Compute the periodogram of a whitened series, with zero padding to at least twice the length.
 
-    The frequencies are at least twice as dense as in a transform without zero padding.
+    Each value is the log-likelihood gain, in nats, of a spectral line. The m + 1 frequencies are equally spaced from 0
+    to half the sample rate.
     """
-    n = white.size
+    n = whitened_series.size
     size = next_fast_len(2 * n, real=True)
     size += size % 2
-    turned = rfft(white, size)
+    turned = rfft(whitened_series, size)
     power = (turned.real**2 + turned.imag**2) / n
     power[: 2 * size // n] = 0.0  # less than one cycle in the recording
     power[-2:] = 0.0
     return np.asarray(power)
 
 
-def diagnose_level_change(whitened: WhitenedAxis) -> Finding:
-    """Find a change of the level: a step at any time, a slope, or a transient after the start.
+def diagnose_mean_level_change(whitened: WhitenedAxis) -> Finding:
+    """Find a change of the mean level: a step, a slope, or a transient at the start.
 
-    If the model contains jumps, nothing is reported, because whitening does not remove jumps of the model.
+    A model with random jumps is not tested, because whitening does not remove the jumps.
     """
     if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in whitened.effects):
         return NO_FINDING
     axis = whitened.axis
-    gains, times_s = level_step_gains(whitened)
+    gains, times_s = compute_level_step_gains(whitened)
     at = int(np.argmax(gains))
     found = [Finding(float(gains[at]), Location(time=(float(times_s[at]), float(times_s[at]))))]
     for fraction in TRANSIENT_TIME_FRACTIONS:
         effect = TurnOnTransient(amplitude=1.0, time_constant=float(fraction * axis.length_s))
         found.append(
             Finding(
-                _regressor_gain(whitened, axis.regressor_transforms(effect)), Location(time=(0.0, effect.time_constant))
+                _regressor_gain(whitened, axis.regressor_cosine_transforms(effect)),
+                Location(time=(0.0, effect.time_constant)),
             )
         )
-    ramp = axis.regressor_transforms(RateRamp(R=1.0))
+    ramp = axis.regressor_cosine_transforms(RateRamp(R=1.0))
     curved = _regressor_gain(whitened, [*ramp, axis.regressors.curvature]) - CURVE_PENALTY_NATS
     found.append(Finding(max(_regressor_gain(whitened, ramp), curved), Location(time=(0.0, axis.length_s))))
     return max(found, key=lambda one: one.gain)
 
 
-def level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
-    """Return the gain of a step of the level at each time.
+def compute_level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
+    """Compute the log-likelihood gain of a step of the mean level at each time.
 
-    A unit step at sample s has the coefficients X_k = −√(2/n) sin(πks/n)/(2 sin(πk/2n)). With the weights W_k, the
-    weighted sum of squares is Σ W_k X_k² = Σ W_k (1 − cos(2πks/n))/(4n sin²(πk/2n)), which a Fourier transform computes
-    for all s. The weighted sum of the products of X_k and the data is a running sum of the data over time.
+    A unit step at sample s has the cosine transform X_k = −√(2/n) sin(πks/n)/(2 sin(πk/2n)). A Fourier transform
+    computes the weighted sums Σ W_k X_k² = Σ W_k (1 − cos(2πks/n))/(4n sin²(πk/2n)) for all s.
 
     Returns
     -------
-    gains : ndarray of float64, shape (k,)
-        Gain in nats.
+        gains : ndarray of float64, shape (k,)
+        Log-likelihood gain of a step at each time, in nats.
     times_s : ndarray of float64, shape (k,)
         Time of the step in seconds from the start.
     """
@@ -202,7 +199,6 @@ def level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
 
 
 def _regressor_gain(whitened: WhitenedAxis, columns: list[Floats]) -> float:
-    """Return the log-likelihood gain in nats of regressors, each of shape (n − 1,), with fitted sizes."""
     stacked = np.stack([column * whitened.weights for column in columns])
     normal, right = stacked @ stacked.T, stacked @ whitened.coefficients
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -212,40 +208,44 @@ def _regressor_gain(whitened: WhitenedAxis, columns: list[Floats]) -> float:
 
 def diagnose_autocorrelation(whitened: WhitenedAxis) -> Finding:
     """Find the lag with the strongest autocorrelation of the whitened series."""
-    gains = 0.5 * autocorrelation(whitened.series) ** 2 * whitened.axis.n
+    gains = 0.5 * compute_autocorrelation(whitened.series) ** 2 * whitened.axis.n
     at = int(np.argmax(gains))
     lag_s = (at + 1) / whitened.axis.rate_hz
     return Finding(float(gains[at]), Location(tau=(lag_s, lag_s)))
 
 
-def autocorrelation(white: Floats) -> Floats:
-    """Return the autocorrelation of a whitened series at lags of 1 to ``MAX_LAG_SAMPLES`` samples."""
-    size = next_fast_len(white.size + MAX_LAG_SAMPLES, real=True)
-    transform = rfft(white, size)
+def compute_autocorrelation(whitened_series: Floats) -> Floats:
+    """Compute the autocorrelation of a whitened series at lags from 1 to ``MAX_LAG_SAMPLES`` samples."""
+    size = next_fast_len(whitened_series.size + MAX_LAG_SAMPLES, real=True)
+    transform = rfft(whitened_series, size)
     products = irfft(transform.real**2 + transform.imag**2, size)
-    return np.asarray(products[1 : MAX_LAG_SAMPLES + 1] / white.size)
+    return np.asarray(products[1 : MAX_LAG_SAMPLES + 1] / whitened_series.size)
 
 
-def diagnose_temperature(whitened: WhitenedAxis) -> Finding:
-    """Find a dependence of the level on the temperature, with and without delay."""
+def diagnose_temperature_dependence(whitened: WhitenedAxis) -> Finding:
+    """Find an immediate or delayed dependence of the sensor output on the temperature."""
     temperature_c = whitened.axis.temperature_c
     if temperature_c is None:
         return NO_FINDING
     reference = float(temperature_c.mean())
 
-    def gain(effect: TemperatureBias | TemperatureLag) -> float:
-        return _regressor_gain(whitened, whitened.axis.regressor_transforms(effect))
+    def temperature_effect_gain(effect: TemperatureBias | TemperatureLag) -> float:
+        return _regressor_gain(whitened, whitened.axis.regressor_cosine_transforms(effect))
 
     gains = [
-        gain(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0)) - CURVE_PENALTY_NATS,
-        gain(TemperatureBias(coefficient=1.0, reference=reference)),
-        *(gain(TemperatureLag(coefficient=1.0, reference=reference, time_constant=t)) for t in TEMPERATURE_DELAYS_S),
+        temperature_effect_gain(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0))
+        - CURVE_PENALTY_NATS,
+        temperature_effect_gain(TemperatureBias(coefficient=1.0, reference=reference)),
+        *(
+            temperature_effect_gain(TemperatureLag(coefficient=1.0, reference=reference, time_constant=t))
+            for t in TEMPERATURE_DELAYS_S
+        ),
     ]
     return Finding(max(gains), Location(temperature=(float(temperature_c.min()), float(temperature_c.max()))))
 
 
-def diagnose_other_axes(whitened: WhitenedAxis) -> Finding:
-    """Find the axis that leaks most strongly into this axis."""
+def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> Finding:
+    """Find the axis that leaks most strongly into the whitened axis."""
     best = NO_FINDING
     for name, coefficients in whitened.axis.leak_sources.items():
         gain = _regressor_gain(whitened, [coefficients])
@@ -254,37 +254,37 @@ def diagnose_other_axes(whitened: WhitenedAxis) -> Finding:
     return best
 
 
-def diagnose_variance(whitened: WhitenedAxis) -> Finding:
-    """Find a variation of the noise variance in time: a step, a trend, a period or a slow random variation."""
+def diagnose_variance_change(whitened: WhitenedAxis) -> Finding:
+    """Find a change of the noise variance over time."""
     found = whitened.variance_changes
     gain = max(found.step.gain, found.largest_alternative_gain)
     return Finding(gain, Location(time=(found.step.time.lo, found.step.time.hi)))
 
 
-def diagnose_spectrogram(whitened: WhitenedAxis) -> Finding:
-    """Find the tile or the row of the spectrogram whose power is least constant in time."""
-    found = whitened.least_constant_tiles
+def diagnose_spectrogram_change(whitened: WhitenedAxis) -> Finding:
+    """Find the part of the spectrogram with the largest change of power over time."""
+    found = whitened.spectrogram_change
     if found.gain >= found.row_gain:
         return Finding(found.gain, Location(time=found.time, frequency=found.frequency))
     return Finding(found.row_gain, Location(frequency=found.row))
 
 
-def diagnose_tails(whitened: WhitenedAxis) -> Finding:
-    """Find outliers in the distribution of the samples."""
-    found = whitened.outliers
+def diagnose_outliers(whitened: WhitenedAxis) -> Finding:
+    """Find outliers among the samples of the whitened series."""
+    found = whitened.outlier_fit
     return Finding(found.gain if found else 0.0, Location())
 
 
 def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> Finding:
-    """Find quantization, clipping or repeats of the measured values, if the model does not contain this effect."""
-    statistics = whitened.axis.value_statistics
+    """Find quantization, clipping or repeated samples that the noise model does not contain."""
+    statistics = whitened.axis.value_artifacts
     best = NO_FINDING
     for kind, found in (
         (Resolution, statistics.quantization),
         (Saturation, statistics.clipping),
         (RandomSampleHold, statistics.repeats),
     ):
-        if found is not None and kind not in whitened.types and found.gain > best.gain:
+        if found is not None and kind not in whitened.effect_types and found.gain > best.gain:
             best = Finding(found.gain, Location())
     if best.gain and statistics.clipping is not None and best.gain == statistics.clipping.gain:
         return Finding(best.gain, Location(value=(statistics.clipping.limit.lo, statistics.clipping.limit.hi)))
@@ -294,13 +294,13 @@ def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> Finding:
 DIAGNOSTICS: Final[dict[str, Diagnostic]] = {
     "values": diagnose_quantization_clipping_repeats,
     "psd": diagnose_psd,
-    "lines": diagnose_lines,
+    "lines": diagnose_spectral_lines,
     "autocorrelation": diagnose_autocorrelation,
-    "level": diagnose_level_change,
-    "temperature": diagnose_temperature,
-    "other_axes": diagnose_other_axes,
-    "tails": diagnose_tails,
-    "variance": diagnose_variance,
-    "spectrogram": diagnose_spectrogram,
+    "level": diagnose_mean_level_change,
+    "temperature": diagnose_temperature_dependence,
+    "other_axes": diagnose_leaks_from_other_axes,
+    "tails": diagnose_outliers,
+    "variance": diagnose_variance_change,
+    "spectrogram": diagnose_spectrogram_change,
 }
 """Diagnostics by name, in the order of the report."""

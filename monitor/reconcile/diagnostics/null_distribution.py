@@ -1,15 +1,11 @@
-"""Null distributions of the diagnostics from simulations of the model, and scores of the measured recording.
+"""Null distributions of the diagnostics, estimated from simulated recordings of the noise model.
 
-The gap of a diagnostic is √(2 × gain). It is the size of the strongest departure in standard deviations. Recordings
-that are simulated from the model under test give the null distribution of the gain. For a true model, the distribution
-of the gain is nearly the same on all axes and for all models. The gains of all axes are therefore pooled. Let q be the
-upper quartile of the pooled gains. Above q, the density of a gain g is modelled as proportional to exp(−(g − q)/s). The
-scale s is the mean of g − q of the gains above q. The scale is limited to the range from 1 to 1.3, which is typical of
-the maximum of many χ²/2 values.
+The gap of a diagnostic is √(2 × gain), the size of the strongest departure in standard deviations. Let q be the upper
+quartile of the simulated gains of all axes. Above q, the density of a gain g is modelled as exp(−(g − q)/s). The scale
+s is the mean excess over q, limited to the range from 1 to 1.3, which is typical of the maximum of many χ²/2 variables.
 
-With a true model, one of 100 recordings exceeds ``threshold`` in any diagnostic on any axis. ``null95`` refers to one
-diagnostic on one axis. Coarse or clipped values may cause larger gains on one axis. If a simulated gain of an axis
-comes close to the pooled threshold, the threshold of this axis is the largest simulated gain of the axis plus a margin.
+If the noise model is true, 1 % of all recordings exceed a threshold in any diagnostic on any axis. An axis with coarse
+or clipped values can have a larger threshold.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,12 +21,12 @@ from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.result import DiagnosticGap
 
 FALSE_ALARM_PROBABILITY: Final = 0.01
-"""Fraction of the recordings of a true model that exceed a threshold in any diagnostic on any axis."""
+"""Fraction of recordings of a true model with a significant gap in any diagnostic on any axis."""
 UPPER_QUANTILE: Final = 0.25
-"""Fraction of the gains, from the largest downwards, whose distribution is modelled as exponential."""
+"""Fraction of the largest gains, for which an exponential distribution is assumed."""
 EXCESS_RANGE_NATS: Final = (1.0, 1.3)
 AXIS_MARGIN_NATS: Final = 3.0
-"""Margin in nats above the largest simulated gain of an axis."""
+"""Margin between the largest simulated gain of an axis and the threshold, in nats."""
 
 Findings = Mapping[str, Finding]
 """Findings of all diagnostics on one axis, by the name of the diagnostic."""
@@ -38,7 +34,7 @@ Findings = Mapping[str, Finding]
 
 @dataclass(frozen=True, slots=True)
 class NullDistribution:
-    """Null distribution of one diagnostic under a true model."""
+    """Quantiles of the log-likelihood gain of one diagnostic under a true noise model."""
 
     null95: float  # 95 % quantile of the gain, nats
     threshold: float  # gain above which a departure is significant, nats
@@ -54,7 +50,7 @@ def run_diagnostics(whitened: WhitenedAxis) -> Findings:
 
 
 def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> dict[str, AxisNull]:
-    """Return the null distributions of each axis from the findings on simulated recordings of the axis."""
+    """Estimate the null distributions of each axis from the findings on simulated recordings."""
     found: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
     for lens in DIAGNOSTICS:
         gains = {axis: np.array([one[lens].gain for one in findings]) for axis, findings in simulated.items()}
@@ -69,7 +65,6 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
 
 
 def _tail_quantiles(gains: Floats, axis_count: int) -> NullDistribution:
-    """Return the null distribution of one diagnostic from the pooled gains of all axes."""
     quartile = float(np.quantile(gains, 1.0 - UPPER_QUANTILE)) if gains.size else 0.0
     beyond = gains[gains > quartile] - quartile
     scale = float(np.clip(beyond.mean() if beyond.size else EXCESS_RANGE_NATS[0], *EXCESS_RANGE_NATS))
@@ -77,8 +72,8 @@ def _tail_quantiles(gains: Floats, axis_count: int) -> NullDistribution:
     return NullDistribution(quartile + scale * log(UPPER_QUANTILE / 0.05), quartile + scale * log(UPPER_QUANTILE / p))
 
 
-def measure_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:
-    """Return the gaps of an axis, in the order of the diagnostics.
+def compute_diagnostic_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:
+    """Compute the differences between recording and model (gaps) in all diagnostics on one axis.
 
     Parameters
     ----------

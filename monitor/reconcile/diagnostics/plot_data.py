@@ -1,7 +1,6 @@
-"""Plot data of an axis and a model: the measurement, the expectation and the 95 % band.
+"""Plot data that compare an axis with the expectation and the 95 % band of a noise model.
 
-If the model is true, the measurement lies in the band in 95 of 100 recordings, at each point separately. The band is
-calculated from the spectrum of the model, without simulation. A plot has at most a few hundred points.
+If the noise model is true, each measured point lies in the band with a probability of 95 %.
 """
 
 from collections.abc import Callable
@@ -14,8 +13,8 @@ from drivers.data_types import Floats, Ints
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 from monitor.noise.spectrum import allan_variance_of_density
-from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, autocorrelation
-from monitor.reconcile.likelihood.whitening import WhitenedAxis, noise_deviation_over_time
+from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, compute_autocorrelation
+from monitor.reconcile.likelihood.whitening import WhitenedAxis, relative_noise_deviation_over_time
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import PlotData
 
@@ -26,8 +25,8 @@ LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
 """Unit of the samples by the first letter of the axis."""
 
 
-def plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
-    """Return the plot data of every diagnostic that has a plot."""
+def build_plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
+    """Build the data of all plots of one whitened axis."""
     fitted = _deterministic_series(whitened)
     plots = [
         _plot_psd(whitened),
@@ -43,13 +42,14 @@ def plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
 
 
 def _deterministic_series(whitened: WhitenedAxis) -> Floats:
-    """Return the sum of the fitted deterministic effects, shape (n,), without its mean."""
+    """Return the sum of the fitted deterministic effects, shape (n,), without the mean."""
     repaired = whitened.axis.repaired
-    return np.asarray(repaired - repaired.mean() - inverse_cosine_transform(whitened.fit.residual_coefficients()))
+    return np.asarray(
+        repaired - repaired.mean() - inverse_cosine_transform(whitened.fit.coefficients_without_deterministic_effects())
+    )
 
 
 def _plot_psd(whitened: WhitenedAxis) -> PlotData:
-    """Return the plot of the spectral density."""
     bins, tau0_s = whitened.axis.bins, 1.0 / whitened.axis.rate_hz
     used = np.flatnonzero(whitened.axis.used_bins)
     # average neighbouring bins to about SPECTRUM_POINTS points that are evenly spaced in the logarithm of frequency
@@ -67,7 +67,6 @@ def _plot_psd(whitened: WhitenedAxis) -> PlotData:
 
 
 def _plot_allan_deviation(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
-    """Return the plot of the Allan deviation."""
     axis, tau0_s = whitened.axis, 1.0 / whitened.axis.rate_hz
     m = cluster_sizes(axis.n, axis.rate_hz)
     measured, _ = overlapping_avar_axis(axis.repaired, m)
@@ -81,7 +80,6 @@ def _plot_allan_deviation(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
 
 
 def _density_function(whitened: WhitenedAxis) -> Callable[[Floats], Floats]:
-    """Return the spectral density of the fitted noise as an interpolating function of the frequency in Hz."""
     bins = whitened.axis.bins
     x, y = np.log(bins.f_hz), np.log(whitened.fit.whittle.variance / whitened.axis.rate_hz)
     return lambda f: np.asarray(np.exp(np.interp(np.log(f), x, y)))
@@ -90,10 +88,9 @@ def _density_function(whitened: WhitenedAxis) -> Callable[[Floats], Floats]:
 def _allan_degrees_of_freedom(whitened: WhitenedAxis, m: Ints) -> Floats:
     """Return the degrees of freedom of overlapping Allan variances.
 
-    An Allan variance is a weighted sum Σ a_k Y_k² of squared coefficients Y_k, which have the variances v_k. The
-    weights a_k are proportional to sin⁴(πfτ)/sin²(πfτ0). A variance with the mean E and the variance V has 2 E²/V
-    degrees of freedom, which is (Σ a_k v_k)²/Σ (a_k v_k)². If a bin is wider than a period of sin⁴, the mean of sin⁴
-    (3/8) and the mean square (35/128) are used in place of the value at the centre of the bin.
+    An Allan variance is a weighted sum Σ a_k Y_k², where the weight a_k is proportional to sin⁴(πfτ)/sin²(πfτ0). Let
+    v_k be the variance of Y_k. The degrees of freedom are then (Σ a_k v_k)²/Σ (a_k v_k)². For a bin wider than one
+    period of sin⁴, the means of sin⁴ (3/8) and sin⁸ (35/128) replace the values at the bin centre.
     """
     bins, variance = whitened.axis.bins, whitened.fit.whittle.variance
     f, count = bins.f_hz, bins.count
@@ -110,7 +107,6 @@ def _allan_degrees_of_freedom(whitened: WhitenedAxis, m: Ints) -> Floats:
 
 
 def _plot_level(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
-    """Return the plot of the level over time."""
     axis = whitened.axis
     length = max(1, axis.n // TIME_BLOCKS)
     measured, expected = _block_means(axis.repaired, length), _block_means(fitted, length) + axis.repaired.mean()
@@ -121,17 +117,16 @@ def _plot_level(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
 
 
 def _level_spread(whitened: WhitenedAxis, length_s: float) -> float:
-    """Return half the width of the 95 % band of the mean over ``length_s`` seconds, in the unit of the axis."""
+    """Return half the width of the 95 % band of a mean over ``length_s`` seconds."""
     bins = whitened.axis.bins
     weight = np.sinc(bins.f_hz * length_s) ** 2
     return Z95 * float(np.sqrt((bins.count * whitened.fit.whittle.variance * weight).sum() / whitened.axis.n))
 
 
 def _plot_variance(whitened: WhitenedAxis) -> PlotData:
-    """Return the plot of the noise standard deviation over time."""
     axis = whitened.axis
     length = max(1, axis.n // TIME_BLOCKS)
-    deviation = noise_deviation_over_time(whitened.fit)
+    deviation = relative_noise_deviation_over_time(whitened.fit)
     measured = np.sqrt(_block_means((whitened.flat_series * deviation) ** 2, length))
     expected = np.sqrt(_block_means(deviation**2, length))
     lo, hi = np.sqrt(_chi2_band(np.array([float(length)])))
@@ -141,7 +136,6 @@ def _plot_variance(whitened: WhitenedAxis) -> PlotData:
 
 
 def _plot_tails(whitened: WhitenedAxis) -> PlotData:
-    """Return the plot of the share of samples whose magnitude exceeds a limit."""
     magnitudes = np.sort(np.abs(whitened.flat_series))
     n = magnitudes.size
     x = np.linspace(0.5, max(float(magnitudes[-1]), 4.0), 80)
@@ -156,47 +150,44 @@ def _plot_tails(whitened: WhitenedAxis) -> PlotData:
 
 
 def _plot_autocorrelation(whitened: WhitenedAxis) -> PlotData:
-    """Return the plot of the autocorrelation of the whitened series."""
     lag_s = np.arange(1, MAX_LAG_SAMPLES + 1) / whitened.axis.rate_hz
     zero, band = np.zeros(MAX_LAG_SAMPLES), np.full(MAX_LAG_SAMPLES, Z95 / whitened.series.size**0.5)
     names = ("autocorrelation", "lag", "s", "autocorrelation", "1")
-    return PlotData(*names, False, lag_s, autocorrelation(whitened.series), zero, -band, band)
+    return PlotData(*names, False, lag_s, compute_autocorrelation(whitened.series), zero, -band, band)
 
 
 def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, temperature_c: Floats) -> PlotData:
-    """Return the plot of the level over temperature."""
     axis = whitened.axis
     edges = np.linspace(float(temperature_c.min()), float(temperature_c.max()), TEMPERATURE_BINS + 1)
     cell = np.clip(np.searchsorted(edges, temperature_c, "right") - 1, 0, TEMPERATURE_BINS - 1)
     count = np.bincount(cell, minlength=TEMPERATURE_BINS)
     filled = count > 0
 
-    def means(series: Floats) -> Floats:
+    def temperature_bin_means(series: Floats) -> Floats:
         return np.asarray(np.bincount(cell, weights=series, minlength=TEMPERATURE_BINS)[filled] / count[filled])
 
-    expected = means(fitted) + axis.repaired.mean()
+    expected = temperature_bin_means(fitted) + axis.repaired.mean()
     spread = np.array([_level_spread(whitened, length_s) for length_s in count[filled] / axis.rate_hz])
     names = ("temperature", "temperature", "°C", "level", _level_unit(whitened))
     middle = 0.5 * (edges[1:] + edges[:-1])[filled]
-    return PlotData(*names, False, middle, means(axis.repaired), expected, expected - spread, expected + spread)
+    return PlotData(
+        *names, False, middle, temperature_bin_means(axis.repaired), expected, expected - spread, expected + spread
+    )
 
 
 def _level_unit(whitened: WhitenedAxis) -> str:
-    """Return the unit of the samples of an axis."""
     return LEVEL_UNITS[whitened.axis.name[0]]
 
 
 def _block_means(values: Floats, length: int) -> Floats:
-    """Return the means of consecutive blocks."""
     count = values.size // length
     return np.asarray(values[: count * length].reshape(count, length).mean(axis=1))
 
 
 def _block_times_s(count: int, length: int, rate_hz: float) -> Floats:
-    """Return the times of the middles of consecutive blocks in seconds."""
     return np.asarray((np.arange(count) + 0.5) * length / rate_hz, np.float64)
 
 
 def _chi2_band(freedom: Floats) -> tuple[Floats, Floats]:
-    """Return the 95 % band of a mean square relative to its expectation."""
+    """Return the 95 % band of a mean square relative to the expected value."""
     return np.asarray(chdtri(freedom, 0.975) / freedom), np.asarray(chdtri(freedom, 0.025) / freedom)

@@ -1,1 +1,1 @@
-"""Likelihood functions for the noise effects of one axis."""
+"""Likelihood of the noise effects of one axis."""

@@ -1,11 +1,8 @@
-"""Role of each effect in the likelihood of an axis: noise variance, regressor or transform.
+"""Role of each effect in the likelihood of an axis: noise, deterministic regressor or spectral transform.
 
-The **size** of an effect is the parameter that scales the effect. All other parameters are **shape parameters**. A
-noise effect adds variance to each frequency bin. The variance is the **variance basis**, which is the variance for size
-one, multiplied by the square of the size. A deterministic effect adds a series. The series is the **regressor**, which
-is the series for size one, multiplied by the size. The simulation uses the same series, so fit and simulation agree.
-The regressor of an ``AxisLeak`` is another axis. A transform, such as a low-pass filter, changes the variance bases of
-all noise effects that act before the transform.
+The **size** of an effect is the scaling parameter, and all other parameters are **shape parameters**. A noise effect
+adds variance to each frequency bin, proportional to the square of the size. A deterministic effect adds a series, which
+is the product of size and **regressor**. The regressor of an ``AxisLeak`` is another axis.
 """
 
 from dataclasses import replace
@@ -63,7 +60,7 @@ SIZE_PARAMETERS: Final = NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS
 """For each effect with a size, the name of the size parameter."""
 
 ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
-"""Names of the effects that happen once. One part of a recording contains no information about another part."""
+"""Names of the effects that happen at most once in a recording."""
 
 _EFFECTS_BY_DIAGNOSTIC: Final = {
     "psd": (
@@ -79,36 +76,36 @@ _EFFECTS_BY_DIAGNOSTIC: Final = {
     "values": ("resolution", "saturation", "sample_hold"),
 }
 MOST_DIRECT_DIAGNOSTIC: Final = {effect: lens for lens, effects in _EFFECTS_BY_DIAGNOSTIC.items() for effect in effects}
-"""For each effect, the diagnostic that shows the effect most directly."""
+"""Diagnostic that is most sensitive to each effect."""
 
 
-def size(effect: Effect) -> float:
-    """Return the size of a noise effect or of a deterministic effect."""
+def effect_size(effect: Effect) -> float:
+    """Return the size parameter of a noise effect or a deterministic effect."""
     return float(getattr(effect, SIZE_PARAMETERS[type(effect)]))
 
 
-def with_size(effect: Effect, value: float) -> Effect:
-    """Return the effect with the given size.
+def with_effect_size(effect: Effect, size: float) -> Effect:
+    """Return a copy of an effect with a new size.
 
-    The sizes of noise effects, ramps and sinusoids are never negative, so the sign of the value is ignored for them.
+    The sizes of noise effects, ramps and sinusoids are never negative.
 
     Parameters
     ----------
     effect : Effect
         Noise effect or deterministic effect.
-    value : float
+    size : float
         New size, in the unit of the size parameter.
     """
     name = SIZE_PARAMETERS[type(effect)]
     unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or type(effect) in NOISE_SIZE_PARAMETERS
-    return replace(effect, **{name: abs(value) if unsigned else value})  # type: ignore[type-var]
+    return replace(effect, **{name: abs(size) if unsigned else size})  # type: ignore[type-var]
 
 
-def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
-    """Return the regressors of a deterministic effect.
+def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
+    """Build the regressors of a deterministic effect.
 
-    A sinusoid has one regressor for each of two phases. A quadratic temperature effect has one regressor for the linear
-    term and one for the quadratic term. All other effects have one regressor.
+    A sinusoid has a regressor for each of two phases. A quadratic temperature effect has a linear and a quadratic
+    regressor. Other effects have one regressor.
 
     Parameters
     ----------
@@ -129,7 +126,7 @@ def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Float
     Raises
     ------
     TypeError
-        If the effect is a leak, because the regressor of a leak is another axis.
+        If the effect is a leak from another axis.
     """
     if isinstance(effect, AxisLeak):
         raise TypeError("the series of a leak is another axis")
@@ -142,12 +139,12 @@ def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Float
             replace(effect, coefficient=0.0, quadratic=1.0),
         ]
     else:
-        variants = [with_size(effect, 1.0)]
+        variants = [with_effect_size(effect, 1.0)]
     return [_series_of(one, n, rate_hz, temperature_c) for one in variants]
 
 
 def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
-    """Return the effect with sizes such that the effect is the sum of the regressors times the given factors.
+    """Return a copy of an effect that equals the sum of the regressors times the given factors.
 
     Parameters
     ----------
@@ -160,11 +157,10 @@ def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
         return replace(effect, amplitude=hypot(*factors), phase=atan2(factors[1], factors[0]) % (2.0 * pi))
     if isinstance(effect, TemperatureBias) and effect.quadratic is not None:
         return replace(effect, coefficient=float(factors[0]), quadratic=float(factors[1]))
-    return with_size(effect, float(factors[0]))
+    return with_effect_size(effect, float(factors[0]))
 
 
 def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:
-    """Return the series of a deterministic effect."""
     values = np.zeros(n)
     known_c = np.full(n, np.nan) if temperature_c is None else temperature_c
     # a deterministic effect draws no random numbers, but the interface requires a generator

@@ -1,9 +1,7 @@
-"""Hypotheses about one axis: the effects of the model under test, some with a changed size, and added effects.
+"""Hypotheses about one axis: effects of a noise model, some with a new size, and added effects.
 
-The size of a noise effect of the model is fitted only if this gains more than ``RESIZE_PENALTY_NATS`` nats.
-Otherwise the size in the model is kept. If N in the model is 5 % wrong, N is therefore changed, and no effect is added.
-A correct K is kept although other effects may resemble a random walk. The sizes of added effects and of all
-deterministic effects (lines, slopes, temperature dependence) are always fitted.
+A noise effect of the model is resized only if the log-likelihood gain exceeds ``RESIZE_PENALTY_NATS``. The sizes of
+added effects and of deterministic effects are always fitted.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,18 +14,18 @@ import numpy as np
 from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
-from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, size
+from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, effect_size
 from monitor.reconcile.result import ParameterInterval
 
 RESIZE_PENALTY_NATS: Final = 5.0
-"""Log-likelihood gain in nats that justifies a change of the size of a noise effect of the model."""
+"""Smallest log-likelihood gain, in nats, for a new size of a noise effect of the model."""
 GOLDEN: Final = 0.6180339887498949
 SHAPE_ITERATIONS: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Fitted effects of one axis."""
+    """Effects of a noise model and added effects, fitted to one axis."""
 
     model: Effects  # effects of the model under test with the original sizes; the first entries of ``effects``
     fit: AxisFit
@@ -39,43 +37,43 @@ class Hypothesis:
 
     @property
     def given_count(self) -> int:
-        """Number of effects in the model under test."""
+        """Number of effects in the original noise model."""
         return len(self.model)
 
     @property
     def added(self) -> Effects:
-        """Effects that are not in the model under test."""
+        """Effects that were added to the noise model."""
         return self.fit.effects[self.given_count :]
 
     @property
     def effects(self) -> Effects:
-        """All effects with fitted sizes."""
+        """All fitted effects: the effects of the noise model, then the added effects."""
         return self.fit.effects
 
     @property
     def refitted_size_count(self) -> int:
-        """Number of noise effects of the model whose size was fitted instead of kept."""
+        """Number of noise effects of the model with a fitted size."""
         return sum(at < self.given_count for at in self.fit.fitted_noise)
 
     @property
     def resize_penalty(self) -> float:
-        """Penalty for the fitted sizes of the model, in nats."""
+        """Penalty in nats for the fitted sizes of the noise model."""
         return RESIZE_PENALTY_NATS * self.refitted_size_count
 
     @property
-    def score(self) -> float:
-        """Log-likelihood less the penalties for fitted sizes of the model, in nats."""
+    def penalised_log_likelihood(self) -> float:
+        """Log-likelihood less the penalty for fitted sizes of the noise model, in nats."""
         return self.fit.log_likelihood - self.resize_penalty
 
     def refit_with_added_effects(self, added: Sequence[Effect]) -> "Hypothesis":
-        """Return the fit of the same model with the given added effects, by ``fit_with_fewest_changes``."""
+        """Fit the same noise model with another set of added effects."""
         return fit_with_fewest_changes(self.axis, added, self.model)
 
 
 def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
-    """Fit the deterministic effects of a model and keep the sizes of the noise effects.
+    """Fit the deterministic effects of a noise model and keep the sizes of the noise effects.
 
-    Deterministic effects are fitted because the sizes differ between recordings.
+    The sizes of deterministic effects differ between recordings.
 
     Parameters
     ----------
@@ -84,11 +82,11 @@ def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    return Hypothesis(model, axis.fit(model, noise_indices(model)))
+    return Hypothesis(model, axis.fit(model, noise_effect_indices(model)))
 
 
 def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects) -> Hypothesis:
-    """Fit added effects together with a model, and change only those sizes of the model that the data contradict.
+    """Fit added effects together with a noise model, and change as few sizes of the model as possible.
 
     Parameters
     ----------
@@ -100,7 +98,7 @@ def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects)
         Effects of the axis in the model under test.
     """
     effects = (*model, *added)
-    fixed_noise = noise_indices(model)
+    fixed_noise = noise_effect_indices(model)
     best = Hypothesis(model, axis.fit(effects, fixed_noise))
     if not fixed_noise:
         return best
@@ -109,31 +107,33 @@ def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects)
         return best
     while fixed_noise:
         trials = [Hypothesis(model, axis.fit(effects, fixed_noise - {at})) for at in sorted(fixed_noise)]
-        better = max(trials, key=lambda one: one.score)
-        if better.score <= best.score:
+        better = max(trials, key=lambda one: one.penalised_log_likelihood)
+        if better.penalised_log_likelihood <= best.penalised_log_likelihood:
             break
         best, fixed_noise = better, better.fit.fixed_noise
     # the loop fits one more size at a time and cannot find two sizes that improve the fit only together
-    return free if free.score > best.score else best
+    return free if free.penalised_log_likelihood > best.penalised_log_likelihood else best
 
 
-def noise_indices(effects: Sequence[Effect]) -> frozenset[int]:
+def noise_effect_indices(effects: Sequence[Effect]) -> frozenset[int]:
     """Return the indices of the noise effects."""
     return frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE_SIZE_PARAMETERS)
 
 
-def refine_shape(axis: Axis, others: Effects, effect: Effect, name: str, search_factor: float = 1.5) -> Effect:
-    """Maximise the likelihood over one shape parameter of an effect, with all sizes fitted.
+def fit_shape_parameter(
+    axis: Axis, other_effects: Effects, effect: Effect, parameter_name: str, search_factor: float = 1.5
+) -> Effect:
+    """Fit one shape parameter of an effect by maximum likelihood, together with all sizes.
 
     Parameters
     ----------
     axis : Axis
         Axis to fit.
-    others : tuple of Effect
+    other_effects : tuple of Effect
         Other effects of the axis.
     effect : Effect
         Effect whose shape parameter is varied.
-    name : str
+    parameter_name : str
         Name of the shape parameter.
     search_factor : float, optional
         Largest factor between the result and the present value, in either direction.
@@ -141,22 +141,25 @@ def refine_shape(axis: Axis, others: Effects, effect: Effect, name: str, search_
     Returns
     -------
     Effect
-        The effect with the best shape and the same size.
+        Effect with the fitted shape parameter and the original size.
     """
 
-    def with_shape(log_value: float) -> Effect:
-        changed: Effect = replace(effect, **{name: exp(log_value)})  # type: ignore[type-var]
+    def with_shape_parameter(log_value: float) -> Effect:
+        changed: Effect = replace(effect, **{parameter_name: exp(log_value)})  # type: ignore[type-var]
         return changed
 
-    middle, width = log(getattr(effect, name)), log(search_factor)
+    middle, width = log(getattr(effect, parameter_name)), log(search_factor)
     best = find_maximum_by_golden_section(
-        lambda x: axis.fit((*others, with_shape(x))).log_likelihood, middle - width, middle + width, SHAPE_ITERATIONS
+        lambda x: axis.fit((*other_effects, with_shape_parameter(x))).log_likelihood,
+        middle - width,
+        middle + width,
+        SHAPE_ITERATIONS,
     )
-    return with_shape(best)
+    return with_shape_parameter(best)
 
 
 def find_maximum_by_golden_section(function: Callable[[float], float], lo: float, hi: float, iterations: int) -> float:
-    """Return the position of the maximum of a function that has a single maximum in an interval.
+    """Find the maximum of a function with a single maximum in an interval, by golden-section search.
 
     Parameters
     ----------
@@ -165,7 +168,7 @@ def find_maximum_by_golden_section(function: Callable[[float], float], lo: float
     lo, hi : float
         Ends of the interval.
     iterations : int
-        Number of iterations. Each iteration calls the function once and shortens the interval by the golden ratio.
+        Number of iterations. Each iteration evaluates the function once.
     """
     a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
     at_a, at_b = function(a), function(b)
@@ -181,21 +184,20 @@ def find_maximum_by_golden_section(function: Callable[[float], float], lo: float
     return 0.5 * (lo + hi)
 
 
-def size_interval(fit: AxisFit, index: int) -> ParameterInterval:
-    """Return the size of an effect with the 95 % interval.
+def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
+    """Compute the 95 % interval of the size of an effect.
 
-    The error of the logarithm is Gaussian for the size of a noise effect. The error of the size itself is Gaussian for
-    a deterministic effect.
+    The interval is symmetric for a deterministic effect, and symmetric on a logarithmic scale for a noise effect.
 
     Parameters
     ----------
     fit : AxisFit
         Fit that contains the effect.
-    index : int
+    effect_index : int
         Index of the effect.
     """
-    value, error = size(fit.effects[index]), fit.size_error(index)
-    if type(fit.effects[index]) in DETERMINISTIC_SIZE_PARAMETERS:
+    value, error = effect_size(fit.effects[effect_index]), fit.size_standard_error(effect_index)
+    if type(fit.effects[effect_index]) in DETERMINISTIC_SIZE_PARAMETERS:
         return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
         return ParameterInterval(value)
@@ -203,39 +205,36 @@ def size_interval(fit: AxisFit, index: int) -> ParameterInterval:
 
 
 def _with_shape(effects: Effects, index: int, name: str, value: float) -> Effects:
-    """Return the effects with a changed parameter of the effect with the given index."""
     changed: Any = replace(effects[index], **{name: value})  # type: ignore[type-var]
     return (*effects[:index], changed, *effects[index + 1 :])
 
 
-def shape_interval(fit: AxisFit, index: int, name: str) -> ParameterInterval:
-    """Return a shape parameter with the 95 % interval from the profile likelihood.
-
-    At each end of the interval, the log-likelihood is ``HALF_CHI2_95`` below the maximum.
+def compute_shape_interval(fit: AxisFit, effect_index: int, parameter_name: str) -> ParameterInterval:
+    """Compute the 95 % interval of a shape parameter from the profile likelihood.
 
     Parameters
     ----------
     fit : AxisFit
         Fit that contains the effect.
-    index : int
+    effect_index : int
         Index of the effect.
-    name : str
+    parameter_name : str
         Name of the shape parameter.
     """
-    value = float(getattr(fit.effects[index], name))
+    value = float(getattr(fit.effects[effect_index], parameter_name))
 
-    def fall(factor: float) -> float:
-        changed = _with_shape(fit.effects, index, name, value * factor)
+    def log_likelihood_loss(factor: float) -> float:
+        changed = _with_shape(fit.effects, effect_index, parameter_name, value * factor)
         return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_noise).log_likelihood
 
     ends = []
     for sign in (-1.0, 1.0):
         step = 1e-6
-        while step < 2.0 and fall(exp(sign * step)) < HALF_CHI2_95:
+        while step < 2.0 and log_likelihood_loss(exp(sign * step)) < HALF_CHI2_95:
             step *= 2.0
         lo, hi = 0.5 * step, step
         for _ in range(8):
             middle = 0.5 * (lo + hi)
-            lo, hi = (middle, hi) if fall(exp(sign * middle)) < HALF_CHI2_95 else (lo, middle)
+            lo, hi = (middle, hi) if log_likelihood_loss(exp(sign * middle)) < HALF_CHI2_95 else (lo, middle)
         ends.append(value * exp(sign * hi))
     return ParameterInterval(value, ends[0], ends[1])

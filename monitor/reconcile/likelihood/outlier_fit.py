@@ -1,14 +1,10 @@
-"""Detection of outliers among white residuals, and tests against other causes of heavy tails.
+"""Fit of outliers to white residuals, and comparison with other causes of heavy tails.
 
-Three distributions are fitted to the magnitudes of a white series: a Gaussian, a mixture of two Gaussians (Tukey 1960)
-and Student's t. The mixture is (1−f) N(0, s²) + f N(0, s² + scale²) with the fraction f of outliers. True outliers fit
-the mixture better than the other two distributions, and they are equally likely at all times. Outliers in successive
-samples indicate bursts or jumps. A rate of outliers that varies from hour to hour indicates noise with a changing
-variance. The caller decides whether the gains suffice.
+The magnitudes of the residuals are fitted by a Gaussian, Student's t and a mixture of two Gaussians (Tukey 1960). The
+mixture is (1−f) N(0, s²) + f N(0, s² + scale²) with the outlier fraction f. True outliers fit the mixture best and are
+equally likely at all times.
 
-The magnitudes are collected in bins, so that the computing time of the fits does not grow with the recording. Up to six
-standard deviations, a bin is a fortieth of a standard deviation wide. Wider bins follow, each 3 % wider than the bin
-before. The mean square of each bin is stored, so that the bins lose almost no information.
+The magnitudes are collected in bins, so that the fit time does not grow with the recording length.
 """
 
 from dataclasses import dataclass
@@ -21,15 +17,14 @@ from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import NORMAL_QUARTILE, Z95
-from monitor.reconcile.preparation.value_statistics import Mask, ValueWithInterval
+from monitor.reconcile.preparation.value_artifacts import Mask, ValueWithInterval
 
 LINEAR_BINS: Final = 240
 LINEAR_RANGE_SIGMA: Final = 6.0
 """Magnitude, in standard deviations, up to which the bins have equal width."""
 TOTAL_BINS: Final = 1024
 BINS_PER_LOG_UNIT: Final = 34.0
-"""Number of bins per natural logarithmic unit beyond the linear range. The last bin ends at 6·10¹⁰ standard
-deviations.
+"""Number of bins per factor e beyond the linear range.
 """
 BIN_EDGES: Final = np.concatenate(
     [
@@ -41,16 +36,16 @@ BIN_EDGES: Final = np.concatenate(
 START_WIDTHS: Final = np.array([1.3, 1.6, 2.0, 2.6, 3.4, 5.0, 8.0, 15.0, 40.0, 200.0, 3000.0])
 """Starting values of the EM algorithm: standard deviation of the wide component relative to the narrow one."""
 NEIGHBOUR_SAMPLES: Final = 4
-"""Largest distance in samples of two outliers that count as neighbours."""
+"""Largest distance, in samples, between neighbouring outliers."""
 STUDENT_FREEDOMS: Final = np.geomspace(1.0, 300.0, 40)
 MIN_MIXTURE_GAIN_NATS: Final = 0.01
 MAX_Z: Final = 37.0
-"""Value of z for a probability that underflows in 64 bits."""
+"""z value of a probability that underflows in 64 bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class OutlierFit:
-    """Fit of a mixture of two Gaussians, with its alternatives."""
+    """Fit of outliers to white residuals, with tests against other explanations."""
 
     fraction: ValueWithInterval
     scale: ValueWithInterval  # standard deviation of the error that is added to a sample
@@ -62,18 +57,18 @@ class OutlierFit:
     misfit_z: float  # z of the misfit between the magnitudes and the mixture
 
 
-def fit_outliers(w: Floats) -> OutlierFit | None:
+def fit_outliers(residuals: Floats) -> OutlierFit | None:
     """Fit a mixture of two Gaussians to white residuals.
 
     Parameters
     ----------
-    w : ndarray of float64, shape (n,)
+    residuals : ndarray of float64, shape (n,)
         White residuals. NaN values are ignored.
 
     Returns
     -------
     OutlierFit or None
-        The best mixture, or None if a single Gaussian fits no worse.
+        Best mixture, or None if a single Gaussian fits equally well.
 
     Examples
     --------
@@ -84,13 +79,13 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     >>> print(f"{found.fraction.value:.4f} {found.scale.value:.1f}", found.gain > 100.0, found.gain_over_student > 5.0)
     0.0023 7.2 True True
     """
-    good = np.isfinite(w)
+    good = np.isfinite(residuals)
     n = int(good.sum())
-    some = np.abs(w[good][:: max(1, n // 20_000)])
+    some = np.abs(residuals[good][:: max(1, n // 20_000)])
     unit = float(np.median(some)) / NORMAL_QUARTILE if n >= 100 else 0.0
     if not unit > 0.0:
         return None
-    counts, squares = _bin_magnitudes(w, unit)
+    counts, squares = _bin_magnitudes(residuals, unit)
     kept = np.flatnonzero(counts)
     counts, squares = counts[kept], squares[kept] / counts[kept]
     narrow, wide, share, best = _fit_mixture(counts, squares, START_WIDTHS)
@@ -98,7 +93,11 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     if not (gain > MIN_MIXTURE_GAIN_NATS and wide > narrow):
         return None
     far = _outlier_threshold(narrow, wide, share)
-    mask = np.asarray(np.abs(w) > far * unit) & good if np.isfinite(far) else np.zeros(w.size, dtype=np.bool_)
+    mask = (
+        np.asarray(np.abs(residuals) > far * unit) & good
+        if np.isfinite(far)
+        else np.zeros(residuals.size, dtype=np.bool_)
+    )
     fraction, scale = _parameter_intervals(counts, squares, narrow, wide, share)
     return OutlierFit(
         fraction=fraction,
@@ -107,14 +106,13 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
         count=int(mask.sum()),
         gain=float(gain),
         gain_over_student=float(best - _student_log_likelihood(counts, squares)),
-        clustering_z=_clustering_z(np.flatnonzero(mask), w.size),
+        clustering_z=_clustering_z(np.flatnonzero(mask), residuals.size),
         misfit_z=_misfit_z(counts, kept, narrow, wide, share),
     )
 
 
 @compiled
 def _bin_magnitudes(w: Floats, unit: float) -> tuple[Floats, Floats]:
-    """Return the number of magnitudes |w|/unit in each bin, and the sum of their squares."""
     counts, squares = np.zeros(TOTAL_BINS), np.zeros(TOTAL_BINS)
     for k in range(w.size):
         x = abs(w[k]) / unit
@@ -131,9 +129,9 @@ def _bin_magnitudes(w: Floats, unit: float) -> tuple[Floats, Floats]:
 
 @compiled
 def _fit_mixture(counts: Floats, squares: Floats, start_widths: Floats) -> tuple[float, float, float, float]:
-    """Return the variances of the two Gaussians, the share of the wide one, and the log-likelihood of the best mixture.
+    """Fit the mixture by the EM algorithm from several starting values.
 
-    The EM algorithm runs for 40 steps from every start, and then from the best result until it converges.
+    Return the variances of the two Gaussians, the share of the wide Gaussian, and the log-likelihood.
     """
     total = counts.sum()
     mean = (counts * squares).sum() / total
@@ -157,7 +155,7 @@ def _fit_mixture(counts: Floats, squares: Floats, start_widths: Floats) -> tuple
 def _em_step(
     counts: Floats, squares: Floats, total: float, narrow: float, wide: float, share: float, held: bool
 ) -> tuple[float, float, float, float]:
-    """Perform one EM step and return the log-likelihood before it.
+    """Update the mixture by one EM step, and return the log-likelihood before the step.
 
     If ``held`` is True, the wide variance stays fixed.
     """
@@ -185,23 +183,21 @@ def _em_step(
 
 
 def _gaussian_log_likelihood(counts: Floats, squares: Floats) -> float:
-    """Return the log-likelihood of the best single Gaussian."""
     total = counts.sum()
     return -0.5 * float(total * (np.log(2.0 * np.pi * np.dot(counts, squares) / total) + 1.0))
 
 
 def _mixture_log_density(squares: Floats, narrow: float, wide: float, share: float) -> Floats:
-    """Return the log-density of the mixture at given squared magnitudes."""
     inside = np.log1p(-share) - 0.5 * (np.log(2.0 * np.pi * narrow) + squares / narrow)
     outside = np.log(share) - 0.5 * (np.log(2.0 * np.pi * wide) + squares / wide)
     return np.asarray(np.logaddexp(inside, outside))
 
 
 def _student_log_likelihood(counts: Floats, squares: Floats) -> float:
-    """Return the log-likelihood of the best Student's t.
+    """Return the largest log-likelihood of Student's t distribution.
 
-    The EM algorithm fits the scale s with the weights (ν+1)/(ν + x²/s²) (Lange, Little & Taylor 1989). It runs for all
-    degrees of freedom ν at the same time.
+    The EM algorithm fits the scale s with the weights (ν+1)/(ν + x²/s²) (Lange, Little & Taylor 1989) for all degrees
+    of freedom ν.
     """
     nu = STUDENT_FREEDOMS[:, None]
     scale = np.ones_like(nu)
@@ -232,13 +228,9 @@ def _outlier_threshold(narrow: float, wide: float, share: float) -> float:
 def _parameter_intervals(
     counts: Floats, squares: Floats, narrow: float, wide: float, share: float
 ) -> tuple[ValueWithInterval, ValueWithInterval]:
-    """Return the fraction and the scale of the outliers with 95 % intervals.
-
-    The intervals follow from the curvature of the log-likelihood in ln s, ln scale and logit f.
-    """
     at = np.array([0.5 * np.log(narrow), 0.5 * np.log(max(wide - narrow, 1e-12)), np.log(share) - np.log1p(-share)])
 
-    def like(x: Floats) -> float:
+    def log_likelihood(x: Floats) -> float:
         inner, f = np.exp(2.0 * x[0]), 1.0 / (1.0 + np.exp(-x[2]))
         return float(np.dot(counts, _mixture_log_density(squares, inner, inner + np.exp(2.0 * x[1]), f)))
 
@@ -247,9 +239,12 @@ def _parameter_intervals(
     for i in range(3):
         for j in range(3):
             a, b = step[i], step[j]
-            curve[i, j] = (like(at + a - b) + like(at - a + b) - like(at + a + b) - like(at - a - b)) / (
-                4.0 * a[i] * b[j]
-            )
+            curve[i, j] = (
+                log_likelihood(at + a - b)
+                + log_likelihood(at - a + b)
+                - log_likelihood(at + a + b)
+                - log_likelihood(at - a - b)
+            ) / (4.0 * a[i] * b[j])
     variance = np.diag(np.linalg.pinv(curve))
     half = np.where(variance > 0.0, Z95 * np.sqrt(np.maximum(variance, 0.0)), 700.0)
     with np.errstate(over="ignore"):
@@ -259,12 +254,11 @@ def _parameter_intervals(
 
 
 def _clustering_z(positions: Ints, n: int) -> float:
-    """Return the z value of the strongest of several tests for clustering of events.
+    """Return the z value of the strongest of several tests for clusters of outliers.
 
-    The first test counts the pairs of events that are at most ``NEIGHBOUR_SAMPLES`` samples apart. Without clustering,
-    this number has a Poisson distribution. The other tests divide the recording into 4, 8, … parts with at least two
-    events per part on average. They compare the dispersion of the event counts with χ² (Cochran 1954). The smallest
-    probability is multiplied by the number of tests.
+    The first test compares the number of pairs of outliers within ``NEIGHBOUR_SAMPLES`` samples with a Poisson
+    distribution. The other tests count the outliers in 4, 8, … parts of the recording and compare the dispersion with
+    χ² (Cochran 1954). The smallest probability is multiplied by the number of tests.
     """
     if positions.size < 2:
         return 0.0
@@ -289,17 +283,14 @@ def _clustering_z(positions: Ints, n: int) -> float:
 
 
 def _z_of_probability(probability: float) -> float:
-    """Return the value that a standard Gaussian exceeds with a given probability, or 0 if it exceeds 0.5."""
+    """Return the z value of a one-sided tail probability, but at least 0."""
     if probability > 0.5:
         return 0.0
     return -float(ndtri(probability)) if probability > 1e-300 else MAX_Z
 
 
 def _misfit_z(counts: Floats, kept: NDArray[np.intp], narrow: float, wide: float, share: float) -> float:
-    """Return the z value of a χ² test that compares the counts with the mixture.
-
-    The bins are combined into groups with about the same expected count.
-    """
+    """Return the z value of a χ² goodness-of-fit test of the fitted mixture."""
     below = (1.0 - share) * ndtr(BIN_EDGES / narrow**0.5) + share * ndtr(BIN_EDGES / wide**0.5)
     total = counts.sum()
     expected = 2.0 * total * np.diff(below)

@@ -1,10 +1,9 @@
-"""Likelihood ratio of Poisson steps and a random walk, which have the same second moments.
+"""Likelihood comparison of Poisson steps and a random walk, which have the same second moments.
 
-In the model of Poisson steps, each block contains a jump of Gaussian height or no jump. Several later blocks are needed
-to decide whether a block contains a jump. The filter therefore has one hypothesis for each possible time since the last
-jump (Fearnhead & Liu, "On-line inference for multiple changepoint problems", J. R. Statist. Soc. B 69, 2007).
-Hypotheses with the same time are merged into one Gaussian distribution with the same mean and covariance (Harrison &
-Stevens, "Bayesian forecasting", J. R. Statist. Soc. B 38, 1976).
+In the model of Poisson steps, each block may contain a jump of Gaussian height. The filter tracks one hypothesis for
+each possible time since the last jump (Fearnhead & Liu, "On-line inference for multiple changepoint problems", J. R.
+Statist. Soc. B 69, 2007). Each hypothesis is approximated by one Gaussian distribution with the same mean and
+covariance (Harrison & Stevens, "Bayesian forecasting", J. R. Statist. Soc. B 38, 1976).
 
 A random walk is the limit of many small jumps. Poisson steps therefore never fit much worse than a random walk, and
 only a large gain indicates jumps.
@@ -24,35 +23,34 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     EventProcessComparison,
     EventProcessFit,
     StateSpaceNoise,
-    block_means,
+    build_state_space_noise,
+    compute_block_means,
     fit_event_process,
-    initial_covariance,
+    initial_state_covariance,
     innovation_of_block,
     kalman_log_likelihood,
     maximise_log_likelihood,
     predict_block_mean_variance,
     prior_level_variance,
-    state_space_noise,
 )
 
 BLOCKS_PER_CROSSING_TIME: Final = 3.0
-"""Number of blocks in the time N/K. A random walk exceeds white noise at longer times."""
+"""Number of blocks in the time N/K, after which a random walk exceeds white noise."""
 JUMP_AGES: Final = 16
-"""Number of hypotheses about the block of the last jump. The last hypothesis includes all older jumps.
+"""Number of hypotheses about the block of the last jump, which cover five times N/K.
 
-Together, the hypotheses cover five times N/K. If they cover 1.3 times N/K, the estimated rate is 15 to 25 % too low. If
-they cover 2.7 times N/K, the estimated rate is 5 to 10 % too low.
+With a coverage of 2.7 times N/K, the estimated rate would be 5 to 10 % too low.
 """
 MIN_HYPOTHESIS_PROBABILITY: Final = 1e-6
 MAX_START_JUMPS: Final = 2.0
-"""Largest number of jumps in the time N/K at the start of a search. More frequent jumps cannot be resolved."""
+"""Largest expected number of jumps in the time N/K. More frequent jumps cannot be resolved."""
 START_RATES: Final = 6
 
 
 def compare_poisson_with_random_walk(
     y: Floats, tau0_s: float, background: BackgroundNoise, K: float
 ) -> EventProcessComparison:
-    """Compare Poisson steps with a random walk.
+    """Compare the likelihoods of Poisson steps and a random walk.
 
     Parameters
     ----------
@@ -61,32 +59,34 @@ def compare_poisson_with_random_walk(
     tau0_s : float
         Sample period in seconds.
     background : BackgroundNoise
-        Other noise of the axis. A random walk in this noise is part of both alternatives.
+        All other noise of the axis.
     K : float
-        Starting value of the random walk coefficient, in unit/√s, above zero.
+        Starting value of the random walk coefficient, in unit/√s. The value must be positive.
 
     Returns
     -------
     EventProcessComparison
-        Gain, ``rate`` and ``height`` of the Poisson steps, and the number of jumps.
+        Log-likelihood gain, fitted rate and height, and number of Poisson steps.
 
     Raises
     ------
     ValueError
         If the series is too short or the background contains no white noise.
     """
-    means, block_s = block_means(y, tau0_s, block_length_s(y.size * tau0_s, background, K))
+    means, block_s = compute_block_means(y, tau0_s, choose_block_length_s(y.size * tau0_s, background, K))
     level_variance, duration_s = prior_level_variance(means), means.size * block_s
 
-    def walk(K: float) -> float:
-        noise = state_space_noise(replace(background, walk=background.walk + K * K), block_s, duration_s)
+    def random_walk_log_likelihood(K: float) -> float:
+        noise = build_state_space_noise(replace(background, walk=background.walk + K * K), block_s, duration_s)
         return float(kalman_log_likelihood(means, noise, level_variance))
 
-    return fit_jumps(means, block_s, background, K).compare_with_effect(maximise_log_likelihood(walk, (K,))[0])
+    return fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
+        maximise_log_likelihood(random_walk_log_likelihood, (K,))[0]
+    )
 
 
-def block_length_s(duration_s: float, background: BackgroundNoise, K: float) -> float:
-    """Return the length of a block in seconds.
+def choose_block_length_s(duration_s: float, background: BackgroundNoise, K: float) -> float:
+    """Choose the length, in seconds, of the blocks over which samples are averaged.
 
     Parameters
     ----------
@@ -101,11 +101,8 @@ def block_length_s(duration_s: float, background: BackgroundNoise, K: float) -> 
     return min(crossing_s / BLOCKS_PER_CROSSING_TIME, duration_s / TARGET_BLOCKS)
 
 
-def fit_jumps(means: Floats, block_s: float, background: BackgroundNoise, K: float) -> EventProcessFit:
-    """Maximise the likelihood over the rate and the height of the jumps.
-
-    The search starts from the likeliest of several rates. The height at the start gives the same second moments as a
-    random walk with the coefficient ``K``.
+def fit_poisson_jumps(means: Floats, block_s: float, background: BackgroundNoise, K: float) -> EventProcessFit:
+    """Fit the rate and the height of Poisson steps by maximum likelihood.
 
     Parameters
     ----------
@@ -119,25 +116,22 @@ def fit_jumps(means: Floats, block_s: float, background: BackgroundNoise, K: flo
         Random walk coefficient in unit/√s.
     """
     duration_s, level_variance = means.size * block_s, prior_level_variance(means)
-    noise = state_space_noise(background, block_s, duration_s)
+    noise = build_state_space_noise(background, block_s, duration_s)
 
-    def poisson(rate: float, height: float, odds: float = 1.0) -> float:
+    def poisson_log_likelihood(rate: float, height: float, odds: float = 1.0) -> float:
         return _log_likelihood(means, noise, level_variance, rate * block_s, height, odds)
 
     rates = np.geomspace(
         2.0 / duration_s, max(MAX_START_JUMPS * K / background.white**0.5, 4.0 / duration_s), START_RATES
     )
-    rate = max(rates, key=lambda rate: poisson(rate, K / rate**0.5))
-    return fit_event_process(poisson, {"rate": rate, "height": K / rate**0.5})
+    rate = max(rates, key=lambda rate: poisson_log_likelihood(rate, K / rate**0.5))
+    return fit_event_process(poisson_log_likelihood, {"rate": rate, "height": K / rate**0.5})
 
 
 def _log_likelihood(
     means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: float, height: float, odds: float = 1.0
 ) -> float:
-    """Return the log-likelihood of Poisson steps with ``jumps`` expected jumps in a block.
-
-    The probability of each jump is multiplied by ``odds``.
-    """
+    """Return the log-likelihood of Poisson steps, with the jump probability multiplied by ``odds``."""
     some = -expm1(-jumps)
     variance = jumps / some * height**2  # variance of the sum of all jumps in a block with at least one jump
     return float(
@@ -146,16 +140,12 @@ def _log_likelihood(
 
 
 class _JumpProbabilities(NamedTuple):
-    """Probabilities of jumps in a block."""
-
     none: float  # probability of no jump
     some: float  # probability of at least one jump
     variance: float  # variance of the sum of all jumps in a block with at least one jump
 
 
 class _GaussianMixture(NamedTuple):
-    """Mixture of Gaussian distributions of the state of the background noise."""
-
     weight: Floats  # [k] probability of each component, or its logarithm
     mean: Floats  # [k, d]
     covariance: Floats  # [k, d, d]
@@ -165,13 +155,12 @@ class _GaussianMixture(NamedTuple):
 def _jump_log_likelihood(
     means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: _JumpProbabilities
 ) -> float:
-    """Return the log-likelihood of a level that jumps at random times."""
     d = noise.table.shape[0]
     by_age = _GaussianMixture(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
     # entries 0 to JUMP_AGES − 1 have no jump in this block, the other entries have a jump
     branches = _GaussianMixture(np.empty(2 * JUMP_AGES), np.zeros((2 * JUMP_AGES, d)), np.zeros((2 * JUMP_AGES, d, d)))
     by_age.weight[JUMP_AGES - 1] = 1.0
-    by_age.covariance[JUMP_AGES - 1] = initial_covariance(noise, level_variance)
+    by_age.covariance[JUMP_AGES - 1] = initial_state_covariance(noise, level_variance)
     total: float = -0.5 * means.size * np.log(2.0 * np.pi)
     for block_mean in means:
         for age in range(JUMP_AGES):
@@ -195,10 +184,10 @@ def _branch(
     noise: StateSpaceNoise,
     jumps: _JumpProbabilities,
 ) -> None:
-    """Update one hypothesis with a block mean, once without a jump in the block and once with a jump.
+    """Update one hypothesis with a block mean, once with and once without a jump in the block.
 
-    The time of a jump is uniformly distributed in the block. A jump therefore changes the block mean by half of the
-    height on average, and adds a third of the variance of the height to the variance of the block mean.
+    The time of a jump is uniformly distributed in the block. On average, the jump changes the block mean by half of the
+    height. The variance of the block mean increases by one third of the height variance.
     """
     branches.weight[age] = branches.weight[JUMP_AGES + age] = -np.inf
     if by_age.weight[age] < MIN_HYPOTHESIS_PROBABILITY:
@@ -243,7 +232,6 @@ def _normalise(weight: Floats) -> float:
 
 @compiled
 def _merge(branches: _GaussianMixture, first: int, end: int, merged: _GaussianMixture, to: int) -> None:
-    """Merge the branches from ``first`` to ``end`` − 1 into one Gaussian with the same mean and covariance."""
     share = 0.0
     for k in range(first, end):
         share += branches.weight[k]

@@ -1,15 +1,11 @@
-"""Comparison of Poisson steps, a random process, with a few single steps at fixed times.
+"""Likelihood comparison of Poisson steps, which are a random process, and a few single steps at fitted times.
 
-The search adds one step at a time. A Kalman smoother computes the gain of a shock of the level at each block, and the
-new step is placed at the block with the largest gain (de Jong & Penzer, "Diagnosing shocks in time series", JASA 93,
-1998). After each new step, the search places every step again while the other steps are kept. Finally, the times are
-refined within the blocks, and the heights are fitted by least squares.
+A new step is placed in the block with the largest log-likelihood gain, which a Kalman smoother computes (de Jong &
+Penzer, "Diagnosing shocks in time series", JASA 93, 1998).
 
-The likelihood of Poisson steps is averaged over all possible times and heights, whereas the times and heights of single
-steps are fitted. Each single step therefore has two penalties, following the minimum description length of Rissanen
-(1978). The penalty for the time is the logarithm of the number of blocks. The penalty for the height h is
-½ ln(1 + h²/Var h). With up to about five steps, the single steps usually have the larger score. With more than about a
-dozen steps, Poisson steps have the larger score, because two parameters describe all steps.
+The fitted time and height of each single step have a penalty, following the minimum description length of Rissanen
+(1978). The time penalty is the logarithm of the number of blocks. The height penalty is ½ ln(1 + h²/Var h) for the
+height h.
 """
 
 from math import log
@@ -24,20 +20,18 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     BackgroundNoise,
     EventProcessComparison,
     StateSpaceNoise,
-    block_means,
+    build_state_space_noise,
+    compute_block_means,
     innovation_variances,
     innovations_of_series,
     kalman_log_likelihood,
     prior_level_variance,
-    state_space_noise,
 )
 
 TIMES_PER_BLOCK: Final = 8
 
 
 class _SingleStepsFit(NamedTuple):
-    """Fitted single steps."""
-
     score: float  # log-likelihood less the penalties for times and heights
     times: Floats  # [k] in blocks since the start
 
@@ -45,7 +39,7 @@ class _SingleStepsFit(NamedTuple):
 def compare_poisson_with_single_steps(
     y: Floats, tau0_s: float, background: BackgroundNoise, K: float, max_single_steps: int = 5
 ) -> EventProcessComparison:
-    """Compare Poisson steps with a few single steps.
+    """Compare the likelihoods of Poisson steps and a few single steps.
 
     Parameters
     ----------
@@ -56,27 +50,31 @@ def compare_poisson_with_single_steps(
     background : BackgroundNoise
         Other noise of the axis.
     K : float
-        Starting value of the random walk coefficient, in unit/√s, above zero.
+        Starting value of the random walk coefficient, in unit/√s. The value must be positive.
     max_single_steps : int, optional
         Largest number of single steps.
 
     Returns
     -------
     EventProcessComparison
-        Gain, ``rate`` and ``height`` of the Poisson steps, the number of jumps, and the number of single steps.
+        Log-likelihood gain, fitted rate and height of Poisson steps, and the numbers of jumps and single steps.
 
     Raises
     ------
     ValueError
         If the series is too short or the background contains no white noise.
     """
-    means, block_s = block_means(y, tau0_s, poisson_steps.block_length_s(y.size * tau0_s, background, K))
-    single = _fit_single_steps(means, state_space_noise(background, block_s, means.size * block_s), max_single_steps)
-    return poisson_steps.fit_jumps(means, block_s, background, K).compare_with_effect(single.score, single.times.size)
+    means, block_s = compute_block_means(y, tau0_s, poisson_steps.choose_block_length_s(y.size * tau0_s, background, K))
+    single = _fit_single_steps(
+        means, build_state_space_noise(background, block_s, means.size * block_s), max_single_steps
+    )
+    return poisson_steps.fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
+        single.score, single.times.size
+    )
 
 
 def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: int) -> _SingleStepsFit:
-    """Return the fit with the largest score of 0 to ``max_single_steps`` steps."""
+    """Return the best fit with 0 to ``max_single_steps`` single steps."""
     blocks: list[int] = []
     best = _SingleStepsFit(kalman_log_likelihood(means, noise, prior_level_variance(means)), np.empty(0))
     for _ in range(max_single_steps):
@@ -90,10 +88,7 @@ def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: i
 
 
 def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Floats:
-    """Return twice the log-likelihood gain, shape (m,), of a shock at the start of each block.
-
-    The model already contains shocks at the start of the given ``blocks``.
-    """
+    """Return twice the log-likelihood gain of an additional step at the start of each block, shape (m,)."""
     shock_variances = np.zeros(means.size)
     shock_variances[blocks] = prior_level_variance(means)
     gains = _shock_statistics(means, noise, prior_level_variance(means), shock_variances)
@@ -102,7 +97,6 @@ def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Fl
 
 
 def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> _SingleStepsFit:
-    """Refine the times of the steps within the blocks and return the fit."""
     times = np.array(blocks, np.float64)
     places = np.arange(-TIMES_PER_BLOCK, TIMES_PER_BLOCK + 1) / TIMES_PER_BLOCK
     for k in range(times.size):
@@ -116,10 +110,7 @@ def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> _
 
 
 def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
-    """Fit the heights of steps at given times.
-
-    Return the log-likelihood, the heights and the standard deviations of the heights.
-    """
+    """Fit the heights of steps at given times. Return the log-likelihood, the heights and the standard errors."""
     # fraction of each block that lies after the step
     columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
     columns = np.column_stack([means, columns])
@@ -133,10 +124,7 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
 
 @compiled
 def _whiten(columns: Floats, noise: StateSpaceNoise, level_variance: float) -> float:
-    """Whiten columns, shape (m, c), in place, and return the sum of ln 2πS of the innovation variances S.
-
-    A whitened column contains innovations divided by the standard deviation.
-    """
+    """Whiten columns, shape (m, c), in place. Return the sum of ln 2πS over all innovation variances S."""
     variances, state_covariances = innovation_variances(np.zeros(columns.shape[0]), noise, level_variance)
     total = 0.0
     for c in range(columns.shape[1]):
@@ -152,12 +140,11 @@ def _whiten(columns: Floats, noise: StateSpaceNoise, level_variance: float) -> f
 def _shock_statistics(
     means: Floats, noise: StateSpaceNoise, level_variance: float, extra_level_variance: Floats
 ) -> Floats:
-    """Return twice the log-likelihood ratio, shape (m,), of a shock of the level at the start of each block.
+    """Return twice the log-likelihood ratio of a step at the start of each block, shape (m,).
 
-    The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are
-    r ← h e/S + L'r and N ← h h'/S + L'N L, with L = F − k h'/S. For each block, e is the innovation, S is the variance
-    of the innovation, k is the covariance of the innovation with the next state, h is the contribution of the state to
-    the block mean, and F is the state transition.
+    The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are r ←
+    h e/S + L'r and N ← h h'/S + L'N L, with L = F − k h'/S. The innovation e has the variance S and the covariance k
+    with the next state. The state transition is F, and the block mean contains h times the state.
     """
     table = noise.table
     d, m = table.shape[0], means.size
@@ -176,7 +163,6 @@ def _shock_statistics(
 
 @compiled
 def _smooth_backward(r: Floats, N: Floats, L: Floats, table: Floats, innovation: float, variance: float) -> None:
-    """Update the smoother variables r, shape (d,), and N, shape (d, d), with one block."""
     d = r.size
     NL, new = np.empty((d, d)), np.empty(d)
     for i in range(d):

@@ -1,14 +1,10 @@
-"""Comparison of a process of random events with an effect that has the same spectrum: parts that the pairs share.
+"""State-space likelihoods that compare a process of random events with an effect of the same spectrum.
 
-A random telegraph has the same second moments as exponentially correlated noise. Poisson steps have the same second
-moments as a random walk. Only the distributions differ. The full likelihood of both effects is therefore computed for
-the same data and the same background noise. The gain of an ``EventProcessComparison`` is the logarithm of the ratio of
-the two maximum likelihoods. The caller subtracts penalties for parameters and prior odds.
+A random telegraph has the same second moments as exponentially correlated noise, and Poisson steps have the same second
+moments as a random walk. Only the full likelihood distinguishes the two effects.
 
-The data are block means. The background noise consists of white noise, random walk, flicker noise and exponentially
-correlated noise. It is modelled as a sum of independent first-order processes. The distribution of a block mean, given
-the state at the start of the block, is known exactly. One step of a Kalman filter per block is therefore sufficient.
-The first level has a nearly flat prior, which is the same for both effects.
+The background noise is modelled as a sum of independent first-order processes. Each step of the Kalman filter processes
+the mean of one block of samples.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,27 +22,26 @@ from monitor.reconcile.result import ParameterInterval
 MAX_BLOCKS: Final = 1 << 15
 """Largest number of blocks. The end of a longer recording is not used."""
 TARGET_BLOCKS: Final = 200.0
-"""Smallest number of blocks in a recording with sufficiently many samples."""
+"""Smallest number of blocks in a recording with enough samples."""
 MIN_BLOCKS: Final = 16
 INITIAL_VARIANCE_RATIO: Final = 100.0
-"""Prior variance of the first level relative to the variance of the data. This prior is effectively flat."""
+"""Prior variance of the first level, relative to the variance of the data."""
 FLICKER_TIME_RATIO: Final = 10.0
-"""Ratio of successive correlation times of the processes that approximate flicker noise. With this ratio, the spectrum
-deviates by 5 % from 1/f.
+"""Ratio of successive correlation times in the approximation of flicker noise. The spectrum deviates by 5 % from 1/f.
 """
 FLICKER_CUTOFF_RATIO: Final = 20.0
 """Highest modelled frequency of flicker noise, relative to the frequency at which flicker and white noise are equal."""
 CURVATURE_STEP: Final = 0.1
 """Step in the logarithm of a parameter for the numerical curvature at the maximum."""
 ODDS_STEP: Final = 1e-3
-"""Relative change of the odds for the numerical derivative that gives the number of events."""
+"""Relative change of the odds for the numerical derivative."""
 MAX_LOG_PARAMETER_RANGE: Final = log(30.0)
-"""Largest distance of the logarithm of a parameter from its starting value."""
+"""Largest change of the logarithm of a parameter during a search."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventProcessComparison:
-    """Comparison of a process of random events with an effect that has the same spectrum, on one axis."""
+    """Comparison of a process of random events with an effect of the same spectrum."""
 
     gain: float  # log-likelihood of the process less the log-likelihood of the other effect, nats
     parameters: Mapping[str, ParameterInterval]  # of the process at the maximum, SI, 95 %
@@ -56,7 +51,7 @@ class EventProcessComparison:
 
 @dataclass(frozen=True, slots=True)
 class BackgroundNoise:
-    """Noise of an axis besides the compared effects. All spectral densities S(f) are two-sided."""
+    """Background noise of an axis, with two-sided spectral densities S(f)."""
 
     white: float  # N²: S(f) = N², unit² s
     walk: float = 0.0  # K²: S(f) = K²/(2πf)², unit²/s
@@ -65,11 +60,10 @@ class BackgroundNoise:
 
 
 class StateSpaceNoise(NamedTuple):
-    """Noise of block means as a sum of independent first-order processes and of white noise.
+    """State-space model of the noise in block means, as a sum of first-order processes and white noise.
 
-    From the start of one block to the start of the next block, the state x of a process changes to a·x + w. The process
-    contributes c·x + v to the block mean. The random terms w and v are Gaussian. The first process is the level,
-    including the random walk.
+    In each block, the state x of a process changes to a·x + w, and the process adds c·x + v to the block mean. The
+    random terms w and v are Gaussian. The first process is the mean level, which includes the random walk.
     """
 
     table: Floats  # [d, 4] a, c, variance of w and covariance of v and w, for each process
@@ -77,28 +71,30 @@ class StateSpaceNoise(NamedTuple):
 
 
 class EventProcessFit(NamedTuple):
-    """Fit of a process of random events at the maximum of the likelihood."""
+    """Maximum-likelihood fit of a process of random events."""
 
     log_likelihood: float
     parameters: dict[str, ParameterInterval]
     events: float  # expected number of events, given the data
 
-    def compare_with_effect(self, other_log_likelihood: float, single_steps: int = 0) -> EventProcessComparison:
-        """Compare the process with another effect.
+    def compare_with_other_effect(
+        self, other_log_likelihood: float, single_step_count: int = 0
+    ) -> EventProcessComparison:
+        """Compare the process of random events with another effect.
 
         Parameters
         ----------
         other_log_likelihood : float
             Maximum log-likelihood of the other effect for the same data.
-        single_steps : int, optional
+        single_step_count : int, optional
             Number of steps if the other effect consists of single steps.
         """
         gain = self.log_likelihood - other_log_likelihood
-        return EventProcessComparison(gain, self.parameters, round(self.events), single_steps)
+        return EventProcessComparison(gain, self.parameters, round(self.events), single_step_count)
 
 
-def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
-    """Return the means of consecutive blocks, less the mean of the series, and the length of a block.
+def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
+    """Compute the means of consecutive blocks, less the mean of the series.
 
     Parameters
     ----------
@@ -123,7 +119,8 @@ def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float
 
     Examples
     --------
-    >>> block_means(np.arange(48.0), 0.5, 1.4)[0][:3].tolist(), block_means(np.arange(48.0), 0.5, 1.4)[1]
+    >>> means, block_s = compute_block_means(np.arange(48.0), 0.5, 1.4)
+    >>> means[:3].tolist(), block_s
     ([-22.5, -19.5, -16.5], 1.5)
     """
     size = max(1, round(block_s / tau0_s))
@@ -134,8 +131,8 @@ def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float
     return means - means.mean(), size * tau0_s
 
 
-def state_space_noise(background: BackgroundNoise, block_s: float, duration_s: float) -> StateSpaceNoise:
-    """Return the state-space model of noise in block means.
+def build_state_space_noise(background: BackgroundNoise, block_s: float, duration_s: float) -> StateSpaceNoise:
+    """Build the state-space model of the background noise in block means.
 
     Parameters
     ----------
@@ -156,24 +153,26 @@ def state_space_noise(background: BackgroundNoise, block_s: float, duration_s: f
     walk = background.walk * block_s
     rows, white = [(1.0, 1.0, walk, 0.5 * walk)], background.white / block_s + walk / 3.0
     for sigma, time_s in (*background.correlated, *_flicker_processes(background, block_s, duration_s)):
-        row, own = block_markov_noise(sigma, time_s, block_s)
+        row, own = correlated_noise_of_block_means(sigma, time_s, block_s)
         rows.append(row)
         white += own
     return StateSpaceNoise(np.array(rows), white)
 
 
-def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tuple[float, float, float, float], float]:
+def correlated_noise_of_block_means(
+    sigma: float, correlation_time_s: float, block_s: float
+) -> tuple[tuple[float, float, float, float], float]:
     """Return the state-space model of exponentially correlated noise in block means.
 
-    Let σ be the standard deviation of the noise and x the ratio of block length to correlation time. The mean of a
-    block then has the variance σ² 2(x − 1 + e^−x)/x². The covariance of the mean with the noise at either end of the
-    block is σ² (1 − e^−x)/x. The variance and the covariance are integrals of the autocovariance σ² e^−|t|/T_c.
+    Let σ be the standard deviation of the noise, and x the ratio of block length to correlation time. The variance of a
+    block mean is σ² 2(x − 1 + e^−x)/x². The covariance of a block mean with the noise at either end of the block is σ²
+    (1 − e^−x)/x.
 
     Parameters
     ----------
     sigma : float
         Standard deviation, in the unit of the axis.
-    time_s : float
+    correlation_time_s : float
         Correlation time in seconds.
     block_s : float
         Length of a block in seconds.
@@ -181,11 +180,11 @@ def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tup
     Returns
     -------
     row : tuple of float
-        Row of ``StateSpaceNoise.table``.
+        Coefficients of one row of ``StateSpaceNoise.table``.
     variance : float
         Variance of the block mean given the noise at the start of the block.
     """
-    x = block_s / time_s
+    x = block_s / correlation_time_s
     decay, mean_share = exp(-x), -float(np.expm1(-x)) / x
     own = x * (2.0 / 3.0 - x * (0.5 - x * 7.0 / 30.0)) if x < 0.01 else 2.0 * (x - 1.0 + decay) / x**2 - mean_share**2
     return (
@@ -197,12 +196,11 @@ def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tup
 
 
 def _flicker_processes(background: BackgroundNoise, block_s: float, duration_s: float) -> list[tuple[float, float]]:
-    """Return the standard deviation and correlation time of each of several processes whose sum is flicker noise.
+    """Return the standard deviations and correlation times of processes whose sum is flicker noise.
 
-    Flicker noise has the spectral density B²/(2πf). The sum has this density from the inverse of the recording length
-    up to the frequency above which white noise dominates. The processes have the same variance s, and successive
-    correlation times have the ratio ρ. The sum of the processes has the spectral density (s π/ln ρ)/(2πf) (Keshner,
-    "1/f noise", Proc. IEEE 70, 1982). The variance is therefore s = B² ln ρ/π.
+    The sum has the spectral density B²/(2πf) from the inverse of the recording length up to the frequency at which
+    white noise dominates. For processes of equal variance s and correlation times of ratio ρ, the sum has the density
+    (s π/ln ρ)/(2πf) (Keshner, "1/f noise", Proc. IEEE 70, 1982). The variance is therefore s = B² ln ρ/π.
     """
     if background.flicker <= 0.0:
         return []
@@ -214,14 +212,16 @@ def _flicker_processes(background: BackgroundNoise, block_s: float, duration_s: 
     return [(sigma, slowest * exp(-k * spacing)) for k in range(count)]
 
 
-def maximise_log_likelihood(log_likelihood: Callable[..., float], start: Sequence[float]) -> tuple[float, Floats]:
+def maximise_log_likelihood(
+    log_likelihood: Callable[..., float], start_values: Sequence[float]
+) -> tuple[float, Floats]:
     """Maximise a log-likelihood over the logarithms of positive parameters by the Nelder-Mead method.
 
     Parameters
     ----------
     log_likelihood : callable
         Function of the parameters.
-    start : sequence of float
+    start_values : sequence of float
         Starting values of the parameters.
 
     Returns
@@ -233,7 +233,7 @@ def maximise_log_likelihood(log_likelihood: Callable[..., float], start: Sequenc
     """
     from scipy.optimize import minimize
 
-    origin = np.log(np.asarray(start, np.float64))
+    origin = np.log(np.asarray(start_values, np.float64))
     found = minimize(
         lambda at: -log_likelihood(*np.exp(at)),
         origin,
@@ -250,33 +250,29 @@ def maximise_log_likelihood(log_likelihood: Callable[..., float], start: Sequenc
 
 
 def fit_event_process(
-    likelihood: Callable[[float, float, float], float], start: Mapping[str, float]
+    log_likelihood: Callable[[float, float, float], float], start_values: Mapping[str, float]
 ) -> EventProcessFit:
-    """Maximise the likelihood of a process of random events over its two parameters.
+    """Fit the two parameters of a process of random events by maximum likelihood.
 
-    The expected number of events is the derivative of the log-likelihood with respect to the logarithm of the odds of
-    an event (Fisher's identity).
+    The expected number of events is the derivative of the log-likelihood with respect to the log-odds of an event
+    (Fisher's identity).
 
     Parameters
     ----------
-    likelihood : callable
+    log_likelihood : callable
         Function of the two parameters and of a factor on the odds of an event.
-    start : mapping of str to float
+    start_values : mapping of str to float
         Names and starting values of the two parameters.
     """
-    height, at = maximise_log_likelihood(lambda a, b: likelihood(a, b, 1.0), list(start.values()))
-    deviations = _log_deviations(lambda x: likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height)
+    height, at = maximise_log_likelihood(lambda a, b: log_likelihood(a, b, 1.0), list(start_values.values()))
+    deviations = _log_deviations(lambda x: log_likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height)
     first, second = np.exp(at).tolist()
-    events = (likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
+    events = (log_likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
     bounds = [_log_interval(*one) for one in zip((first, second), deviations.tolist(), strict=True)]
-    return EventProcessFit(height, dict(zip(start, bounds, strict=True)), events)
+    return EventProcessFit(height, dict(zip(start_values, bounds, strict=True)), events)
 
 
 def _log_interval(value: float, deviation: float) -> ParameterInterval:
-    """Return a parameter with the 95 % interval, or without an interval that is wider than the search range.
-
-    ``deviation`` is the standard deviation of the logarithm.
-    """
     wide = Z95 * deviation
     if not wide < MAX_LOG_PARAMETER_RANGE:
         return ParameterInterval(value)
@@ -284,7 +280,6 @@ def _log_interval(value: float, deviation: float) -> ParameterInterval:
 
 
 def _log_deviations(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
-    """Return the standard deviations of the logarithms of the parameters, or NaN if the curvature shows no maximum."""
     curvature = _curvature(function, at, height)
     if (np.linalg.eigvalsh(curvature) < 0.0).all():
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(-curvature))))
@@ -292,7 +287,6 @@ def _log_deviations(function: Callable[[Floats], float], at: Floats, height: flo
 
 
 def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
-    """Return the second derivatives, shape (k, k), from finite differences with the step ``CURVATURE_STEP``."""
     k = at.size
     steps = CURVATURE_STEP * np.eye(k)
     curvature = np.empty((k, k))
@@ -305,16 +299,13 @@ def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -
 
 
 def prior_level_variance(means: Floats) -> float:
-    """Return the prior variance of the first level."""
+    """Return the prior variance of the mean level in the first block."""
     return INITIAL_VARIANCE_RATIO * float(means.var())
 
 
 @compiled
-def initial_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
-    """Return the state covariance, shape (d, d), before the first block.
-
-    The prior variance of the level is ``level_variance``. The other processes are stationary.
-    """
+def initial_state_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
+    """Return the state covariance, shape (d, d), before the first block."""
     table = noise.table
     d = table.shape[0]
     covariance = np.zeros((d, d))
@@ -326,9 +317,9 @@ def initial_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
 
 @compiled
 def predict_block_mean_variance(noise: StateSpaceNoise, covariance: Floats, state_covariance_out: Floats) -> float:
-    """Return the predicted variance of a block mean from the state covariance, shape (d, d), at the start of the block.
+    """Predict the variance of a block mean from the state covariance, shape (d, d), at the start of the block.
 
-    The covariance of the block mean with the next state is written to ``state_covariance_out``, shape (d,).
+    The covariance of the block mean with the next state, shape (d,), is written to ``state_covariance_out``.
     """
     table = noise.table
     d = table.shape[0]
@@ -344,7 +335,7 @@ def predict_block_mean_variance(noise: StateSpaceNoise, covariance: Floats, stat
 
 @compiled
 def innovation_of_block(block_mean: float, noise: StateSpaceNoise, state: Floats) -> float:
-    """Return the block mean less the prediction from the state, shape (d,), at the start of the block."""
+    """Return the difference between a block mean and the prediction from the state, shape (d,)."""
     innovation = block_mean
     for i in range(noise.table.shape[0]):
         innovation -= noise.table[i, 1] * state[i]
@@ -355,14 +346,14 @@ def innovation_of_block(block_mean: float, noise: StateSpaceNoise, state: Floats
 def innovation_variances(
     extra_level_variance: Floats, noise: StateSpaceNoise, level_variance: float
 ) -> tuple[Floats, Floats]:
-    """Return the variances of the innovations, shape (m,), and the covariances with the next state, shape (m, d).
+    """Return the innovation variances, shape (m,), and the covariances with the next state, shape (m, d).
 
-    ``extra_level_variance``, shape (m,), is added to the variance of the level at the start of each block.
+    The variance of the mean level increases by ``extra_level_variance``, shape (m,), at the start of each block.
     """
     table = noise.table
     d, m = table.shape[0], extra_level_variance.size
     variances, state_covariances = np.empty(m), np.empty((m, d))
-    covariance = initial_covariance(noise, level_variance)
+    covariance = initial_state_covariance(noise, level_variance)
     for k in range(m):
         covariance[0, 0] += extra_level_variance[k]
         variances[k] = predict_block_mean_variance(noise, covariance, state_covariances[k])
@@ -378,7 +369,7 @@ def innovation_variances(
 def innovations_of_series(
     series: Floats, noise: StateSpaceNoise, variances: Floats, state_covariances: Floats
 ) -> Floats:
-    """Return the innovations, shape (m,): the block means less the predictions of the Kalman filter."""
+    """Return the innovations of a Kalman filter, shape (m,), for a series of block means."""
     table = noise.table
     d = table.shape[0]
     state, innovations = np.zeros(d), np.empty(series.size)

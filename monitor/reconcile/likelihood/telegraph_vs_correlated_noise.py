@@ -1,12 +1,9 @@
-"""Likelihood ratio of a random telegraph and exponentially correlated noise, which have the same second moments.
+"""Likelihood comparison of a random telegraph and exponentially correlated noise, which have the same second moments.
 
-The two levels are the modes of a switching Kalman filter. The Gaussian state of the filter contains the background
-noise and the position of the levels. Each block has one of three cases. In case 0, the level does not change. In case
-1, the level changes and changes back. In case 2, the level changes once. Each case has a mean and a variance of the
-block mean. After each block, the cases that end in the same level are merged into one Gaussian with the same mean and
-covariance. This is the GPB2 algorithm (Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and
-Navigation", 2001, section 11.6.4). If the background is white noise and the levels are known, the filter is the forward
-algorithm of a hidden Markov model.
+The random telegraph is modelled by a switching Kalman filter with two levels. Within a block, the level stays constant,
+changes once, or changes and returns. After each block, all cases with the same final level are merged into one Gaussian
+by the GPB2 algorithm (Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+section 11.6.4).
 """
 
 from math import log
@@ -22,40 +19,39 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     EventProcessComparison,
     EventProcessFit,
     StateSpaceNoise,
-    block_markov_noise,
-    block_means,
+    build_state_space_noise,
+    compute_block_means,
+    correlated_noise_of_block_means,
     fit_event_process,
-    initial_covariance,
+    initial_state_covariance,
     innovation_of_block,
     kalman_log_likelihood,
     maximise_log_likelihood,
     predict_block_mean_variance,
     prior_level_variance,
-    state_space_noise,
 )
 
 BLOCKS_PER_CORRELATION_TIME: Final = 8.0
-"""Number of blocks in a correlation time. The level then changes in one of sixteen blocks."""
+"""Number of blocks in a correlation time."""
 MAX_FINE_BLOCKS: Final = 20_000.0
-"""Number of blocks in a recording above which blocks are not shortened to resolve the switches."""
+"""Largest number of blocks to which a recording is divided to resolve the switches."""
 MIN_SAMPLES_PER_BLOCK: Final = 20
-"""Smallest number of samples in a block if the correlation time allows it. The noise of a sensor is white only over
-several samples.
+"""Smallest number of samples in a block, unless the correlation time is too short.
 """
 START_AMPLITUDE_FACTORS: Final = np.geomspace(0.5, 2.0, 7)
-"""Starting amplitudes as multiples of 2 σ. The likelihood has several maxima."""
+"""Starting amplitudes as multiples of 2 σ, because the likelihood has several maxima."""
 START_DWELL_FACTORS: Final = (0.35, 1.0)
-"""Starting dwell times as multiples of 2 T_c. A random walk in the background makes T_c appear longer."""
+"""Starting dwell times as multiples of 2 T_c."""
 INITIAL_LEVEL_BLOCKS: Final = 1024
-"""Number of blocks, about 64 dwell times, for which both possible first levels are tracked."""
+"""Number of blocks for which the filter tracks both possible first levels."""
 MIN_WEIGHT: Final = 1e-300
-"""Smallest weight of a case relative to the likeliest case. This limit avoids a division by zero."""
+"""Smallest weight of a case relative to the likeliest case, to avoid a division by zero."""
 
 
 def compare_telegraph_with_correlated_noise(
     y: Floats, tau0_s: float, background: BackgroundNoise, sigma: float, correlation_time: float
 ) -> EventProcessComparison:
-    """Compare a random telegraph with exponentially correlated noise.
+    """Compare the likelihoods of a random telegraph and exponentially correlated noise.
 
     Parameters
     ----------
@@ -73,32 +69,36 @@ def compare_telegraph_with_correlated_noise(
     Returns
     -------
     EventProcessComparison
-        Gain, ``amplitude`` and ``dwell_time`` of the telegraph, and the number of switches.
+        Log-likelihood gain, fitted amplitude and dwell time, and number of switches of the telegraph.
 
     Raises
     ------
     ValueError
         If the series is too short or the background contains no white noise.
     """
-    means, block_s = block_means(
-        y, tau0_s, _block_length_s(y.size * tau0_s, tau0_s, correlation_time, background.white / sigma**2)
+    means, block_s = compute_block_means(
+        y, tau0_s, _choose_block_length_s(y.size * tau0_s, tau0_s, correlation_time, background.white / sigma**2)
     )
-    noise, level_variance = state_space_noise(background, block_s, means.size * block_s), prior_level_variance(means)
+    noise, level_variance = (
+        build_state_space_noise(background, block_s, means.size * block_s),
+        prior_level_variance(means),
+    )
 
-    def correlated(sigma: float, time_s: float) -> float:
-        row, own = block_markov_noise(sigma, time_s, block_s)
+    def correlated_noise_log_likelihood(sigma: float, time_s: float) -> float:
+        row, own = correlated_noise_of_block_means(sigma, time_s, block_s)
         both = StateSpaceNoise(np.vstack([noise.table, row]), noise.white + own)
         return float(kalman_log_likelihood(means, both, level_variance))
 
     telegraph = _fit_telegraph(means, block_s, noise, sigma, correlation_time)
-    return telegraph.compare_with_effect(maximise_log_likelihood(correlated, (sigma, correlation_time))[0])
+    return telegraph.compare_with_other_effect(
+        maximise_log_likelihood(correlated_noise_log_likelihood, (sigma, correlation_time))[0]
+    )
 
 
-def _block_length_s(duration_s: float, tau0_s: float, correlation_time: float, equal_noise_s: float) -> float:
-    """Return the length of a block in seconds.
+def _choose_block_length_s(duration_s: float, tau0_s: float, correlation_time: float, equal_noise_s: float) -> float:
+    """Choose the block length in seconds.
 
-    In a block of ``equal_noise_s`` seconds, the white noise of the block mean is half of the amplitude. Shorter blocks
-    contain no more information about the switches.
+    Blocks shorter than ``equal_noise_s`` do not improve the resolution of the switches, because of the white noise.
     """
     return min(
         correlation_time / BLOCKS_PER_CORRELATION_TIME,
@@ -110,10 +110,9 @@ def _block_length_s(duration_s: float, tau0_s: float, correlation_time: float, e
 def _fit_telegraph(
     means: Floats, block_s: float, noise: StateSpaceNoise, sigma: float, correlation_time: float
 ) -> EventProcessFit:
-    """Maximise the likelihood over amplitude and dwell time, from several starting values."""
     level_variance = prior_level_variance(means)
 
-    def two_levels(amplitude: float, dwell_s: float, odds: float) -> float:
+    def telegraph_log_likelihood(amplitude: float, dwell_s: float, odds: float) -> float:
         return _log_likelihood(means, noise, level_variance, amplitude, block_s / dwell_s, odds)
 
     starts = [
@@ -121,28 +120,24 @@ def _fit_telegraph(
         for a in START_AMPLITUDE_FACTORS.tolist()
         for d in START_DWELL_FACTORS
     ]
-    amplitude, dwell_s = max(starts, key=lambda start: two_levels(start[0], start[1], 1.0))
-    return fit_event_process(two_levels, {"amplitude": amplitude, "dwell_time": dwell_s})
+    amplitude, dwell_s = max(starts, key=lambda start: telegraph_log_likelihood(start[0], start[1], 1.0))
+    return fit_event_process(telegraph_log_likelihood, {"amplitude": amplitude, "dwell_time": dwell_s})
 
 
 def _log_likelihood(
     means: Floats, noise: StateSpaceNoise, level_variance: float, amplitude: float, switches: float, odds: float = 1.0
 ) -> float:
-    """Return the log-likelihood of a random telegraph with ``switches`` expected switches in a block.
-
-    The probability of each switch is multiplied by ``odds``.
-    """
+    """Return the log-likelihood of a random telegraph, with the switch probability multiplied by ``odds``."""
     even, odd = 0.5 * (1.0 + np.exp(-2.0 * switches)), -0.5 * np.expm1(-2.0 * switches)
     none = np.exp(-switches)
-    # Let x be the fraction of the block that the process spends in the other level. Without a change, x is 0. If the
-    # level changes back, x has the density 2(1 − x), the mean 1/3 and the variance 1/18. With one change, x is uniform.
+    # If the level changes and returns, the fraction of the block in the other level has the mean 1/3 and the variance
+    # 1/18. If the level changes once, the fraction is uniformly distributed.
     cases = np.array([
         [none, 0.5 * amplitude, 0.0],
         [odds**2 * (even - none), amplitude / 6.0, amplitude**2 / 18.0],
         [odds * odd, 0.0, amplitude**2 / 12.0],
     ])  # fmt: skip
-    # The filter runs once for each first level. A single filter would merge the two first levels before the position of
-    # the levels is known.
+    # The filter runs once for each first level, because one filter would merge the levels too early.
     states = [_initial_state(noise, level_variance, first_level) for first_level in (0, 1)]
     first_parts = [_switching_log_likelihood(means[:INITIAL_LEVEL_BLOCKS], noise, cases, state) for state in states]
     second_part = _switching_log_likelihood(
@@ -152,7 +147,7 @@ def _log_likelihood(
 
 
 class _SwitchingFilterState(NamedTuple):
-    """Gaussian state of the filter for each of the two levels."""
+    """Gaussian state of the switching Kalman filter for each of the two levels."""
 
     probability: Floats  # [2]
     mean: Floats  # [2, d]
@@ -160,7 +155,7 @@ class _SwitchingFilterState(NamedTuple):
 
 
 class _BlockFilterUpdate(NamedTuple):
-    """Update of the filter with one block mean, for each level at the start of the block and each case."""
+    """Update of the switching Kalman filter with one block mean."""
 
     weight: Floats  # [2, 3] probability
     scaled_innovation: Floats  # [2, 3] innovation divided by its variance
@@ -170,11 +165,10 @@ class _BlockFilterUpdate(NamedTuple):
 
 @compiled
 def _initial_state(noise: StateSpaceNoise, level_variance: float, first_level: int) -> _SwitchingFilterState:
-    """Return the state before the first block, if the process starts in the given level."""
     d = noise.table.shape[0]
     state = _SwitchingFilterState(np.zeros(2), np.zeros((2, d)), np.empty((2, d, d)))
     state.probability[first_level] = 1.0
-    state.covariance[:] = initial_covariance(noise, level_variance)
+    state.covariance[:] = initial_state_covariance(noise, level_variance)
     return state
 
 
@@ -182,10 +176,10 @@ def _initial_state(noise: StateSpaceNoise, level_variance: float, first_level: i
 def _switching_log_likelihood(
     means: Floats, noise: StateSpaceNoise, cases: Floats, state: _SwitchingFilterState
 ) -> float:
-    """Return the log-likelihood of two levels and update the filter state in place.
+    """Return the log-likelihood of a random telegraph, and update the filter state in place.
 
-    ``cases``, shape (3, 3), contains the probability of each case, and the mean and variance of the contribution of the
-    telegraph to the block mean. The means are valid for a start in the upper level.
+    Each row of ``cases``, shape (3, 3), contains the probability of a case, and the mean and variance that the
+    telegraph adds to a block mean. The means apply to a block that starts in the upper level.
     """
     d = noise.table.shape[0]
     update = _BlockFilterUpdate(np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, d)))
@@ -207,10 +201,8 @@ def _switching_log_likelihood(
 def _weigh_cases(
     block_mean: float, noise: StateSpaceNoise, cases: Floats, state: _SwitchingFilterState, update: _BlockFilterUpdate
 ) -> tuple[float, float]:
-    """Compute the update with a block mean for each level and case.
-
-    All weights are multiplied by a common factor to avoid underflow. Return the sum of the weights and the logarithm of
-    the factor.
+    """Compute the filter update for each level and case. Return the sum of the weights and the logarithm of a scale
+    factor.
     """
     weight, pull, known = update.weight, update.scaled_innovation, update.inverse_variance
     for level in range(2):
@@ -233,7 +225,7 @@ def _weigh_cases(
 
 @compiled
 def _merge_returning_case(weight: Floats, pull: Floats, known: Floats) -> None:
-    """Merge case 1, in which the level changes and changes back, into case 0, in which the level does not change."""
+    """Merge the case of a level change and return into the case of a constant level."""
     back = weight[1] / (weight[0] + weight[1])
     apart = pull[1] - pull[0]
     pull[0] += back * apart
@@ -251,7 +243,7 @@ def _merge_into_level(
     moved: Floats,
     merged: Floats,
 ) -> None:
-    """Merge all cases that end in ``level`` into one Gaussian with the mean ``moved`` and the covariance ``merged``."""
+    """Merge all cases with the final level ``level`` into one Gaussian, and write the mean and covariance in place."""
     d, other = table.shape[0], 1 - level
     state_covariance, pull, known, at, covariance = (
         update.state_covariance,

@@ -1,18 +1,13 @@
-"""Variance of white residuals as a function of time, for all frequencies together and for each band.
+"""Changes of the variance of white residuals over time, in the whole spectrum and in frequency bands.
 
-``fit_variance_changes`` fits a step of the variance at every time, and three alternatives to a step: a trend, a
-periodic variation and a slow random variation. The alternatives are fitted to the mean squares of blocks, which have a
-χ² distribution. Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable.
+``fit_variance_changes`` fits a step, a trend, a periodic variation and a slow random variation of the variance.
+``find_spectrogram_change`` searches the spectrogram for a change of power.
 
-``find_least_constant_tiles`` divides the recording into pieces and computes the Fourier transform of each piece at the
-frequencies (k + ½)/piece. At these frequencies, the coefficients of white noise are independent, and the power of a
-steady line is the same in each piece. A **tile** is a rectangle of 2^a pieces by 2^b frequencies. A **row** consists of
-all tiles at the same frequencies. Each tile is compared with the other tiles of the same row, so that a steady line or
-a coloured spectrum has no influence. Each row is also tested for a constant power. Long pieces detect lines with a
-varying power, and short pieces detect bursts.
+The spectrogram consists of Fourier transforms of short pieces of the recording. A **tile** is a rectangle of 2^a pieces
+by 2^b frequencies, and a **row** contains all tiles of the same frequencies. Each tile is compared with the other tiles
+of the row, so that a coloured spectrum has no influence. Bartlett's test detects rows with a varying power.
 
-All statistics are ratios without a unit. For white Gaussian noise, the distribution of each statistic depends only on
-the number of samples. Outliers change the distribution, so they must be replaced first.
+Outliers must be replaced before these tests, because outliers change the null distributions.
 """
 
 from dataclasses import dataclass
@@ -26,32 +21,32 @@ from scipy.special import gammaincc, gammaln, polygamma, psi
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
-from monitor.reconcile.preparation.value_statistics import ValueWithInterval
+from monitor.reconcile.preparation.value_artifacts import ValueWithInterval
 
 MIN_SEGMENT_SAMPLES: Final = 16
 """Smallest number of samples on each side of a step."""
 STEP_SEARCH_STRIDE: Final = 8
 """Distance in samples between the times of the first search for a step."""
 FINE_SEARCH_SAMPLES: Final = 20_000
-"""Largest range in samples that the second search examines sample by sample."""
+"""Largest range, in samples, of the second search."""
 MIN_BLOCK_SAMPLES: Final = 32
-"""Smallest number of samples in a block. The mean square of fewer samples is far from Gaussian."""
+"""Smallest number of samples in a block."""
 MAX_VARIANCE_BLOCKS: Final = 4096
 MIN_VARIANCE_BLOCKS: Final = 8
-"""Smallest number of blocks or pieces for a variance history."""
+"""Smallest number of blocks or pieces for a test of the variance."""
 MIN_CYCLES: Final = 2
-"""Smallest number of periods in the recording. A slower variation is a trend."""
+"""Smallest number of periods of a periodic variance in the recording."""
 PIECE_SAMPLES: Final = (256, 2048)
 """Piece lengths of the spectrogram, in samples."""
 MIN_SQUARES_PER_CELL: Final = 64
-"""Smallest number of squared values in a tile of several pieces for which the row is tested for a constant power."""
+"""Smallest number of squares per tile in a test of a row for constant power."""
 MIN_SQUARES_FOR_DECREASE: Final = 8
-"""Smallest number of squared values in a tile for which a low power counts as evidence."""
+"""Smallest number of squares in a tile for which a low power is evidence."""
 
 
 @dataclass(frozen=True, slots=True)
 class VarianceStep:
-    """Step of the variance."""
+    """Step of the noise variance at one time."""
 
     gain: float  # log-likelihood gain over a constant variance, nats
     time: ValueWithInterval  # s from the first sample
@@ -60,7 +55,7 @@ class VarianceStep:
 
 @dataclass(frozen=True, slots=True)
 class VarianceChangeFit:
-    """Best step of the variance, and the log-likelihood gains of three alternatives over a constant variance."""
+    """Log-likelihood gains of a step and of three other changes over a constant variance."""
 
     step: VarianceStep
     trend_gain: float  # of ln σ² = a + b t + c t², nats
@@ -69,13 +64,13 @@ class VarianceChangeFit:
 
     @property
     def largest_alternative_gain(self) -> float:
-        """Largest gain of the three alternatives to a step, in nats."""
+        """Largest log-likelihood gain of the three changes other than a step, in nats."""
         return max(self.trend_gain, self.periodic_gain, self.slow_variation_gain)
 
 
 @dataclass(frozen=True, slots=True)
-class LeastConstantTiles:
-    """Tile that differs most from its row, and row whose power is least constant in time."""
+class SpectrogramChange:
+    """Tile and row of a spectrogram with the largest change of power over time."""
 
     gain: float  # log-likelihood gain of a separate power for the tile, nats
     time: tuple[float, float]  # time range of the tile, s from the first sample
@@ -84,12 +79,12 @@ class LeastConstantTiles:
     row: tuple[float, float]  # frequency range of the row, Hz
 
 
-def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
-    """Fit steps and other variations of the variance of white residuals.
+def fit_variance_changes(residuals: Floats, tau0_s: float) -> VarianceChangeFit:
+    """Fit a step and three other changes of the variance to white residuals.
 
     Parameters
     ----------
-    w : ndarray of float64, shape (n,)
+    residuals : ndarray of float64, shape (n,)
         White residuals without missing samples.
     tau0_s : float
         Sample period in seconds.
@@ -108,10 +103,10 @@ def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
-    _check_sample_count(w, MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES)
-    squares = w * w
-    length = max(MIN_BLOCK_SAMPLES, -(-w.size // MAX_VARIANCE_BLOCKS))
-    count = w.size // length
+    _check_sample_count(residuals, MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES)
+    squares = residuals * residuals
+    length = max(MIN_BLOCK_SAMPLES, -(-residuals.size // MAX_VARIANCE_BLOCKS))
+    count = residuals.size // length
     energy = squares[: count * length].reshape(count, length).mean(axis=1)
     scores = energy / energy.mean() - 1.0
     time = np.linspace(-1.0, 1.0, count)
@@ -123,12 +118,12 @@ def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
     )
 
 
-def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
-    """Find the tile and the row of the spectrogram whose power is least constant in time.
+def find_spectrogram_change(residuals: Floats, tau0_s: float) -> SpectrogramChange:
+    """Find the tile and the row of the spectrogram with the largest change of power.
 
     Parameters
     ----------
-    w : ndarray of float64, shape (n,)
+    residuals : ndarray of float64, shape (n,)
         White residuals without missing samples.
     tau0_s : float
         Sample period in seconds.
@@ -143,21 +138,20 @@ def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
     >>> rng = np.random.default_rng(0)
     >>> w, t = rng.standard_normal(60_000), 0.01 * np.arange(60_000)
     >>> w[30_000:40_000] += 0.3 * np.sin(2.0 * np.pi * 17.3 * t[30_000:40_000])
-    >>> found = find_least_constant_tiles(w, 0.01)
+    >>> found = find_spectrogram_change(w, 0.01)
     >>> found.gain > 50.0, found.frequency[0] < 17.3 < found.frequency[1]
     (True, True)
     """
-    _check_sample_count(w, MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0])
-    pieces = [piece for piece in PIECE_SAMPLES if w.size >= MIN_VARIANCE_BLOCKS * piece]
-    tiles, rows = zip(*(_best_tiles(_piece_spectra(w, piece), piece) for piece in pieces), strict=True)
+    _check_sample_count(residuals, MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0])
+    pieces = [piece for piece in PIECE_SAMPLES if residuals.size >= MIN_VARIANCE_BLOCKS * piece]
+    tiles, rows = zip(*(_best_tiles(_piece_spectra(residuals, piece), piece) for piece in pieces), strict=True)
     best, row = max(tiles), max(rows)
-    return LeastConstantTiles(
-        best.gain, best.time_s(tau0_s), best.frequency_hz(tau0_s), row.gain, row.frequency_hz(tau0_s)
+    return SpectrogramChange(
+        best.gain, best.time_range_s(tau0_s), best.frequency_range_hz(tau0_s), row.gain, row.frequency_range_hz(tau0_s)
     )
 
 
 def _check_sample_count(w: Floats, minimum: int) -> None:
-    """Raise ValueError if the series is too short."""
     if w.size < minimum:
         raise ValueError(f"the series has {w.size} samples; at least {minimum} are needed")
 
@@ -165,8 +159,7 @@ def _check_sample_count(w: Floats, minimum: int) -> None:
 def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:
     """Return the most likely step of the variance from the squares of the residuals.
 
-    The gain is first computed at every ``STEP_SEARCH_STRIDE``-th sample. If the likely times lie close together, the
-    gain is then computed at each sample between them.
+    The step time is first searched at every ``STEP_SEARCH_STRIDE``-th sample, and then at all samples near the maximum.
     """
     sums = np.cumsum(squares)
     k = np.arange(MIN_SEGMENT_SAMPLES, sums.size - MIN_SEGMENT_SAMPLES + 1, STEP_SEARCH_STRIDE)
@@ -196,7 +189,6 @@ def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:
 
 
 def _step_gains(sums: Floats, k: Ints) -> Floats:
-    """Return the log-likelihood gains of a step after ``k`` samples, from running sums of squares."""
     n, before, after = sums.size, sums[k - 1], sums[-1] - sums[k - 1]
     return np.asarray(0.5 * (n * np.log(sums[-1] / n) - k * np.log(before / k) - (n - k) * np.log(after / (n - k))))
 
@@ -204,8 +196,7 @@ def _step_gains(sums: Floats, k: Ints) -> Floats:
 def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
     """Return the log-likelihood gain of the variance model ln σ² = a + Σ b_i row_i over a constant variance.
 
-    ``energy`` contains means of ``length`` squares. The method is Fisher scoring of a Gamma model with logarithmic link
-    (McCullagh & Nelder 1989).
+    Fisher scoring fits a Gamma model with logarithmic link to means of ``length`` squares (McCullagh & Nelder 1989).
     """
     x = np.vstack([np.ones(energy.size), rows])
     normal = np.linalg.inv(x @ x.T)
@@ -222,7 +213,7 @@ def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
 
 
 def _periodic_gain(energy: Floats, scores: Floats, length: int) -> float:
-    """Return the log-likelihood gain of a periodic variation at the peak of the periodogram of the scores."""
+    """Return the log-likelihood gain of a periodic variance at the strongest frequency."""
     power = np.abs(np.fft.rfft(scores, 2 * scores.size)) ** 2
     power[: 2 * MIN_CYCLES] = 0.0
     best = int(power[:-1].argmax())
@@ -234,11 +225,10 @@ def _periodic_gain(energy: Floats, scores: Floats, length: int) -> float:
 
 
 def _slow_variation_gain(scores: Floats, length: int) -> float:
-    """Return the log-likelihood gain of a slow random variation.
+    """Return the log-likelihood gain of a slow random variation of the variance.
 
-    White scores have the variance 2/length, and their periodogram values are exponentially distributed with mean 1. If
-    the lowest K frequencies have the mean power p, a separate power for them gains K (p − 1 − ln p). The result is the
-    largest gain of all K = 2^j with p > 1.
+    Let p be the mean power of the K lowest frequencies. A separate variance for these frequencies has the gain K (p − 1
+    − ln p). The result is the largest gain of all K = 2^j with p > 1.
     """
     ordinates = np.abs(np.fft.rfft(scores)[1 : scores.size // 2]) ** 2 * length / (2.0 * scores.size)
     ends = 2 ** np.arange(2, int(np.log2(max(ordinates.size, 4))) + 1)
@@ -248,7 +238,7 @@ def _slow_variation_gain(scores: Floats, length: int) -> float:
 
 
 class _TileScore(NamedTuple):
-    """Tile of a spectrogram with the log-likelihood gain of a separate power for this tile."""
+    """Spectrogram tile with the log-likelihood gain of a separate power."""
 
     gain: float  # nats
     piece_samples: int
@@ -257,29 +247,25 @@ class _TileScore(NamedTuple):
     frequencies: int  # number of frequencies in the tile
     frequency_index: int
 
-    def time_s(self, tau0_s: float) -> tuple[float, float]:
-        """Return the time range in seconds for a sample period of ``tau0_s`` seconds."""
+    def time_range_s(self, tau0_s: float) -> tuple[float, float]:
+        """Return the time range of the tile in seconds."""
         length = self.pieces * self.piece_samples
         return self.time_index * length * tau0_s, (self.time_index + 1) * length * tau0_s
 
-    def frequency_hz(self, tau0_s: float) -> tuple[float, float]:
-        """Return the frequency range in Hz for a sample period of ``tau0_s`` seconds."""
+    def frequency_range_hz(self, tau0_s: float) -> tuple[float, float]:
+        """Return the frequency range of the tile in Hz."""
         first, step = self.frequency_index, self.piece_samples * tau0_s
         return first * self.frequencies / step, (first + 1) * self.frequencies / step
 
 
 def _piece_spectra(w: Floats, piece: int) -> Floats:
-    """Return the powers, shape (pieces, piece/2), of the Fourier coefficients at the frequencies (k + ½)/piece.
-
-    For white noise, each power has a χ² distribution with two degrees of freedom.
-    """
+    """Return the powers, shape (pieces, piece/2), of all pieces at the frequencies (k + ½)/piece."""
     half = np.exp(-1j * np.pi / piece * np.arange(piece))
     lines = fft(w[: w.size // piece * piece].reshape(-1, piece) * half, axis=1)[:, : piece // 2]
     return np.asarray(lines.real**2 + lines.imag**2)
 
 
 def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:
-    """Return the tile and the row with the largest gains, from powers of shape (pieces, frequencies)."""
     best = row = _TileScore(-1.0, piece, 1, 0, 1, 0)
     b, total = 1, power.sum(axis=0)
     while True:
@@ -301,9 +287,9 @@ def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:
 
 @compiled
 def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]:
-    """Return the minimum and maximum of each column with their positions, and the sum of the logarithms of the column.
+    """Return the minimum and maximum of each column, the positions, and the sum of the logarithms.
 
-    The logarithm is computed once for the product of eight values, which is faster.
+    For speed, the logarithm is computed for products of eight values.
     """
     rows, columns = power.shape
     low, high, logs = power[0].copy(), power[0].copy(), np.zeros(columns)
@@ -328,10 +314,8 @@ def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]
 def _best_contrast(x: Floats, total: Floats, inside: int, whole: int) -> tuple[float, int]:
     """Return the largest gain of a separate power for one tile of each row, and the index of the row.
 
-    ``x`` contains the sum of ``inside`` squares of one tile of each row. ``total`` contains the sum of all ``whole``
-    squares of the row. Let x be the sum of c squares in the tile, and R the sum of the d other squares. The gain is
-    then (c+d)/2 ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d). The gain is convex in x, so that the tile with the largest
-    gain has the smallest or the largest x of the row. A low power of a few squares does not count as evidence.
+    Let x be the sum of c squares in the tile, and R the sum of the other d squares of the row. The gain is (c+d)/2
+    ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d). A low power of only a few squares is ignored.
     """
     outside = whole - inside
     best, place = -1.0, 0
@@ -348,11 +332,10 @@ def _best_contrast(x: Floats, total: Floats, inside: int, whole: int) -> tuple[f
 
 
 def _bartlett_test(total: Floats, logs: Floats, count: int, squares: int) -> tuple[float, int]:
-    """Return −ln p of the row whose power is least constant, and the index of the row.
+    """Return −ln p of the row with the least constant power, and the index of the row.
 
-    ``total`` contains the sum, and ``logs`` the sum of the logarithms, of the ``count`` powers of each row. Bartlett's
-    statistic (1937) is c/2 Σ (ln m − ln x_i), with c squares in each power x_i and the mean m. The distribution of the
-    statistic is approximated by a Gamma distribution with the same mean and variance.
+    Bartlett's statistic (1937) is c/2 Σ (ln m − ln x_i), with c squares in each power x_i and the mean power m. A Gamma
+    distribution with the same mean and variance approximates the distribution.
     """
     uneven = 0.5 * squares * (count * np.log(total / count) - logs)
     j = int(uneven.argmax())
@@ -366,6 +349,6 @@ def _bartlett_test(total: Floats, logs: Floats, count: int, squares: int) -> tup
 
 @lru_cache(maxsize=1024)
 def _bartlett_moments(count: int, half: float) -> tuple[float, float]:
-    """Return the exact mean and variance of Bartlett's statistic for ``count`` sums of 2·``half`` squares each."""
+    """Return the mean and variance of Bartlett's statistic for ``count`` sums of 2·``half`` squares."""
     expected = half * count * (float(psi(count * half)) - float(np.log(count)) - float(psi(half)))
     return expected, half**2 * (count * float(polygamma(1, half)) - count**2 * float(polygamma(1, count * half)))

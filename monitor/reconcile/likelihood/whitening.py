@@ -1,7 +1,6 @@
-"""Whitening of an axis by a fitted model.
+"""Whitening of an axis by a fitted noise model.
 
-If the model is true, the whitened coefficients are independent with variance one, and so are the samples of the
-whitened series. All diagnostics work on a ``WhitenedAxis``.
+If the model is true, the whitened coefficients are independent and have a variance of one.
 """
 
 from dataclasses import dataclass
@@ -16,30 +15,28 @@ from monitor.noise.effects import NoiseStep
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.outlier_fit import OutlierFit, fit_outliers
 from monitor.reconcile.likelihood.variance_history import (
-    LeastConstantTiles,
+    SpectrogramChange,
     VarianceChangeFit,
-    find_least_constant_tiles,
+    find_spectrogram_change,
     fit_variance_changes,
 )
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 
 SLOW_BAND_FRACTION: Final = 0.01
-"""Fraction of the frequency range, from zero, that the tests of tails and variance ignore. A model describes low
-frequencies less accurately, and they contain little information about single samples.
+"""Fraction of the frequency range, from zero, that the tests for outliers and variance changes ignore.
 """
 MIN_COEFFICIENTS_PER_BIN: Final = 64
-"""Number of coefficients whose mean power has a standard error of 18 %. The power of smaller bins is averaged over
-``SMOOTHING_BINS`` bins.
+"""Smallest number of coefficients in a bin whose power is not smoothed. The standard error is 18 %.
 """
 SMOOTHING_BINS: Final = 9
-"""Number of bins over which the power of a small bin is averaged."""
+"""Number of neighbouring bins over which the power of a small bin is averaged."""
 MIN_DENSITY_RATIO: Final = 1e-3
-"""Smallest density of a bin relative to the median. Bins with less are stop bands without information about samples."""
+"""Smallest spectral density of a bin relative to the median. Bins below this limit are stop bands."""
 
 
 @dataclass(frozen=True, eq=False)
 class WhitenedAxis:
-    """Axis whitened by a model."""
+    """Axis whitened by a fitted noise model."""
 
     fit: AxisFit
     coefficients: Floats  # [n − 1] coefficients divided by the standard deviation; random draws in stop bands
@@ -49,49 +46,49 @@ class WhitenedAxis:
 
     @property
     def axis(self) -> Axis:
-        """Axis that was whitened."""
+        """Axis before whitening."""
         return self.fit.axis
 
     @property
     def effects(self) -> Effects:
-        """Fitted effects by which the axis was whitened."""
+        """Effects of the fitted noise model."""
         return self.fit.effects
 
     @property
-    def types(self) -> set[type[Effect]]:
+    def effect_types(self) -> set[type[Effect]]:
         """Types of the fitted effects."""
         return {type(effect) for effect in self.effects}
 
     @cached_property
     def variance_changes(self) -> VarianceChangeFit:
-        """Changes of the variance of the flattened series over time."""
+        """Changes of the variance of the flattened series."""
         return fit_variance_changes(self.flat_series, 1.0 / self.axis.rate_hz)
 
     @cached_property
-    def least_constant_tiles(self) -> LeastConstantTiles:
-        """Least constant tile and row of the spectrogram, after the noise steps of the model are removed."""
-        series = self.series / noise_deviation_over_time(self.fit)
-        return find_least_constant_tiles(series, 1.0 / self.axis.rate_hz)
+    def spectrogram_change(self) -> SpectrogramChange:
+        """Largest change of power in the spectrogram that no noise step of the model explains."""
+        series = self.series / relative_noise_deviation_over_time(self.fit)
+        return find_spectrogram_change(series, 1.0 / self.axis.rate_hz)
 
     @cached_property
-    def outliers(self) -> OutlierFit | None:
-        """Outliers of the flattened series, or None if a Gaussian fits as well as a mixture."""
+    def outlier_fit(self) -> OutlierFit | None:
+        """Fit of outliers to the flattened series, or None if a Gaussian fits equally well."""
         return fit_outliers(self.flat_series)
 
 
 def whiten_axis(fit: AxisFit) -> WhitenedAxis:
-    """Whiten an axis by a fitted model."""
+    """Whiten an axis by a fitted noise model."""
     axis = fit.axis
     weight = axis.bins.expand_to_coefficients(axis.used_bins / np.sqrt(fit.whittle.variance))
-    whitened = fit.residual_coefficients() * weight
+    whitened = fit.coefficients_without_deterministic_effects() * weight
     _replace_by_noise(whitened, np.flatnonzero(weight == 0.0))  # a diagnostic would detect a gap in the spectrum
     return WhitenedAxis(fit, whitened, weight, inverse_cosine_transform(whitened), _flattened_series(fit, whitened))
 
 
 def _flattened_series(fit: AxisFit, whitened: Floats) -> Floats:
-    """Return the whitened series, rescaled to unit power in each bin.
+    """Return the whitened series with unit power in each frequency bin.
 
-    The result has the tails and the variance of white noise, even if the spectrum of the model is wrong.
+    The flattened series has the tails and the variance of white noise, even if the spectrum of the model is wrong.
     """
     axis = fit.axis
     count, window = axis.bins.count, np.ones(SMOOTHING_BINS)
@@ -104,16 +101,15 @@ def _flattened_series(fit: AxisFit, whitened: Floats) -> Floats:
         flat, np.flatnonzero(axis.bins.expand_to_coefficients(density) < MIN_DENSITY_RATIO * np.median(density))
     )
     _replace_by_noise(flat, np.arange(int(SLOW_BAND_FRACTION * axis.n)))
-    return inverse_cosine_transform(flat) / noise_deviation_over_time(fit)
+    return inverse_cosine_transform(flat) / relative_noise_deviation_over_time(fit)
 
 
 def _replace_by_noise(coefficients: Floats, at: Ints) -> None:
-    """Replace the coefficients at the given indices by white noise. The seed is the number of indices."""
     coefficients[at] = np.random.default_rng(at.size).standard_normal(at.size)
 
 
-def noise_deviation_over_time(fit: AxisFit) -> Floats:
-    """Return the relative standard deviation over time, shape (n,), of white noise with the noise steps of a fit."""
+def relative_noise_deviation_over_time(fit: AxisFit) -> Floats:
+    """Return the standard deviation of the white noise over time, shape (n,), relative to the root mean square."""
     deviation = np.ones(fit.axis.n)
     for effect in fit.effects:
         if isinstance(effect, NoiseStep):

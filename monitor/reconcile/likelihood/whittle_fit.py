@@ -1,19 +1,16 @@
-"""Whittle likelihood of one axis, maximised jointly over the variances of the noise and the sizes of the regressors.
+"""Whittle likelihood of one axis, maximised over noise variances and regressor sizes.
 
-The cosine transform coefficients Y_k of an axis are independent and Gaussian (Whittle 1953). The mean of Y_k is
-Σ_i β_i R_ik with the transforms R_i of the regressors and the sizes β_i. The variance of the n_b coefficients in bin b
-is
+The cosine transform coefficients Y_k of an axis are independent and Gaussian (Whittle 1953). The mean of Y_k is Σ_i β_i
+R_ik with the regressor transforms R_i and the regressor sizes β_i. The variance of the n_b coefficients in bin b is
 
     v_b = c_b + Σ_j θ_j B_jb,    θ_j ≥ 0,
 
-with the fixed variance c_b, the variance bases B_j and the squared sizes θ_j of the noise effects. The residual power
-of bin b is P_b = Σ_k (Y_k − Σ_i β_i R_ik)², and the log-likelihood is
+with the fixed variance c_b, the variance bases B_j and the squared sizes θ_j of the noise effects. With the residual
+power P_b = Σ_k (Y_k − Σ_i β_i R_ik)² of bin b, the log-likelihood is
 
     ln L = −½ Σ_b (n_b ln v_b + P_b/v_b).
 
-The likelihood depends only on the sums over bins of the products of Y and R. Fisher scoring finds θ. Coordinate descent
-on the quadratic approximation respects the bound θ ≥ 0. Generalised least squares finds β for the current variances.
-The two steps alternate until ln L no longer increases. A step that does not increase ln L is halved.
+Fisher scoring for θ and generalised least squares for β alternate until ln L converges.
 """
 
 from dataclasses import dataclass
@@ -32,8 +29,8 @@ MIN_VARIANCE_RATIO: Final = 1e-20
 
 
 @dataclass(frozen=True, slots=True)
-class BinSums:
-    """Sums over bins of products of the axis Y and the regressors R."""
+class BinnedProductSums:
+    """Sums of products of the axis Y and the regressors R over each frequency bin."""
 
     power: Floats  # [m] Σ Y²
     cross: Floats  # [q, m] Σ R_i Y
@@ -53,25 +50,27 @@ class WhittleFit:
     beta_covariance: Floats  # [q, q] covariance of β
 
 
-def maximise_whittle(count: Floats, sums: BinSums, bases: Floats, constant: Floats, start: Floats) -> WhittleFit:
-    """Return the θ and β with the largest likelihood.
+def maximise_whittle_likelihood(
+    count: Floats, sums: BinnedProductSums, variance_bases: Floats, fixed_variance: Floats, start_theta: Floats
+) -> WhittleFit:
+    """Maximise the Whittle likelihood over the noise variances θ and the regressor sizes β.
 
     Parameters
     ----------
     count : ndarray of float64, shape (m,)
         Number of coefficients in each bin.
-    sums : BinSums
+    sums : BinnedProductSums
         Sums over bins of the products of the axis and the regressors.
-    bases : ndarray of float64, shape (p, m)
+    variance_bases : ndarray of float64, shape (p, m)
         Variance of a coefficient for θ_j = 1.
-    constant : ndarray of float64, shape (m,)
+    fixed_variance : ndarray of float64, shape (m,)
         Variance that is not fitted.
-    start : ndarray of float64, shape (p,)
+    start_theta : ndarray of float64, shape (p,)
         Starting values of θ.
     """
     floor = MIN_VARIANCE_RATIO * float((sums.power / np.maximum(count, 1.0)).max(initial=0.0)) or MIN_VARIANCE_RATIO
     theta, beta, variance, residual, likelihood, information, normal = _maximise(
-        count, sums.power, sums.cross, sums.gram, bases, constant + floor, np.maximum(start, 0.0)
+        count, sums.power, sums.cross, sums.gram, variance_bases, fixed_variance + floor, np.maximum(start_theta, 0.0)
     )
     covariance = np.linalg.pinv(normal) if beta.size else np.zeros((0, 0))
     return WhittleFit(theta, beta, variance, residual, float(likelihood), information, covariance)
@@ -81,7 +80,6 @@ def maximise_whittle(count: Floats, sums: BinSums, bases: Floats, constant: Floa
 def _maximise(
     count: Floats, power: Floats, cross: Floats, gram: Floats, bases: Floats, constant: Floats, start: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, float, Floats, Floats]:
-    """Alternate Fisher scoring for θ and least squares for β until the log-likelihood no longer increases."""
     theta = start.copy()
     variance, beta, normal, residual, best = _profile(theta, count, power, cross, gram, bases, constant)
     information = np.zeros((theta.size, theta.size))
@@ -106,10 +104,7 @@ def _maximise(
 def _profile(
     theta: Floats, count: Floats, power: Floats, cross: Floats, gram: Floats, bases: Floats, constant: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, float]:
-    """Return the variances, the best β with its normal matrix, the residuals and the log-likelihood for a given θ.
-
-    The log-likelihood has no constant term.
-    """
+    """Fit β for a given θ. Return the variances, β, the normal matrix, the residuals and the log-likelihood."""
     variance = constant.copy()
     for j in range(theta.size):
         if theta[j] > 0.0:
@@ -130,7 +125,6 @@ def _profile(
 def _score_and_information(
     count: Floats, bases: Floats, variance: Floats, residual: Floats, information: Floats
 ) -> Floats:
-    """Return the gradient of the log-likelihood with respect to θ, and write the Fisher information in place."""
     p, m = bases.shape
     gradient = np.zeros(p)
     for j in range(p):
@@ -149,7 +143,7 @@ def _score_and_information(
 
 @compiled
 def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Return the generalised least-squares estimate of β and its normal matrix.
+    """Return the generalised least-squares estimate of β and the normal matrix.
 
     A small ridge term allows collinear regressors.
     """
@@ -178,7 +172,6 @@ def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Flo
 
 @compiled
 def _residual(power: Floats, cross: Floats, gram: Floats, beta: Floats) -> Floats:
-    """Return the sum of squares in each bin after the regressors are removed."""
     q, m = cross.shape
     left = power.copy()
     for b in range(m):
@@ -193,7 +186,7 @@ def _residual(power: Floats, cross: Floats, gram: Floats, beta: Floats) -> Float
 
 @compiled
 def _nonnegative_maximum(information: Floats, gradient: Floats, theta: Floats) -> Floats:
-    """Return the maximum of the quadratic approximation over θ ≥ 0, by coordinate descent."""
+    """Maximise the quadratic approximation of the log-likelihood over θ ≥ 0 by coordinate descent."""
     p = theta.size
     found = theta.copy()
     slope = gradient.copy()

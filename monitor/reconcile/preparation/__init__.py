@@ -1,1 +1,1 @@
-"""Preparation of a recording: usable axes, value statistics, repair of samples, and the cosine transform."""
+"""Preparation of a recording: selection of axes, repair of samples, and cosine transform."""

@@ -1,15 +1,10 @@
-"""Orthonormal cosine transform (DCT-II) of one axis and sums of its coefficients over frequency bins.
+"""Orthonormal cosine transform (DCT-II) of an axis, and sums of coefficients over frequency bins.
 
-The transform needs no window. A stationary series of n samples has the coefficients Y_k for k = 1 … n − 1 at the
-frequencies f_k = k·rate/2n. The coefficients are nearly independent, and the variance of Y_k is nearly S(f_k)/τ0. For
-white noise and random walk, the independence and the variance are exact. The transform continues the series as a mirror
-image. Therefore, a slope or a step does not leak into other frequencies as in a periodogram. The coefficient Y_0, which
-contains the mean of the series, is not used, because the mean of a model is always free.
+A stationary series of n samples has nearly independent coefficients Y_k at the frequencies k·rate/2n. The variance of
+Y_k is nearly S(f_k)/τ0. The transform continues the series as a mirror image. A slope or a step therefore does not leak
+into other frequencies. The coefficient of the mean is not used, because the mean of an axis is always fitted.
 
-The likelihood needs only sums over bins. The bins are so narrow that the spectrum is nearly constant within a bin. The
-first ``SINGLE_COEFFICIENT_BINS`` coefficients have one bin each. ``BINS_PER_OCTAVE`` bins per octave follow. No bin is
-wider than ``MAX_BIN_WIDTH_HZ``. The bins are finer around narrow peaks and towards half the sample rate. A recording of
-one hour at 100 Hz has about 850 bins.
+The spectrum is nearly constant within a bin. The bins are finer around narrow peaks and near half the sample rate.
 """
 
 from collections.abc import Sequence
@@ -26,16 +21,16 @@ SINGLE_COEFFICIENT_BINS: Final = 48
 BINS_PER_OCTAVE: Final = 16
 MAX_BIN_WIDTH_HZ: Final = 0.1
 MAX_BIN_WIDTH_FRACTION: Final = 0.002
-"""Largest width of a bin as a fraction of the band. This limit matters for recordings with a low sample rate."""
+"""Largest width of a bin as a fraction of the frequency range."""
 BINS_PER_PEAK_SIDE: Final = 24
 """Number of bins on each side of a narrow peak."""
 PEAK_REACH_HALF_WIDTHS: Final = 30.0
-"""Distance from the centre of a peak, in half widths, up to which the bins are finer."""
+"""Distance from a narrow peak, in half widths, up to which the bins are finer."""
 
 
 @dataclass(frozen=True, slots=True)
-class Bins:
-    """Assignment of transform coefficients to frequency bins."""
+class FrequencyBins:
+    """Assignment of cosine transform coefficients to frequency bins."""
 
     first: Ints  # [m] k of the first coefficient of each bin, minus 1
     count: Floats  # [m] number of coefficients
@@ -43,16 +38,16 @@ class Bins:
     rate_hz: float
 
     def sum_over_bins(self, products: Floats) -> Floats:
-        """Return the sum over each bin, shape (m,), of one value for each coefficient, shape (n − 1,)."""
+        """Sum coefficient values, shape (n − 1,), over each bin, shape (m,)."""
         return np.asarray(np.add.reduceat(products, self.first))
 
     def expand_to_coefficients(self, bin_values: Floats) -> Floats:
-        """Return one value for each coefficient, shape (n − 1,), from one value for each bin, shape (m,)."""
+        """Repeat the value of each bin, shape (m,), for all coefficients of the bin, shape (n − 1,)."""
         return np.repeat(bin_values, self.count.astype(np.int64))
 
 
-def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> Bins:
-    """Return the frequency bins of a series.
+def build_frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> FrequencyBins:
+    """Build the frequency bins of a series.
 
     Parameters
     ----------
@@ -65,12 +60,12 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
 
     Returns
     -------
-    Bins
-        Bins that together contain all n − 1 coefficients.
+    FrequencyBins
+        Bins of all n − 1 coefficients.
 
     Examples
     --------
-    >>> found = frequency_bins(360_000, 100.0)
+    >>> found = build_frequency_bins(360_000, 100.0)
     >>> int(found.count.sum()), 700 < found.count.size < 1000
     (359999, True)
     """
@@ -80,8 +75,7 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
     edges = list(range(1, min(SINGLE_COEFFICIENT_BINS, n - 1) + 1))
     at = float(edges[-1])
     while at < n:
-        # The bins become narrower towards half the sample rate, because the spectrum near the null of a digital filter
-        # follows a power law.
+        # near half the sample rate, the spectrum of a digital filter decreases to zero
         at += max(min(at * ratio, (n - at) * ratio, widest), 1.0)
         edges.append(round(at))
     parts = [np.asarray(edges, np.int64)]
@@ -92,11 +86,11 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
     k = np.unique(np.concatenate(parts))
     first = k[(k >= 1) & (k < n)]
     last = np.append(first[1:], n)
-    return Bins(first - 1, (last - first).astype(np.float64), np.sqrt(first * (last - 1.0)) * step_hz, rate_hz)
+    return FrequencyBins(first - 1, (last - first).astype(np.float64), np.sqrt(first * (last - 1.0)) * step_hz, rate_hz)
 
 
 def cosine_transform(y: Floats) -> Floats:
-    """Return the cosine transform of a series, without the coefficient of the mean.
+    """Compute the orthonormal cosine transform of a series, without the coefficient of the mean.
 
     Parameters
     ----------
@@ -112,7 +106,7 @@ def cosine_transform(y: Floats) -> Floats:
 
 
 def inverse_cosine_transform(coefficients: Floats) -> Floats:
-    """Return the zero-mean series, shape (n,), that has the given coefficients, shape (n − 1,).
+    """Compute the zero-mean series, shape (n,), from the cosine transform, shape (n − 1,).
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Input of ``reconcile``: the recording, the selection of usable axes and the smoothing of the temperature."""
+"""Input of ``reconcile``: a recording with usable axes and a smoothed temperature."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,53 +11,52 @@ from drivers.errors import NotReady
 from monitor.noise.model import NoiseModel
 
 MIN_SAMPLES: Final = 4096
-"""Smallest number of samples. A spectrum and a spectrogram need at least this number."""
+"""Smallest number of valid samples of an axis."""
 MIN_VALID_FRACTION: Final = 0.5
 TEMPERATURE_SMOOTHING_FRACTION: Final = 0.001
-"""Length of the moving average of the temperature, as a fraction of the recording. The temperature of a sensor changes
-slowly, and thermometers are noisy.
+"""Length of the moving average of the noisy temperature, as a fraction of the recording.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Measured samples of one recording, with the sample rate and the temperature."""
+    """Recorded samples of several axes, with the sample rate and the temperature."""
 
     values: Mapping[str, Floats]  # axis -> [n] SI; NaN = missing
     rate_hz: float
     temperature_c: Floats | None = None  # [n] °C; NaN = missing
 
     @property
-    def samples(self) -> int:
+    def sample_count(self) -> int:
         """Number of samples of each axis."""
         return next(iter(self.values.values())).size
 
 
 def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[Recording, tuple[str, ...]]:
-    """Select the axes that can be compared.
+    """Select the axes that can be compared with a noise model, and smooth the temperature.
 
     Parameters
     ----------
     recording : Recording
-        Recording to check.
+        Recording with all axes.
     model : NoiseModel or None
-        Model under test. If None, every axis with enough samples and varying values is kept.
+        Noise model that must contain the axis. If None, no axis is excluded because of the model.
 
     Returns
     -------
     recording : Recording
         Recording with the selected axes and the smoothed temperature.
     notes : tuple of str
-        One sentence for each axis that is not used.
+        Reason for each excluded axis.
 
     Raises
     ------
     NotReady
         If the recording has too few samples or no usable axis.
     """
-    if recording.samples < MIN_SAMPLES:
+    if recording.sample_count < MIN_SAMPLES:
         raise NotReady(
-            f"the recording has {recording.samples} samples; at least {MIN_SAMPLES} are needed "
+            f"the recording has {recording.sample_count} samples; at least {MIN_SAMPLES} are needed "
             f"({MIN_SAMPLES / recording.rate_hz:.0f} s at {recording.rate_hz:g} Hz)"
         )
     notes, kept = [], {}
@@ -80,7 +79,6 @@ def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[
 
 
 def _smooth_temperature(temperature_c: Floats) -> Floats:
-    """Interpolate missing samples of the temperature and smooth the noise of the thermometer by a moving average."""
     known = np.flatnonzero(np.isfinite(temperature_c))
     whole = np.interp(np.arange(temperature_c.size), known, temperature_c[known])
     half = int(0.5 * TEMPERATURE_SMOOTHING_FRACTION * whole.size)

@@ -1,16 +1,10 @@
-"""Replacement of missing, wrong and clipped samples by plausible random draws.
+"""Replacement of missing, wrong and clipped samples by random samples with the same statistics.
 
-``fill_missing`` replaces each missing sample by the mean of good neighbours plus a random deviation. The deviation is
-that of a randomly chosen good sample, the **donor**, from the mean around the donor. Level, drift and white noise
-therefore continue through a gap. The neighbourhood is as wide as the drift allows. The mean contains the noise of the
-averaged samples. If p percent of the samples are missing and the noise is white, the spectral density below the inverse
-of the neighbourhood length is therefore 2p percent too high. Other frequencies are not affected. A long gap is filled
-along a line between the levels at both ends, with a random walk as strong as the drift of the recording.
+``fill_missing_samples`` adds a random deviation to the mean of neighbouring samples. The deviation is taken from a
+randomly chosen valid sample (**donor**). Mean level, drift and white noise therefore continue through missing samples.
+A long run of missing samples is filled by a random walk with the drift of the recording.
 
-``restore_clipped`` replaces each clipped sample by a draw from the tail of a Gaussian beyond the limit. The mean of the
-Gaussian is the local mean of the restored series.
-
-The functions do not change the input arrays, and good samples keep the measured values.
+``restore_clipped_samples`` replaces each clipped sample by a random sample from the tail of a Gaussian.
 """
 
 from typing import Final
@@ -20,37 +14,36 @@ from scipy.special import log_ndtr, ndtr, ndtri
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.reconcile.preparation.value_statistics import Mask
+from monitor.reconcile.preparation.value_artifacts import Mask
 
 NEIGHBOURHOOD_WIDTHS: Final = (1024, 256, 64, 16, 4)
-"""Possible numbers of neighbours on each side, widest first."""
+"""Possible numbers of neighbours on each side, in descending order."""
 MAX_VARIANCE_RATIO: Final = 1.01
-"""Largest prediction variance of a neighbourhood relative to the best one. A neighbourhood with a larger variance is
-too wide.
+"""Largest prediction variance of a neighbourhood, relative to the best neighbourhood.
 """
 MAX_WIDTH_TEST_SAMPLES: Final = 20_000
 DONOR_RANGE_SAMPLES: Final = 1024
-"""Number of good samples on each side among which the donor is chosen."""
+"""Number of valid samples on each side from which the donor is chosen."""
 LONG_GAP_SAMPLES: Final = 100
-"""Length in samples above which a gap is filled with a Brownian bridge."""
+"""Number of consecutive missing samples above which a Brownian bridge is used."""
 MIN_WANDER_INTERVALS: Final = 16
-"""Smallest ratio of the recording length to the interval over which the drift is measured."""
+"""Smallest ratio of recording length to the interval of the drift measurement."""
 CLIP_LEVEL_SAMPLES: Final = 64
-"""Number of samples on each side that determine the level of clipped samples."""
+"""Number of samples on each side that determine the mean level of clipped samples."""
 MAX_CLIP_ITERATIONS: Final = 50
 CLIP_TOLERANCE_SIGMA: Final = 1e-2
-"""Largest change of a sample, in standard deviations, that ends the iterations."""
+"""Largest change of a sample, in standard deviations, at convergence."""
 
 
-def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
-    """Return a copy of the series with masked and non-finite samples replaced.
+def fill_missing_samples(y: Floats, replace_mask: Mask, rng: np.random.Generator) -> Floats:
+    """Return a copy of a series with masked and non-finite samples replaced.
 
     Parameters
     ----------
     y : ndarray of float64, shape (n,)
         Series in the unit of the axis.
-    mask : ndarray of bool, shape (n,)
-        True for each sample to replace.
+    replace_mask : ndarray of bool, shape (n,)
+        True for each sample to be replaced.
     rng : numpy.random.Generator
         Generator for the replacement samples.
 
@@ -62,17 +55,17 @@ def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     Raises
     ------
     ValueError
-        If there is no good sample.
+        If the series contains no valid sample.
 
     Examples
     --------
     >>> rng = np.random.default_rng(0)
     >>> y = 5.0 + rng.standard_normal(100_000)
-    >>> new = fill_missing(y, rng.random(100_000) < 0.3, rng)
+    >>> new = fill_missing_samples(y, rng.random(100_000) < 0.3, rng)
     >>> print(f"{new.mean():.2f} {new.std():.2f}")
     5.00 1.00
     """
-    good = np.isfinite(y) & ~mask
+    good = np.isfinite(y) & ~replace_mask
     missing = np.flatnonzero(~good)
     new = y.copy()
     if not missing.size:
@@ -95,8 +88,8 @@ def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     return new
 
 
-def restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
-    """Return a copy of the series with clipped samples replaced by draws from beyond the limit.
+def restore_clipped_samples(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
+    """Return a copy of a series with each clipped sample replaced by a random sample beyond the limit.
 
     Parameters
     ----------
@@ -112,13 +105,13 @@ def restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Genera
     Returns
     -------
     ndarray of float64, shape (n,)
-        Series with values beyond the limit.
+        Series with random samples beyond the limit.
 
     Examples
     --------
     >>> rng = np.random.default_rng(0)
     >>> x = 0.5 + rng.standard_normal(100_000)
-    >>> new = restore_clipped(np.clip(x, -1.0, 1.0), 1.0, 1.0, rng)
+    >>> new = restore_clipped_samples(np.clip(x, -1.0, 1.0), 1.0, 1.0, rng)
     >>> print(f"{new.mean():.2f} {new.std():.2f}")
     0.50 1.00
     """
@@ -144,7 +137,7 @@ def restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Genera
 
 
 def _local_means(y: Floats, good: Mask, at: Ints) -> Floats:
-    """Return the means of the good samples within ``CLIP_LEVEL_SAMPLES`` samples of the given positions."""
+    """Return the means of the valid samples within ``CLIP_LEVEL_SAMPLES`` samples of given positions."""
     sums, counts = _running_sums(y, good, 0.0)
     lo, hi = np.maximum(at - CLIP_LEVEL_SAMPLES, 0), np.minimum(at + CLIP_LEVEL_SAMPLES + 1, y.size)
     return np.asarray((sums[hi] - sums[lo]) / (counts[hi] - counts[lo]))
@@ -152,7 +145,7 @@ def _local_means(y: Floats, good: Mask, at: Ints) -> Floats:
 
 @compiled
 def _running_sums(y: Floats, good: Mask, middle: float) -> tuple[Floats, Ints]:
-    """Return the sum of (sample − ``middle``) and the number of the good samples before each sample."""
+    """Return running sums and running counts of the valid samples, after subtraction of ``middle``."""
     sums, counts = np.empty(y.size + 1), np.empty(y.size + 1, np.int64)
     total, count = 0.0, 0
     for k in range(y.size):
@@ -165,7 +158,7 @@ def _running_sums(y: Floats, good: Mask, middle: float) -> tuple[Floats, Ints]:
 
 
 def _neighbourhood_width(y: Floats, where: Ints, sums: Floats, counts: Ints, middle: float) -> int:
-    """Return the widest neighbourhood whose mean predicts a sample nearly as well as the best neighbourhood does."""
+    """Return the largest neighbourhood width whose mean predicts a sample nearly as well as the best width."""
     some = where[:: max(1, where.size // MAX_WIDTH_TEST_SAMPLES)]
     errors = []
     for width in NEIGHBOURHOOD_WIDTHS:
@@ -187,11 +180,6 @@ def _neighbourhood_width(y: Floats, where: Ints, sums: Floats, counts: Ints, mid
 def _draw_missing(
     new: Floats, where: Ints, missing: Ints, sums: Floats, counts: Ints, middle: float, width: int, chances: Floats
 ) -> None:
-    """Fill the missing samples of ``new`` in place.
-
-    ``where`` contains the positions of the good samples. ``chances`` contains a random number in [0, 1) for each
-    missing sample.
-    """
     n = new.size
     for k in range(missing.size):
         at = missing[k]
@@ -216,8 +204,7 @@ def _draw_missing(
         from_, to = max(donor - width, 0), min(donor + width + 1, n)
         others = counts[to] - counts[from_]
         away = new[donor] - middle - (sums[to] - sums[from_]) / others
-        # If a sample has the variance 1, the mean of ``used`` samples has the variance 1/used, and the deviation of the
-        # donor has 1 − 1/others. The deviation is scaled so that the sum of mean and deviation has the variance 1.
+        # scale the deviation of the donor so that the variance of the new sample equals the variance of a valid sample
         grown = 1.0
         if used > 1.0 and others > 1:
             grown = ((1.0 - 1.0 / used) / (1.0 - 1.0 / others)) ** 0.5
@@ -225,7 +212,6 @@ def _draw_missing(
 
 
 def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> float:
-    """Return the variance per sample of a random walk as strong as the drift over about ``length`` samples."""
     n = counts.size - 1
     length = min(length, n // MIN_WANDER_INTERVALS)
     begins = np.arange(0, n - length - 2 * width, max(width, (n - length) // 2000 or 1))
@@ -245,9 +231,6 @@ def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> flo
 
 
 def _brownian_bridge(length: int, variance: float, rng: np.random.Generator) -> Floats:
-    """Return a random walk that is zero before the first sample and after the last sample.
-
-    ``variance`` is the variance per sample.
-    """
+    """Return a random walk with zero at both ends. ``variance`` is the variance per sample."""
     walk = np.cumsum(rng.standard_normal(length + 1)) * variance**0.5
     return np.asarray(walk[:-1] - walk[-1] * np.arange(1, length + 1) / (length + 1))

@@ -1,1 +1,1 @@
-"""Search for missing effects on one axis, with the checks that each effect must pass."""
+"""Search for missing effects on one axis, and tests of the effects that the search adds."""

@@ -1,9 +1,7 @@
-"""Replacement of the samples of an axis that are missing or that effects of the model have altered.
+"""Repair of the samples of an axis, by replacement of missing and altered samples.
 
-``sample_repair`` draws the replacement samples. Missing samples are always replaced. Repeated, outlying and clipped
-samples are replaced only if the model contains the effect. The positions of repeats of continuous values are known.
-Outliers are detected in the whitened axis. Measured and simulated recordings are repaired in the same way. The spectrum
-of a repaired axis depends only on the other effects.
+Missing samples are always replaced. Repeated, outlying and clipped samples are replaced if the effects of the axis
+include the cause. Measured and simulated recordings are repaired in the same way.
 """
 
 from collections.abc import Mapping
@@ -13,17 +11,17 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.noise.effects import Outliers, RandomSampleHold, Saturation
-from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache, ValueStatistics
+from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache, ValueArtifacts
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.outlier_fit import fit_outliers
 from monitor.reconcile.likelihood.whitening import whiten_axis
-from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
+from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform
 from monitor.reconcile.preparation.reconcile_input import Recording
-from monitor.reconcile.preparation.sample_repair import fill_missing, restore_clipped
-from monitor.reconcile.preparation.value_statistics import detect_clipping, detect_quantization, detect_repeats
+from monitor.reconcile.preparation.sample_repair import fill_missing_samples, restore_clipped_samples
+from monitor.reconcile.preparation.value_artifacts import detect_clipping, detect_quantization, detect_repeats
 
 CLIP_RELATIVE_TOLERANCE: Final = 1e-9
-"""Relative distance to the limit below which a sample counts as clipped."""
+"""Relative distance from the limit within which a sample is clipped."""
 MAX_SIGMA_ITERATIONS: Final = 40
 SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
 
@@ -31,12 +29,12 @@ SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
 def build_repaired_axes(
     recording: Recording, effects: Mapping[str, Effects], regressors: RegressorCache, rng: np.random.Generator
 ) -> dict[str, Axis]:
-    """Build the axes of one recording, with repaired samples.
+    """Build the axes of one recording with repaired samples.
 
     Parameters
     ----------
     recording : Recording
-        Measured or simulated recording. The temperature must not have missing samples.
+        Measured or simulated recording without missing temperatures.
     effects : mapping of str to tuple of Effect
         Effects of each axis in the model.
     regressors : RegressorCache
@@ -45,8 +43,8 @@ def build_repaired_axes(
         Generator for the replacement samples.
     """
     raw = recording.values
-    bins = frequency_bins(recording.samples, recording.rate_hz)
-    statistics = {name: measure_value_statistics(y) for name, y in raw.items()}
+    bins = build_frequency_bins(recording.sample_count, recording.rate_hz)
+    statistics = {name: detect_value_artifacts(y) for name, y in raw.items()}
     repaired = {name: _repair_samples(y, statistics[name], effects[name], rng) for name, y in raw.items()}
     coefficients = {name: cosine_transform(y) for name, y in repaired.items()}
     axes = {}
@@ -68,7 +66,7 @@ def build_repaired_axes(
 
 
 def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
-    """Return the axis with the measured samples repaired again, for a different set of effects.
+    """Repair the measured samples of an axis again for another set of effects.
 
     Parameters
     ----------
@@ -80,48 +78,42 @@ def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) ->
         Generator for the replacement samples.
     """
     return _replace_outliers(
-        axis.with_samples(_repair_samples(axis.raw, axis.value_statistics, effects, rng)), effects, rng
+        axis.with_repaired_samples(_repair_samples(axis.raw, axis.value_artifacts, effects, rng)), effects, rng
     )
 
 
 def _may_leak(source: str, axis: str) -> bool:
-    """Return True if one axis may leak into another.
-
-    Any axis may leak into a gyroscope axis. Only accelerometer axes may leak into an accelerometer axis.
-    """
+    """Return True if one axis can leak into another axis. A gyroscope never leaks into an accelerometer."""
     return source != axis and (axis.startswith("g") or source.startswith("a"))
 
 
-def measure_value_statistics(y: Floats) -> ValueStatistics:
-    """Return the quantization, clipping and repeats of measured samples ``y``, shape (n,), in rad/s or m/s²."""
+def detect_value_artifacts(y: Floats) -> ValueArtifacts:
+    """Detect quantization, clipping and repeats in measured samples, shape (n,), in rad/s or m/s²."""
     grid = detect_quantization(y)
     step = grid.step.value if grid else 0.0
     ends = detect_clipping(y, step)
-    return ValueStatistics(grid, ends, detect_repeats(y, step, ends.limit.value if ends and ends.symmetric else np.inf))
+    return ValueArtifacts(grid, ends, detect_repeats(y, step, ends.limit.value if ends and ends.symmetric else np.inf))
 
 
-def _repair_samples(y: Floats, statistics: ValueStatistics, effects: Effects, rng: np.random.Generator) -> Floats:
-    """Return the samples ``y``, shape (n,), with missing, repeated and clipped samples replaced.
-
-    Repeated and clipped samples are replaced only if the effects include ``RandomSampleHold`` or ``Saturation``.
-    """
+def _repair_samples(y: Floats, statistics: ValueArtifacts, effects: Effects, rng: np.random.Generator) -> Floats:
+    """Replace missing samples, and repeated or clipped samples if the effects include the cause."""
     missing = ~np.isfinite(y)
     types = {type(effect) for effect in effects}
     if RandomSampleHold in types and statistics.repeats:
         missing = missing | statistics.repeats.mask
-    repaired = fill_missing(y, missing, rng)
+    repaired = fill_missing_samples(y, missing, rng)
     if Saturation not in types or statistics.clipping is None or not statistics.clipping.symmetric:
         return repaired
-    return _restore_clipped(repaired, statistics.clipping.limit.value, rng)
+    return _restore_clipped_samples(repaired, statistics.clipping.limit.value, rng)
 
 
-def _restore_clipped(y: Floats, limit: float, rng: np.random.Generator) -> Floats:
-    """Replace the clipped samples repeatedly, until the standard deviation of the noise converges."""
+def _restore_clipped_samples(y: Floats, limit: float, rng: np.random.Generator) -> Floats:
+    """Restore the clipped samples repeatedly until the standard deviation of the noise converges."""
     inside = np.abs(y) < limit * (1.0 - CLIP_RELATIVE_TOLERANCE)
     sigma = float(np.std(np.diff(y)[inside[1:] & inside[:-1]])) / 2.0**0.5
     whole = y
     for _ in range(MAX_SIGMA_ITERATIONS):
-        whole = restore_clipped(y, limit, sigma, rng)
+        whole = restore_clipped_samples(y, limit, sigma, rng)
         before, sigma = sigma, float(np.std(np.diff(whole))) / 2.0**0.5
         if abs(sigma - before) < SIGMA_RELATIVE_TOLERANCE * sigma:
             break
@@ -129,8 +121,7 @@ def _restore_clipped(y: Floats, limit: float, rng: np.random.Generator) -> Float
 
 
 def _replace_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
-    """Return the axis with the outliers replaced, if the effects include outliers."""
     if not any(isinstance(effect, Outliers) for effect in effects):
         return axis
     found = fit_outliers(whiten_axis(fit_with_fixed_noise(axis, effects).fit).flat_series)
-    return axis if found is None else axis.with_samples(fill_missing(axis.repaired, found.mask, rng))
+    return axis if found is None else axis.with_repaired_samples(fill_missing_samples(axis.repaired, found.mask, rng))

@@ -1,10 +1,8 @@
 """Candidate effects for one axis, with starting values from the data.
 
-Each function takes a whitened axis and proposes effects of one kind. The shape parameters of a proposed effect are
-fitted together with the effects by which the axis was whitened. The caller fits the sizes. The log-likelihood gain of
-an effect must exceed the penalty in ``PENALTY_NATS``. The penalty is the gain that an effect reaches by chance if the
-model is true. The penalty is larger for effects that can occur at many frequencies or times, and for effects with
-fitted shape parameters. The values are empirical.
+Each function proposes effects of one kind for a whitened axis. Shape parameters are fitted here, and the caller fits
+the sizes. ``PENALTY_NATS`` contains the log-likelihood gain that an effect reaches by chance. The penalties are
+empirical. Effects that can occur at many frequencies or times have larger penalties.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,9 +30,13 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.diagnostics import find_line_peaks, free_variance_gain_nats, level_step_gains
+from monitor.reconcile.diagnostics.diagnostics import (
+    compute_level_step_gains,
+    find_periodogram_peaks,
+    fitted_variance_gain_nats,
+)
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
-from monitor.reconcile.likelihood.hypothesis import refine_shape
+from monitor.reconcile.likelihood.hypothesis import fit_shape_parameter
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 
 PENALTY_NATS: Final[dict[str, float]] = {
@@ -67,13 +69,13 @@ PENALTY_NATS: Final[dict[str, float]] = {
 SHAPES_PER_DECADE: Final = 4
 """Number of shape values per decade in the first search."""
 MAX_CORRELATION_FRACTION: Final = 0.1
-"""Longest correlation time as a fraction of the recording. With a longer one, the noise resembles a random walk."""
+"""Longest correlation time, as a fraction of the recording length."""
 MAX_TIME_CONSTANT_FRACTION: Final = 0.4
-"""Longest time constant of a transient or delay as a fraction of the recording. Longer transients resemble a slope."""
+"""Longest time constant of a transient or delay, as a fraction of the recording length."""
 PEAK_SEPARATION_STEPS: Final = 24
-"""Distance, in quarters of the window width, within which two windows contain the same peak."""
+"""Smallest distance between two peaks, in quarters of the window width."""
 MIN_DELAY_FRACTION: Final = 0.002
-"""Shortest temperature delay as a fraction of the recording. The noise of the thermometer hides shorter delays."""
+"""Shortest temperature delay, as a fraction of the recording length."""
 MAX_PEAKS: Final = 2
 FILTER_ORDERS: Final = (1, 2, 3, 4)
 
@@ -81,20 +83,20 @@ CandidateFunction = Callable[[WhitenedAxis], list[Effect]]
 """Function that proposes effects of one kind."""
 
 
-def propose_classic_terms(whitened: WhitenedAxis) -> list[Effect]:
-    """Return those terms of Q, N, B and K that the hypothesis does not contain."""
-    small = initial_size(whitened.axis)
+def propose_allan_terms(whitened: WhitenedAxis) -> list[Effect]:
+    """Propose the noise terms Q, N, B and K that the current hypothesis lacks."""
+    small = initial_effect_size(whitened.axis)
     every = (QuantizationNoise(Q=small), AngleRandomWalk(N=small), BiasInstability(B=small), RateRandomWalk(K=small))
-    return [effect for effect in every if type(effect) not in whitened.types]
+    return [effect for effect in every if type(effect) not in whitened.effect_types]
 
 
 def propose_correlated_noise(whitened: WhitenedAxis) -> list[Effect]:
-    """Return the best exponentially correlated noise. The list is empty if the correlation time is out of range."""
+    """Propose exponentially correlated noise, if a suitable correlation time is found."""
     return fit_correlated_noise(whitened.axis, whitened.effects)
 
 
 def fit_correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
-    """Return the best exponentially correlated noise. The list is empty if the correlation time is out of range.
+    """Fit exponentially correlated noise. The list is empty if the correlation time is out of range.
 
     Parameters
     ----------
@@ -108,31 +110,35 @@ def fit_correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
         return []
     times_s = np.geomspace(shortest, longest, max(3, round(SHAPES_PER_DECADE * np.log10(longest / shortest))))
     best = _most_likely(
-        axis, effects, [ExponentiallyCorrelated(sigma=initial_size(axis), correlation_time=float(t)) for t in times_s]
+        axis,
+        effects,
+        [ExponentiallyCorrelated(sigma=initial_effect_size(axis), correlation_time=float(t)) for t in times_s],
     )
-    found = refine_shape(axis, effects, best, "correlation_time", 2.0)
+    found = fit_shape_parameter(axis, effects, best, "correlation_time", 2.0)
     assert isinstance(found, ExponentiallyCorrelated)
     return [found] if shortest <= found.correlation_time <= longest else []
 
 
 def propose_resonances(whitened: WhitenedAxis) -> list[Effect]:
-    """Return resonances at the peaks of the whitened spectrum."""
+    """Propose resonances at the peaks of the whitened spectrum."""
     axis, found = whitened.axis, list[Effect]()
     for middle, width in find_spectral_peaks(whitened):
         trials = [
-            Narrowband(sigma=initial_size(axis), frequency=middle, bandwidth=float(width * factor))
+            Narrowband(sigma=initial_effect_size(axis), frequency=middle, bandwidth=float(width * factor))
             for factor in (0.3, 0.6, 1.0, 1.8)
         ]
         peak = _most_likely(axis, whitened.effects, trials)
-        peak = refine_shape(axis, whitened.effects, peak, "bandwidth", 2.5)
+        peak = fit_shape_parameter(axis, whitened.effects, peak, "bandwidth", 2.5)
         assert isinstance(peak, Narrowband)
-        peak = refine_shape(axis, whitened.effects, peak, "frequency", 1.0 + 0.7 * peak.bandwidth / peak.frequency)
-        found.append(refine_shape(axis, whitened.effects, peak, "bandwidth", 1.5))
+        peak = fit_shape_parameter(
+            axis, whitened.effects, peak, "frequency", 1.0 + 0.7 * peak.bandwidth / peak.frequency
+        )
+        found.append(fit_shape_parameter(axis, whitened.effects, peak, "bandwidth", 1.5))
     return found
 
 
 def find_spectral_peaks(whitened: WhitenedAxis, max_peaks: int = MAX_PEAKS) -> list[tuple[float, float]]:
-    """Return the peaks of the whitened spectrum that are wider than a line, strongest first.
+    """Find the peaks of the whitened spectrum that are wider than a spectral line, in descending order.
 
     Parameters
     ----------
@@ -154,7 +160,7 @@ def find_spectral_peaks(whitened: WhitenedAxis, max_peaks: int = MAX_PEAKS) -> l
     while width < n // 8:
         first = np.arange(width, n - 1 - width, max(1, width // 4))
         power = np.maximum((running[first + width] - running[first]) / width, 1.0)
-        gains = free_variance_gain_nats(power, np.full(first.size, width))
+        gains = fitted_variance_gain_nats(power, np.full(first.size, width))
         for _ in range(max_peaks):
             at = int(np.argmax(gains))
             middle = (first[at] + 0.5 * width) * step_hz
@@ -171,16 +177,16 @@ def find_spectral_peaks(whitened: WhitenedAxis, max_peaks: int = MAX_PEAKS) -> l
 
 
 def propose_sinusoids(whitened: WhitenedAxis) -> list[Effect]:
-    """Return sinusoids at the lines of the spectrum."""
+    """Propose sinusoids at the strongest spectral lines."""
     return [
-        Sinusoidal(amplitude=initial_size(whitened.axis), frequency=_line_frequency(whitened, f_hz), phase=0.0)
-        for gain, f_hz in find_line_peaks(whitened.series, whitened.axis.rate_hz, MAX_PEAKS)
+        Sinusoidal(amplitude=initial_effect_size(whitened.axis), frequency=_line_frequency(whitened, f_hz), phase=0.0)
+        for gain, f_hz in find_periodogram_peaks(whitened.series, whitened.axis.rate_hz, MAX_PEAKS)
         if gain > PENALTY_NATS["sinusoidal"] / 2.0
     ]
 
 
 def _line_frequency(whitened: WhitenedAxis, f_hz: float) -> float:
-    """Return the frequency of the maximum of the periodogram near ``f_hz``."""
+    """Return the frequency, near ``f_hz``, with the largest value of the periodogram."""
     t = np.arange(whitened.axis.n) / whitened.axis.rate_hz
     half = 0.5 * whitened.axis.rate_hz / whitened.axis.n
 
@@ -195,11 +201,8 @@ def _line_frequency(whitened: WhitenedAxis, f_hz: float) -> float:
 
 
 def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
-    """Return the best low-pass filter.
-
-    The list is empty if the hypothesis contains a low-pass filter, or if the best cut-off is half the sample rate.
-    """
-    if BandwidthLimit in whitened.types:
+    """Propose a low-pass filter, if the current hypothesis contains none."""
+    if BandwidthLimit in whitened.effect_types:
         return []
     axis = whitened.axis
     nyquist = 0.5 * axis.rate_hz
@@ -207,7 +210,7 @@ def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
     found: list[Effect] = []
     for order in FILTER_ORDERS:
         best = _most_likely(axis, whitened.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
-        refined = refine_shape(axis, whitened.effects, best, "cutoff", 1.4)
+        refined = fit_shape_parameter(axis, whitened.effects, best, "cutoff", 1.4)
         assert isinstance(refined, BandwidthLimit)
         if refined.cutoff < 0.99 * nyquist:
             found.append(refined)
@@ -215,31 +218,31 @@ def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def propose_drifts(whitened: WhitenedAxis) -> list[Effect]:
-    """Return effects that depend on time: a ramp, a transient after the start, and a step."""
+    """Propose a ramp, a transient at the start, and a step of the bias."""
     found: list[Effect] = []
-    if RateRamp not in whitened.types:
-        found.append(RateRamp(R=initial_size(whitened.axis)))
-    if TurnOnTransient not in whitened.types:
+    if RateRamp not in whitened.effect_types:
+        found.append(RateRamp(R=initial_effect_size(whitened.axis)))
+    if TurnOnTransient not in whitened.effect_types:
         times_s = np.geomspace(0.003, MAX_TIME_CONSTANT_FRACTION, 9) * whitened.axis.length_s
         trials = [TurnOnTransient(amplitude=1.0, time_constant=float(t)) for t in times_s]
         found += _best_time_constant(whitened, trials, 1.6, 0.0)
-    if not whitened.types & {PoissonSteps, RandomTelegraph}:
-        gains, times_s = level_step_gains(whitened)
+    if not whitened.effect_types & {PoissonSteps, RandomTelegraph}:
+        gains, times_s = compute_level_step_gains(whitened)
         found.append(BiasStep(time=float(times_s[int(np.argmax(gains))]), height=1.0))
     return found
 
 
 def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
-    """Return linear, quadratic and delayed temperature effects."""
+    """Propose linear, quadratic and delayed temperature effects."""
     temperature_c = whitened.axis.temperature_c
     if temperature_c is None or np.ptp(temperature_c) == 0.0:
         return []
     reference = float(round(temperature_c.mean(), 2))
     found: list[Effect] = []
-    if TemperatureBias not in whitened.types:
+    if TemperatureBias not in whitened.effect_types:
         found.append(TemperatureBias(coefficient=1.0, reference=reference))
         found.append(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0))
-    if TemperatureLag not in whitened.types:
+    if TemperatureLag not in whitened.effect_types:
         shortest_s = MIN_DELAY_FRACTION * whitened.axis.length_s
         times_s = np.geomspace(shortest_s, MAX_TIME_CONSTANT_FRACTION * whitened.axis.length_s, 9)
         lags = [TemperatureLag(coefficient=1.0, reference=reference, time_constant=float(t)) for t in times_s]
@@ -250,16 +253,16 @@ def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
 def _best_time_constant(
     whitened: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], search_factor: float, shortest_s: float
 ) -> list[Effect]:
-    """Return the best effect with a fitted time constant. The list is empty if the time constant is out of range."""
+    """Return the most likely effect, or an empty list if the fitted time constant is out of range."""
     best = _most_likely(whitened.axis, whitened.effects, trials)
-    refined = refine_shape(whitened.axis, whitened.effects, best, "time_constant", search_factor)
+    refined = fit_shape_parameter(whitened.axis, whitened.effects, best, "time_constant", search_factor)
     assert isinstance(refined, (TurnOnTransient, TemperatureLag))
     longest_s = MAX_TIME_CONSTANT_FRACTION * whitened.axis.length_s
     return [refined] if shortest_s < refined.time_constant <= longest_s else []
 
 
-def propose_leaks(whitened: WhitenedAxis) -> list[Effect]:
-    """Return a leak from each axis that the hypothesis does not already contain as a source."""
+def propose_leaks_from_other_axes(whitened: WhitenedAxis) -> list[Effect]:
+    """Propose a leak from each other axis that is not yet a source of a leak."""
     known = {getattr(effect, "source", None) for effect in whitened.effects}
     found: list[Effect] = []
     for source in whitened.axis.leak_sources:
@@ -271,7 +274,7 @@ def propose_leaks(whitened: WhitenedAxis) -> list[Effect]:
 
 
 NOISE_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
-    propose_classic_terms,
+    propose_allan_terms,
     propose_correlated_noise,
     propose_resonances,
     propose_sinusoids,
@@ -281,16 +284,15 @@ NOISE_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
 DETERMINISTIC_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
     propose_drifts,
     propose_temperature_effects,
-    propose_leaks,
+    propose_leaks_from_other_axes,
 )
 """Functions that propose effects that depend on time, temperature or another axis."""
 
 
 def _most_likely(axis: Axis, effects: Effects, trials: Sequence[Effect]) -> Effect:
-    """Return the effect with the largest likelihood when all sizes are fitted."""
     return max(trials, key=lambda one: axis.fit((*effects, one)).log_likelihood)
 
 
-def initial_size(axis: Axis) -> float:
-    """Return a starting value for a size, which is small compared with the standard deviation of the samples."""
-    return 1e-3 * axis.rms
+def initial_effect_size(axis: Axis) -> float:
+    """Return a small starting value for the size of an effect, relative to the noise of the axis."""
+    return 1e-3 * axis.coefficient_rms

@@ -1,10 +1,8 @@
 """Cross-validation of a new effect on the two halves of a recording.
 
-The hypotheses before and after the step are fitted to one half of the recording. Both fits are then tested on the other
-half with the diagnostic that detected the difference. The test is repeated with the halves exchanged. The effect is
-kept if the gap decreases and the likelihood of the test halves increases. An effect that happens once cannot be
-validated. An effect with an expected gain below ``MIN_HALF_GAIN_NATS`` in one half cannot be validated either. These
-effects are kept, and the reason is reported.
+The hypotheses with and without the effect are fitted to one half and tested on the other half. The effect is kept if
+the likelihood of the other half increases and the gap of the diagnostic decreases. One-time effects, and effects with
+too little evidence in one half, are kept without cross-validation.
 """
 
 from collections.abc import Collection
@@ -20,22 +18,22 @@ from monitor.noise.effects import Outliers, RandomSampleHold, Resolution, Satura
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects, RegressorCache
-from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, ONE_TIME_EFFECTS, size
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, noise_indices
+from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, ONE_TIME_EFFECTS, effect_size
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, noise_effect_indices
 from monitor.reconcile.likelihood.whitening import whiten_axis
-from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins, inverse_cosine_transform
-from monitor.reconcile.search.axis_repair import measure_value_statistics, repair_axis_again
+from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
+from monitor.reconcile.search.axis_repair import detect_value_artifacts, repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
-"""Smallest gain in nats of an effect in one half of the recording."""
+"""Smallest log-likelihood gain of an effect in one half of the recording, in nats."""
 SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers)
 """Effects that alter single samples."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
 
 
 @dataclass(frozen=True, slots=True)
-class CrossValidation:
-    """Result of the cross-validation of one step."""
+class CrossValidationResult:
+    """Result of the cross-validation of one search step."""
 
     before: float  # gap without the step, standard deviations
     after: float  # gap with the step, standard deviations
@@ -43,82 +41,78 @@ class CrossValidation:
     reason: str  # reason why the step was not validated, or empty; without validation, the gaps are NaN
 
 
-def not_validated(reason: str) -> CrossValidation:
-    """Return the result for a step that cannot be validated and is kept."""
-    return CrossValidation(float("nan"), float("nan"), True, reason)
+def accept_without_validation(reason: str) -> CrossValidationResult:
+    """Return a result that accepts a search step without cross-validation."""
+    return CrossValidationResult(float("nan"), float("nan"), True, reason)
 
 
 def cross_validate(
     before: Hypothesis,
     after: Hypothesis,
-    added: Effect | None,
-    lens: str,
+    added_effect: Effect | None,
+    diagnostic: str,
     null: NullDistribution,
     rng: np.random.Generator,
-) -> CrossValidation:
-    """Cross-validate a step on the two halves of an axis.
+) -> CrossValidationResult:
+    """Cross-validate a search step on the two halves of an axis.
 
     Parameters
     ----------
     before, after : Hypothesis
-        Effects before and after the step, fitted to the whole axis. The axis of ``after`` is repaired with the effects
-        of ``after``.
-    added : Effect or None
-        Effect that was added, or None if only sizes of the model were changed.
-    lens : str
+        Hypotheses before and after the step, fitted to the whole axis.
+    added_effect : Effect or None
+        Added effect, or None if the step changed only sizes.
+    diagnostic : str
         Name of the diagnostic that detected the difference.
     null : NullDistribution
         Null distribution of the diagnostic.
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
-    if added is not None and added.name in ONE_TIME_EFFECTS:
-        return not_validated("the effect happens only once")
+    if added_effect is not None and added_effect.name in ONE_TIME_EFFECTS:
+        return accept_without_validation("the effect happens only once")
     n = after.axis.n
     parts = [slice(0, n // 2), slice(n - n // 2, n)]
     sources = {getattr(effect, "source", "") for effect in (*before.effects, *after.effects)}
     repaired = [_half_axis(after.axis, part, after.effects, sources, rng) for part in parts]
-    if isinstance(added, SAMPLE_EFFECTS):
+    if isinstance(added_effect, SAMPLE_EFFECTS):
         halves = [_half_axis(after.axis, part, before.effects, sources, rng) for part in parts]
-        gap_before, gap_after = _summed_gap(halves, before, lens), _summed_gap(repaired, after, lens)
-        return CrossValidation(gap_before, gap_after, gap_after < gap_before, "")
-    if type(added) in DETERMINISTIC_SIZE_PARAMETERS:
+        gap_before, gap_after = _summed_gap(halves, before, diagnostic), _summed_gap(repaired, after, diagnostic)
+        return CrossValidationResult(gap_before, gap_after, gap_after < gap_before, "")
+    if type(added_effect) in DETERMINISTIC_SIZE_PARAMETERS:
         gains = [_expected_gain(_fit_half(half, after), after.effects[-1]) for half in repaired]
         if min(gains) < MIN_HALF_GAIN_NATS:
-            return not_validated(TOO_LITTLE_EVIDENCE)
+            return accept_without_validation(TOO_LITTLE_EVIDENCE)
     if after.fit.log_likelihood - before.fit.log_likelihood < 4.0 * MIN_HALF_GAIN_NATS:
-        return not_validated(TOO_LITTLE_EVIDENCE)
-    return _exchange_halves(repaired, before, after, lens, null)
+        return accept_without_validation(TOO_LITTLE_EVIDENCE)
+    return _exchange_halves(repaired, before, after, diagnostic, null)
 
 
 def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
-    """Fit the effects of a hypothesis to one half. Sizes that are fixed in the hypothesis stay fixed."""
     return half.fit(hypothesis.effects, hypothesis.fit.fixed_noise)
 
 
-def _summed_gap(halves: list[Axis], hypothesis: Hypothesis, lens: str) -> float:
-    """Return the combined gap of a diagnostic in both halves. The hypothesis is fitted to each half separately."""
-    return sqrt(sum(DIAGNOSTICS[lens](whiten_axis(_fit_half(half, hypothesis))).gain for half in halves))
+def _summed_gap(halves: list[Axis], hypothesis: Hypothesis, diagnostic: str) -> float:
+    """Return the combined difference in a diagnostic after separate fits to both halves."""
+    return sqrt(sum(DIAGNOSTICS[diagnostic](whiten_axis(_fit_half(half, hypothesis))).gain for half in halves))
 
 
 def _exchange_halves(
-    halves: list[Axis], before: Hypothesis, after: Hypothesis, lens: str, null: NullDistribution
-) -> CrossValidation:
-    """Fit each half, with and without the step, and test the fit on the other half."""
+    halves: list[Axis], before: Hypothesis, after: Hypothesis, diagnostic: str, null: NullDistribution
+) -> CrossValidationResult:
     gaps = np.zeros(2)
     better = 0.0
     for learn, test in ((0, 1), (1, 0)):
         for at, hypothesis in enumerate((before, after)):
             predicted = _predict_half(halves[test], _fit_half(halves[learn], hypothesis))
-            gaps[at] += DIAGNOSTICS[lens](whiten_axis(predicted)).gain
+            gaps[at] += DIAGNOSTICS[diagnostic](whiten_axis(predicted)).gain
             better += predicted.log_likelihood * (2 * at - 1)
     gap_before, gap_after = (sqrt(gain) for gain in gaps)
     below = gap_after < max(gap_before, sqrt(2.0 * null.threshold))
-    return CrossValidation(gap_before, gap_after, bool(better > 0.0 and below), "")
+    return CrossValidationResult(gap_before, gap_after, bool(better > 0.0 and below), "")
 
 
 def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[str], rng: np.random.Generator) -> Axis:
-    """Return one half of an axis as a new axis."""
     raw, y = axis.raw[part], axis.repaired[part]
     temperature_c = None if axis.temperature_c is None else axis.temperature_c[part]
     others = {
@@ -131,40 +125,40 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
         raw,
         y,
         cosine_transform(y),
-        frequency_bins(raw.size, axis.rate_hz),
+        build_frequency_bins(raw.size, axis.rate_hz),
         others,
         temperature_c,
-        measure_value_statistics(raw),
+        detect_value_artifacts(raw),
         RegressorCache(raw.size, axis.rate_hz, temperature_c),
     )
     return repair_axis_again(half, effects, rng)
 
 
 def _expected_gain(fit: AxisFit, effect: Effect) -> float:
-    """Return the expected gain in nats of a deterministic effect with its present size.
+    """Return the expected log-likelihood gain, in nats, of a deterministic effect.
 
-    The gain is ½ Σ s²/v with the transform s of the series of the effect and the variance v of the fitted noise.
+    The gain is ½ Σ s²/v with the transform s of the effect and the variance v of the noise.
     """
     half = fit.axis
-    columns = half.regressor_transforms(effect)
+    columns = half.regressor_cosine_transforms(effect)
     weight = half.bins.expand_to_coefficients(half.used_bins / fit.whittle.variance)
     if isinstance(effect, Sinusoidal):
         return 0.5 * effect.amplitude**2 * float((columns[0] ** 2 * weight).sum())
     quadratic = getattr(effect, "quadratic", None)
-    made = size(effect) * columns[0] + (quadratic * columns[1] if quadratic is not None else 0.0)
+    made = effect_size(effect) * columns[0] + (quadratic * columns[1] if quadratic is not None else 0.0)
     return 0.5 * float((made**2 * weight).sum())
 
 
 def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
-    """Apply the fit of one half of an axis, ``learned``, to the other half.
+    """Apply the fit of one half of an axis to the other half.
 
-    Noise effects have the learned sizes. Let β₁ be the learned sizes of the deterministic effects with the covariance
-    C₁, and β₂ the sizes fitted to the other half with the covariance C₂. The result has the weighted mean of β₁ and β₂.
-    The log-likelihood is the value for β₂, less a penalty for the difference Δ = β₂ − β₁. The penalty is
-    ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln(|C₁ + C₂|/|C₂|). A line has the learned amplitude and a fitted phase.
+    Noise effects keep the learned sizes. Let β₁ be the learned regressor sizes with the covariance C₁, and β₂ the sizes
+    fitted to the other half with the covariance C₂. The prediction uses the weighted mean of β₁ and β₂. With the
+    difference Δ = β₂ − β₁, the log-likelihood for β₂ is reduced by ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln(|C₁ + C₂|/|C₂|). A sinusoid
+    keeps the learned amplitude, and the phase is fitted again.
     """
     effects = learned.effects
-    free = half.fit(effects, noise_indices(effects))
+    free = half.fit(effects, noise_effect_indices(effects))
     beta = free.whittle.beta.copy()
     known: list[int] = []
     for at, place in free.regressor_slices:
@@ -187,5 +181,5 @@ def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
 
 
 def _regularised(covariance: Floats) -> Floats:
-    """Add a small value to the diagonal of a covariance, so that the determinant is positive."""
+    """Add a small value to the diagonal of a covariance matrix, so that the determinant is positive."""
     return covariance + np.diag(1e-9 * np.diag(covariance) + 1e-300)

@@ -1,9 +1,7 @@
-"""Alternatives to Gaussian effects that have the same spectrum but another distribution.
+"""Alternatives to Gaussian effects with the same spectrum and another distribution.
 
-The pairs are correlated noise and random telegraph, random walk and Poisson steps, and single steps and Poisson steps.
-The search adds the effect that it finds with a Gaussian likelihood. This module then computes the full likelihood of
-the effect and of the alternative, with all other effects unchanged. The alternative replaces the effect if it has a
-larger log-likelihood by ``MIN_ALTERNATIVE_GAIN_NATS``.
+A random telegraph can replace correlated noise. Poisson steps can replace a random walk or single steps. The Gaussian
+effect is replaced if the full log-likelihood of the alternative is larger by ``MIN_ALTERNATIVE_GAIN_NATS``.
 """
 
 from collections.abc import Mapping
@@ -21,7 +19,7 @@ from monitor.noise.effects import (
     RateRandomWalk,
 )
 from monitor.reconcile.likelihood.axis_fit import AxisFit, Effects
-from monitor.reconcile.likelihood.effect_roles import size
+from monitor.reconcile.likelihood.effect_roles import effect_size
 from monitor.reconcile.likelihood.hypothesis import Hypothesis
 from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
 from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
@@ -33,26 +31,27 @@ from monitor.reconcile.search.candidates import PENALTY_NATS, fit_correlated_noi
 from monitor.reconcile.search.trials import Trial
 
 MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0
-"""Gain in nats that an alternative must exceed. In 2 of 4000 simulated recordings, a larger gain led to a confusion of
-telegraph and correlated noise.
+"""Log-likelihood gain that an alternative must exceed, in nats.
+
+In 2 of 4000 simulated recordings, a wrong alternative exceeded this gain.
 """
 POISSON_PENALTY_NATS: Final = 1.0
-"""Penalty in nats for Poisson steps. A random walk is a limit of Poisson steps and therefore never fits better."""
+"""Penalty for Poisson steps, in nats. A random walk is a limit of Poisson steps and never fits better."""
 MAX_FREE_STEPS: Final = 2
 """Number of single steps without an additional penalty."""
 STEP_PENALTY_NATS: Final = 3.0
-"""Penalty in nats for each further single step, because a new effect needs more evidence than a new step time."""
+"""Penalty for each further single step, in nats."""
 MIN_FITTED_STEPS: Final = 5
 """Smallest number of single steps that the comparison with Poisson steps may fit."""
 MIN_SWITCHES: Final = 10
-"""Smallest number of switches of a telegraph that replaces Poisson steps. A few jumps may alternate by chance."""
+"""Smallest number of switches of a telegraph that replaces Poisson steps. A few jumps can alternate by chance."""
 WALK_EFFECTS: Final = (BiasStep, RateRandomWalk)
-"""Effects that jump processes are compared with."""
+"""Effects that Poisson steps or a telegraph can replace."""
 
 
 @dataclass(frozen=True, slots=True)
 class NonGaussianAlternative:
-    """Alternative effect with the same spectrum as an added effect and another distribution."""
+    """Alternative to an added effect, with the same spectrum and another distribution."""
 
     added: Effects  # added effects; the alternative is the last one and replaces the original effect
     gain: float  # log-likelihood gain over the original effect, nats
@@ -64,9 +63,9 @@ class NonGaussianAlternative:
     runner_up: "NonGaussianAlternative | None" = None  # alternative that fits second best
 
     def as_trials(self, replaced_score: float) -> tuple[Trial, ...]:
-        """Return the trials of this alternative and of the runner-up.
+        """Convert the alternative and the runner-up to trials.
 
-        ``replaced_score`` is the score of the replaced effect in nats.
+        ``replaced_score`` is the score of the replaced effect, in nats.
         """
         effect = self.added[-1]
         trial = Trial(
@@ -76,21 +75,21 @@ class NonGaussianAlternative:
 
 
 def choose_distribution(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
-    """Replace a new effect by the alternative with the same spectrum, if the alternative fits better.
+    """Replace a new effect by a more likely alternative with the same spectrum.
 
     Parameters
     ----------
     hypothesis : Hypothesis
-        Fitted effects. The last effect is the new one.
+        Fitted effects, with the new effect at the end.
     trials : list of Trial
-        Trials. The first trial is the selected one.
+        All trials, with the selected trial at the start.
 
     Returns
     -------
     hypothesis : Hypothesis
         Fitted effects with the selected alternative.
     trials : list of Trial
-        Trials including the alternatives.
+        All trials, including the alternatives.
     """
     alternative, new = None, trials[0].effect
     if isinstance(new, ExponentiallyCorrelated) and isinstance(hypothesis.effects[-1], ExponentiallyCorrelated):
@@ -106,10 +105,7 @@ def choose_distribution(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hy
 
 
 def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
-    """Return the better of Poisson steps and a slow telegraph as an alternative to a random walk or single steps.
-
-    The result is None if the hypothesis contains neither single steps nor a changed random walk.
-    """
+    """Return the more likely of Poisson steps and a slow random telegraph, or None if neither process applies."""
     steps = fit_poisson_alternative(hypothesis)
     if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps
@@ -117,7 +113,7 @@ def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | N
     bare, fixed_noise = _with_original_walks(hypothesis)
     for noise in fit_correlated_noise(hypothesis.axis, hypothesis.axis.fit(bare, fixed_noise).effects):
         other = Hypothesis(hypothesis.model, hypothesis.axis.fit((*bare, noise), fixed_noise))
-        if size(other.added[-1]) == 0.0:
+        if effect_size(other.added[-1]) == 0.0:
             continue
         telegraph = fit_telegraph_alternative(other, len(other.effects) - 1)
         if telegraph is None or telegraph.event_count < MIN_SWITCHES:
@@ -130,9 +126,9 @@ def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | N
 
 
 def _with_original_walks(hypothesis: Hypothesis) -> tuple[Effects, frozenset[int]]:
-    """Return the effects without added steps and random walks, and the indices of the noise effects with a fixed size.
+    """Return the effects without added random walks and steps, and the indices of fixed noise effects.
 
-    Random walks of the model have the original size.
+    Random walks of the noise model have the original size.
     """
     walks = frozenset(at for at, effect in enumerate(hypothesis.model) if isinstance(effect, WALK_EFFECTS))
     known = [hypothesis.model[at] if at in walks else hypothesis.effects[at] for at in range(hypothesis.given_count)]
@@ -143,7 +139,7 @@ def _with_original_walks(hypothesis: Hypothesis) -> tuple[Effects, frozenset[int
 
 
 def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussianAlternative | None:
-    """Return a random telegraph as an alternative to correlated noise.
+    """Fit a random telegraph as an alternative to correlated noise.
 
     Parameters
     ----------
@@ -159,7 +155,7 @@ def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussian
     """
     noise = hypothesis.effects[index]
     assert isinstance(noise, ExponentiallyCorrelated)
-    background = background_noise((*hypothesis.effects[:index], *hypothesis.effects[index + 1 :]))
+    background = build_background_noise((*hypothesis.effects[:index], *hypothesis.effects[index + 1 :]))
     if not background.white > 0.0:
         return None
     series, tau0_s = _residual_series(hypothesis.fit), 1.0 / hypothesis.axis.rate_hz
@@ -171,10 +167,9 @@ def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussian
 
 
 def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
-    """Return Poisson steps as an alternative to single steps or to an increase of the random walk.
+    """Fit Poisson steps as an alternative to single steps or an increased random walk.
 
-    The random walk of the model keeps the original size. The result is None if the hypothesis contains neither single
-    steps nor an increased random walk.
+    Return None if the hypothesis contains neither single steps nor an increased random walk.
     """
     steps = sum(isinstance(effect, BiasStep) for effect in hypothesis.added)
     walks = [at for at, effect in enumerate(hypothesis.effects) if isinstance(effect, RateRandomWalk)]
@@ -182,10 +177,10 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
         return None
     effects, fixed_noise = _with_original_walks(hypothesis)
     without = hypothesis.axis.fit(effects, fixed_noise)
-    known = max((size(effects[at]) for at in walks if at < hypothesis.given_count), default=0.0)
+    known = max((effect_size(effects[at]) for at in walks if at < hypothesis.given_count), default=0.0)
     walk = hypothesis.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), fixed_noise)
-    excess = size(walk.effects[-1])
-    background = background_noise(without.effects)
+    excess = effect_size(walk.effects[-1])
+    background = build_background_noise(without.effects)
     if not (excess > 0.0 and background.white > 0.0):
         return None
     series, tau0_s = _residual_series(without), 1.0 / hypothesis.axis.rate_hz
@@ -204,12 +199,11 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
 
 
 def _residual_series(fit: AxisFit) -> Floats:
-    """Return the series, shape (n,), less all fitted deterministic effects."""
-    return inverse_cosine_transform(fit.residual_coefficients())
+    return inverse_cosine_transform(fit.coefficients_without_deterministic_effects())
 
 
-def background_noise(effects: Effects) -> BackgroundNoise:
-    """Return the noise of all given effects as a ``BackgroundNoise``."""
+def build_background_noise(effects: Effects) -> BackgroundNoise:
+    """Convert noise effects to a ``BackgroundNoise``."""
     white = walk = flicker = 0.0
     correlated: list[tuple[float, float]] = []
     for effect in effects:

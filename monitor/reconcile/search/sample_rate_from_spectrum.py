@@ -1,8 +1,8 @@
-"""Detection of a true sample rate that differs from the stated sample rate of a recording.
+"""Detection of a wrong sample rate from the spectrum of a recording.
 
-A wrong sample rate multiplies all frequencies on all axes by the same ratio. The error can be detected if the model
-contains a **feature**, which is a line or a resonance. The recording then shows the feature at a frequency that differs
-from the frequency in the model. Without a feature, a wrong sample rate cannot be distinguished from a wrong N.
+A wrong sample rate multiplies all frequencies on all axes by the same ratio. The ratio can be estimated from the lines
+and resonances of the noise model (**features**). Without features, a wrong sample rate cannot be distinguished from a
+wrong N.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,7 +16,7 @@ from drivers.data_types import Floats
 from monitor.common.distributions import HALF_CHI2_95
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
-from monitor.reconcile.diagnostics.diagnostics import periodogram
+from monitor.reconcile.diagnostics.diagnostics import compute_periodogram
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.hypothesis import find_maximum_by_golden_section, fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
@@ -24,13 +24,12 @@ from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidates import find_spectral_peaks
 
 MAX_LOG_RATIO: Final = 0.15
-"""Largest absolute logarithm of the ratio. A larger ratio indicates a recording of another sensor."""
+"""Largest absolute logarithm of the ratio of sample rates."""
 MIN_OTHER_GAIN_NATS: Final = 6.0
-"""Smallest log-likelihood gain in nats of the other features and the noise, without the strongest feature. The value is
-also the largest loss of a single feature, because a feature with a larger loss is still at the stated frequency.
+"""Smallest log-likelihood gain without the strongest feature, and largest loss of any feature, in nats.
 """
 SAME_FEATURE_RATIO: Final = 1.01
-"""Largest ratio of two frequencies, on any axes, that belong to the same feature."""
+"""Largest frequency ratio of the same feature on different axes."""
 MAX_TRIAL_RATIOS: Final = 12
 SAMPLE_RATE_PENALTY_NATS: Final = 12.0
 SEARCH_ITERATIONS: Final = 18
@@ -48,9 +47,9 @@ RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "time": 1.0,
     "rate": -1.0,
 }
-"""For each parameter, the exponent of r that converts the parameter from true time to stated time.
+"""Exponent of each parameter in the conversion from true time to stated time.
 
-r is the true rate over the stated rate. A spectral density S(f) in true time is r S(rf) in stated time.
+Let r be the ratio of true to stated sample rate. A spectral density S(f) in true time is r S(rf) in stated time.
 """
 Feature = Sinusoidal | Narrowband
 """Effect at a known frequency."""
@@ -58,7 +57,7 @@ Feature = Sinusoidal | Narrowband
 
 @dataclass(frozen=True, slots=True)
 class SampleRateErrorEstimate:
-    """Detected error of the sample rate."""
+    """Estimate of the ratio of true to stated sample rate."""
 
     ratio: ParameterInterval  # true rate over stated rate
     gain: float  # log-likelihood gain summed over all axes, nats
@@ -66,23 +65,23 @@ class SampleRateErrorEstimate:
     frequency: tuple[float, float]  # frequency of the feature in the model and in the recording, Hz
 
 
-def convert_to_stated_time(effect: Effect, ratio: float) -> Effect:
-    """Return the effect as it appears in a recording with a wrong sample rate.
+def rescale_effect_time(effect: Effect, rate_ratio: float) -> Effect:
+    """Convert an effect from true time to the time scale of a recording with a wrong sample rate.
 
     Parameters
     ----------
     effect : Effect
         Effect with parameters in true time.
-    ratio : float
+    rate_ratio : float
         True rate over stated rate.
 
     Examples
     --------
-    >>> convert_to_stated_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
+    >>> rescale_effect_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
     10.0
     """
     changed: dict[str, Any] = {
-        name: getattr(effect, name) * ratio**power
+        name: getattr(effect, name) * rate_ratio**power
         for name, power in RATIO_EXPONENTS.items()
         if getattr(effect, name, None)
     }
@@ -104,30 +103,32 @@ def detect_sample_rate_error(
     Returns
     -------
     SampleRateErrorEstimate or None
-        The ratio with the largest likelihood of all axes, or None if there is no significant error.
+        Most likely sample rate error of all axes, or None if no error is significant.
     """
     trials = _candidate_ratios(axes, effects)
     if not trials:
         return None
     before = {name: _log_likelihood(axes[name], effects[name]) for name in axes}
 
-    def gains(x: float) -> dict[str, float]:
-        changed = {name: tuple(convert_to_stated_time(effect, exp(x)) for effect in effects[name]) for name in axes}
+    def gain_by_axis(log_ratio: float) -> dict[str, float]:
+        changed = {
+            name: tuple(rescale_effect_time(effect, exp(log_ratio)) for effect in effects[name]) for name in axes
+        }
         return {name: _log_likelihood(axes[name], changed[name]) - before[name] for name in axes}
 
-    def gain(x: float) -> float:
-        return sum(gains(x).values())
+    def total_gain(log_ratio: float) -> float:
+        return sum(gain_by_axis(log_ratio).values())
 
-    ratio, width = max(trials, key=lambda one: gain(log(one[0])))
-    x = find_maximum_by_golden_section(gain, log(ratio) - width, log(ratio) + width, SEARCH_ITERATIONS)
-    top = gain(x)
+    ratio, width = max(trials, key=lambda one: total_gain(log(one[0])))
+    x = find_maximum_by_golden_section(total_gain, log(ratio) - width, log(ratio) + width, SEARCH_ITERATIONS)
+    top = total_gain(x)
     if top < SAMPLE_RATE_PENALTY_NATS:
         return None
     alone = _gain_per_feature(axes, effects, before, exp(x))
     if top - max(alone) < MIN_OTHER_GAIN_NATS or min(alone) < -MIN_OTHER_GAIN_NATS:
         return None
-    ends = [_interval_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
-    of_axes = gains(x)
+    ends = [_interval_end(total_gain, x, top, sign * width) for sign in (-1.0, 1.0)]
+    of_axes = gain_by_axis(x)
     strongest = max(of_axes, key=lambda one: of_axes[one])
     features = _features(effects[strongest])
     stated = features[0].frequency if features else 0.0
@@ -137,19 +138,17 @@ def detect_sample_rate_error(
 
 
 def _log_likelihood(axis: Axis, effects: Effects) -> float:
-    """Return the log-likelihood of effects with fixed sizes of the noise effects."""
     return fit_with_fixed_noise(axis, effects).fit.log_likelihood
 
 
 def _features(effects: Effects) -> list[Feature]:
-    """Return the lines and resonances of an axis."""
     return [effect for effect in effects if isinstance(effect, Feature)]
 
 
 def _gain_per_feature(
     axes: Mapping[str, Axis], effects: Mapping[str, Effects], before: Mapping[str, float], ratio: float
 ) -> list[float]:
-    """Return the gain in nats of each feature if only the frequency of this feature is changed by the ratio."""
+    """Return the log-likelihood gain of each feature if only the feature frequency changes by the ratio."""
     groups: list[list[float]] = []
     for f_hz in sorted({feature.frequency for of in effects.values() for feature in _features(of)}):
         if groups and f_hz < groups[-1][-1] * SAME_FEATURE_RATIO:
@@ -160,7 +159,7 @@ def _gain_per_feature(
     for group in groups:
         gain = 0.0
         for name, of in effects.items():
-            moved = tuple(convert_to_stated_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
+            moved = tuple(rescale_effect_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
             if moved != of:
                 gain += _log_likelihood(axes[name], moved) - before[name]
         gains.append(gain)
@@ -168,7 +167,7 @@ def _gain_per_feature(
 
 
 def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:
-    """Return the ratios of features of the model to observed peaks, each with half the width of the search range."""
+    """Return the ratios of feature frequencies to observed peaks, with half the width of each search range."""
     features = {name: _features(of) for name, of in effects.items()}
     if not any(features.values()):
         return []
@@ -188,9 +187,9 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
 
 
 def _line_power(whitened: WhitenedAxis, features: list[Feature], factors: Floats) -> Floats:
-    """Return, for each factor, the total power at the frequencies of all lines times the factor."""
+    """Return, for each factor, the total power at all line frequencies times the factor."""
     power = np.zeros(factors.size)
-    spectrum = periodogram(whitened.series)
+    spectrum = compute_periodogram(whitened.series)
     spacing_hz = whitened.axis.rate_hz / (2 * (spectrum.size - 1))
     for line in features:
         if isinstance(line, Sinusoidal):
@@ -200,7 +199,6 @@ def _line_power(whitened: WhitenedAxis, features: list[Feature], factors: Floats
 
 
 def _resonance_ratios(whitened: WhitenedAxis, features: list[Feature]) -> list[tuple[float, float]]:
-    """Return the ratios of resonances to observed peaks, each with half the width of the search range."""
     return [
         (feature.frequency / peak_hz, 2.0 * feature.bandwidth / feature.frequency)
         for feature in features
@@ -211,7 +209,6 @@ def _resonance_ratios(whitened: WhitenedAxis, features: list[Feature]) -> list[t
 
 
 def _interval_end(gain: Callable[[float], float], x: float, top: float, step: float) -> float:
-    """Return the position beside the maximum at ``x`` at which the gain is ``HALF_CHI2_95`` below the maximum."""
     near, far = x, x + step
     for _ in range(12):
         if top - gain(far) > HALF_CHI2_95:

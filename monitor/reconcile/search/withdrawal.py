@@ -1,20 +1,15 @@
 """Withdrawal of added effects that the final diagnostics contradict.
 
-Several lines, or a resonance, can fit a line with a varying amplitude or frequency. A wide resonance can fit a chirp,
-and a comb of lines can fit a pulse. Such an effect has a high likelihood and is wrong. A line, a resonance or a
-low-pass filter is therefore withdrawn in each of these cases:
+Lines and resonances can fit an oscillation with a varying frequency, although the fitted model is wrong. Lines,
+resonances and low-pass filters are withdrawn in these cases:
 
 - Several lines or resonances overlap.
 - ``MIN_COMB_LINES`` or more lines are harmonics of one frequency.
-- The power at the frequency of the effect still changes in time or differs from the model, and the remaining gain
-  exceeds a share of the gain that the effect should explain.
+- A significant difference remains at the frequency of the effect.
 
-A leak is withdrawn if more than half of the dependence on other axes remains. In this case, vibration acts on several
-axes, and a leak is the wrong explanation. A step is withdrawn if the level still changes. An effect with a smooth
-spectrum is withdrawn if the noise is mainly non-stationary, non-Gaussian or shared with other axes, because such noise
-also changes the spectrum.
-
-The difference that led to a withdrawn effect is reported as unexplained.
+A leak is withdrawn if more than half of the dependence on other axes remains. A step is withdrawn if the mean level
+still changes. A smooth spectrum is withdrawn if the noise is mainly non-Gaussian, non-stationary or common to several
+axes.
 """
 
 from collections.abc import Mapping
@@ -30,23 +25,23 @@ from monitor.reconcile.likelihood.axis_fit import Effects
 MIN_COMB_LINES: Final = 4
 MAX_HARMONIC: Final = 60
 DIFFERENCE_DIVISORS: Final = (1, 2, 3)
-"""Divisors of the frequency difference of two lines. The quotients are tried as fundamental frequency."""
+"""Divisors that convert the distance of two lines to a possible fundamental frequency."""
 HARMONIC_TOLERANCE: Final = 2e-4
-"""Largest distance of a line from a multiple of the fundamental, relative to the highest line."""
+"""Largest distance of a line from a harmonic, relative to the highest line frequency."""
 RESONANCE_REACH_HALF_WIDTHS: Final = 2.0
-"""Range of a resonance to each side, in half widths. Another feature in this range overlaps with the resonance."""
+"""Distance from a resonance, in half widths, within which other lines and resonances overlap."""
 LINE_REACH_HZ: Final = 0.1
 MAX_REMAINING_SHARE: Final = 0.1
-"""Largest remaining gain relative to the gain that an effect should explain. The limit allows an inexact shape."""
+"""Largest remaining gain, relative to the gain that an effect should explain."""
 MAX_REMAINING_LEAK_SHARE: Final = 0.5
-"""Largest remaining gain relative to the gain that a leak should explain."""
+"""Largest remaining gain, relative to the gain that a leak should explain."""
 MAX_FOREIGN_RATIO: Final = 100.0
-"""Largest gain of the ``NON_SPECTRAL_DIAGNOSTICS`` relative to the gain that a smooth spectrum should explain."""
+"""Largest gain of the non-spectral diagnostics, relative to the gain that a smooth spectrum should explain."""
 SMOOTH_SPECTRA: Final = (BandwidthLimit, ExponentiallyCorrelated)
 NON_SPECTRAL_DIAGNOSTICS: Final = ("tails", "variance", "other_axes")
-"""Diagnostics of departures that no stationary Gaussian spectrum explains."""
+"""Diagnostics of non-Gaussian, non-stationary or common noise."""
 FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")
-"""Diagnostics that locate a departure in frequency."""
+"""Diagnostics that resolve the frequency."""
 
 
 def keep_supported_effects(
@@ -66,11 +61,11 @@ def keep_supported_effects(
         Null distribution of each diagnostic.
     """
 
-    def remaining(lens: str) -> float:
+    def significant_gain(lens: str) -> float:
         gain = findings[lens].gain
         return gain if gain > null[lens].threshold else 0.0
 
-    def contradicted(kinds: type[Effect] | tuple[type[Effect], ...], gain: float, share: float) -> set[int]:
+    def contradicted_effects(kinds: type[Effect] | tuple[type[Effect], ...], gain: float, share: float) -> set[int]:
         return {
             at
             for at, e in enumerate(added)
@@ -81,16 +76,17 @@ def keep_supported_effects(
     for lens in FREQUENCY_DIAGNOSTICS:
         place = findings[lens].where.frequency
         if place is not None:
-            candidates = contradicted(Effect, remaining(lens), MAX_REMAINING_SHARE)
+            candidates = contradicted_effects(Effect, significant_gain(lens), MAX_REMAINING_SHARE)
             withdrawn |= {at for at in candidates if _overlaps(added[at], place)}
-    withdrawn |= contradicted(AxisLeak, remaining("other_axes"), MAX_REMAINING_LEAK_SHARE)
-    withdrawn |= contradicted(BiasStep, remaining("level"), MAX_REMAINING_SHARE)
-    withdrawn |= contradicted(SMOOTH_SPECTRA, max(map(remaining, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO)
+    withdrawn |= contradicted_effects(AxisLeak, significant_gain("other_axes"), MAX_REMAINING_LEAK_SHARE)
+    withdrawn |= contradicted_effects(BiasStep, significant_gain("level"), MAX_REMAINING_SHARE)
+    withdrawn |= contradicted_effects(
+        SMOOTH_SPECTRA, max(map(significant_gain, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO
+    )
     return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)
 
 
 def _frequency_range(effect: Effect) -> tuple[float, float]:
-    """Return the range of frequencies, in Hz, that a line or resonance occupies."""
     if isinstance(effect, Narrowband):
         half = max(RESONANCE_REACH_HALF_WIDTHS * 0.5 * effect.bandwidth, LINE_REACH_HZ)
         return effect.frequency - half, effect.frequency + half
@@ -99,7 +95,7 @@ def _frequency_range(effect: Effect) -> tuple[float, float]:
 
 
 def _overlaps(effect: Effect, place: tuple[float, float]) -> bool:
-    """Return True if an effect acts in a range of frequencies."""
+    """Return True if an effect acts in a frequency range."""
     if isinstance(effect, BandwidthLimit):
         return place[1] > 0.5 * effect.cutoff
     if not isinstance(effect, (Narrowband, Sinusoidal)):
@@ -109,7 +105,6 @@ def _overlaps(effect: Effect, place: tuple[float, float]) -> bool:
 
 
 def _overlapping_features(added: Effects) -> set[int]:
-    """Return the indices of lines and resonances that overlap each other."""
     features = {at: effect for at, effect in enumerate(added) if isinstance(effect, (Sinusoidal, Narrowband))}
     overlapping: set[int] = set()
     for at, one in features.items():
@@ -120,10 +115,7 @@ def _overlapping_features(added: Effects) -> set[int]:
 
 
 def _harmonic_comb(added: Effects) -> set[int]:
-    """Return the indices of lines that are harmonics of one fundamental frequency.
-
-    The fundamental is one of the lines, or a fraction of the difference of two lines.
-    """
+    """Return the indices of lines that are harmonics of one fundamental frequency."""
     lines = {at: effect.frequency for at, effect in enumerate(added) if isinstance(effect, Sinusoidal)}
     f = np.array(list(lines.values()))
     if f.size < MIN_COMB_LINES:

@@ -1,12 +1,8 @@
-"""Explanation of why one recording does not show an effect that another recording of the same sensor shows.
+"""Explanation why one recording does not show an effect that another recording of the same sensor shows.
 
-The result is one of five meanings, with a sentence that states the reason. The gap of a diagnostic, in standard
-deviations, grows with the square root of the recording length if the effect is permanent. The gap of a temperature
-effect also grows with the temperature range. If the noise of both recordings is similar, the gap in the other recording
-is therefore predictable to about one standard deviation. If the expected gap is clearly larger than the threshold of
-the other recording, the absence is a contradiction. Otherwise the data are not sensitive enough. No conclusion is
-possible for an effect that happens once or for a leak from another axis. No conclusion is possible either if the other
-recording has an unexplained difference in the same diagnostic.
+The difference due to a permanent effect grows with the square root of the recording length. The difference due to a
+temperature effect also grows with the temperature range. If the expected difference clearly exceeds the threshold, the
+absence is a contradiction.
 """
 
 from dataclasses import dataclass
@@ -26,14 +22,14 @@ Meaning = Literal["contradiction", "too_faint", "other_name", "unnamed", "may_di
 - ``may_differ``: the recording need not contain the effect.
 """
 MIN_EXCESS_SIGMA: Final = 2.0
-"""Number of standard deviations by which the expected gap must exceed the threshold for a contradiction."""
+"""Smallest excess of the expected gap over the threshold for a contradiction, in standard deviations."""
 LEAK_EFFECTS: Final = ("g_sensitivity", "cross_axis")
 TEMPERATURE_EFFECTS: Final = ("temperature_bias", "temperature_lag")
 
 
 @dataclass(frozen=True, slots=True)
 class Absence:
-    """Recording that contains the axis and does not show the effect."""
+    """Recording that does not show an effect, with the explanation."""
 
     run: str  # name of the recording
     meaning: Meaning
@@ -42,7 +38,7 @@ class Absence:
 
 @dataclass(frozen=True, slots=True)
 class ClearestOccurrence:
-    """Effect in the recording that shows it most clearly."""
+    """Effect in the recording with the clearest evidence."""
 
     step: AddedOrResizedEffect
     axis_result: AxisResult  # result of the axis in this recording
@@ -51,12 +47,12 @@ class ClearestOccurrence:
 
 
 def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[Meaning, str]:
-    """Return the meaning of the absence of an effect, with a sentence that states the reason.
+    """Explain why a recording does not show an effect of another recording.
 
     Parameters
     ----------
     shown : ClearestOccurrence
-        Effect in the recording that shows it most clearly.
+        Effect in the recording with the clearest evidence.
     other : Reconciliation
         Result of the recording without the effect.
     """
@@ -88,7 +84,7 @@ def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[M
 
 
 def _compare_expected_gap(expected: float, growth: float, gap: DiagnosticGap, seconds: float) -> tuple[Meaning, str]:
-    """Compare the expected gap with the threshold, and return the meaning with a sentence."""
+    """Compare the expected difference with the threshold, and return the meaning with an explanation."""
     said = (
         f"with the size in the other recording, {seconds:.6g} s of data would show a gap of about {expected:.1f} "
         f"({gap.lens}), and the threshold of {gap.threshold:.1f} is not passed"
@@ -99,9 +95,8 @@ def _compare_expected_gap(expected: float, growth: float, gap: DiagnosticGap, se
 
 
 def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, gap: DiagnosticGap) -> float | None:
-    """Return the ratio of the expected gap in the other recording to the gap in the recording of ``step``.
-
-    The result is None if the other recording contains no change of temperature.
+    """Return the ratio of the expected gap in the other recording to the observed gap, or None without a temperature
+    change.
     """
     longer = other_s / seconds
     if step.effect == "rate_ramp":
@@ -119,7 +114,7 @@ def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, gap: 
 def _confused_effect(step: AddedOrResizedEffect, axis_result: AxisResult, other_axis_result: AxisResult) -> str:
     """Return an effect of the other recording that is hard to distinguish from the effect of ``step``, or "".
 
-    Two effects are hard to distinguish if one of them was a runner-up when the other one was added.
+    Two effects are hard to distinguish if one effect was a runner-up of the other effect.
     """
     mine = {one.effect for one in axis_result.steps}
     for one in other_axis_result.steps:
@@ -130,5 +125,4 @@ def _confused_effect(step: AddedOrResizedEffect, axis_result: AxisResult, other_
 
 
 def _runner_up_names(step: AddedOrResizedEffect) -> set[str]:
-    """Return the names of the runners-up."""
     return {one.effect for one in step.runners_up}

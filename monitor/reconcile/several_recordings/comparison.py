@@ -1,13 +1,8 @@
-"""Comparison of the results of several recordings of one sensor that were reconciled with the same model.
+"""Comparison of the results of several recordings of one sensor, reconciled with the same noise model.
 
-Two recordings show the same effect if the effects have the same name, the same kind and matching identifying parameters
-(``effect_matching``). An effect is **common** if every recording of the axis shows the effect. Every other effect is
-**single**. The parameters of an effect are pooled over the recordings that show the effect. For a single effect,
-``absence`` explains why the other recordings do not show the effect. A sample rate error belongs to all axes of a
-recording.
-
-The common effects are added to the model under test. Single effects are not added, because a single effect may be a
-property of one recording and not of the sensor.
+Two recordings show the same effect if the name, the kind and the identifying parameters of the effect match. A
+**common** effect occurs in every recording of the axis and is added to the noise model. All other effects are
+**single** effects and may be properties of one recording. The parameters of an effect are averaged over the recordings.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,12 +26,12 @@ from monitor.reconcile.result import (
 from monitor.reconcile.several_recordings.absence import Absence, ClearestOccurrence, explain_absence
 from monitor.reconcile.several_recordings.effect_matching import (
     SAMPLE_RATE_EFFECT,
+    effect_parameters,
     find_closest_effect,
     find_effect_of_step,
-    identifying_parameter,
+    find_identifying_parameter,
     identifying_parameter_distance,
     identifying_parameter_name,
-    parameters_of,
 )
 from monitor.reconcile.several_recordings.pooled_parameters import (
     MIN_AGREEMENT_PROBABILITY,
@@ -47,12 +42,12 @@ from monitor.reconcile.several_recordings.pooled_parameters import (
 )
 
 NON_SIZE_PARAMETERS: Final = ("phase", "reference", "order")
-"""Parameters that are not sizes, because they are chosen or random."""
+"""Parameters that are excluded from the comparison of sizes."""
 
 
 @dataclass(frozen=True, slots=True)
 class NamedResult:
-    """Result of one recording, with its name."""
+    """Name and result of one recording."""
 
     name: str
     result: Reconciliation
@@ -60,7 +55,7 @@ class NamedResult:
 
 @dataclass(frozen=True, slots=True)
 class MatchedEffect:
-    """Effect on one axis, in one or more recordings."""
+    """Effect that one or more recordings show on one axis."""
 
     effect: str
     kind: StepKind
@@ -70,11 +65,11 @@ class MatchedEffect:
     absent: tuple[Absence, ...] = ()
 
     @property
-    def consistent(self) -> bool | None:
-        """True if the sizes in all recordings agree, or None if there is nothing to compare."""
+    def sizes_agree(self) -> bool | None:
+        """True if the sizes in all recordings agree, or None with fewer than two sizes."""
         return None if self.p is None else self.p >= MIN_AGREEMENT_PROBABILITY
 
-    def pooled_step(self) -> AddedOrResizedEffect:
+    def step_with_pooled_parameters(self) -> AddedOrResizedEffect:
         """Return the effect of the first recording with the pooled parameters."""
         first = next(iter(self.steps.values()))
         return replace(first, parameters={name: one.bounds for name, one in self.parameters.items()})
@@ -82,7 +77,7 @@ class MatchedEffect:
 
 @dataclass(frozen=True, slots=True)
 class AxisComparison:
-    """One axis in all recordings that contain it."""
+    """Comparison of one axis in several recordings."""
 
     axis: str
     results: Mapping[str, AxisResult]  # by name of the recording
@@ -92,7 +87,7 @@ class AxisComparison:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Joint result of several recordings."""
+    """Comparison of several recordings of one sensor."""
 
     verdict: Decision
     runs: tuple[NamedResult, ...]
@@ -107,7 +102,7 @@ class Comparison:
 def compare_results(
     runs: Sequence[NamedResult], fitted_to: str | None = None, without_result: Mapping[str, str] | None = None
 ) -> Comparison:
-    """Compare the results of several recordings that were reconciled with one model.
+    """Compare the results of several recordings that were reconciled with one noise model.
 
     Parameters
     ----------
@@ -135,10 +130,7 @@ def compare_results(
 def _add_common_effects(
     baseline: NoiseModel, axes: Mapping[str, AxisComparison], models: Mapping[str, NoiseModel]
 ) -> NoiseModel:
-    """Return the model under test with the common effects and their pooled parameters.
-
-    ``models`` contains the extended model of each recording.
-    """
+    """Return the noise model with the common effects, which have the pooled parameters."""
     effects = dict(baseline.effects)
     for axis, one in axes.items():
         for matched in one.common:
@@ -148,20 +140,19 @@ def _add_common_effects(
             if matched.kind == "added":
                 effects[axis] = (*known, made)
             else:
-                old = find_closest_effect(known, matched.effect, parameters_of(made))
+                old = find_closest_effect(known, matched.effect, effect_parameters(made))
                 effects[axis] = tuple(made if effect is old else effect for effect in known)
     return NoiseModel(effects, baseline.sample_rate_hz, baseline.temperature)
 
 
 def _with_pooled_parameters(effect: Effect, matched: MatchedEffect) -> Effect:
-    """Return the effect with the pooled values of the parameters. The phase of a line becomes random."""
+    """Return an effect with the pooled parameters. The phase of a sinusoid becomes random."""
     known = {name: one.bounds.value for name, one in matched.parameters.items() if one.bounds.lo is not None}
     made: Effect = replace(effect, **known)  # type: ignore[type-var]
     return replace(made, phase=None) if isinstance(made, Sinusoidal) else made
 
 
 def _compare_axis(axis: str, runs: Sequence[NamedResult]) -> AxisComparison:
-    """Match the effects of one axis between the recordings."""
     results = {run.name: run.result.axes[axis] for run in runs if axis in run.result.axes}
     groups: list[dict[str, AddedOrResizedEffect]] = []
     for run in runs:
@@ -175,7 +166,7 @@ def _compare_axis(axis: str, runs: Sequence[NamedResult]) -> AxisComparison:
 def _steps_of_axis(run: NamedResult, axis: str, runs: Sequence[NamedResult]) -> list[AddedOrResizedEffect]:
     """Return the added and resized effects of one axis.
 
-    A sample rate error belongs to the first axis on which any recording shows it.
+    A sample rate error is assigned to the same axis in all recordings.
     """
     found = run.result.axes[axis].steps if axis in run.result.axes else ()
     steps = [step for step in found if step.effect != SAMPLE_RATE_EFFECT]
@@ -183,12 +174,11 @@ def _steps_of_axis(run: NamedResult, axis: str, runs: Sequence[NamedResult]) -> 
 
 
 def _sample_rate_steps(run: NamedResult) -> list[AddedOrResizedEffect]:
-    """Return the sample rate errors of a recording."""
     return [step for one in run.result.axes.values() for step in one.steps if step.effect == SAMPLE_RATE_EFFECT]
 
 
 def _sample_rate_axis(runs: Sequence[NamedResult]) -> str:
-    """Return the first axis on which any recording shows a sample rate error, or ""."""
+    """Return the first axis with a sample rate error in any recording, or an empty string."""
     results = [(axis, run.result.axes.get(axis)) for axis in AXES for run in runs]
     return next((axis for axis, one in results if one and any(s.effect == SAMPLE_RATE_EFFECT for s in one.steps)), "")
 
@@ -200,15 +190,17 @@ def _add_to_group(
     axis: str,
     runs: Sequence[NamedResult],
 ) -> None:
-    """Add an effect to the group with the closest matching effect, or start a new group."""
+    """Add an effect to the group of the closest matching effect, or start a new group."""
     models = {one.name: one.result.model for one in runs}
-    here = identifying_parameter(step, axis, models[run])
+    here = find_identifying_parameter(step, axis, models[run])
     best: tuple[float, dict[str, AddedOrResizedEffect]] | None = None
     for group in groups:
         other, first = next(iter(group.items()))
         if run in group or (first.effect, first.kind) != (step.effect, step.kind):
             continue
-        apart = identifying_parameter_distance(step.effect, here, identifying_parameter(first, axis, models[other]))
+        apart = identifying_parameter_distance(
+            step.effect, here, find_identifying_parameter(first, axis, models[other])
+        )
         if apart is not None and (best is None or apart < best[0]):
             best = apart, group
     if best is None:
@@ -220,7 +212,6 @@ def _add_to_group(
 def _summarise_group(
     group: Mapping[str, AddedOrResizedEffect], axis: str, runs: Sequence[NamedResult]
 ) -> MatchedEffect:
-    """Return the summary of one effect from the steps of the recordings that show the effect."""
     first = next(iter(group.values()))
     parameters = _pool_parameters(group)
     sizes = [
@@ -242,21 +233,16 @@ def _summarise_group(
 
 
 def _gap_of_effect(step: AddedOrResizedEffect, axis: str, result: Reconciliation) -> float:
-    """Return the gap that is due to an effect.
-
-    For a resized effect, the result is the difference between the fitted size and the size in the model, in standard
-    deviations.
-    """
+    """Return the difference that an effect causes, in standard deviations."""
     if step.kind == "added":
         return sqrt(max(step.before.gap**2 - step.after.gap**2, 0.0))
     given = find_closest_effect(
-        result.baseline.effects[axis], step.effect, parameters_of(find_effect_of_step(result.model, axis, step))
+        result.baseline.effects[axis], step.effect, effect_parameters(find_effect_of_step(result.model, axis, step))
     )
     return max(distance_in_sigma(one, getattr(given, name)) for name, one in step.parameters.items())
 
 
 def _pool_parameters(group: Mapping[str, AddedOrResizedEffect]) -> dict[str, PooledParameter]:
-    """Return the pooled parameters of the effects of several recordings."""
     steps = [_at_common_reference(step, next(iter(group.values()))) for step in group.values()]
     names = dict.fromkeys(name for step in steps for name in step.parameters if name != "phase")
     return {
@@ -267,7 +253,7 @@ def _pool_parameters(group: Mapping[str, AddedOrResizedEffect]) -> dict[str, Poo
 def _at_common_reference(step: AddedOrResizedEffect, first: AddedOrResizedEffect) -> AddedOrResizedEffect:
     """Convert a quadratic temperature effect to the reference temperature T₁ of the first recording.
 
-    With the quadratic coefficient q, the linear coefficient c at the temperature T₀ becomes c + 2 q (T₁ − T₀).
+    With the quadratic coefficient q, the linear coefficient c at the reference T₀ becomes c + 2 q (T₁ − T₀).
     """
     own = step.parameters
     if "quadratic" not in own or "reference" not in first.parameters:
@@ -283,11 +269,9 @@ def _at_common_reference(step: AddedOrResizedEffect, first: AddedOrResizedEffect
 
 
 def _numerical_value(bounds: ParameterInterval) -> float:
-    """Return the numerical value of a parameter."""
     assert not isinstance(bounds.value, str)
     return bounds.value
 
 
 def _half_width(bounds: ParameterInterval) -> float:
-    """Return half the width of the interval, or NaN if there is none."""
     return nan if bounds.lo is None or bounds.hi is None else 0.5 * (bounds.hi - bounds.lo)

@@ -1,10 +1,8 @@
 """JSON report of a comparison of several recordings: schema imu-monitor/reconcile-runs/1.
 
-Equal comparisons give equal bytes. Numbers are in SI units, and a number that is not finite becomes null. The
-``parameters`` of an effect are pooled over the recordings that show the effect. The entry ``p`` of a parameter is the
-probability of an equal or larger scatter if the true value is the same in all recordings. The entries ``consistent``
-and ``p`` of an effect refer to the size. ``each`` contains the values of each recording. The file ``report.json`` in
-``folder`` contains the complete result of a recording.
+Equal comparisons are encoded as equal bytes. All numbers are in SI units. A number that is not finite is encoded as
+null. The parameters of an effect are averaged over the recordings. ``p`` is the probability of an equal or larger
+scatter if the true value is the same in all recordings. ``each`` contains the values of each recording.
 """
 
 from typing import Any, Final
@@ -18,23 +16,25 @@ from monitor.reconcile.several_recordings.comparison import AxisComparison, Comp
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
 
 
-def encode_comparison(c: Comparison) -> bytes:
-    """Encode a comparison as JSON."""
+def encode_comparison(comparison: Comparison) -> bytes:
+    """Encode a comparison of several recordings as JSON."""
     return msgspec.json.encode({
         "schema": SCHEMA,
-        "verdict": c.verdict,
-        "seed": int(c.seed),
-        "fitted_to": c.fitted_to,
+        "verdict": comparison.verdict,
+        "seed": int(comparison.seed),
+        "fitted_to": comparison.fitted_to,
         "recordings": [
-            *(_run_entry(run) for run in c.runs),
-            *({"name": name, "folder": name, "verdict": None, "why": why} for name, why in c.without_result.items()),
+            *(_run_entry(run) for run in comparison.runs),
+            *(
+                {"name": name, "folder": name, "verdict": None, "why": why}
+                for name, why in comparison.without_result.items()
+            ),
         ],
-        "axes": {axis: _axis_entry(one) for axis, one in c.axes.items()},
+        "axes": {axis: _axis_entry(one) for axis, one in comparison.axes.items()},
     })  # fmt: skip
 
 
 def _run_entry(run: NamedResult) -> dict[str, Any]:
-    """Return the report entry of one recording."""
     return {
         "name": run.name,
         "folder": run.name,
@@ -46,7 +46,6 @@ def _run_entry(run: NamedResult) -> dict[str, Any]:
 
 
 def _axis_entry(one: AxisComparison) -> dict[str, Any]:
-    """Return the report entry of one axis."""
     return {
         "verdicts": {run: result.verdict for run, result in one.results.items()},
         "common": [_effect_entry(matched) for matched in one.common],
@@ -61,23 +60,21 @@ def _axis_entry(one: AxisComparison) -> dict[str, Any]:
 
 
 def _effect_entry(matched: MatchedEffect) -> dict[str, Any]:
-    """Return the report entry of one effect."""
     return {
         "effect": matched.effect,
         "kind": matched.kind,
         "recordings": list(matched.steps),
         "parameters": {
-            name: {**parameter_entry(one.bounds), **({} if one.p is None else {"p": finite_or_none(one.p)})}
+            name: {**parameter_entry(one.bounds), **({} if one.p_value is None else {"p": finite_or_none(one.p_value)})}
             for name, one in matched.parameters.items()
         },
-        "consistent": matched.consistent,
+        "consistent": matched.sizes_agree,
         "p": finite_or_none(matched.p),
         "each": {run: _step_entry(step) for run, step in matched.steps.items()},
     }
 
 
 def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
-    """Return the report entry of one effect in one recording."""
     return {
         "parameters": {name: parameter_entry(one) for name, one in step.parameters.items()},
         "confidence": finite_or_none(step.confidence),

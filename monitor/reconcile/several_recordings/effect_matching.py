@@ -1,9 +1,8 @@
 """Matching of effects between recordings of one sensor.
 
-An identifying parameter, such as a frequency, a time constant or a source axis, distinguishes effects of the same name.
-Two identifying parameters match if the intervals overlap. Before this test, the intervals are stretched, and widened by
-a share of the value that allows for the drift of real sensors. An effect without an identifying parameter occurs at
-most once on an axis.
+An identifying parameter, such as a frequency or a source axis, distinguishes effects of the same name. Two identifying
+parameters match if the widened intervals overlap. An effect without an identifying parameter occurs at most once on an
+axis.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,25 +26,23 @@ IDENTIFYING_PARAMETERS: Final[Mapping[str, tuple[str, float]]] = {
     "g_sensitivity": ("source", 0.0),
     "cross_axis": ("source", 0.0),
 }
-"""Identifying parameter of each effect, and the share of the value by which the interval is widened on both sides.
-
-Motors and clocks drift by a few percent, and time constants vary within a factor of two.
+"""Identifying parameter of each effect, and the relative amount by which the interval is widened on both sides.
 """
 INTERVAL_STRETCH: Final = 2.0
-"""Factor by which a 95 % interval is stretched, so that one effect rarely appears as two effects."""
+"""Factor that widens a 95 % interval, so that one effect rarely appears as two effects."""
 SAMPLE_RATE_EFFECT: Final = "sample_rate_error"
-"""Name of the effect that is common to all axes of a recording."""
+"""Name of the effect that all axes of a recording have in common."""
 
 
 def identifying_parameter_name(effect: str) -> str:
-    """Return the name of the parameter that identifies an effect, or "" if there is none."""
+    """Return the name of the identifying parameter of an effect, or an empty string."""
     return IDENTIFYING_PARAMETERS.get(effect, ("", 0.0))[0]
 
 
-def identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseModel) -> ParameterInterval | None:
-    """Return the parameter that identifies an effect among effects of the same name.
+def find_identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseModel) -> ParameterInterval | None:
+    """Return the identifying parameter of an effect, or None.
 
-    A resized effect contains only the size. The identifying parameter is then read from the model of the recording.
+    The identifying parameter of a resized effect is read from the noise model.
 
     Parameters
     ----------
@@ -67,7 +64,7 @@ def identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseMod
 def identifying_parameter_distance(
     effect: str, a: ParameterInterval | None, b: ParameterInterval | None
 ) -> float | None:
-    """Return the relative distance of two identifying parameters, or None if they do not match.
+    """Return the relative distance of two identifying parameters, or None if the parameters do not match.
 
     The distance is 0 if one of the parameters is None.
 
@@ -94,7 +91,7 @@ def identifying_parameter_distance(
 
 
 def find_effect_of_step(model: NoiseModel, axis: str, step: AddedOrResizedEffect) -> Effect:
-    """Return the effect that a step added or resized, from the extended model of the recording.
+    """Find the effect that a search step added or resized in the extended noise model.
 
     Parameters
     ----------
@@ -115,7 +112,7 @@ def find_effect_of_step(model: NoiseModel, axis: str, step: AddedOrResizedEffect
 
 
 def find_closest_effect(effects: Sequence[Effect], name: str, parameters: Mapping[str, Any]) -> Effect:
-    """Return the effect of a given name whose parameters are closest to the given ones.
+    """Find the effect with a given name and the closest parameters.
 
     Parameters
     ----------
@@ -133,20 +130,19 @@ def find_closest_effect(effects: Sequence[Effect], name: str, parameters: Mappin
     return min((effect for effect in effects if effect.name == name), key=parameter_distance)
 
 
-def parameters_of(effect: Effect) -> dict[str, Any]:
+def effect_parameters(effect: Effect) -> dict[str, Any]:
     """Return all parameters of an effect by name."""
     return {f.name: getattr(effect, f.name) for f in fields(effect)}  # type: ignore[arg-type]
 
 
 def _relative_difference(a: Any, b: Any) -> float:
-    """Return 0 for equal parameters and 1 for parameters with different signs or different names."""
+    """Return a relative difference between 0 (equal) and 1 (different signs or names)."""
     if isinstance(a, str) or isinstance(b, str) or a is None or b is None:
         return float(a != b)
     return min(abs(a - b) / (abs(a) + abs(b)), 1.0) if a != b else 0.0
 
 
 def _widened_interval(bounds: ParameterInterval, share: float) -> tuple[float, float]:
-    """Return the stretched and widened interval of a parameter."""
     assert not isinstance(bounds.value, str)
     below = 0.0 if bounds.lo is None else bounds.value - bounds.lo
     above = 0.0 if bounds.hi is None else bounds.hi - bounds.value

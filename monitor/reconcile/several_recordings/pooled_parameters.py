@@ -1,11 +1,9 @@
-"""Weighted mean of one parameter over several recordings, and a test of whether the recordings agree.
+"""Weighted mean of one parameter over several recordings, and a test of agreement.
 
-Each value is weighted by the inverse of the variance, which follows from the 95 % interval of the recording. χ² is the
-weighted scatter of the values about the mean. The intervals of standard deviations and time constants are symmetric on
-a logarithmic scale. The logarithms of such parameters are averaged. If the recordings disagree, the interval of the
-mean is widened by √(χ²/ν) with the degrees of freedom ν (Birge, "The calculation of errors by the method of least
-squares", Phys. Rev. 40, 1932). The value of a parameter without an interval, such as an order, is the value of the
-first recording.
+Each value is weighted by the inverse of the variance, which follows from the 95 % interval. If an interval is symmetric
+on a logarithmic scale, the logarithms are averaged. If the recordings disagree, the interval of the mean is widened by
+√(χ²/ν) with ν degrees of freedom (Birge, "The calculation of errors by the method of least squares", Phys. Rev. 40,
+1932).
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,34 +19,34 @@ from monitor.common.distributions import Z95
 from monitor.reconcile.result import ParameterInterval
 
 MIN_AGREEMENT_PROBABILITY: Final = 0.01
-"""Probability below which recordings disagree. The value is small because a report contains many parameters."""
+"""Probability below which recordings disagree. The value is small, because a report contains many parameters."""
 MIN_RELATIVE_ERROR: Final = 1e-6
-"""Smallest standard deviation relative to the value. Sample times and numbers in files are rounded."""
+"""Smallest standard deviation relative to the value, because numbers in files are rounded."""
 
 
 @dataclass(frozen=True, slots=True)
 class PooledParameter:
-    """Parameter, averaged over all recordings that contain it."""
+    """Parameter averaged over several recordings."""
 
     bounds: ParameterInterval
     chi2: float = 0.0  # χ² of the recordings about their mean
     freedom: int = 0  # degrees of freedom: number of recordings with an interval, less one
 
     @property
-    def p(self) -> float | None:
-        """Probability of a larger χ² if the true value is the same in all recordings. None: too few values."""
+    def p_value(self) -> float | None:
+        """Probability of a larger χ² if the true value is the same in all recordings."""
         return agreement_probability([self])
 
 
 def agreement_probability(parameters: Iterable[PooledParameter]) -> float | None:
-    """Return the probability of a larger sum of the χ² values of independent parameters. None: too few values."""
+    """Return the probability of a larger χ² sum if all parameters agree, or None without degrees of freedom."""
     every = list(parameters)
     freedom = sum(one.freedom for one in every)
     return float(chdtrc(freedom, sum(one.chi2 for one in every))) if freedom else None
 
 
-def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
-    """Return the mean of one parameter over one or more recordings.
+def pool_parameter(intervals: Sequence[ParameterInterval]) -> PooledParameter:
+    """Compute the weighted mean of one parameter over one or more recordings.
 
     Examples
     --------
@@ -56,9 +54,9 @@ def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
     >>> print(round(both.bounds.value, 3), round(both.chi2, 3), both.freedom)
     11.0 2.0 1
     """
-    known = [one for one in found if _finite_interval(one) is not None]
+    known = [one for one in intervals if _finite_interval(one) is not None]
     if len(known) < 2:
-        return PooledParameter(known[0] if known else found[0])
+        return PooledParameter(known[0] if known else intervals[0])
     ends, factors = _symmetric_scale(np.array([_finite_interval(one) for one in known]))
     x, deviation = ends[:, 1], 0.5 * (ends[:, 2] - ends[:, 0]) / Z95
     weight = np.maximum(deviation, MIN_RELATIVE_ERROR * (1.0 if factors else np.abs(x))) ** -2
@@ -73,7 +71,7 @@ def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
 
 
 def distance_in_sigma(bounds: ParameterInterval, value: float) -> float:
-    """Return the distance of a value from a parameter, in standard deviations of the parameter.
+    """Return the distance between a value and a parameter, in standard deviations of the parameter.
 
     The distance is 0 if the parameter has no interval.
 
@@ -98,7 +96,7 @@ def distance_in_sigma(bounds: ParameterInterval, value: float) -> float:
 
 
 def _finite_interval(bounds: ParameterInterval) -> tuple[float, float, float] | None:
-    """Return the lower end, the value and the upper end, or None if there is no finite interval."""
+    """Return the lower end, the value and the upper end of a finite interval, otherwise None."""
     if isinstance(bounds.value, str) or bounds.lo is None or bounds.hi is None or not bounds.lo < bounds.hi:
         return None
     three = bounds.lo, bounds.value, bounds.hi
@@ -106,7 +104,7 @@ def _finite_interval(bounds: ParameterInterval) -> tuple[float, float, float] | 
 
 
 def _symmetric_scale(ends: Floats) -> tuple[Floats, bool]:
-    """Return intervals, shape (k, 3), on a symmetric scale, and True if the scale is logarithmic."""
+    """Return intervals, shape (k, 3), on a symmetric scale, and True for a logarithmic scale."""
     lo, value, hi = ends.T
     if np.any(lo <= 0.0) or np.abs(value - np.sqrt(lo * hi)).sum() >= np.abs(value - 0.5 * (lo + hi)).sum():
         return ends, False

@@ -50,7 +50,7 @@ def without_proof() -> Iterator[None]:
     """Nothing held out."""
     from monitor.reconcile.search import search
 
-    with patch.object(search, "cross_validate", lambda *_arguments: search.not_validated("switched off")):
+    with patch.object(search, "cross_validate", lambda *_arguments: search.accept_without_validation("switched off")):
         yield
 
 
@@ -61,7 +61,7 @@ def without_refit() -> Iterator[None]:
     from monitor.reconcile.search import search
 
     def stiff(axis: Any, added: Sequence[Any], model: tuple[Any, ...]) -> Any:
-        return hypothesis.Hypothesis(model, axis.fit((*model, *added), hypothesis.noise_indices(model)))
+        return hypothesis.Hypothesis(model, axis.fit((*model, *added), hypothesis.noise_effect_indices(model)))
 
     name = "fit_with_fewest_changes"
     with patch.object(search, name, stiff), patch.object(hypothesis, name, stiff):

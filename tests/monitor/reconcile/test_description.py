@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.axis_result import describe_axis
+from monitor.reconcile.axis_result import build_axis_result
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.json_report import encode_report
 from monitor.reconcile.result import Reconciliation
-from monitor.reconcile.search.search import search_axis
+from monitor.reconcile.search.search import search_missing_effects
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     STRICT,
@@ -58,12 +58,12 @@ NAMES = ("nothing", "line", "louder", "outliers", "correlated", "filtered and co
 
 @cache
 def found(name):
-    return search_axis(axis(hidden(name), MODEL), MODEL, STRICT, np.random.default_rng(0))
+    return search_missing_effects(axis(hidden(name), MODEL), MODEL, STRICT, np.random.default_rng(0))
 
 
 @cache
 def told(name):
-    return describe_axis(found(name), STRICT, STRICT)
+    return build_axis_result(found(name), STRICT, STRICT)
 
 
 @pytest.mark.long
@@ -127,20 +127,20 @@ def test_runners_up_are_other_names_and_never_certain():
 
 
 def test_verdicts_follow_from_steps_and_what_is_left():
-    assert describe_axis(found("nothing"), STRICT, STRICT).verdict == "agrees"
-    assert describe_axis(found("nothing"), STRICT, ALWAYS).verdict == "unexplained"
-    assert describe_axis(found("line"), STRICT, STRICT).verdict == "explained"
-    left = describe_axis(found("line"), STRICT, ALWAYS)
+    assert build_axis_result(found("nothing"), STRICT, STRICT).verdict == "agrees"
+    assert build_axis_result(found("nothing"), STRICT, ALWAYS).verdict == "unexplained"
+    assert build_axis_result(found("line"), STRICT, STRICT).verdict == "explained"
+    left = build_axis_result(found("line"), STRICT, ALWAYS)
     assert left.verdict == "partly_explained"
     assert {score.lens for score in left.left_over} == {
         lens for lens, one in found("line").final.findings.items() if one.gain
     }
-    assert describe_axis(found("line"), STRICT, UNREACHED).left_over == ()
+    assert build_axis_result(found("line"), STRICT, UNREACHED).left_over == ()
 
 
 def test_gaps_before_are_beside_the_model_that_decided_and_after_beside_the_new_one():
     other = dict.fromkeys(DIAGNOSTICS, NullDistribution(8.0, 18.0))
-    (step,) = describe_axis(found("line"), STRICT, other).steps
+    (step,) = build_axis_result(found("line"), STRICT, other).steps
     assert step.before.threshold == pytest.approx(30.0**0.5)
     assert step.after.threshold == pytest.approx(36.0**0.5)
     assert step.after.null95 == pytest.approx(4.0)
@@ -150,4 +150,4 @@ def test_what_did_not_shrink_is_still_told():
     """A search whose last look sees as much as its first has a step and is partly explained."""
     one = found("line")
     again = replace(one, final=one.rounds[0].before)
-    assert describe_axis(again, STRICT, STRICT).verdict == "partly_explained"
+    assert build_axis_result(again, STRICT, STRICT).verdict == "partly_explained"

@@ -9,11 +9,11 @@ from monitor.noise.effects import AngleRandomWalk, NoiseStep, RateRandomWalk, Re
 from monitor.reconcile.diagnostics import diagnostics
 from monitor.reconcile.diagnostics.diagnostics import (
     _regressor_gain,
-    find_line_peaks,
-    free_variance_gain_nats,
-    level_step_gains,
+    compute_level_step_gains,
+    find_periodogram_peaks,
+    fitted_variance_gain_nats,
 )
-from monitor.reconcile.likelihood.whitening import noise_deviation_over_time
+from monitor.reconcile.likelihood.whitening import relative_noise_deviation_over_time
 from monitor.reconcile.preparation.cosine_bins import cosine_transform
 from tests.monitor.reconcile.axes import RATE_HZ, WHITE, N, axes, axis, correlated, seen, time_s, walk, white
 
@@ -37,7 +37,7 @@ def least_squares(view, columns):
 def test_gain_of_a_step_at_each_time_is_that_of_least_squares(model):
     y = drawn() + 3e-3 * (np.arange(n) >= 1700)
     view = seen(axis(y), model)
-    gains, times_s = level_step_gains(view)
+    gains, times_s = compute_level_step_gains(view)
     for at in (0, 1, 700, int(np.argmax(gains)), gains.size - 2, gains.size - 1):
         step = cosine_transform(np.where(np.arange(n) >= round(times_s[at] * RATE_HZ), 1.0, 0.0))
         assert gains[at] == pytest.approx(least_squares(view, [step]), rel=1e-6, abs=1e-9)
@@ -64,16 +64,16 @@ def test_gain_of_power_is_that_of_a_variance_of_its_own():
             return 0.5 * float(np.sum(log_v + w**2 * np.exp(-log_v)))
 
         best = loss(0.0) - minimize_scalar(loss).fun
-        assert free_variance_gain_nats(np.mean(w**2, keepdims=True), np.array([count]))[0] == pytest.approx(
+        assert fitted_variance_gain_nats(np.mean(w**2, keepdims=True), np.array([count]))[0] == pytest.approx(
             best, abs=1e-6
         )
-    assert np.isfinite(free_variance_gain_nats(np.zeros(1), np.ones(1))).all()
+    assert np.isfinite(fitted_variance_gain_nats(np.zeros(1), np.ones(1))).all()
 
 
 def test_peaks_of_the_periodogram_are_those_of_scipy():
     rng = np.random.default_rng(3)
     w = rng.standard_normal(n) + 0.3 * np.sin(2 * np.pi * 7.3 * time_s(n)) + 0.2 * np.cos(2 * np.pi * 31.0 * time_s(n))
-    (first, f1), (second, f2), (third, _) = find_line_peaks(w, RATE_HZ, 3)
+    (first, f1), (second, f2), (third, _) = find_periodogram_peaks(w, RATE_HZ, 3)
     assert (f1, f2) == (pytest.approx(7.3, abs=0.02), pytest.approx(31.0, abs=0.02))
     assert first > second > third
     f, power = periodogram(w, RATE_HZ, detrend=False, scaling="density", nfft=2 * n)
@@ -96,8 +96,8 @@ def test_autocorrelation_is_the_sum_of_products():
 def test_power_over_frequency_is_at_least_that_of_every_bin():
     view = seen(axis(drawn(6)), MODEL)
     bins = view.axis.bins
-    each = free_variance_gain_nats(bins.sum_over_bins(view.coefficients**2) / bins.count, bins.count)
-    whole = free_variance_gain_nats(np.array([np.mean(view.coefficients**2)]), np.array([n - 1.0]))[0]
+    each = fitted_variance_gain_nats(bins.sum_over_bins(view.coefficients**2) / bins.count, bins.count)
+    whole = fitted_variance_gain_nats(np.array([np.mean(view.coefficients**2)]), np.array([n - 1.0]))[0]
     found = diagnostics.diagnose_psd(view)
     assert found.gain >= each.max() - 1e-9
     wider = diagnostics.diagnose_psd(seen(axis(1.2 * drawn(6)), MODEL))
@@ -124,21 +124,21 @@ def test_fast_series_is_white_whatever_the_spectrum_is():
     view = seen(axis(y), (WHITE,))
     assert np.mean(view.series**2) > 2.0
     assert np.mean(view.flat_series**2) == pytest.approx(1.0, abs=0.05)
-    assert diagnostics.diagnose_tails(view).gain < 5.0
-    assert diagnostics.diagnose_variance(view).gain < 15.0
+    assert diagnostics.diagnose_outliers(view).gain < 5.0
+    assert diagnostics.diagnose_variance_change(view).gain < 15.0
 
 
 def test_noise_steps_of_a_model_are_in_its_course():
     steady = axis(drawn())
-    course = noise_deviation_over_time(steady.fit((WHITE, NoiseStep(time=12.0, ratio=3.0))))
+    course = relative_noise_deviation_over_time(steady.fit((WHITE, NoiseStep(time=12.0, ratio=3.0))))
     assert np.mean(course**2) == pytest.approx(1.0)
     assert course[1200] / course[1199] == pytest.approx(3.0)
     assert np.unique(course).size == 2
-    np.testing.assert_array_equal(noise_deviation_over_time(steady.fit((WHITE,))), np.ones(n))
+    np.testing.assert_array_equal(relative_noise_deviation_over_time(steady.fit((WHITE,))), np.ones(n))
     y = white(n, np.random.default_rng(9)) * np.where(time_s(n) < 12.0, 1.0, 3.0)
     effects = (AngleRandomWalk(N=N), NoiseStep(time=12.0, ratio=3.0))
-    assert diagnostics.diagnose_variance(seen(axis(y), effects)).gain < 15.0
-    assert diagnostics.diagnose_variance(seen(axis(y), (AngleRandomWalk(N=2.5 * N),))).gain > 300.0
+    assert diagnostics.diagnose_variance_change(seen(axis(y), effects)).gain < 15.0
+    assert diagnostics.diagnose_variance_change(seen(axis(y), (AngleRandomWalk(N=2.5 * N),))).gain > 300.0
 
 
 def test_what_a_model_has_is_no_finding():
@@ -159,8 +159,8 @@ def test_ends_of_the_range_have_their_value_as_place():
 
 def test_no_temperature_and_no_other_axis_is_no_finding():
     view = seen(axis(drawn(12)), MODEL)
-    assert diagnostics.diagnose_temperature(view).gain == 0.0
-    assert diagnostics.diagnose_other_axes(view).gain == 0.0
+    assert diagnostics.diagnose_temperature_dependence(view).gain == 0.0
+    assert diagnostics.diagnose_leaks_from_other_axes(view).gain == 0.0
 
 
 def test_the_axis_that_leaks_is_named():
@@ -168,7 +168,7 @@ def test_the_axis_that_leaks_is_named():
     gx, gy = correlated(n, rng, 1e-2, 1.0), correlated(n, rng, 1e-2, 1.0)
     one = axes({"gx": gx, "gy": gy, "gz": drawn(14) + 0.03 * gy}, {"gx": (), "gy": (), "gz": MODEL})["gz"]
     view = seen(one, MODEL)
-    found = diagnostics.diagnose_other_axes(view)
+    found = diagnostics.diagnose_leaks_from_other_axes(view)
     assert found.where.source == "gy"
     assert found.gain == pytest.approx(least_squares(view, [cosine_transform(gy)]), rel=1e-6)
 
@@ -178,4 +178,8 @@ def test_courses_that_were_fitted_are_taken_out():
     one = axis(drawn(15) + line)
     model = (*MODEL, Sinusoidal(amplitude=1.0, frequency=7.3, phase=0.0))
     view = seen(one, model)
-    assert diagnostics.diagnose_lines(view).gain < 20.0 < diagnostics.diagnose_lines(seen(one, MODEL)).gain
+    assert (
+        diagnostics.diagnose_spectral_lines(view).gain
+        < 20.0
+        < diagnostics.diagnose_spectral_lines(seen(one, MODEL)).gain
+    )

@@ -9,8 +9,8 @@ from monitor.reconcile.diagnostics.null_distribution import (
     FALSE_ALARM_PROBABILITY,
     NullDistribution,
     _tail_quantiles,
+    compute_diagnostic_gaps,
     estimate_null_distributions,
-    measure_gaps,
 )
 from monitor.reconcile.result import Location
 
@@ -82,7 +82,7 @@ def test_a_lens_that_never_sees_anything_has_a_threshold():
 
 def test_a_gap_is_in_standard_deviations():
     seen = {lens: Finding(0.5 * k**2, Location(tau=(1.0, 2.0))) for k, lens in enumerate(DIAGNOSTICS)}
-    found = measure_gaps(seen, dict.fromkeys(DIAGNOSTICS, NullDistribution(2.0, 8.0)))
+    found = compute_diagnostic_gaps(seen, dict.fromkeys(DIAGNOSTICS, NullDistribution(2.0, 8.0)))
     assert [score.lens for score in found] == list(DIAGNOSTICS)
     assert [score.gap for score in found] == pytest.approx(np.arange(len(DIAGNOSTICS)))
     assert {(score.null95, score.threshold) for score in found} == {(2.0, 4.0)}

@@ -25,7 +25,7 @@ from monitor.noise.effects import (
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.axis_fit import RegressorCache
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
-from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
+from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     TERMS,
@@ -74,8 +74,10 @@ def test_sizes_are_found_with_their_errors():
         y = white(n, rng) + walk(n, rng, 1e-4) + 2e-5 * time_s(n)
         found = axis(y).fit((AngleRandomWalk(N=1.0), RateRandomWalk(K=1.0), RateRamp(R=1.0)))
         noise, random_walk, _ = found.effects
-        off.append([(noise.N - N) / found.size_error(0), (random_walk.K - 1e-4) / found.size_error(1)])
-        off[-1].append((found.whittle.beta[0] - 2e-5) / found.size_error(2))
+        off.append(
+            [(noise.N - N) / found.size_standard_error(0), (random_walk.K - 1e-4) / found.size_standard_error(1)]
+        )
+        off[-1].append((found.whittle.beta[0] - 2e-5) / found.size_standard_error(2))
     # 40 standardised errors scatter by 11 %, their mean by 16 %
     assert np.std(off, axis=0) == pytest.approx(1.0, abs=0.35)
     assert np.abs(np.mean(off, axis=0)).max() < 0.55
@@ -96,7 +98,7 @@ def test_courses_and_noises_are_fitted_together():
     )
     found = one.fit(effects)
     noise, fitted_line, bias, leak = found.effects
-    errors = [found.size_error(at) for at in range(4)]
+    errors = [found.size_standard_error(at) for at in range(4)]
     assert pytest.approx(N, abs=4 * errors[0]) == noise.N
     assert fitted_line.amplitude == pytest.approx(2e-4, abs=4 * errors[1])
     assert fitted_line.phase == pytest.approx(0.8, abs=4 * errors[1] / 2e-4)
@@ -104,7 +106,7 @@ def test_courses_and_noises_are_fitted_together():
     assert leak.coefficient == pytest.approx(-0.03, abs=4 * errors[3])
     assert errors[1] == pytest.approx(N * RATE_HZ**0.5 * np.sqrt(2.0 / n), rel=0.05)
     clean = cosine_transform(gz - line - 1e-4 * (warm - 25.0) + 0.03 * gx)
-    assert np.std(found.residual_coefficients() - clean) < 0.03 * np.std(clean)
+    assert np.std(found.coefficients_without_deterministic_effects() - clean) < 0.03 * np.std(clean)
 
 
 def test_a_size_that_is_held_stays_and_costs_likelihood():
@@ -113,7 +115,7 @@ def test_a_size_that_is_held_stays_and_costs_likelihood():
     wrong = (AngleRandomWalk(N=1.1 * N), RateRandomWalk(K=1e-4))
     held, free = one.fit(wrong, frozenset({0})), one.fit(wrong)
     assert held.effects[0].N == 1.1 * N
-    assert np.isnan(held.size_error(0))
+    assert np.isnan(held.size_standard_error(0))
     assert held.fitted_noise == (1,)
     # n ln(1.1) − n/2 (1 − 1/1.21), each within a few nats
     assert free.log_likelihood - held.log_likelihood == pytest.approx(n * (np.log(1.1) - 0.5 * (1 - 1 / 1.21)), rel=0.3)
@@ -125,7 +127,7 @@ def test_courses_of_any_size_beside_the_same_noise():
     found = one.fit((WHITE, RateRamp(R=1.0)), frozenset({0}))
     same = found.with_regressor_sizes(found.whittle.beta)
     assert same.log_likelihood == pytest.approx(found.log_likelihood, abs=1e-6)
-    error = found.size_error(1)
+    error = found.size_standard_error(1)
     for shift in (-2.0, 1.0, 3.0):  # standard errors: a parabola
         moved = found.with_regressor_sizes(found.whittle.beta + shift * error)
         assert found.log_likelihood - moved.log_likelihood == pytest.approx(0.5 * shift**2, rel=1e-3)
@@ -173,7 +175,7 @@ def test_nameless_bases_are_fitted_besides():
 def test_other_bins_are_the_same_axis():
     rng = np.random.default_rng(7)
     one = axis(white(n, rng) + walk(n, rng))
-    finer = replace(one, bins=frequency_bins(n, RATE_HZ, [(20.0, 0.1)]))
+    finer = replace(one, bins=build_frequency_bins(n, RATE_HZ, [(20.0, 0.1)]))
     assert finer.bins.count.size > one.bins.count.size
     np.testing.assert_array_equal(finer.coefficients, one.coefficients)
     assert (finer.name, finer.n, finer.rate_hz) == ("gz", n, RATE_HZ)
@@ -182,13 +184,13 @@ def test_other_bins_are_the_same_axis():
 
 def test_a_course_is_made_once_for_all_sizes():
     made = RegressorCache(n, RATE_HZ, warmth(n))
-    one = made.regressor_transforms(Sinusoidal(amplitude=3.0, frequency=5.0, phase=1.0))
-    assert made.regressor_transforms(Sinusoidal(amplitude=0.1, frequency=5.0, phase=2.0)) is one
-    assert made.regressor_transforms(Sinusoidal(amplitude=0.1, frequency=5.1, phase=2.0)) is not one
+    one = made.regressor_cosine_transforms(Sinusoidal(amplitude=3.0, frequency=5.0, phase=1.0))
+    assert made.regressor_cosine_transforms(Sinusoidal(amplitude=0.1, frequency=5.0, phase=2.0)) is one
+    assert made.regressor_cosine_transforms(Sinusoidal(amplitude=0.1, frequency=5.1, phase=2.0)) is not one
     sine = np.sin(2.0 * np.pi * 5.0 * time_s(n))
     np.testing.assert_allclose(one[0], cosine_transform(sine), atol=1e-9)
     bias = TemperatureBias(coefficient=4.0, reference=25.0)
-    np.testing.assert_allclose(made.regressor_transforms(bias)[0], cosine_transform(warmth(n)), atol=1e-9)
+    np.testing.assert_allclose(made.regressor_cosine_transforms(bias)[0], cosine_transform(warmth(n)), atol=1e-9)
 
 
 def test_terms_of_size_zero_stay_as_small_as_they_are():

@@ -8,10 +8,10 @@ from monitor.noise.effects import EFFECTS, CrossAxis, Sinusoidal, TemperatureBia
 from monitor.reconcile.likelihood.effect_roles import (
     DETERMINISTIC_SIZE_PARAMETERS,
     NOISE_SIZE_PARAMETERS,
-    size,
-    unit_regressors,
+    build_unit_regressors,
+    effect_size,
+    with_effect_size,
     with_regressor_factors,
-    with_size,
 )
 from tests.contracts.effect_examples import effect
 from tests.monitor.reconcile.axes import RATE_HZ, warmth
@@ -41,19 +41,21 @@ def test_a_spectrum_grows_with_the_square_of_the_size(kind):
     one = effect(kind.name)
     f_hz, tau0_s = np.geomspace(0.01, 0.5 * RATE_HZ, 40), 1.0 / RATE_HZ
     np.testing.assert_allclose(
-        size(one) ** 2 * with_size(one, 1.0).two_sided_psd(f_hz, tau0_s), one.two_sided_psd(f_hz, tau0_s), rtol=1e-12
+        effect_size(one) ** 2 * with_effect_size(one, 1.0).two_sided_psd(f_hz, tau0_s),
+        one.two_sided_psd(f_hz, tau0_s),
+        rtol=1e-12,
     )
-    bigger = with_size(one, 7.0)
+    bigger = with_effect_size(one, 7.0)
     np.testing.assert_allclose(
-        49.0 * with_size(one, 1.0).two_sided_psd(f_hz, tau0_s), bigger.two_sided_psd(f_hz, tau0_s), rtol=1e-12
+        49.0 * with_effect_size(one, 1.0).two_sided_psd(f_hz, tau0_s), bigger.two_sided_psd(f_hz, tau0_s), rtol=1e-12
     )
-    assert size(with_size(one, -7.0)) == 7.0
+    assert effect_size(with_effect_size(one, -7.0)) == 7.0
 
 
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)
 def test_columns_times_factors_are_the_series(kind):
     one = effect(kind.name)
-    made = unit_regressors(one, n, RATE_HZ, warmth(n))
+    made = build_unit_regressors(one, n, RATE_HZ, warmth(n))
     factors = np.array([0.8, -1.7])[: len(made)]
     fitted = with_regressor_factors(one, factors)
     want = drawn(fitted)
@@ -67,7 +69,7 @@ def test_columns_times_factors_are_the_series(kind):
 
 def test_phase_of_a_line_is_in_its_two_columns():
     line = Sinusoidal(amplitude=0.4, frequency=7.3, phase=2.2)
-    made = np.stack(unit_regressors(line, n, RATE_HZ, None))
+    made = np.stack(build_unit_regressors(line, n, RATE_HZ, None))
     factors, *_ = np.linalg.lstsq(made.T, drawn(line), rcond=None)
     back = with_regressor_factors(line, factors)
     assert back.amplitude == pytest.approx(0.4)
@@ -76,19 +78,19 @@ def test_phase_of_a_line_is_in_its_two_columns():
 
 def test_a_curve_over_temperature_has_two_columns_and_a_line_one():
     straight = TemperatureBias(coefficient=0.3, reference=25.0)
-    assert len(unit_regressors(straight, n, RATE_HZ, warmth(n))) == 1
+    assert len(build_unit_regressors(straight, n, RATE_HZ, warmth(n))) == 1
     bent = TemperatureBias(coefficient=0.3, reference=25.0, quadratic=-0.04)
-    one, two = unit_regressors(bent, n, RATE_HZ, warmth(n))
+    one, two = build_unit_regressors(bent, n, RATE_HZ, warmth(n))
     np.testing.assert_allclose(one, warmth(n) - 25.0, atol=1e-12)
     np.testing.assert_allclose(two, (warmth(n) - 25.0) ** 2, atol=1e-12)
 
 
 def test_size_keeps_its_sign_where_it_has_one():
-    assert size(with_size(effect("bias_step"), -2.0)) == -2.0
-    assert size(with_size(effect("sinusoidal"), -2.0)) == 2.0
-    assert size(with_size(effect("rate_ramp"), -2.0)) == 2.0
+    assert effect_size(with_effect_size(effect("bias_step"), -2.0)) == -2.0
+    assert effect_size(with_effect_size(effect("sinusoidal"), -2.0)) == 2.0
+    assert effect_size(with_effect_size(effect("rate_ramp"), -2.0)) == 2.0
 
 
 def test_a_leak_has_no_series_of_its_own():
     with pytest.raises(TypeError, match="another axis"):
-        unit_regressors(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)
+        build_unit_regressors(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)

@@ -9,13 +9,13 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     BackgroundNoise,
     _flicker_processes,
     _log_interval,
-    block_markov_noise,
-    block_means,
+    build_state_space_noise,
+    compute_block_means,
+    correlated_noise_of_block_means,
     fit_event_process,
     kalman_log_likelihood,
     maximise_log_likelihood,
     prior_level_variance,
-    state_space_noise,
 )
 from tests.monitor.reconcile.event_noise import BLOCK_S, dense
 
@@ -32,19 +32,19 @@ from tests.monitor.reconcile.event_noise import BLOCK_S, dense
 def test_filter_is_the_dense_gaussian_likelihood(rest):
     covariance = dense(rest, 300, start=5.0)
     means = np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(300)
-    around = state_space_noise(rest, BLOCK_S, 300 * BLOCK_S)
+    around = build_state_space_noise(rest, BLOCK_S, 300 * BLOCK_S)
     found = kalman_log_likelihood(means, around, 5.0)
     assert found == pytest.approx(multivariate_normal.logpdf(means, cov=covariance), abs=1e-6)
 
 
 def test_slow_process_is_a_random_walk_in_a_block():
     for block_s in (0.0999, 0.1001):  # either side of where a series takes over
-        row, own = block_markov_noise(1.0, 10.0, block_s)
+        row, own = correlated_noise_of_block_means(1.0, 10.0, block_s)
         walk = 2.0 / 10.0 * block_s
         assert row[2:] == pytest.approx((walk, 0.5 * walk), rel=0.02)
         assert own == pytest.approx(walk / 3.0, rel=0.02)
-    assert block_markov_noise(1.0, 10.0, 0.0999)[1] / 0.0999 == pytest.approx(
-        block_markov_noise(1.0, 10.0, 0.1001)[1] / 0.1001, rel=1e-4
+    assert correlated_noise_of_block_means(1.0, 10.0, 0.0999)[1] / 0.0999 == pytest.approx(
+        correlated_noise_of_block_means(1.0, 10.0, 0.1001)[1] / 0.1001, rel=1e-4
     )
 
 
@@ -91,11 +91,11 @@ def test_search_does_not_leave_the_neighbourhood_of_its_start():
 
 def test_block_means():
     y = np.random.default_rng(0).standard_normal(1003) + 5.0
-    means, block_s = block_means(y, 0.01, 0.1)
+    means, block_s = compute_block_means(y, 0.01, 0.1)
     assert block_s == pytest.approx(0.1)
     assert means + y[:1000].mean() == pytest.approx([y[10 * k : 10 * k + 10].mean() for k in range(100)])
     assert prior_level_variance(means) == pytest.approx(100.0 * means.var())
     with pytest.raises(ValueError, match="at least 16"):
-        block_means(y, 0.01, 1.0)
+        compute_block_means(y, 0.01, 1.0)
     with pytest.raises(ValueError, match="above zero"):
-        state_space_noise(BackgroundNoise(0.0, walk=1.0), 1.0, 100.0)
+        build_state_space_noise(BackgroundNoise(0.0, walk=1.0), 1.0, 100.0)

@@ -15,11 +15,11 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.likelihood.hypothesis import (
     _with_shape,
+    compute_shape_interval,
+    compute_size_interval,
+    fit_shape_parameter,
     fit_with_fewest_changes,
     fit_with_fixed_noise,
-    refine_shape,
-    shape_interval,
-    size_interval,
 )
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, K, N, axis, correlated, time_s, walk, white
 
@@ -52,7 +52,7 @@ def test_a_wrong_size_is_another_size_and_the_right_one_stays(wrong, at):
     assert state.effects[1 - at] == given[1 - at]
     found = (state.effects[0].N / N, state.effects[1].K / 3e-5)[at]
     assert found == pytest.approx(1.0, abs=0.4 if at else 0.02)
-    assert state.score > fit_with_fixed_noise(one, given).score
+    assert state.penalised_log_likelihood > fit_with_fixed_noise(one, given).penalised_log_likelihood
 
 
 def test_both_wrong_sizes_are_found():
@@ -66,7 +66,7 @@ def test_what_was_found_is_always_fitted():
     y = drawn(3) + 5e-5 * time_s(n)
     state = fit_with_fewest_changes(axis(y), (RateRamp(R=1.0),), MODEL)
     assert state.refitted_size_count == 0
-    assert pytest.approx(5e-5, abs=5 * state.fit.size_error(2)) == state.effects[2].R
+    assert pytest.approx(5e-5, abs=5 * state.fit.size_standard_error(2)) == state.effects[2].R
     alone = fit_with_fewest_changes(axis(drawn(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
     assert pytest.approx(N, rel=0.03) == alone.effects[0].N
     assert alone.refitted_size_count == 0  # nothing was given
@@ -76,7 +76,7 @@ def test_a_shape_is_at_the_top_of_its_profile():
     rng = np.random.default_rng(4)
     one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
     effects = (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.8))
-    found = refine_shape(one, effects[:1], effects[1], "correlation_time", 3.0)
+    found = fit_shape_parameter(one, effects[:1], effects[1], "correlation_time", 3.0)
 
     def loss(x):
         return -one.fit(_with_shape(effects, 1, "correlation_time", float(np.exp(x)))).log_likelihood
@@ -91,9 +91,9 @@ def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
     rng = np.random.default_rng(5)
     one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
     start = ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5)
-    effects = (WHITE, refine_shape(one, (WHITE,), start, "correlation_time"))
+    effects = (WHITE, fit_shape_parameter(one, (WHITE,), start, "correlation_time"))
     state = fit_with_fewest_changes(one, effects, ())
-    found = shape_interval(state.fit, 1, "correlation_time")
+    found = compute_shape_interval(state.fit, 1, "correlation_time")
     assert found.lo < found.value < found.hi
     assert found.lo < 0.5 < found.hi
     for end in (found.lo, found.hi):
@@ -110,9 +110,9 @@ def test_intervals_of_a_line_hold_its_frequency():
         y = white(n, rng) + 3e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n) + 1.0)
         one = axis(y)
         start = Sinusoidal(amplitude=1e-4, frequency=17.3, phase=0.0)
-        effects = (WHITE, refine_shape(one, (WHITE,), start, "frequency", 1.0001))
+        effects = (WHITE, fit_shape_parameter(one, (WHITE,), start, "frequency", 1.0001))
         state = fit_with_fewest_changes(one, effects, ())
-        found = shape_interval(state.fit, 1, "frequency")
+        found = compute_shape_interval(state.fit, 1, "frequency")
         inside.append(found.lo < 17.3 < found.hi)
         error = np.sqrt(6.0 / n) / (np.pi * n / RATE_HZ) * N * RATE_HZ**0.5 / 3e-4
         assert found.hi - found.lo == pytest.approx(2 * 1.96 * error, rel=0.15)
@@ -124,7 +124,7 @@ def test_intervals_of_sizes():
     for seed in range(40):
         y = drawn(seed, np.where(time_s(n) < 80.0, 0.0, -3e-4))
         state = fit_with_fewest_changes(axis(y), (*MODEL, BiasStep(time=80.0, height=1.0)), ())
-        white_noise, _, step = (size_interval(state.fit, at) for at in range(3))
+        white_noise, _, step = (compute_size_interval(state.fit, at) for at in range(3))
         inside += [white_noise.lo < N < white_noise.hi, step.lo < -3e-4 < step.hi]
         assert white_noise.lo * white_noise.hi == pytest.approx(white_noise.value**2)
     assert np.mean(inside) > 0.87  # of 80, less than 0.88 once in 150
@@ -132,12 +132,12 @@ def test_intervals_of_sizes():
 
 def test_a_size_that_is_held_or_zero_has_no_interval():
     one = axis(white(n, np.random.default_rng(0)))
-    held = size_interval(fit_with_fixed_noise(one, (WHITE, WALK)).fit, 0)
+    held = compute_size_interval(fit_with_fixed_noise(one, (WHITE, WALK)).fit, 0)
     assert (held.value, held.lo, held.hi) == (N, None, None)
     for seed in range(8):  # K is at its bound in about half of the cases
         state = fit_with_fewest_changes(axis(white(n, np.random.default_rng(seed))), (WHITE, RateRandomWalk(K=K)), ())
         if state.effects[1].K == 0.0:
-            assert size_interval(state.fit, 1).lo is None
+            assert compute_size_interval(state.fit, 1).lo is None
             break
     else:
         pytest.fail("no fit was at the bound")

@@ -10,8 +10,8 @@ from monitor.reconcile.likelihood import poisson_steps_vs_random_walk as poisson
 from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
 from monitor.reconcile.likelihood.state_space_comparison import (
     BackgroundNoise,
+    build_state_space_noise,
     kalman_log_likelihood,
-    state_space_noise,
 )
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, walk, white
 
@@ -42,7 +42,7 @@ def enumerated(means, covariance):
 
 
 def likelihood(means, rest, rate, height, start):
-    around = state_space_noise(rest, BLOCK_S, means.size * BLOCK_S)
+    around = build_state_space_noise(rest, BLOCK_S, means.size * BLOCK_S)
     return poisson_steps._log_likelihood(means, around, start, rate * BLOCK_S, height)
 
 
@@ -62,7 +62,7 @@ def test_many_small_jumps_are_a_random_walk():
     K = 0.1
     rng = np.random.default_rng(0)
     means = np.linalg.cholesky(dense(BackgroundNoise(1.0, walk=K * K), 300)) @ rng.standard_normal(300)
-    around = state_space_noise(BackgroundNoise(1.0, walk=K * K), BLOCK_S, 300 * BLOCK_S)
+    around = build_state_space_noise(BackgroundNoise(1.0, walk=K * K), BLOCK_S, 300 * BLOCK_S)
     gaussian = kalman_log_likelihood(means, around, 9.0)
     often = 20.0 / BLOCK_S
     assert likelihood(means, BackgroundNoise(1.0), often, K / often**0.5, 9.0) == pytest.approx(gaussian, abs=1e-4)

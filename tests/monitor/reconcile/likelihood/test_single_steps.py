@@ -6,7 +6,11 @@ from scipy.stats import multivariate_normal
 
 from monitor.reconcile.likelihood import poisson_steps_vs_single_steps as single_steps
 from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
-from monitor.reconcile.likelihood.state_space_comparison import BackgroundNoise, block_means, state_space_noise
+from monitor.reconcile.likelihood.state_space_comparison import (
+    BackgroundNoise,
+    build_state_space_noise,
+    compute_block_means,
+)
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, white
 
 REST = BackgroundNoise(1.0, walk=0.01, correlated=((1.0, 30.0),))
@@ -23,7 +27,7 @@ def short():
 
 def test_every_shock_gains_what_a_regression_gains(short):
     means, covariance = short
-    around = state_space_noise(REST, BLOCK_S, M * BLOCK_S)
+    around = build_state_space_noise(REST, BLOCK_S, M * BLOCK_S)
     known = 40
     free = np.zeros(M)
     free[known] = 1e4
@@ -37,7 +41,7 @@ def test_every_shock_gains_what_a_regression_gains(short):
 
 def test_whitened_columns_have_the_dense_likelihood(short):
     means, covariance = short
-    around = state_space_noise(REST, BLOCK_S, M * BLOCK_S)
+    around = build_state_space_noise(REST, BLOCK_S, M * BLOCK_S)
     columns = np.column_stack([means, np.arange(M) >= 20.0])
     logs = single_steps._whiten(columns, around, 50.0)
     assert -0.5 * (logs + columns[:, 0] @ columns[:, 0]) == pytest.approx(
@@ -55,8 +59,8 @@ def stepped(times, heights, rng):
 def test_finds_times():
     times, heights = (700.3, 1801.7, 2950.1), (4e-4, -3e-4, 5e-4)
     y = stepped(times, heights, np.random.default_rng(0))
-    means, block_s = block_means(y, TAU0_S, 5.0)
-    noise = state_space_noise(BackgroundNoise(N * N), block_s, means.size * block_s)
+    means, block_s = compute_block_means(y, TAU0_S, 5.0)
+    noise = build_state_space_noise(BackgroundNoise(N * N), block_s, means.size * block_s)
     assert single_steps._fit_single_steps(means, noise, 5).times * block_s == pytest.approx(times, abs=3.0)
     found = compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5)
     assert found.single_steps == 3
@@ -94,6 +98,8 @@ def test_steps_stay_apart_in_neighbouring_blocks():
     """A climb in two blocks side by side: times are refined without ever meeting, where no height could be told."""
     means = np.where(np.arange(M) < 30, 0.0, np.where(np.arange(M) < 31, 20.0, 60.0)) - 29.0
     means = means + 0.1 * np.random.default_rng(0).standard_normal(M)
-    found = single_steps._fit_single_steps(means, state_space_noise(BackgroundNoise(0.03), BLOCK_S, M * BLOCK_S), 2)
+    found = single_steps._fit_single_steps(
+        means, build_state_space_noise(BackgroundNoise(0.03), BLOCK_S, M * BLOCK_S), 2
+    )
     assert found.times.size == 2
     assert found.times[1] - found.times[0] >= 1.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.likelihood.variance_history import find_least_constant_tiles, fit_variance_changes
+from monitor.reconcile.likelihood.variance_history import find_spectrogram_change, fit_variance_changes
 
 N = 60_000
 TAU0 = 0.01
@@ -83,7 +83,7 @@ def within(pair, value):
 
 def test_a_line_that_comes_and_goes_is_found_in_time_and_frequency():
     w = noise() + np.where((T > 200.0) & (T < 330.0), 0.3, 0.0) * np.sin(2.0 * np.pi * 31.4 * T)
-    found = find_least_constant_tiles(w, TAU0)
+    found = find_spectrogram_change(w, TAU0)
     assert found.gain > 50.0
     assert within(found.frequency, 31.4)
     assert within((200.0 - 25.0, 330.0 + 25.0), sum(found.time) / 2.0)
@@ -93,7 +93,7 @@ def test_a_line_that_comes_and_goes_is_found_in_time_and_frequency():
 def test_a_burst_of_all_frequencies_is_found_in_time():
     w = noise()
     w[41_000:41_100] *= 3.0
-    found = find_least_constant_tiles(w, TAU0)
+    found = find_spectrogram_change(w, TAU0)
     assert found.gain > 30.0
     assert within(found.time, 410.5)
 
@@ -101,7 +101,7 @@ def test_a_burst_of_all_frequencies_is_found_in_time():
 def test_a_pause_is_found_too():
     w = noise()
     w[30_000:34_000] *= 0.7
-    found = find_least_constant_tiles(w, TAU0)
+    found = find_spectrogram_change(w, TAU0)
     assert found.gain > 30.0
 
 
@@ -114,14 +114,14 @@ def test_a_pause_is_found_too():
     ids=["modulated line", "chirp"],
 )
 def test_lines_that_do_not_stay_as_they_are_make_a_row_uneven(add):
-    found = find_least_constant_tiles(noise() + add, TAU0)
+    found = find_spectrogram_change(noise() + add, TAU0)
     assert found.row_gain > 20.0
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.5, 3.0])
 def test_steady_noise_and_steady_lines_gain_little(amplitude):
     found = [
-        find_least_constant_tiles(noise(seed) + amplitude * np.sin(2.0 * np.pi * 17.0 * T + seed), TAU0)
+        find_spectrogram_change(noise(seed) + amplitude * np.sin(2.0 * np.pi * 17.0 * T + seed), TAU0)
         for seed in range(10)
     ]
     assert max(one.gain for one in found) < 20.0
@@ -129,18 +129,18 @@ def test_steady_noise_and_steady_lines_gain_little(amplitude):
 
 
 def test_the_unit_makes_no_difference():
-    one, other = find_least_constant_tiles(noise(), TAU0), find_least_constant_tiles(1e-4 * noise(), TAU0)
+    one, other = find_spectrogram_change(noise(), TAU0), find_spectrogram_change(1e-4 * noise(), TAU0)
     assert one.gain == pytest.approx(other.gain)
     assert one.time == other.time
 
 
-@pytest.mark.parametrize("look", [fit_variance_changes, find_least_constant_tiles])
+@pytest.mark.parametrize("look", [fit_variance_changes, find_spectrogram_change])
 def test_too_few_samples_are_refused(look):
     with pytest.raises(ValueError, match="at least"):
         look(noise()[:200], TAU0)
 
 
 def test_short_recordings_have_short_pieces_only():
-    found = find_least_constant_tiles(noise()[:5_000], TAU0)
+    found = find_spectrogram_change(noise()[:5_000], TAU0)
     assert found.gain < 15.0
     assert round((found.time[1] - found.time[0]) / 2.56) >= 1

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from monitor.reconcile.likelihood.whittle_fit import BinSums, maximise_whittle
-from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
+from monitor.reconcile.likelihood.whittle_fit import BinnedProductSums, maximise_whittle_likelihood
+from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform
 
 n = 160
 D = np.array([cosine_transform(row) for row in np.eye(n)]).T  # [n − 1, n]: coefficients of a series
@@ -40,8 +40,8 @@ def dense(y, theta, beta=(0.0, 0.0, 0.0)):
 def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
     """Each coefficient in a bin of its own."""
     products = np.einsum("ik,jk->ijk", regressors, regressors)
-    found = BinSums(y**2, regressors * y, products)
-    return maximise_whittle(np.ones(n - 1), found, BASES, np.full(n - 1, constant), np.array(start))
+    found = BinnedProductSums(y**2, regressors * y, products)
+    return maximise_whittle_likelihood(np.ones(n - 1), found, BASES, np.full(n - 1, constant), np.array(start))
 
 
 @pytest.mark.long
@@ -119,13 +119,13 @@ def test_errors_are_those_of_many_runs():
 
 def test_a_bin_of_many_is_the_sum_of_its_coefficients():
     rng = np.random.default_rng(1)
-    binned = frequency_bins(3000, 100.0)
+    binned = build_frequency_bins(3000, 100.0)
     y = rng.standard_normal(2999)
     regressors = rng.standard_normal((2, 2999))
     bases = np.array([np.ones(binned.count.size), 1.0 / binned.f_hz])
     products = np.array([[binned.sum_over_bins(a * b) for b in (y, *regressors)] for a in (y, *regressors)])
-    sums = BinSums(products[0, 0], products[1:, 0], products[1:, 1:])
-    found = maximise_whittle(binned.count, sums, bases, np.zeros(binned.count.size), np.ones(2))
+    sums = BinnedProductSums(products[0, 0], products[1:, 0], products[1:, 1:])
+    found = maximise_whittle_likelihood(binned.count, sums, bases, np.zeros(binned.count.size), np.ones(2))
     each = binned.expand_to_coefficients(found.variance)
     left = y - found.beta @ regressors
     assert found.log_likelihood == pytest.approx(-0.5 * np.sum(np.log(each) + left**2 / each))

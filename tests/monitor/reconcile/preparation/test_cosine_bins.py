@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter, periodogram
 
-from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins, inverse_cosine_transform
+from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
 
 
 def matrix(n):
@@ -54,7 +54,7 @@ def test_variance_of_a_coefficient_is_the_spectrum(pole):
 )
 @settings(max_examples=60, deadline=None)
 def test_every_coefficient_is_in_one_bin(n, rate_hz, peaks):
-    found = frequency_bins(n, rate_hz, [(middle * rate_hz, width * rate_hz) for middle, width in peaks])
+    found = build_frequency_bins(n, rate_hz, [(middle * rate_hz, width * rate_hz) for middle, width in peaks])
     assert found.count.min() >= 1
     assert found.first[0] == 0
     np.testing.assert_array_equal(found.first[1:], np.cumsum(found.count)[:-1])
@@ -67,7 +67,7 @@ def test_every_coefficient_is_in_one_bin(n, rate_hz, peaks):
 
 def test_bins_are_narrow_where_spectra_are_steep():
     n, rate_hz = 360_000, 100.0
-    found = frequency_bins(n, rate_hz)
+    found = build_frequency_bins(n, rate_hz)
     step_hz = 0.5 * rate_hz / n
     width_hz = found.count * step_hz
     assert np.all(found.count[:20] == 1)
@@ -75,14 +75,14 @@ def test_bins_are_narrow_where_spectra_are_steep():
     assert np.all(width_hz[slow] < 0.1 * found.f_hz[slow])
     assert width_hz.max() <= 0.1 + 2 * step_hz
     assert np.all(width_hz[high] <= 0.1 * (0.5 * rate_hz - found.f_hz[high]) + 2 * step_hz)
-    around = frequency_bins(n, rate_hz, [(17.3, 0.02)])
+    around = build_frequency_bins(n, rate_hz, [(17.3, 0.02)])
     near = np.abs(around.f_hz - 17.3) < 0.02
     assert np.count_nonzero(near) > 10
     assert np.max((around.count * step_hz)[near]) < 0.01
 
 
 def test_sums_are_those_of_each_bin_and_spread_is_their_way_back():
-    found = frequency_bins(5000, 100.0, [(10.0, 0.5)])
+    found = build_frequency_bins(5000, 100.0, [(10.0, 0.5)])
     values = np.random.default_rng(0).standard_normal(4999)
     direct, at = [], 0
     for count in found.count.astype(int):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.preparation.sample_repair import fill_missing, restore_clipped
+from monitor.reconcile.preparation.sample_repair import fill_missing_samples, restore_clipped_samples
 
 N = 200_000
 
@@ -17,7 +17,7 @@ def test_good_samples_stay_and_the_input_too():
     y[3] = np.nan
     before = y.copy()
     mask = rng(1).random(5_000) < 0.05
-    new = fill_missing(y, mask, rng(2))
+    new = fill_missing_samples(y, mask, rng(2))
     assert np.array_equal(y, before, equal_nan=True)
     kept = ~mask & np.isfinite(y)
     assert np.array_equal(new[kept], y[kept])
@@ -27,8 +27,8 @@ def test_good_samples_stay_and_the_input_too():
 
 def test_the_same_seed_gives_the_same_samples():
     y, mask = rng().standard_normal(5_000), rng(1).random(5_000) < 0.05
-    assert np.array_equal(fill_missing(y, mask, rng(2)), fill_missing(y, mask, rng(2)))
-    assert not np.array_equal(fill_missing(y, mask, rng(2)), fill_missing(y, mask, rng(3)))
+    assert np.array_equal(fill_missing_samples(y, mask, rng(2)), fill_missing_samples(y, mask, rng(2)))
+    assert not np.array_equal(fill_missing_samples(y, mask, rng(2)), fill_missing_samples(y, mask, rng(3)))
 
 
 def test_the_spectrum_is_unbiased():
@@ -36,7 +36,7 @@ def test_the_spectrum_is_unbiased():
     apart = []
     for seed in range(6):
         y = rng(seed).standard_normal(N)
-        new = fill_missing(
+        new = fill_missing_samples(
             np.where(rng(seed + 50).random(N) < 0.01, 99.0, y), np.asarray(rng(seed + 50).random(N) < 0.01), rng(seed)
         )
         power, truth = (np.abs(np.fft.rfft(x))[200:] ** 2 for x in (new, y))
@@ -47,7 +47,7 @@ def test_the_spectrum_is_unbiased():
 def test_white_variance_and_differences_stay():
     y = rng().standard_normal(N)
     mask = rng(1).random(N) < 0.4
-    new = fill_missing(y, mask, rng(2))
+    new = fill_missing_samples(y, mask, rng(2))
     assert new[mask].var() == pytest.approx(1.0, abs=0.02)
     assert np.diff(new).var() == pytest.approx(2.0, abs=0.04)
 
@@ -58,7 +58,7 @@ def test_drift_goes_on_through_short_holes(drift):
     mask = np.zeros(N, dtype=bool)
     for at in range(500, N - 500, 1000):
         mask[at : at + 30] = True
-    new = fill_missing(walk + 0.3 * rng(1).standard_normal(N), mask, rng(2))
+    new = fill_missing_samples(walk + 0.3 * rng(1).standard_normal(N), mask, rng(2))
     left = (new - walk)[mask]
     assert abs(left.mean()) < 0.03
     assert left.std() == pytest.approx(0.3, rel=0.45 if drift > 0.01 else 0.05)
@@ -68,7 +68,7 @@ def test_a_long_hole_is_bridged_between_its_ends():
     level = np.where(np.arange(N) < 120_000, 0.0, 10.0)
     mask = np.zeros(N, dtype=bool)
     mask[100_000:140_000] = True
-    new = fill_missing(level + 0.1 * rng().standard_normal(N), mask, rng(2))
+    new = fill_missing_samples(level + 0.1 * rng().standard_normal(N), mask, rng(2))
     means = new[100_000:140_000].reshape(40, 1000).mean(axis=1)
     assert means == pytest.approx(np.linspace(0.125, 9.875, 40), abs=0.05)
     assert np.diff(new[100_000:140_000]).std() == pytest.approx(0.1 * 2.0**0.5, rel=0.05)
@@ -80,7 +80,7 @@ def test_a_bridge_wanders_as_the_recording_does():
         walk = np.cumsum(0.02 * rng(seed).standard_normal(N))
         mask = np.zeros(N, dtype=bool)
         mask[100_000:104_000] = True
-        new = fill_missing(walk + rng(seed + 50).standard_normal(N), mask, rng(seed))
+        new = fill_missing_samples(walk + rng(seed + 50).standard_normal(N), mask, rng(seed))
         middle = new[101_500:102_500].mean()
         spreads.append(middle - 0.5 * (walk[100_000] + walk[104_000]))
     assert np.std(spreads) == pytest.approx(0.02 * 1000.0**0.5, rel=0.6)  # √(L/4) of the walk in the middle
@@ -90,23 +90,27 @@ def test_holes_at_the_ends_take_the_level_next_to_them():
     y = 5.0 + 0.1 * rng().standard_normal(2_000)
     mask = np.zeros(2_000, dtype=bool)
     mask[:300] = mask[-300:] = True
-    new = fill_missing(y, mask, rng(1))
+    new = fill_missing_samples(y, mask, rng(1))
     assert new[:300].mean() == pytest.approx(5.0, abs=0.05)
     assert new[-300:].std() == pytest.approx(0.1, rel=0.2)
 
 
 def test_one_good_sample_is_enough_and_none_is_not():
-    assert fill_missing(np.array([np.nan, 2.0, np.nan]), np.zeros(3, dtype=bool), rng()).tolist() == [2.0, 2.0, 2.0]
+    assert fill_missing_samples(np.array([np.nan, 2.0, np.nan]), np.zeros(3, dtype=bool), rng()).tolist() == [
+        2.0,
+        2.0,
+        2.0,
+    ]
     with pytest.raises(ValueError, match="contains no good sample"):
-        fill_missing(np.full(5, np.nan), np.zeros(5, dtype=bool), rng())
-    assert fill_missing(np.arange(3.0), np.zeros(3, dtype=bool), rng()).tolist() == [0.0, 1.0, 2.0]
+        fill_missing_samples(np.full(5, np.nan), np.zeros(5, dtype=bool), rng())
+    assert fill_missing_samples(np.arange(3.0), np.zeros(3, dtype=bool), rng()).tolist() == [0.0, 1.0, 2.0]
 
 
 @pytest.mark.parametrize("limit", [1.0, 2.0, 3.5])
 @pytest.mark.parametrize("mean", [0.0, 0.6])
 def test_clipped_samples_get_their_distribution_back(limit, mean):
     x = mean + rng().standard_normal(N)
-    new = restore_clipped(np.clip(x, -limit, limit), limit, 1.0, rng(1))
+    new = restore_clipped_samples(np.clip(x, -limit, limit), limit, 1.0, rng(1))
     inside = np.abs(x) < limit
     assert np.array_equal(new[inside], x[inside])
     assert (np.abs(new[~inside]) >= limit).all()
@@ -120,11 +124,11 @@ def test_a_level_beyond_the_limit_is_found_and_missing_samples_stay():
     x = 2.3 + rng().standard_normal(N)
     y = np.minimum(x, 2.0)
     y[::1000] = np.nan
-    new = restore_clipped(y, 2.0, 1.0, rng(1))
+    new = restore_clipped_samples(y, 2.0, 1.0, rng(1))
     assert np.isnan(new[::1000]).all()
     assert np.nanmean(new) == pytest.approx(2.3, abs=0.1)
 
 
 def test_nothing_clipped_changes_nothing():
     y = rng().standard_normal(1_000)
-    assert np.array_equal(restore_clipped(y, 10.0, 1.0, rng(1)), y)
+    assert np.array_equal(restore_clipped_samples(y, 10.0, 1.0, rng(1)), y)

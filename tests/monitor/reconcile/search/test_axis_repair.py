@@ -8,7 +8,7 @@ from monitor.noise.effects import AngleRandomWalk, Outliers, RandomSampleHold, R
 from monitor.reconcile.search.axis_repair import (
     _may_leak,
     _repair_samples,
-    measure_value_statistics,
+    detect_value_artifacts,
     repair_axis_again,
 )
 from tests.monitor.reconcile.axes import RATE_HZ, WHITE, N, axes, axis, correlated, white
@@ -49,7 +49,7 @@ def test_repeats_are_mended_where_the_model_has_them():
     held[0] = False
     for at in np.flatnonzero(held):
         y[at] = y[at - 1]
-    shown = measure_value_statistics(y)
+    shown = detect_value_artifacts(y)
     assert shown.repeats is not None
     assert shown.repeats.fraction.value == pytest.approx(0.2, abs=0.03)
     as_it_is = _repair_samples(y, shown, (WHITE,), np.random.default_rng(RNG))
@@ -64,7 +64,7 @@ def test_clipped_samples_are_drawn_from_beyond_the_limit():
     y = noise()
     limit = 2.0 * SIGMA
     clipped = np.clip(y, -limit, limit)
-    shown = measure_value_statistics(clipped)
+    shown = detect_value_artifacts(clipped)
     assert shown.clipping is not None
     mended = _repair_samples(clipped, shown, (WHITE, Saturation(limit=limit)), np.random.default_rng(RNG))
     at_limit = np.abs(clipped) >= limit
@@ -118,9 +118,9 @@ def test_which_axes_may_leak_into_which():
 
 def test_what_the_values_show():
     y = noise()
-    shown = measure_value_statistics(y)
+    shown = detect_value_artifacts(y)
     assert shown.quantization is None
-    coarse = measure_value_statistics(4e-4 * np.rint(y / 4e-4))
+    coarse = detect_value_artifacts(4e-4 * np.rint(y / 4e-4))
     assert coarse.quantization is not None
     assert coarse.quantization.step.value == pytest.approx(4e-4)
     # repeats of coarse values are no repeats of samples

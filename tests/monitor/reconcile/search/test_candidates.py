@@ -60,10 +60,10 @@ def test_every_effect_of_the_vocabulary_has_a_price():
 
 
 def test_classic_terms_that_are_lacking():
-    assert set(asked(candidates.propose_classic_terms, axis(noise()))) == {"quantization_noise", "bias_instability"}
-    assert set(asked(candidates.propose_classic_terms, axis(noise()), TERMS)) == {"quantization_noise"}
+    assert set(asked(candidates.propose_allan_terms, axis(noise()))) == {"quantization_noise", "bias_instability"}
+    assert set(asked(candidates.propose_allan_terms, axis(noise()), TERMS)) == {"quantization_noise"}
     model = (QuantizationNoise(Q=1e-8), *TERMS)
-    assert asked(candidates.propose_classic_terms, axis(noise()), model) == {}
+    assert asked(candidates.propose_allan_terms, axis(noise()), model) == {}
 
 
 @pytest.mark.parametrize("correlation_s", [0.05, 0.5, 5.0])
@@ -159,12 +159,12 @@ def test_other_axes_by_their_kind():
     every = axes(values, (WHITE,))
     found = {}
     for name, one in every.items():
-        offered = candidates.propose_leaks(seen(one, (WHITE,)))
+        offered = candidates.propose_leaks_from_other_axes(seen(one, (WHITE,)))
         found[name] = {(type(effect), effect.source) for effect in offered}
     assert found["gz"] == {(CrossAxis, "gy"), (GSensitivity, "ax"), (GSensitivity, "az")}
     assert found["ax"] == {(CrossAxis, "az")}
     known = (WHITE, CrossAxis(source="gy", coefficient=0.1))
-    rest = candidates.propose_leaks(seen(every["gz"], known))
+    rest = candidates.propose_leaks_from_other_axes(seen(every["gz"], known))
     assert {effect.source for effect in rest} == {"ax", "az"}
 
 

@@ -16,7 +16,7 @@ from monitor.noise.effects import (
     Sinusoidal,
     TemperatureBias,
 )
-from monitor.reconcile.diagnostics.diagnostics import find_line_peaks
+from monitor.reconcile.diagnostics.diagnostics import find_periodogram_peaks
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_fixed_noise
 from monitor.reconcile.search.axis_repair import repair_axis_again
@@ -105,7 +105,7 @@ def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
     """The strongest line of pure noise gains its dozen nats; halves of that decide nothing, and the reason says so."""
     one = axis(noise(4))
     view = seen(one, MODEL)
-    gain, f_hz = find_line_peaks(view.series, one.rate_hz, 1)[0]
+    gain, f_hz = find_periodogram_peaks(view.series, one.rate_hz, 1)[0]
     assert gain > 7.0
     found = proven(one, Sinusoidal(amplitude=1.0, frequency=f_hz, phase=0.0), "lines")
     assert found.reason or not found.kept

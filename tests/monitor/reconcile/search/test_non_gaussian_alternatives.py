@@ -13,7 +13,7 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes
 from monitor.reconcile.search.non_gaussian_alternatives import (
-    background_noise,
+    build_background_noise,
     fit_poisson_alternative,
     fit_telegraph_alternative,
 )
@@ -123,7 +123,7 @@ def test_the_noise_around_has_the_spectrum_of_its_effects():
     )
     f_hz = np.geomspace(1e-3, 0.3, 20)  # far below the rate
     for some in (effects, effects[:3]):
-        rest = background_noise(some)
+        rest = build_background_noise(some)
         turn = 2.0 * np.pi * f_hz
         density = rest.white + rest.walk / turn**2 + rest.flicker / turn
         density += sum(2.0 * s**2 * t / (1.0 + (turn * t) ** 2) for s, t in rest.correlated)

@@ -12,8 +12,8 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_fixed_noise
-from monitor.reconcile.search.search import AxisSearchResult, drop_unneeded_effects, search_axis
-from monitor.reconcile.search.trials import trial_groups
+from monitor.reconcile.search.search import AxisSearchResult, drop_unneeded_effects, search_missing_effects
+from monitor.reconcile.search.trials import generate_trial_groups
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     STRICT,
@@ -44,7 +44,7 @@ def noise(seed=0):
 
 
 def looked(y, model=MODEL, temperature_c=None) -> AxisSearchResult:
-    return search_axis(axis(y, model, temperature_c), model, STRICT, np.random.default_rng(0))
+    return search_missing_effects(axis(y, model, temperature_c), model, STRICT, np.random.default_rng(0))
 
 
 def names(found):
@@ -169,7 +169,9 @@ def test_candidates_on_a_true_model_are_not_worth_their_price():
     wrong = 0
     for seed in range(6):
         one = axis(noise(20 + seed), MODEL)
-        trials = [each for kind in trial_groups(fit_with_fixed_noise(one, MODEL), seen(one, MODEL)) for each in kind]
+        trials = [
+            each for kind in generate_trial_groups(fit_with_fixed_noise(one, MODEL), seen(one, MODEL)) for each in kind
+        ]
         assert trials
         wrong += max(each.score for each in trials) > 0.0
     assert wrong <= 1

@@ -31,21 +31,21 @@ def test_a_line_of_every_recording_is_common_and_pooled() -> None:
     assert "phase" not in seen.parameters  # of no meaning in another recording
     # two of them are 2 µrad/s from the mean, the deviation of each is 3 µrad/s / 1.96
     assert seen.parameters["amplitude"].chi2 == pytest.approx(2 * (2 / (3 / 1.959964)) ** 2)
-    assert seen.p == seen.parameters["amplitude"].p
-    assert seen.consistent is True
+    assert seen.p == seen.parameters["amplitude"].p_value
+    assert seen.sizes_agree is True
 
 
 def test_sizes_that_differ_are_common_and_not_consistent() -> None:
     seen = only(gz(run("a", line(1.5e-4)), run("b", line(2.5e-4))).common)
-    assert seen.consistent is False
+    assert seen.sizes_agree is False
     assert seen.p is not None
     assert seen.p < 1e-6
 
 
 def test_sizes_that_agree_are_consistent_wherever_the_line_moved() -> None:
     seen = only(gz(run("a", line(1.50e-4)), run("b", line(1.51e-4, 17.35))).common)
-    assert seen.consistent is True
-    moved = seen.parameters["frequency"].p
+    assert seen.sizes_agree is True
+    moved = seen.parameters["frequency"].p_value
     assert moved is not None
     assert moved < 0.001  # it is told, but is no size
 
@@ -57,7 +57,7 @@ def test_one_recordings_own_effect_is_single_with_its_absence_elsewhere() -> Non
     seen = only(axis.single)
     assert (seen.effect, list(seen.steps)) == ("bias_step", ["b"])
     assert [(one.run, one.meaning) for one in seen.absent] == [("a", "may_differ"), ("c", "may_differ")]
-    assert seen.consistent is None
+    assert seen.sizes_agree is None
 
 
 def test_steps_at_other_times_are_two() -> None:
@@ -71,7 +71,7 @@ def test_two_lines_are_matched_one_by_one_to_the_nearest() -> None:
     axis = gz(run("a", line(1e-4, 17.30), line(3e-4, 17.36)), run("b", line(3e-4, 17.37), line(1e-4, 17.31)))
     assert axis.single == ()
     assert [round(float(one.parameters["amplitude"].bounds.value), 6) for one in axis.common] == [1e-4, 3e-4]
-    assert all(one.consistent for one in axis.common)
+    assert all(one.sizes_agree for one in axis.common)
 
 
 def test_names_that_differ_are_two() -> None:
@@ -133,7 +133,7 @@ def test_what_has_no_interval_stays_as_the_first_recording_has_it() -> None:
     c = compare_results([run("a", low_pass), run("b", low_pass)])
     found = c.model.effects["gz"][-1]
     assert found == BandwidthLimit(cutoff=20.0, order=2)
-    assert only(c.axes["gz"].common).consistent is True  # by its cutoff, as it has no size
+    assert only(c.axes["gz"].common).sizes_agree is True  # by its cutoff, as it has no size
 
 
 def test_a_curved_temperature_effect_is_pooled_at_one_reference() -> None:
@@ -145,7 +145,7 @@ def test_a_curved_temperature_effect_is_pooled_at_one_reference() -> None:
     )
     c = compare_results([run("a", first), run("b", second)])
     seen = only(c.axes["gz"].common)
-    assert seen.consistent is True
+    assert seen.sizes_agree is True
     found = c.model.effects["gz"][-1]
     assert isinstance(found, TemperatureBias)
     assert (found.coefficient, found.quadratic, found.reference) == pytest.approx((2e-4, 1e-5, 20.0))

@@ -10,7 +10,7 @@ from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.several_recordings.effect_matching import (
     IDENTIFYING_PARAMETERS,
     find_effect_of_step,
-    identifying_parameter,
+    find_identifying_parameter,
     identifying_parameter_distance,
     identifying_parameter_name,
 )
@@ -69,5 +69,5 @@ def test_a_step_is_found_in_the_model_by_its_parameters() -> None:
 
 def test_the_place_of_a_retuned_line_is_that_in_the_model() -> None:
     retuned = step("sinusoidal", kind="retuned", amplitude=1.01)
-    assert identifying_parameter(retuned, "gz", LINES) == ParameterInterval(30.0)
-    assert identifying_parameter(step("angle_random_walk", kind="retuned", N=1e-4), "gz", LINES) is None
+    assert find_identifying_parameter(retuned, "gz", LINES) == ParameterInterval(30.0)
+    assert find_identifying_parameter(step("angle_random_walk", kind="retuned", N=1e-4), "gz", LINES) is None

@@ -26,7 +26,7 @@ def test_the_mean_is_weighed_by_the_inverse_of_the_variances() -> None:
     half = Z95 / np.sqrt(1 / 0.01 + 1 / 0.04)
     assert [both.bounds.value, both.bounds.lo, both.bounds.hi] == pytest.approx([mean, mean - half, mean + half])
     assert both.chi2 == pytest.approx(0.3**2 / (0.01 + 0.04))
-    assert both.p == pytest.approx(stats.chi2(1).sf(1.8))
+    assert both.p_value == pytest.approx(stats.chi2(1).sf(1.8))
 
 
 def test_intervals_that_are_even_as_factors_are_averaged_as_logarithms() -> None:
@@ -40,8 +40,8 @@ def test_intervals_that_are_even_as_factors_are_averaged_as_logarithms() -> None
 def test_where_recordings_differ_the_interval_holds_their_scatter() -> None:
     values = [normal(v, 0.01) for v in (1.0, 2.0, 3.0)]
     together = pool_parameter(values)
-    assert together.p is not None
-    assert together.p < MIN_AGREEMENT_PROBABILITY
+    assert together.p_value is not None
+    assert together.p_value < MIN_AGREEMENT_PROBABILITY
     assert together.bounds.hi is not None
     # χ²/ν is the sample variance over 0.01²: the interval is that of a mean of three values that scatter by 1
     assert together.bounds.hi - 2.0 == pytest.approx(Z95 / np.sqrt(3))
@@ -50,22 +50,22 @@ def test_where_recordings_differ_the_interval_holds_their_scatter() -> None:
 def test_the_same_interval_twice_counts_twice() -> None:
     both = pool_parameter([normal(1.0, 0.1)] * 2)
     assert both.freedom == 1
-    assert both.p == 1.0
+    assert both.p_value == 1.0
     assert both.bounds.hi == pytest.approx(1.0 + Z95 * 0.1 / np.sqrt(2))
 
 
 @pytest.mark.parametrize("runs", [2, 5])
 def test_p_is_even_where_all_measure_the_same(runs: int) -> None:
     rng = np.random.default_rng(3)
-    p = [pool_parameter([normal(10.0 + rng.standard_normal(), 1.0) for _ in range(runs)]).p for _ in range(2000)]
+    p = [pool_parameter([normal(10.0 + rng.standard_normal(), 1.0) for _ in range(runs)]).p_value for _ in range(2000)]
     assert stats.kstest(np.array(p, float), "uniform").pvalue > 0.001
 
 
 def test_nothing_is_made_of_what_has_no_interval() -> None:
     assert pool_parameter([ParameterInterval("ax"), ParameterInterval("ax")]).bounds == ParameterInterval("ax")
-    assert pool_parameter([ParameterInterval(2.0), ParameterInterval(2.0)]).p is None
+    assert pool_parameter([ParameterInterval(2.0), ParameterInterval(2.0)]).p_value is None
     one = pool_parameter([ParameterInterval(5.0), normal(1.0, 0.1), ParameterInterval(7.0, 6.0, np.inf)])
-    assert (one.bounds, one.p) == (normal(1.0, 0.1), None)
+    assert (one.bounds, one.p_value) == (normal(1.0, 0.1), None)
     assert agreement_probability([one]) is None
 
 

@@ -1,17 +1,11 @@
-"""Detection of quantization, clipping and repeated samples from the values of one axis.
+"""Detection of quantization, clipping and repeated samples in the values of one axis.
 
-The input is one axis as measured, with NaN for missing samples. Each function returns the detected property, or None.
-The evidence is the log-likelihood gain in nats over a series without the property.
+Each function returns the detected artifact, or None. The evidence is the log-likelihood gain, in nats, over a series
+without the artifact.
 
-Values lie on a grid if all differences are whole multiples of a step. Steps far below the noise are detected too. The
-number format also causes steps: the spacing of float32 or float64 values, or the last decimal of numbers in a text. The
-unit of such a text may be SI, degrees or g. If a grid is no coarser than the number format, it is reported only if the
-step is at least a tenth of the noise, because such a grid changes the spectrum.
-
-Continuous values reach the same maximum twice only if they are clipped. Values on a grid reach the highest level more
-often than the next levels predict only if they are clipped. Each repeat of a continuous value is located. For values
-on a grid, only the number of repeats is known, from the excess of zero differences. Repeats cannot be detected if the
-step is larger than the noise. Clipping cannot be detected if the step is larger than two standard deviations.
+A quantization step can be much smaller than the noise. A step of the number format, such as float32 or decimal text, is
+reported only if the step is at least a tenth of the noise. Repeated samples cannot be detected if the step exceeds the
+noise. Clipping cannot be detected if the step exceeds two standard deviations.
 """
 
 from dataclasses import dataclass
@@ -32,32 +26,30 @@ Mask = NDArray[np.bool_]
 
 MIN_SAMPLES: Final = 16
 GRID_SEARCH_SAMPLES: Final = 4096
-"""Number of samples in which a grid is searched. All samples are then checked against the grid."""
+"""Number of samples in the search for a grid."""
 MIN_STEP_TO_ROUNDING: Final = 25.0
 """Smallest detectable step, as a multiple of the rounding of the values."""
 MIN_STEP_TO_NOISE: Final = 0.1
-"""Ratio of step to noise from which a step is reported, whatever its origin."""
+"""Smallest ratio of step to noise at which a step of the number format is reported."""
 MIN_NOISE_TO_STEP_CLIPPING: Final = 0.5
-"""Smallest ratio of noise to step at which clipping is tested. With less noise, the counts of the highest levels depend
-on the position of the mean between two levels.
+"""Smallest ratio of noise to step at which clipping is tested.
 """
 MIN_NOISE_TO_STEP_REPEATS: Final = 0.9
-"""Smallest ratio of noise to step at which repeats are tested. With more noise, the position of the mean between two
-levels changes the probability of a repeat by less than exp(−π²·0.8) = 4·10⁻⁴.
+"""Smallest ratio of noise to step at which repeats are tested.
 """
 CHANCE_RELATIVE_ERROR: Final = 0.01
-"""Relative uncertainty of the expected share of equal neighbours, because the noise is only approximately Gaussian."""
+"""Relative uncertainty of the expected number of equal neighbours, because the noise is only nearly Gaussian."""
 MIN_EXPECTED_COINCIDENCES: Final = 1e-3
 TEXT_UNITS: Final = (1.0, DEGREE, DEGREE / HOUR_S, G0)
-"""Units in which a text may contain the values: SI, °/s, °/h and g."""
+"""Possible units of values in a text file: SI, °/s, °/h and g."""
 MIN_DISTINCT_DECIMALS: Final = 8
-"""Number of different decimal numbers above which agreement with a text is not due to chance."""
+"""Smallest number of different decimal numbers that cannot be due to chance."""
 PREDICTOR_TAPS: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
 class ValueWithInterval:
-    """Value with its 95 % interval."""
+    """Value with the 95 % interval."""
 
     value: float
     lo: float
@@ -66,7 +58,7 @@ class ValueWithInterval:
 
 @dataclass(frozen=True, slots=True)
 class QuantizationGrid:
-    """Grid that all values lie on."""
+    """Quantization grid of all values."""
 
     step: ValueWithInterval
     levels: int  # number of grid levels from the smallest to the largest value
@@ -75,11 +67,11 @@ class QuantizationGrid:
 
 @dataclass(frozen=True, slots=True)
 class Clipping:
-    """Clipping of the values at an end of the range."""
+    """Clipping of the values at an end of the measuring range."""
 
     limit: ValueWithInterval
     count: int  # number of clipped samples
-    symmetric: bool  # True if no value lies beyond ± limit, as for y = clip(x, ± limit)
+    symmetric: bool  # True if the values are clipped at ± limit
     gain: float  # log-likelihood gain over values without clipping, nats
 
 
@@ -94,9 +86,9 @@ class RepeatedSamples:
 
 
 def detect_quantization(y: Floats) -> QuantizationGrid | None:
-    """Detect the grid that all values lie on.
+    """Detect the quantization grid of the values.
 
-    A grid that the number format explains is not reported.
+    A fine grid due to the number format is not reported.
 
     Parameters
     ----------
@@ -106,7 +98,7 @@ def detect_quantization(y: Floats) -> QuantizationGrid | None:
     Returns
     -------
     QuantizationGrid or None
-        The grid, or None if no grid is detected.
+        Quantization grid, or None if no grid is detected.
 
     Examples
     --------
@@ -132,7 +124,7 @@ def detect_quantization(y: Floats) -> QuantizationGrid | None:
 
 
 def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
-    """Detect clipping at the largest or the smallest value.
+    """Detect clipping at the largest or smallest value.
 
     Parameters
     ----------
@@ -144,7 +136,7 @@ def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
     Returns
     -------
     Clipping or None
-        The clipping limit, or None if no clipping is detected.
+        Detected clipping, or None if no clipping is detected.
 
     Examples
     --------
@@ -177,7 +169,7 @@ def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
 
 
 def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> RepeatedSamples | None:
-    """Detect repeats of the previous sample that are more frequent than expected by chance.
+    """Detect repeated samples that are more frequent than expected by chance.
 
     Parameters
     ----------
@@ -191,7 +183,7 @@ def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repea
     Returns
     -------
     RepeatedSamples or None
-        The repeats. The result is None if no repeats are detected, or if the step is too coarse to detect repeats.
+        Repeated samples, or None if no repeats are detected or the step is too coarse.
 
     Examples
     --------
@@ -211,24 +203,21 @@ def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repea
     if step < 1e-6 * noise:
         return _repeats_of_continuous(y, pairs, apart, noise)
     twice = (y[2:] - y[:-2])[good[2:] & good[1:-1] & good[:-2]]
-    # repeats change differences over two samples less than differences of neighbours
+    # repeated samples have less influence on differences over two samples
     quiet = SIGMA_PER_MEAN_DISTANCE * float(np.abs(twice).mean()) < MIN_NOISE_TO_STEP_REPEATS * step
     return None if quiet else _repeats_of_stepped(np.abs(apart) / step, np.abs(twice) / step, y.size)
 
 
 def _finite_values(y: Floats) -> Floats:
-    """Return the finite values."""
     return y if np.isfinite(y.sum()) else y[np.isfinite(y)]
 
 
 def _sample_noise(values: Floats) -> float:
-    """Return the standard deviation from sample to sample, from the mean absolute difference of neighbours."""
     return SIGMA_PER_MEAN_DISTANCE * float(_total_variation(values)) / (values.size - 1)
 
 
 @compiled
 def _total_variation(values: Floats) -> float:
-    """Return the sum of the absolute differences of neighbours."""
     total = 0.0
     for k in range(1, values.size):
         total += abs(values[k] - values[k - 1])
@@ -236,10 +225,7 @@ def _total_variation(values: Floats) -> float:
 
 
 def _float_spacing(values: Floats) -> float:
-    """Return the spacing of floating-point numbers at the largest value.
-
-    If float32 can represent a sample of the values exactly, the spacing of float32 is returned.
-    """
+    """Return the spacing of float32 or float64 numbers at the largest value."""
     values = values[:: max(1, values.size // GRID_SEARCH_SAMPLES)]
     largest = float(np.abs(values).max())
     narrow = values.astype(np.float32)
@@ -247,7 +233,7 @@ def _float_spacing(values: Floats) -> float:
 
 
 def _last_decimal(levels: Floats) -> float:
-    """Return the unit of the last digit, in SI units, if all values are decimal numbers of a text, otherwise 0."""
+    """Return the unit of the last decimal place, in SI units, or 0 if the values are not decimal numbers."""
     some = levels[np.linspace(0, levels.size - 1, min(256, levels.size)).astype(np.int64)]
     some = np.abs(some[some != 0.0])
     if not some.size:
@@ -265,10 +251,7 @@ def _last_decimal(levels: Floats) -> float:
 
 
 def _common_divisor(gaps: Floats, blur: float) -> float | None:
-    """Return the greatest common divisor of ascending distances by Euclid's algorithm with error bounds.
-
-    The error of a value is at most ``blur``.
-    """
+    """Return the greatest common divisor of distances with errors up to ``blur``, by Euclid's algorithm."""
     gaps = gaps[gaps > 2.0 * blur]
     if not gaps.size:
         return None
@@ -296,7 +279,6 @@ def _common_divisor(gaps: Floats, blur: float) -> float | None:
 
 
 def _fit_grid(values: Floats, step: float, blur: float) -> QuantizationGrid | None:
-    """Return the grid with a given step if every value lies on it."""
     middle = float(values[values.size // 2])
     for _ in range(2):  # the second pass uses the step derived from the two extreme values
         counts = np.rint((values - middle) / step)
@@ -319,10 +301,7 @@ def _fit_grid(values: Floats, step: float, blur: float) -> QuantizationGrid | No
 
 
 def _continuous_clipping_gain(values: Floats, end: float, step: float, noise: float) -> float:
-    """Return the gain of clipping continuous values at the maximum.
-
-    Clipped values reach the maximum several times and stay there for several samples.
-    """
+    """Return the gain of clipping at the maximum for continuous values."""
     at = values == end
     count = int(np.count_nonzero(at))
     visits = int(np.count_nonzero(at[1:] & ~at[:-1])) + int(at[0])
@@ -344,11 +323,10 @@ def _continuous_clipping_gain(values: Floats, end: float, step: float, noise: fl
 
 
 def _stepped_clipping_gain(values: Floats, end: float, step: float, noise: float) -> float:
-    """Return the gain of clipping values on a grid at the highest level.
+    """Return the gain of clipping at the highest level for values on a grid.
 
-    The result is the smaller gain of two tests. The first test compares the count of the highest level with the counts
-    of the next levels. The second test predicts each sample from its neighbours and compares the predictions with the
-    highest level.
+    The gain is the smaller gain of two tests. The first test compares the counts of the highest levels. The second test
+    predicts each sample from the neighbouring samples.
     """
     if noise < MIN_NOISE_TO_STEP_CLIPPING * step:
         return 0.0
@@ -362,10 +340,6 @@ def _stepped_clipping_gain(values: Floats, end: float, step: float, noise: float
 
 
 def _excess_over_parabola(counts: Floats) -> float:
-    """Return the gain of the first of four counts if it lies above the extrapolation of the others, otherwise 0.
-
-    The extrapolation is a parabola through the logarithms of the other three counts.
-    """
     if not counts[1:].all():
         return 0.0
     above = float(np.log(counts) @ np.array([1.0, -3.0, 3.0, -1.0]))
@@ -373,19 +347,13 @@ def _excess_over_parabola(counts: Floats) -> float:
 
 
 def _count_difference_gain(one: float, other: float) -> float:
-    """Return the log-likelihood gain of two different expected counts over equal expected counts.
-
-    The gain is 0 if the first count is not the larger one.
-    """
+    """Return the log-likelihood gain of two different expected counts over equal expected counts, or 0."""
     half = 0.5 * (one + other)
     return float(xlogy(one, one / half) + xlogy(other, other / half)) if one > other else 0.0
 
 
 def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
-    """Return the prediction of every sample from its neighbours, and the standard deviation of the error.
-
-    The prediction is linear and symmetric in ``PREDICTOR_TAPS`` neighbours on each side.
-    """
+    """Return a linear prediction of every sample from neighbouring samples, and the standard deviation of the error."""
     z = values - values.mean()
     lags = np.array([np.dot(z[: z.size - k], z[k:]) for k in range(2 * PREDICTOR_TAPS + 1)]) / z.size
     k = np.arange(1, PREDICTOR_TAPS + 1)
@@ -397,10 +365,9 @@ def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
 
 
 def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: float) -> RepeatedSamples | None:
-    """Return the repeats in values for which no grid was detected.
+    """Return the repeated samples in values without a detected grid.
 
-    If a sample equals the sample two before it but not its neighbour, the values lie on an unknown grid. The share of
-    neighbours that are equal by chance is then estimated from the share of equal samples at a distance of two.
+    If samples at a distance of two are equal, the values lie on an unknown grid, and some repeats are due to chance.
     """
     mask = np.zeros(y.size, dtype=np.bool_)
     mask[1:] = pairs & (y[1:] == y[:-1])
@@ -428,13 +395,10 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: f
 
 
 def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: int) -> RepeatedSamples | None:
-    """Return the repeats in values on a grid.
+    """Return the repeated samples in values on a grid.
 
-    The arguments are the absolute differences, in steps, between neighbours and between samples at a distance of two.
-    ``_step_difference_probabilities`` gives the distribution of the differences of Gaussian noise on a grid. Repeats
-    increase the number of zero differences. Outliers, modulated noise and a mean midway between two levels have the
-    same influence, but at a distance of two samples as well. If the share h of the samples are repeats, the share of
-    zero differences at a distance of two increases only by h². The smaller gain of the two tests is therefore returned.
+    Repeats, outliers and modulated noise all increase the number of zero differences between neighbours. Only repeats
+    have little influence on the differences over two samples. The result has the smaller gain of both tests.
     """
     most = int(np.clip(np.ceil(SIGMA_PER_MEAN_DISTANCE * 2.0**0.5 * differences.mean()), 2, 64))
     counts, chance, gain = _zero_difference_excess(differences, most)
@@ -453,16 +417,16 @@ def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: in
 
 
 def _zero_difference_excess(differences: Floats, most: int) -> tuple[Floats, float, float]:
-    """Compare the number of zero differences with the number that the other differences predict.
+    """Compare the number of zero differences with the prediction from all other differences.
 
     Returns
     -------
     counts : ndarray of float64, shape (most + 1,)
         Counts of differences of 0, 1, … ``most`` steps.
     chance : float
-        Number of zeros that the distribution of the other differences predicts.
+        Predicted number of zero differences.
     gain : float
-        Log-likelihood gain of a fitted number of zeros, nats.
+        Log-likelihood gain of a fitted number of zero differences, nats.
     """
     counts = np.bincount(np.minimum(np.rint(differences), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(
         float
@@ -477,10 +441,7 @@ def _zero_difference_excess(differences: Floats, most: int) -> tuple[Floats, flo
 
 
 def _excess_gain(count: float, chance: float, variance: float) -> float:
-    """Return the gain of a count above the expected count ``chance``, otherwise 0.
-
-    The expected count has the given variance and the relative error ``CHANCE_RELATIVE_ERROR``.
-    """
+    """Return the log-likelihood gain of a count over an uncertain expected count, or 0."""
     excess = count - chance
     return (
         0.5 * excess**2 / (count + chance + variance + (CHANCE_RELATIVE_ERROR * chance) ** 2) if excess > 0.0 else 0.0
@@ -488,28 +449,27 @@ def _excess_gain(count: float, chance: float, variance: float) -> float:
 
 
 def _fit_difference_spread(counts: Floats, first: int) -> tuple[float, float]:
-    """Fit the noise to a histogram of differences, and return the largest log-likelihood and the standard deviation.
+    """Fit Gaussian noise to a histogram of differences in quantization steps.
 
-    The histogram counts the differences of 0, 1, … quantization steps. Counts below ``first`` are not used.
+    Counts below ``first`` are ignored. Return the log-likelihood and the standard deviation.
     """
     kept = counts[first:]
 
-    def cost(log_spread: float) -> float:
+    def negative_log_likelihood(log_spread: float) -> float:
         form = _step_difference_probabilities(float(np.exp(log_spread)), counts.size - 1)[first:]
         return -float(xlogy(kept, form / form.sum()).sum())
 
     from scipy.optimize import minimize_scalar
 
-    best = minimize_scalar(cost, bounds=(np.log(0.2), np.log(4.0 * counts.size)), method="bounded")
+    best = minimize_scalar(negative_log_likelihood, bounds=(np.log(0.2), np.log(4.0 * counts.size)), method="bounded")
     return -float(best.fun), float(np.exp(best.x))
 
 
 def _step_difference_probabilities(spread: float, most: int) -> Floats:
-    """Return the probabilities that two values on a grid differ by 0 … ``most`` steps in either direction.
+    """Return the probabilities that two values on a grid differ by 0 … ``most`` steps.
 
-    ``spread`` is the standard deviation, in steps, of the difference before rounding. The mean has any position between
-    two levels with the same probability. Each probability is the integral of the Gaussian density times a triangle with
-    a width of two steps. It is computed as a second difference of the double integral of the density.
+    Before rounding, the difference is Gaussian with the standard deviation ``spread``, in steps. Each probability is
+    the integral of the Gaussian density times a triangle with a width of two steps.
     """
     x = np.arange(-1.0, most + 2.0)
     twice = x * ndtr(x / spread) + spread * np.exp(-0.5 * (x / spread) ** 2) / np.sqrt(2.0 * np.pi)
@@ -519,10 +479,7 @@ def _step_difference_probabilities(spread: float, most: int) -> Floats:
 
 
 def _share_difference_gain(counts: Floats, trials: Floats) -> float:
-    """Return the log-likelihood gain of two different shares over a common share.
-
-    The gain is 0 if the first share is not the larger one.
-    """
+    """Return the log-likelihood gain of two different shares over a common share, or 0."""
     share, same = counts / trials, counts.sum() / trials.sum()
     if share[0] <= share[1]:
         return 0.0
@@ -530,12 +487,11 @@ def _share_difference_gain(counts: Floats, trials: Floats) -> float:
 
 
 def _poisson_gain(count: float, expected: float) -> float:
-    """Return the log-likelihood gain of a Poisson count above the expected count, otherwise 0."""
+    """Return the log-likelihood gain of a Poisson count over the expected count, or 0."""
     return float(count * np.log(count / expected) - count + expected) if count > expected else 0.0
 
 
 def _wilson_interval(count: int, trials: int) -> ValueWithInterval:
-    """Return a share with its 95 % interval (Wilson 1927)."""
     share, extra = count / trials, Z95**2 / trials
     middle = (share + 0.5 * extra) / (1.0 + extra)
     half = Z95 / (1.0 + extra) * (share * (1.0 - share) / trials + 0.25 * extra / trials) ** 0.5

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.preparation.value_statistics import detect_clipping, detect_quantization, detect_repeats
+from monitor.reconcile.preparation.value_artifacts import detect_clipping, detect_quantization, detect_repeats
 
 N = 30_000
 DEGREE = np.pi / 180.0
