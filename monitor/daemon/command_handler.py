@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import structlog
 
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.operations.reconcile_on_request import Job, Reconciler
+from monitor.daemon.operations.reconcile_on_request import ReconcileJob, Reconciler
 from monitor.publishing.messages.results import ResetReply
 from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 
@@ -38,13 +38,13 @@ class CommandHandler:
 
     def publish_reconciled(self, workers: Mapping[str, DeviceWorker]) -> None:
         """Publish an event for each reconciliation that has finished since the last call."""
-        for finished in self._reconciler.take_finished():
+        for finished in self._reconciler.take_finished_reconciliations():
             if finished.device in workers:
                 workers[finished.device].publish_event("reconciled", finished.text)
 
-    def close(self) -> None:
+    def abort_reconciliations(self) -> None:
         """Kill the running reconciliations, and refuse their queries."""
-        self._reconciler.close()
+        self._reconciler.abort_reconciliations()
 
     def _execute(self, command: Command, worker: DeviceWorker) -> None:
         """Execute and answer one command for a device."""
@@ -66,6 +66,6 @@ class CommandHandler:
             command.reply_refusal("no samples yet")
             return
         received, device = worker.driver.counts.received, worker.device
-        newest_s = worker.timeline.unix_s(worker.pipeline.newest_ns)
-        job = Job(worker.name, newest_s, received, *window, device.model, device.reconcile_folder)
-        self._reconciler.start(job, command)
+        newest_s = worker.timeline.to_unix_s(worker.pipeline.newest_ns)
+        job = ReconcileJob(worker.name, newest_s, received, *window, device.model, device.reconcile_folder)
+        self._reconciler.start_reconciliation(job, command)

@@ -32,7 +32,7 @@ class ConfigChange:
     limited: tuple[Device, ...]  # devices in which only the limits differ
     restart: tuple[str, ...]  # changed tables that take effect only after a restart
 
-    def text(self) -> str:
+    def describe_changes(self) -> str:
         """Return the changes in one sentence."""
         new = {device.name for device in self.added}
         parts = {

@@ -81,7 +81,7 @@ class HistoryOutput(Output):
 
     # --- reading
 
-    def read_newest(self, device: str, span_s: float) -> HistoryTable | None:
+    def read_recent_history(self, device: str, span_s: float) -> HistoryTable | None:
         """Return the results of the last ``span_s`` seconds of a device, or None if there are no results.
 
         Parameters

@@ -86,13 +86,13 @@ class ResultPublisher:
         """Collect new samples, and publish the collected batch if it is due; return True if it was published."""
         self._batch += blocks
         interval_s = min(self.device.publish_s, MAX_BATCH_S)
-        if not self._batch or not self.schedule.claim("samples", interval_s):
+        if not self._batch or not self.schedule.claim_if_due("samples", interval_s):
             return False
         batch, self._batch = self._batch, []
         compensation = self.pipeline.compensation
         for samples in merge_contiguous_blocks(batch):
             self.published += len(samples)
-            offsets_ns = self.timeline.offsets_ns(samples)
+            offsets_ns = self.timeline.unix_offsets_ns(samples)
             for output in self.outputs:
                 output.publish_samples(self.device.name, self.published, samples, offsets_ns)
             if compensation is not None and np.isfinite(samples.values[:, :3]).any():
@@ -102,7 +102,11 @@ class ResultPublisher:
     def publish_estimate_if_due(self) -> bool:
         """Update the fit if it is due, and publish the estimate if it is due; return True if it was published."""
         self._refit()
-        if self.latest is None or not self._refitted or not self.schedule.claim("publish", self.device.publish_s):
+        if (
+            self.latest is None
+            or not self._refitted
+            or not self.schedule.claim_if_due("publish", self.device.publish_s)
+        ):
             return False
         self._refitted = False
         self._result(self.latest.t_ns, self.latest)
@@ -133,7 +137,7 @@ class ResultPublisher:
         return self.driver.counts.received
 
     def _unix_s(self, t_ns: int) -> float:
-        return self.timeline.unix_s(t_ns)
+        return self.timeline.to_unix_s(t_ns)
 
     def _result(self, t_ns: int, result: Any) -> None:
         """Publish a result with the sample time ``t_ns``."""
@@ -148,7 +152,7 @@ class ResultPublisher:
             at += len(piece)
             compensated = live.update(piece)
             self.pipeline.update_drift_models()
-            offsets_ns = self.timeline.offsets_ns(compensated)
+            offsets_ns = self.timeline.unix_offsets_ns(compensated)
             for output in self.outputs:
                 output.publish_compensated_samples(
                     self.device.name, self.published - len(samples) + at, compensated, offsets_ns
@@ -161,7 +165,7 @@ class ResultPublisher:
         # with a refit at every sample, ``get`` is called only for a publication, because ``get`` empties the history
         interval_s = self.device.refit_s or self.device.publish_s
         pipeline = self.pipeline
-        if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim("refit", interval_s):
+        if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim_if_due("refit", interval_s):
             return
         fitted = pipeline.fit_kernels_ready
         pipeline.advanced = not fitted  # a curve without coefficients is fitted as soon as the kernels are ready

@@ -29,7 +29,7 @@ class Schedule:
         """Return True if a task is due in this round."""
         return self._now_s >= self._next_s.get(task, 0.0)
 
-    def claim(self, task: Task, interval_s: float) -> bool:
+    def claim_if_due(self, task: Task, interval_s: float) -> bool:
         """Return True if a task is to run in this round, and schedule its next run.
 
         Parameters

@@ -1,7 +1,7 @@
 """Main service of the daemon: starts the device workers and outputs, runs the main loop, and stops.
 
-In each round, ``Service.loop`` calls every device worker. The worker takes the new samples, updates the estimate and
-publishes the results. Between two rounds, the loop sleeps until a reader thread has pushed samples.
+In each round, ``Service.run_main_loop`` calls every device worker. The worker takes the new samples, updates the
+estimate and publishes the results. Between two rounds, the loop sleeps until a reader thread has pushed samples.
 
 If an output cannot start or is too slow, the status of every device reports this problem, and sampling continues.
 systemd receives the readiness message as soon as the service has tried to start every output.
@@ -132,10 +132,10 @@ class Service:
 
     def run(self, seconds: float | None = None) -> None:
         """Run the service for a number of seconds, by default until ``request_stop`` or the end of all replays."""
-        threading.Thread(target=self._ready.compile, args=(self._wake,), name="warm-up", daemon=True).start()
+        threading.Thread(target=self._ready.compile_kernels, args=(self._wake,), name="warm-up", daemon=True).start()
         try:
             self._start()
-            self.loop(None if seconds is None else time.monotonic() + seconds)
+            self.run_main_loop(None if seconds is None else time.monotonic() + seconds)
         finally:
             self._close()
 
@@ -150,7 +150,7 @@ class Service:
             self.recorder.start()
             threading.Thread(target=self._rebuild_windows, args=(self.workers,), name="rebuild", daemon=True).start()
 
-    def loop(self, until_s: float | None) -> None:
+    def run_main_loop(self, until_s: float | None) -> None:
         """Process the samples of all devices in rounds, and publish the status once a second.
 
         The loop ends after ``request_stop``, at the end of all replays, or at the monotonic time ``until_s``.
@@ -207,7 +207,7 @@ class Service:
         if self.history is None or history_s is None or self_timed:
             return None
         assert isinstance(history_s, float)
-        return self.history.read_newest(device, history_s)
+        return self.history.read_recent_history(device, history_s)
 
     def _rebuild_windows(self, workers: Sequence[DeviceWorker]) -> None:
         """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
@@ -229,7 +229,7 @@ class Service:
 
     def _reload(self) -> None:
         """Read the configuration file again and apply the changes. A file with a mistake changes nothing."""
-        self._unit.reloading()
+        self._unit.send_reloading()
         try:
             change = reload.compare_with_file(self.config, {worker.name: worker.model for worker in self.workers})
             built = [self._build_worker(device) for device in change.added]
@@ -237,9 +237,9 @@ class Service:
             _log.error("not reloaded, the running configuration stays in force", error=str(error))
         else:
             self._apply(change, built)
-            (_log.warning if change.restart else _log.info)("reloaded", text=change.text())
+            (_log.warning if change.restart else _log.info)("reloaded", text=change.describe_changes())
         if self._unit.ready_sent:
-            self._unit.ready()
+            self._unit.send_ready()
 
     def _apply(self, change: ConfigChange, built: Sequence[DeviceWorker]) -> None:
         """Stop the removed devices, replace the changed limits, and start the added devices."""
@@ -249,7 +249,7 @@ class Service:
         for worker in leaving:
             self._remove(worker)
         for device in change.limited:
-            next(worker for worker in self.workers if worker.name == device.name).set_limits(device)
+            next(worker for worker in self.workers if worker.name == device.name).replace_limits(device)
         self.config = change.config
         self.hooks.hooks = change.config.hooks
         set_log_level(change.config.log.level)
@@ -271,7 +271,7 @@ class Service:
 
     def _remove(self, worker: DeviceWorker) -> None:
         """Remove a stopped device and publish its remaining samples, while the other devices continue."""
-        if not self._work_until(lambda: worker.join(0.0) and not worker.restore.active):
+        if not self._work_until(lambda: worker.join_reader_thread(0.0) and not worker.restore.active):
             _log.warning("reader did not end in time", device=worker.name)
         worker.process_new_samples(time.monotonic(), drain=True)
         self.workers = [one for one in self.workers if one is not worker]
@@ -307,10 +307,10 @@ class Service:
             not any(state in STARTING_STATES for state in states.values()) or now_s - self._started_s > READY_TIMEOUT_S
         )
         if tried and not self._unit.ready_sent:
-            self._unit.ready()
+            self._unit.send_ready()
         turns = {worker.name: worker.read_attempts for worker in self.workers}
         stuck = self._unit.send_watchdog({name: count for name, count in turns.items() if count is not None}, now_s)
-        self._unit.status(format_service_status(healths, states, stuck))
+        self._unit.send_status(format_service_status(healths, states, stuck))
 
     def _publish_recorder_events(self) -> None:
         """Publish the events of the recorder as events of the devices."""
@@ -334,11 +334,11 @@ class Service:
 
     def _close(self) -> None:
         """Stop the devices, publish their remaining samples, and close all outputs."""
-        self._unit.stopping()
+        self._unit.send_stopping()
         try:
             self._drain()
         finally:
-            self._commands.close()
+            self._commands.abort_reconciliations()
             self._commands.publish_reconciled({worker.name: worker for worker in self.workers})
             for output in (self.recorder, self.hooks, self.metrics, self.viewer, self.zenoh, self.history):
                 if output is not None:
@@ -352,7 +352,7 @@ class Service:
             self._ready.all.wait()  # the samples of these devices are still in the ring buffer
         for worker in self.workers:
             until_s = time.monotonic() + JOIN_TIMEOUT_S
-            while not (ended := worker.join(ROUND_PAUSE_S)) and time.monotonic() < until_s:
+            while not (ended := worker.join_reader_thread(ROUND_PAUSE_S)) and time.monotonic() < until_s:
                 worker.process_new_samples(time.monotonic())  # a replay waits for space in its ring buffer
             if not ended:
                 _log.warning("reader did not end in time", device=worker.name)

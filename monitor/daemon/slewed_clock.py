@@ -28,11 +28,11 @@ class SlewedClock:
     Examples
     --------
     >>> clock = SlewedClock(monotonic_ns=5_000_000_000, unix_ns=1_700_000_000_000_000_000)
-    >>> clock.unix_ns(6_000_000_000)
+    >>> clock.to_unix_ns(6_000_000_000)
     1700000001000000000
     >>> clock.slew_and_return_host_step(6_000_000_000, 1_700_000_003_000_000_000)  # set forward by 2 s
     2000000000
-    >>> clock.unix_ns(7_000_000_000)
+    >>> clock.to_unix_ns(7_000_000_000)
     1700000002000500000
     """
 
@@ -46,9 +46,9 @@ class SlewedClock:
         self._knots: Ints = np.array([[monotonic_ns, self._host_ns, 0]], np.int64)
 
     @property
-    def behind_ns(self) -> int:
+    def lag_behind_host_ns(self) -> int:
         """Time by which the slewed Unix time is behind the host clock, in nanoseconds."""
-        return self._host_ns - self.offset_ns(self._slewed_at_ns)
+        return self._host_ns - self.unix_offset_ns(self._slewed_at_ns)
 
     def slew_and_return_host_step(self, monotonic_ns: int, unix_ns: int) -> int:
         """Start to slew towards the host clock. This method is called about once a second.
@@ -62,17 +62,17 @@ class SlewedClock:
         begun_ns, offset_ns, correction_ns = self._knots[-1].tolist()
         self._slewed_at_ns = max(monotonic_ns, begun_ns)
         if offset_ns + correction_ns != self._host_ns:
-            now_ns = self.offset_ns(self._slewed_at_ns)
+            now_ns = self.unix_offset_ns(self._slewed_at_ns)
             knot = np.array([[self._slewed_at_ns, now_ns, self._host_ns - now_ns]], np.int64)
             kept = self._knots[:-1] if self._slewed_at_ns == begun_ns else self._knots
             self._knots = np.concatenate([kept[1 - MAX_KNOTS :], knot])
         return self._host_ns - before_ns
 
-    def offset_ns(self, monotonic_ns: int) -> int:
+    def unix_offset_ns(self, monotonic_ns: int) -> int:
         """Return the difference between Unix time and monotonic time at a monotonic time."""
-        return int(self.offsets_ns(np.array([monotonic_ns], np.int64))[0])
+        return int(self.unix_offsets_ns(np.array([monotonic_ns], np.int64))[0])
 
-    def offsets_ns(self, monotonic_ns: Ints) -> Ints:
+    def unix_offsets_ns(self, monotonic_ns: Ints) -> Ints:
         """Return the difference between Unix time and monotonic time at each monotonic time [n]."""
         knots = self._knots
         begun_ns, offset_ns, correction_ns = knots[np.searchsorted(knots[1:, 0], monotonic_ns, side="right")].T
@@ -80,6 +80,6 @@ class SlewedClock:
         offsets: Ints = offset_ns + np.clip(correction_ns, -most_ns, most_ns)
         return offsets
 
-    def unix_ns(self, monotonic_ns: int) -> int:
+    def to_unix_ns(self, monotonic_ns: int) -> int:
         """Return the Unix time of a monotonic time."""
-        return monotonic_ns + self.offset_ns(monotonic_ns)
+        return monotonic_ns + self.unix_offset_ns(monotonic_ns)

@@ -40,7 +40,9 @@ class Estimate:
     fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN without a fit, or at τ left out
     coefficients: Coefficients
     k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
-    display_curve: AllanCurve | None = None  # curve at the same τ over shorter spans, see ``window.display_spans``
+    display_curve: AllanCurve | None = (
+        None  # curve at the same τ over shorter spans, see ``window.samples_per_displayed_tau``
+    )
     history: PerSampleCoefficients | None = None  # since the previous estimate, if the fit is updated with every sample
 
     def without_coefficients(self) -> "Estimate":

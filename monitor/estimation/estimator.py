@@ -31,16 +31,23 @@ from monitor.estimation.allan.uncertainty import (
     PerTauSpanDegreesOfFreedom,
     deviation_intervals,
 )
-from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, display_spans
+from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, samples_per_displayed_tau
 from monitor.estimation.estimate import Estimate, PerSampleCoefficients, concatenate_coefficients
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, empty_fit, fit, make_design
+from monitor.estimation.fit.coefficient_fit import (
+    Fit,
+    MeasuredCurve,
+    concatenate_fits,
+    empty_fit,
+    fit_coefficients,
+    make_design_matrix,
+)
 from monitor.estimation.fit.continuous_refit import ContinuousRefit
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
-    apply_low_passes,
-    is_contradicted,
+    is_contradicted_by_curve,
     power_spectrum,
-    search_low_pass,
+    refit_with_low_passes,
+    search_low_pass_in_steps,
 )
 from monitor.estimation.window_snapshot import WindowSnapshot, copy_window
 
@@ -79,13 +86,13 @@ class Estimator:
         length = min(max(round(window_s * rate_hz), MIN_LENGTH), MAX_LENGTH)
         self.window_s = length / rate_hz
         factors = cluster_sizes(length, rate_hz, tau)
-        spans = display_spans(factors, rate_hz, length)
+        spans = samples_per_displayed_tau(factors, rate_hz, length)
         self._m = factors.size
         # The first m rows are fitted. The next m rows are only displayed.
         rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
-        self._design = make_design(factors, rate_hz)
+        self._design = make_design_matrix(factors, rate_hz)
         self._tables = AxisCovarianceTables(factors, length)
         self._spans = PerTauSpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
@@ -127,11 +134,11 @@ class Estimator:
         if samples.lost > self._window.length:
             self.reset()
         elif samples.lost:
-            self._window.skip(samples.lost)
+            self._window.append_missing_samples(samples.lost)
             self._lengths += samples.lost
         np.minimum(self._lengths, self._window.samples_in_window, out=self._lengths)
         if self._refit is None:
-            self._window.update(samples.values)
+            self._window.append_samples(samples.values)
             self._lengths += len(samples)
         else:
             self._history.append(
@@ -147,11 +154,11 @@ class Estimator:
 
     def reset(self) -> None:
         """Empty the window."""
-        self._window.reset()
+        self._window.discard_samples()
         self._lengths[:], self._theta[:] = 0, np.nan
         self._entered[:] = False
         if self._refit is not None:
-            self._refit.reset()
+            self._refit.restart_all_fits()
 
     def restart(self, axis: int, samples: int) -> None:
         """Discard all but the newest samples of one axis, because its noise has changed.
@@ -167,14 +174,14 @@ class Estimator:
         self._lengths[axis] = min(samples, self._lengths[axis])
         self._entered[:, axis], self._theta[:, axis] = False, np.nan
         if self._refit is not None:
-            self._refit.restart(axis)
+            self._refit.restart_fit_of_axis(axis)
 
     def fit_state(self) -> tuple[NDArray[np.bool_], Floats]:
         """Return the terms in the newest fit and the squared coefficients θ in SI, both of shape (5, 6).
 
         ``restore_fit`` accepts these arrays as the start of the next fit.
         """
-        return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
+        return (self._entered if self._refit is None else self._refit.terms_in_fit).copy(), self._theta.copy()
 
     def restore_fit(self, entered: NDArray[np.bool_], theta: Floats) -> None:
         """Use a fit from before a restart of the program as the start, and repeat the fit until it converges.
@@ -201,7 +208,7 @@ class Estimator:
         """
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
-        self._design = make_design(self._factors, rate_hz)
+        self._design = make_design_matrix(self._factors, rate_hz)
 
     def get(self, fitted: bool = True) -> Estimate:
         """Return the Allan curve of the window and the coefficients fitted to it.
@@ -219,7 +226,7 @@ class Estimator:
         n = self._window.samples_in_window
         if n < MIN_SAMPLES:
             raise NotReady(f"{n} of at least {MIN_SAMPLES} samples")
-        avar, terms = self._window.avar(), self._window.terms()
+        avar, terms = self._window.avar(), self._window.term_counts()
         own, recent = slice(0, self._m), slice(self._m, None)
         result = self._fit(avar[own], terms[own]) if fitted else empty_fit(avar[own])
         curve = self._curve(avar[own], terms[own], result.edf, n)
@@ -245,10 +252,10 @@ class Estimator:
             Both curves if this step has completed a round, otherwise None.
         """
         rounds = self._total_hadamard.rounds
-        self._total_hadamard.step()
+        self._total_hadamard.compute_next_tau()
         self._step_low_pass_search()
         return (
-            self._total_hadamard.get(self.rate_hz, np.where(self._entered, self._theta, 0.0))
+            self._total_hadamard.curves_of_last_round(self.rate_hz, np.where(self._entered, self._theta, 0.0))
             if self._total_hadamard.rounds > rounds
             else None
         )
@@ -259,25 +266,27 @@ class Estimator:
         The covariances depend on the number of samples of an axis.
         """
         lengths = np.minimum(self._lengths, self._window.samples_in_window)
-        slope, slopes = self._window.slopes_of_axes_and_taus(lengths)
-        before = self._entered if self._refit is None else self._refit.entered
+        slope, slopes = self._window.rate_slopes_per_axis_and_tau(lengths)
+        before = self._entered if self._refit is None else self._refit.terms_in_fit
         shorter = [axis for axis in range(len(lengths)) if lengths[axis] < self._window.samples_in_window]
         groups = [np.flatnonzero(lengths == self._window.samples_in_window), *(np.array([axis]) for axis in shorter)]
         groups = [axes for axes in groups if axes.size]
         fits = []
         for axes in groups:
             n = int(lengths[axes[0]])
-            table = self._tables.at(int(axes[0]), n, self._window.samples_in_window)
+            table = self._tables.table_of_axis(int(axes[0]), n, self._window.samples_in_window)
             measured = MeasuredCurve(
                 avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[: self._m, axes] * self.rate_hz,
                 before[:, axes],
             )  # fmt: skip
-            one = fit(self._design, table, measured, start=self._theta[:, axes])
+            one = fit_coefficients(self._design, table, measured, start_theta=self._theta[:, axes])
             self._theta[:, axes] = one.theta
             for column, axis in enumerate(axes.tolist()):
-                self._contradicting[axis] = (table, measured.axis(column)) if is_contradicted(one, column) else None
+                self._contradicting[axis] = (
+                    (table, measured.select_axis(column)) if is_contradicted_by_curve(one, column) else None
+                )
             fits.append(
-                apply_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
+                refit_with_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
             )
         result = fits[0] if len(fits) == 1 else concatenate_fits(fits, np.concatenate(groups))
         self._entered = result.entered
@@ -299,7 +308,7 @@ class Estimator:
             self._search_axis = (self._search_axis + 1) % len(self._contradicting)
             contradicting = self._contradicting[self._search_axis]
             if contradicting is not None:
-                self._search = search_low_pass(
+                self._search = search_low_pass_in_steps(
                     self._design,
                     *contradicting,
                     power_spectrum(self._window.newest_samples(self._search_axis, SPECTRUM_SAMPLES)),

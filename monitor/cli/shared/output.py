@@ -88,7 +88,7 @@ def compile_analysis_kernels(tell: ProgressCallback) -> None:
         if not kernel_compilation.is_warm(group):
             with contextlib.suppress(OSError):  # without a cache on disk, each kernel is compiled at its first call
                 for _ in kernel_compilation.prepare_kernels(
-                    group, lambda progress: tell(str(progress), progress.share)
+                    group, lambda progress: tell(str(progress), progress.compiled_share)
                 ):
                     pass
 

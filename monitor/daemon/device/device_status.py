@@ -42,7 +42,7 @@ class DeviceStatus:
             Resident memory of the process.
         """
         driver, clock, signal_monitor = self._driver, self._driver.clock, self._pipeline.signal_monitor
-        median_s, high_s = self.latency.take_quantiles()
+        median_s, high_s = self.latency.take_latency_quantiles()
         return Health(
             state=driver.state,
             rate_hz=clock.measured_hz if driver.state == "running" else None,

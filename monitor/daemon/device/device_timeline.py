@@ -39,20 +39,20 @@ class DeviceTimeline:
 
     # --- conversion of times
 
-    def offset_ns(self, t_ns: int) -> int:
+    def unix_offset_ns(self, t_ns: int) -> int:
         """Return the difference between Unix time and a sample time, in nanoseconds."""
-        return 0 if self._driver.times_are_unix else self._clock.offset_ns(t_ns)
+        return 0 if self._driver.times_are_unix else self._clock.unix_offset_ns(t_ns)
 
-    def offsets_ns(self, samples: SampleBlock) -> Ints | int:
+    def unix_offsets_ns(self, samples: SampleBlock) -> Ints | int:
         """Return the difference between Unix time and the time of each sample, int64 [n] or one number for all.
 
         The resulting Unix times increase even if the host clock was set back.
         """
-        return 0 if self._driver.times_are_unix else self._clock.offsets_ns(samples.t_ns)
+        return 0 if self._driver.times_are_unix else self._clock.unix_offsets_ns(samples.t_ns)
 
-    def unix_s(self, t_ns: int) -> float:
+    def to_unix_s(self, t_ns: int) -> float:
         """Convert a sample time in nanoseconds to Unix time in seconds."""
-        return (t_ns + self.offset_ns(t_ns)) / 1e9
+        return (t_ns + self.unix_offset_ns(t_ns)) / 1e9
 
     # --- present time
 
@@ -70,7 +70,7 @@ class DeviceTimeline:
             before the first sample of a device with its own time stamps.
         """
         now_ns = self._now_ns()
-        return None if now_ns is None else self.unix_s(now_ns)
+        return None if now_ns is None else self.to_unix_s(now_ns)
 
     def _now_ns(self) -> int | None:
         """Return the present time on the timeline of the samples, in nanoseconds; None if it is unknown."""
@@ -118,7 +118,7 @@ class DeviceTimeline:
 
     # --- host clock
 
-    def slew_to_host(self) -> None:
+    def slew_to_host_clock(self) -> None:
         """Slew the Unix times towards the host clock, and queue an event if the host clock was set."""
         now_ns = time.monotonic_ns()
         step_s = self._clock.slew_and_return_host_step(now_ns, time.time_ns()) / 1e9
@@ -132,7 +132,7 @@ class DeviceTimeline:
 
     def host_clock_offset_text(self) -> str:
         """Return a message about the offset of the sample times from the host clock; empty if the offset is small."""
-        behind_s = 0.0 if self._driver.times_are_unix else self._clock.behind_ns / 1e9
+        behind_s = 0.0 if self._driver.times_are_unix else self._clock.lag_behind_host_ns / 1e9
         if abs(behind_s) < MIN_CLOCK_STEP_S:
             return ""
         where = "behind" if behind_s > 0.0 else "ahead of"

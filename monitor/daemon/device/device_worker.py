@@ -133,7 +133,7 @@ class DeviceWorker:
         if self.simulated is not None:
             self.simulated.stop()
 
-    def join(self, timeout_s: float) -> bool:
+    def join_reader_thread(self, timeout_s: float) -> bool:
         """Wait for the end of the reader thread; return False if the thread still runs after ``timeout_s`` seconds."""
         if self._thread.is_alive():
             self._thread.join(timeout_s)
@@ -178,7 +178,7 @@ class DeviceWorker:
             return
         blocks = self._take() if drain or self._can_take() else []
         events = self.timeline.take_events() + events  # the time of the first sample is known now
-        self.pipeline.advance(blocks, self.clock.rate_hz, drain)
+        self.pipeline.process_blocks(blocks, self.clock.rate_hz, drain)
         if drain:
             self.pipeline.process_held_samples()
         if self.pipeline.thermal is not None and any(event.kind == "link_back" for event in events):
@@ -201,13 +201,13 @@ class DeviceWorker:
         if pipeline.estimator is not None or pipeline.refusal_reason:
             return True
         if self.clock.rate_hz is None:  # samples are published even if the sample rate stays unknown
-            return self.ring.room < self.ring.capacity // 2
+            return self.ring.free_capacity < self.ring.capacity // 2
         return pipeline.required_kernels_ready(self.clock.rate_hz)
 
     def _take(self) -> list[SampleBlock]:
         """Return all samples from the ring buffer."""
         self.status.latency.note_samples_taken()
-        blocks = self.ring.take()
+        blocks = self.ring.take_samples()
         if blocks:
             self.timeline.set_newest_sample_time(int(blocks[-1].t_ns[-1]))
         return blocks
@@ -254,7 +254,7 @@ class DeviceWorker:
         """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
         return None if self.restore.active else self.pipeline.copy_window_and_temperature()
 
-    def set_limits(self, device: Device) -> None:
+    def replace_limits(self, device: Device) -> None:
         """Replace the limits by the limits of new settings. Unchanged limits keep their state.
 
         Raises
@@ -294,7 +294,7 @@ class DeviceWorker:
         Health
             The published status.
         """
-        self.timeline.slew_to_host()
+        self.timeline.slew_to_host_clock()
         self.publisher.publish_events(self.timeline.take_events())
         self._update_rate()
         if self._recorder is not None:
@@ -309,7 +309,7 @@ class DeviceWorker:
     def _record_chunks(self, chunks: Sequence[Chunk]) -> None:
         """Record raw bytes."""
         if self._recorder is not None and chunks:
-            self._recorder.queue_chunks(self.name, chunks, self.timeline.offset_ns(chunks[0].t_ns))
+            self._recorder.queue_chunks(self.name, chunks, self.timeline.unix_offset_ns(chunks[0].t_ns))
 
     def _push(self, samples: SampleBlock) -> None:
         """Record decoded samples, and put the samples into the ring buffer.
@@ -319,12 +319,12 @@ class DeviceWorker:
         if self._recorder is not None:
             if self.pipeline.estimator is None:  # the program may crash before the first status is published
                 self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
-            self._recorder.queue_samples(self.name, samples, self.timeline.offsets_ns(samples))
+            self._recorder.queue_samples(self.name, samples, self.timeline.unix_offsets_ns(samples))
             while self._replayed and self._recorder.is_queue_filling(self.name):
                 time.sleep(REPLAY_PAUSE_S)
-        while self._replayed and self.ring.room < len(samples) < self.ring.capacity:
+        while self._replayed and self.ring.free_capacity < len(samples) < self.ring.capacity:
             time.sleep(REPLAY_PAUSE_S)
-        self.ring.push(samples)
+        self.ring.push_samples(samples)
         self.status.latency.note_samples_arrived()
         self._wake.set()
 

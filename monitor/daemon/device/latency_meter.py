@@ -31,7 +31,7 @@ class LatencyMeter:
             self._latencies_s.append((time.monotonic_ns() - self._taken_ns) / 1e9)
             self._taken_ns = 0
 
-    def take_quantiles(self) -> tuple[float | None, float | None]:
+    def take_latency_quantiles(self) -> tuple[float | None, float | None]:
         """Return median and 99 % quantile of the latency since the last call, in seconds; None without results."""
         latencies_s, self._latencies_s = self._latencies_s, []
         if not latencies_s:

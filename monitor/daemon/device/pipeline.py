@@ -90,7 +90,7 @@ class DevicePipeline:
     def required_kernels_ready(self, rate_hz: float) -> bool:
         """Return True if the kernels that the first samples need are compiled or can be interpreted."""
         if not self._interprets and not self._needs.is_set():
-            self._interprets = self._live and self.ready.reserve_interpreter(rate_hz)
+            self._interprets = self._live and self.ready.reserve_interpreted_rate(rate_hz)
         return self._interprets or self._needs.is_set()
 
     @property
@@ -119,7 +119,7 @@ class DevicePipeline:
         """True while samples of a recording wait for the selection of a thermal model."""
         return bool(self._pieces)
 
-    def advance(self, blocks: Sequence[SampleBlock], rate_hz: float | None, drain: bool) -> None:
+    def process_blocks(self, blocks: Sequence[SampleBlock], rate_hz: float | None, drain: bool) -> None:
         """Process blocks of samples. While the sample rate is unknown, the samples are discarded.
 
         Parameters
@@ -176,7 +176,7 @@ class DevicePipeline:
             Sample rate.
         """
         self._replaying = True
-        self.advance([samples], rate_hz, drain=True)
+        self.process_blocks([samples], rate_hz, drain=True)
         self._replaying = False
         live = self.compensation
         if live is not None and np.isfinite(samples.values[:, :3]).any():

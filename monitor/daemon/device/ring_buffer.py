@@ -40,17 +40,17 @@ class RingBuffer:
         return self._read == self._written
 
     @property
-    def room(self) -> int:
+    def free_capacity(self) -> int:
         """Number of samples that fit into the buffer without overwriting older samples."""
         return self.capacity - (self._written - self._read)
 
-    def push(self, samples: SampleBlock) -> None:
+    def push_samples(self, samples: SampleBlock) -> None:
         """Add samples. A full buffer overwrites its oldest samples."""
         with self._lock:
             for start in range(0, len(samples), self.capacity):
                 self._write(samples[start : start + self.capacity])
 
-    def take(self) -> list[SampleBlock]:
+    def take_samples(self) -> list[SampleBlock]:
         """Return all samples since the last call, split into blocks where samples are missing."""
         with self._lock:
             n = self._written - self._read

@@ -56,7 +56,7 @@ class WindowRestore:
         if tail is None:
             return
         newest, state = tail.newest.samples, tail.newest.state
-        t_ns = int(newest.t_ns[-1]) - self._timeline.offset_ns(time.monotonic_ns())
+        t_ns = int(newest.t_ns[-1]) - self._timeline.unix_offset_ns(time.monotonic_ns())
         ago_s = (time.time_ns() - int(newest.t_ns[-1])) / 1e9
         rate_hz = self._device.rate_hz or state.rate
         if rate_hz is None or not 0.0 <= ago_s <= self._device.window_s:
@@ -73,7 +73,7 @@ class WindowRestore:
         tail = self._tail
         if tail is None:
             return
-        offset_ns = self._timeline.offset_ns(time.monotonic_ns())
+        offset_ns = self._timeline.unix_offset_ns(time.monotonic_ns())
         try:
             text = self._replay(tail, offset_ns)
         except (ImuError, OSError) as error:
@@ -92,7 +92,7 @@ class WindowRestore:
         tick_step = self._clock.ticks_per_sample or before.tick_step
         if estimator is None:
             return msgspec.structs.replace(before, rate=self._clock.rate_hz or before.rate, tick_step=tick_step)
-        offset_ns = self._timeline.offset_ns(self._pipeline.newest_ns)
+        offset_ns = self._timeline.unix_offset_ns(self._pipeline.newest_ns)
         entered, theta = estimator.fit_state()
         since = tuple(None if t_ns is None else (t_ns + offset_ns) / 1e9 for t_ns in self._pipeline.since_ns)
         parameters = tuple(None if np.isnan(value) else float(value) for value in theta.ravel())
@@ -103,7 +103,7 @@ class WindowRestore:
         pipeline, state = self._pipeline, tail.newest.state
         rate_hz = self._clock.rate_hz or state.rate or 0.0
         counted = np.zeros(len(AXES), np.int64)
-        for piece in tail.pieces(max(self._device.window_s, MIN_REPLAY_S)):
+        for piece in tail.read_pieces(max(self._device.window_s, MIN_REPLAY_S)):
             samples = piece.samples
             counted += _count_since_restart(samples, state)
             t_ns = samples.t_ns - offset_ns

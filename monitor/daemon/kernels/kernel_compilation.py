@@ -39,12 +39,12 @@ BAR_LENGTH: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class CompilationProgress:
     """Progress of the compilation.
 
     Examples
     --------
-    >>> print(Progress(2, 8, ("change detection",)), Progress(2, 8).bar)
+    >>> print(CompilationProgress(2, 8, ("change detection",)), CompilationProgress(2, 8).bar)
     compiling 3 of 8: change detection ███░░░░░░░░░
     """
 
@@ -57,19 +57,19 @@ class Progress:
         return f"compiling {min(self.done + 1, self.of)} of {self.of}: {' and '.join(self.running)}"
 
     @property
-    def share(self) -> float:
+    def compiled_share(self) -> float:
         """Share of the parts that are compiled, 0 to 1."""
         return self.done / self.of
 
     @property
-    def bar(self) -> str:
+    def progress_bar_text(self) -> str:
         """Text bar that shows ``share``."""
-        filled = round(BAR_LENGTH * self.share)
+        filled = round(BAR_LENGTH * self.compiled_share)
         return "█" * filled + "░" * (BAR_LENGTH - filled)
 
 
 def prepare_kernels(
-    group: KernelGroup, tell: Callable[[Progress], None], processes: int | None = None
+    group: KernelGroup, report_progress: Callable[[CompilationProgress], None], processes: int | None = None
 ) -> Iterator[str]:
     """Prepare the kernels of a group for calls, and yield the name of each part that is ready.
 
@@ -77,8 +77,9 @@ def prepare_kernels(
     ----------
     group : KernelGroup
         Parts to prepare.
-    tell : callable
-        Called with a ``Progress`` when the compilation of a part begins or ends, unless all parts are cached on disk.
+    report_progress : callable
+        Called with a ``CompilationProgress`` when the compilation of a part begins or ends, unless all parts are cached
+        on disk.
     processes : int, optional
         Number of child processes. The default is the number of processors, at most ``MAX_PROCESSES``. If the number is
         0 or no cache folder can be written, the calling process compiles the kernels.
@@ -105,8 +106,8 @@ def prepare_kernels(
         processes = min(_count_processors(), MAX_PROCESSES)
     with closing(_ChildProcesses(group.parts, processes)) as children:
         for done, part in enumerate(group.parts):
-            if not children.wait_for(part, tell):
-                tell(Progress(done, len(group.parts), (part.name,)))
+            if not children.wait_for_part(part, report_progress):
+                report_progress(CompilationProgress(done, len(group.parts), (part.name,)))
             part.prepare()
             yield part.name
     if folder is not None:
@@ -159,7 +160,7 @@ class _ChildProcesses:
         self._running: list[str] = []
         # True if a child has compiled the part, False if the calling process must compile it
         self._compiled: dict[str, bool] = {}
-        self._changes: queue.SimpleQueue[Progress] = queue.SimpleQueue()
+        self._changes: queue.SimpleQueue[CompilationProgress] = queue.SimpleQueue()
         self._children: list[subprocess.Popen[str]] = []
         self._active_threads = processes
         self._lock = threading.Lock()
@@ -175,12 +176,12 @@ class _ChildProcesses:
             for child in self._children:
                 child.kill()
 
-    def wait_for(self, part: KernelPart, tell: Callable[[Progress], None]) -> bool:
+    def wait_for_part(self, part: KernelPart, report_progress: Callable[[CompilationProgress], None]) -> bool:
         """Wait for a part, and report the progress; return False if the calling process must compile the part."""
         while part.name not in self._compiled or not self._changes.empty():
             progress = self._changes.get()
             if progress.running:
-                tell(progress)
+                report_progress(progress)
         return self._compiled[part.name]
 
     def _run_child(self) -> None:
@@ -231,7 +232,7 @@ class _ChildProcesses:
     def _put_progress(self) -> None:
         """Put the progress into the queue of the waiting thread."""
         done = sum(self._compiled.values())
-        self._changes.put(Progress(done, self._number_of_parts, tuple(self._running)))
+        self._changes.put(CompilationProgress(done, self._number_of_parts, tuple(self._running)))
 
 
 def _compile_in_child(child: "subprocess.Popen[str]", name: str) -> bool:

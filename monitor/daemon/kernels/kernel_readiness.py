@@ -30,14 +30,14 @@ class KernelReadiness:
     interpretable_hz: float = MAX_INTERPRETED_HZ
     """Total sample rate that is still available for devices with interpreted kernels."""
 
-    def reserve_interpreter(self, rate_hz: float) -> bool:
+    def reserve_interpreted_rate(self, rate_hz: float) -> bool:
         """Return True if Python can also interpret the kernels for a device with this sample rate."""
         if rate_hz > self.interpretable_hz:
             return False
         self.interpretable_hz -= rate_hz
         return True
 
-    def compile(self, wake: threading.Event) -> None:
+    def compile_kernels(self, wake: threading.Event) -> None:
         """Compile the kernels, and set a flag and ``wake`` for each compiled part. Called in a thread.
 
         All flags are set even if the compilation fails, because the main loop would otherwise wait forever. The main
@@ -45,14 +45,14 @@ class KernelReadiness:
         """
         begin_s = time.monotonic()
 
-        def show(progress: kernel_compilation.Progress) -> None:
+        def show_progress(progress: kernel_compilation.CompilationProgress) -> None:
             if not self.progress:
                 _log.info("compiling kernels, because this version has not run on this machine before")
-            self.progress = f"{progress} {progress.bar}"
+            self.progress = f"{progress} {progress.progress_bar_text}"
             wake.set()
 
         try:
-            for part in kernel_compilation.prepare_kernels(kernel_parts.SERVICE, show):
+            for part in kernel_compilation.prepare_kernels(kernel_parts.SERVICE, show_progress):
                 flag = {kernel_parts.WINDOW: self.window, kernel_parts.FIT: self.fit}.get(part)
                 if flag is not None:
                     flag.set()

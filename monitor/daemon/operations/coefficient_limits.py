@@ -35,7 +35,7 @@ LIMIT_BACK: Final = "limit_back"
 
 
 @dataclass(frozen=True, slots=True)
-class Bound:
+class AxisLimit:
     """Limit of one coefficient on one axis."""
 
     axis: str
@@ -46,7 +46,7 @@ class Bound:
     times_model: float | None = None  # limit as a multiple of the coefficient of the noise model
 
     @property
-    def place(self) -> str:
+    def axis_and_letter(self) -> str:
         """Axis and letter, for example ``gz N``."""
         return f"{self.axis} {self.letter}"
 
@@ -59,11 +59,11 @@ class _Measured:
     lo: float
     hi: float
 
-    def is_beyond(self, bound: Bound) -> bool:
+    def is_beyond_limit(self, bound: AxisLimit) -> bool:
         """Return True if the interval is beyond the limit."""
         return self.lo > bound.limit if bound.upper else self.hi < bound.limit
 
-    def is_back(self, bound: Bound) -> bool:
+    def is_within_limit(self, bound: AxisLimit) -> bool:
         """Return True if the value is within the limit."""
         if not bound.upper:
             return self.value >= bound.limit
@@ -95,12 +95,12 @@ class LimitMonitor:
     """
 
     def __init__(self, limits: Sequence[Limit], model: NoiseModel | None) -> None:
-        self.states = {bound: _State() for bound in make_bounds(limits, model)}
+        self.states = {bound: _State() for bound in make_axis_limits(limits, model)}
 
     @property
     def limits_crossed_now(self) -> tuple[str, ...]:
         """Axis and letter of each crossed limit, for example ``gz N``."""
-        return tuple(bound.place for bound, state in self.states.items() if state.crossed)
+        return tuple(bound.axis_and_letter for bound, state in self.states.items() if state.crossed)
 
     def copy_states_from(self, other: "LimitMonitor") -> None:
         """Copy the states of all limits that both monitors have."""
@@ -112,10 +112,10 @@ class LimitMonitor:
         events = (self._test_bound(bound, state, estimate) for bound, state in self.states.items())
         return [event for event in events if event is not None]
 
-    def _test_bound(self, bound: Bound, state: _State, estimate: Estimate) -> Event | None:
+    def _test_bound(self, bound: AxisLimit, state: _State, estimate: Estimate) -> Event | None:
         """Compare an estimate with one limit; return an event if the state of the limit changes."""
         seen = _measured(bound, estimate)
-        if not (seen.is_back(bound) if state.crossed else seen.is_beyond(bound)):
+        if not (seen.is_within_limit(bound) if state.crossed else seen.is_beyond_limit(bound)):
             state.since = None
             return None
         if state.since is None:
@@ -137,13 +137,13 @@ def read_model_in_force(device: Device) -> NoiseModel | None:
     """
     model = None if device.model is None else read_model(device.model)
     try:
-        make_bounds(device.limits, model)
+        make_axis_limits(device.limits, model)
     except ConfigError as error:
         raise ConfigError(*(f"device {device.name}: {line}" for line in error.lines)) from None
     return model
 
 
-def make_bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
+def make_axis_limits(limits: Sequence[Limit], model: NoiseModel | None) -> list[AxisLimit]:
     """Return one bound for each axis of each limit.
 
     Parameters
@@ -171,17 +171,17 @@ def make_bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound
                     )
                     continue
                 upper = limit.times_model * term.value
-                found.append(Bound(axis, limit.letter, upper, True, limit.hold_s, limit.times_model))
+                found.append(AxisLimit(axis, limit.letter, upper, True, limit.hold_s, limit.times_model))
             if limit.above is not None:
-                found.append(Bound(axis, limit.letter, limit.above, True, limit.hold_s))
+                found.append(AxisLimit(axis, limit.letter, limit.above, True, limit.hold_s))
             if limit.below is not None:
-                found.append(Bound(axis, limit.letter, limit.below, False, limit.hold_s))
+                found.append(AxisLimit(axis, limit.letter, limit.below, False, limit.hold_s))
     if wrong:
         raise ConfigError(*wrong)
     return found
 
 
-def _measured(bound: Bound, estimate: Estimate) -> _Measured:
+def _measured(bound: AxisLimit, estimate: Estimate) -> _Measured:
     """Return the coefficient of an estimate to which a limit applies."""
     table, at = estimate.coefficients, (SYMBOLS.index(bound.letter), AXES.index(bound.axis))
     if Status(int(table.status[at])) == Status.UNESTIMATED:
@@ -189,7 +189,7 @@ def _measured(bound: Bound, estimate: Estimate) -> _Measured:
     return _Measured(float(table.value[at]), float(table.lo[at]), float(table.hi[at]))
 
 
-def _event(bound: Bound, seen: _Measured, crossed: bool, t_ns: int, since_ns: int) -> Event:
+def _event(bound: AxisLimit, seen: _Measured, crossed: bool, t_ns: int, since_ns: int) -> Event:
     """Return the event ``limit_crossed`` or ``limit_back``."""
     what = {"value": seen.value, "lo": seen.lo, "hi": seen.hi, "limit": bound.limit}
     kind = LIMIT_CROSSED if crossed else LIMIT_BACK
@@ -198,7 +198,7 @@ def _event(bound: Bound, seen: _Measured, crossed: bool, t_ns: int, since_ns: in
     )
 
 
-def _sigma(bound: Bound, seen: _Measured) -> float | None:
+def _sigma(bound: AxisLimit, seen: _Measured) -> float | None:
     """Return the distance between value and limit in standard errors; None for an upper bound."""
     if not isfinite(seen.value):
         return None
@@ -206,7 +206,7 @@ def _sigma(bound: Bound, seen: _Measured) -> float | None:
     return abs(seen.value - bound.limit) / error if error > 0.0 else None
 
 
-def _text(bound: Bound, seen: _Measured, crossed: bool) -> str:
+def _text(bound: AxisLimit, seen: _Measured, crossed: bool) -> str:
     """Return the message of the event."""
     unit, name = unit_of(bound.letter, bound.axis), COEFFICIENT_NAMES[sensor_kind(bound.axis)][bound.letter]
     measured = unit.text(seen.value) if isfinite(seen.value) else f"at most {unit.text(seen.hi)}"

@@ -215,9 +215,9 @@ def _wait_for_end(
             return f"killed after {timeout_s:g} s"
     if process.returncode == 0:
         return ""
-    pipes.read_rest_of_pipe()
+    pipes.read_remaining_output()
     how = f"signal {-process.returncode}" if process.returncode < 0 else f"exit status {process.returncode}"
-    return f"{how}{pipes.last_line()}"
+    return f"{how}{pipes.last_output_line_text()}"
 
 
 class _Pipes:
@@ -250,13 +250,13 @@ class _Pipes:
             else:
                 self._read()
 
-    def read_rest_of_pipe(self) -> None:
+    def read_remaining_output(self) -> None:
         """Read the rest of the output of a finished command, within limits, because its children may still write."""
         for _ in range(16):
             if self._out.closed or not self._read():
                 return
 
-    def last_line(self) -> str:
+    def last_output_line_text(self) -> str:
         """Return ``: `` and the last output line with unprintable characters replaced; "" without output."""
         lines = self._tail.decode("utf-8", "replace").strip().splitlines()
         if not lines:

@@ -51,7 +51,7 @@ JOIN_TIMEOUT_S: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class ReconcileJob:
     """Copy of a window to reconcile."""
 
     device: str
@@ -64,7 +64,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Finished:
+class FinishedReconciliation:
     """Result of a reconciliation in one sentence."""
 
     device: str
@@ -87,15 +87,15 @@ class Reconciler:
         self._limit_s = limit_s
         self._running: dict[str, threading.Thread] = {}
         self._children: dict[str, subprocess.Popen[bytes]] = {}
-        self._finished: queue.SimpleQueue[Finished] = queue.SimpleQueue()
+        self._finished: queue.SimpleQueue[FinishedReconciliation] = queue.SimpleQueue()
         self._closing = threading.Event()
 
-    def start(self, job: Job, command: Command) -> None:
+    def start_reconciliation(self, job: ReconcileJob, command: Command) -> None:
         """Start a reconciliation and return at once. A second query for the same device is refused.
 
         Parameters
         ----------
-        job : Job
+        job : ReconcileJob
             Window to reconcile.
         command : Command
             Query that receives the answer.
@@ -109,7 +109,7 @@ class Reconciler:
         self._running[job.device] = thread
         thread.start()
 
-    def take_finished(self) -> list[Finished]:
+    def take_finished_reconciliations(self) -> list[FinishedReconciliation]:
         """Return the results since the last call."""
         found = []
         with contextlib.suppress(queue.Empty):
@@ -117,7 +117,7 @@ class Reconciler:
                 found.append(self._finished.get_nowait())
         return found
 
-    def close(self) -> None:
+    def abort_reconciliations(self) -> None:
         """Kill the running reconciliations, and refuse their queries."""
         self._closing.set()
         for child in list(self._children.values()):
@@ -127,19 +127,19 @@ class Reconciler:
 
     # --- thread of one query
 
-    def _run(self, job: Job, command: Command) -> None:
+    def _run(self, job: ReconcileJob, command: Command) -> None:
         """Reconcile a window and answer its query."""
         try:
             result, status, folder = self._reconcile(job)
         except (OSError, RuntimeError) as error:
             command.reply_refusal(str(error))
-            self._finished.put(Finished(job.device, f"reconcile failed: {error}"))
+            self._finished.put(FinishedReconciliation(job.device, f"reconcile failed: {error}"))
             return
         head = ReconcileReply(device=job.device, t=job.unix_s, samples=job.samples)
         command.reply_result(head.encode_report(result, status, folder))
-        self._finished.put(Finished(job.device, format_result(result, status)))
+        self._finished.put(FinishedReconciliation(job.device, format_reconcile_result(result, status)))
 
-    def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:
+    def _reconcile(self, job: ReconcileJob) -> tuple[dict[str, Any], int, str | None]:
         """Return the JSON result, the exit status, and the folder of the report; None if the report is not kept."""
         with tempfile.TemporaryDirectory(prefix="imu-monitor-") as temporary:
             path, folder = Path(temporary) / f"{job.device}.npz", Path(temporary) / "report"
@@ -183,7 +183,7 @@ class Reconciler:
         return child.returncode, output, errors
 
 
-def _write_window(path: Path, job: Job) -> None:
+def _write_window(path: Path, job: ReconcileJob) -> None:
     """Write the measured axes, the temperature and the sample rate of a window as a recording."""
     values = job.window.values()
     columns = {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
@@ -192,7 +192,7 @@ def _write_window(path: Path, job: Job) -> None:
     np.savez(path, fs=np.float64(job.window.rate_hz), **columns)  # type: ignore[arg-type]
 
 
-def format_result(result: dict[str, Any], status: int = DONE) -> str:
+def format_reconcile_result(result: dict[str, Any], status: int = DONE) -> str:
     """Return the verdict and the changes of the model in one sentence.
 
     Parameters
@@ -204,7 +204,7 @@ def format_result(result: dict[str, Any], status: int = DONE) -> str:
 
     Examples
     --------
-    >>> format_result({"verdict": "explained", "axes": {"gz": {"steps": [
+    >>> format_reconcile_result({"verdict": "explained", "axes": {"gz": {"steps": [
     ...     {"kind": "added", "effect": "sinusoidal", "confidence": 0.998}]}}})
     'reconcile: explained: gz sinusoidal added (0.998)'
     """

@@ -62,32 +62,32 @@ class SystemdNotifier:
         known = address.startswith(("/", "@"))
         return cls(address if known else "", int(usec) / 1e6 if known and watched else None)
 
-    def ready(self) -> None:
+    def send_ready(self) -> None:
         """Send the message that the service has started or has finished a reload."""
         self.ready_sent = True
         self._send("READY=1")
 
-    def status(self, sentence: str) -> None:
+    def send_status(self, sentence: str) -> None:
         """Send the status in one sentence, if it has changed."""
         line = " ".join(sentence.split())
         if line != self._said:
             self._said = line
             self._send(f"STATUS={line}")
 
-    def reloading(self) -> None:
+    def send_reloading(self) -> None:
         """Send the message that a reload has begun. ``ready`` reports the end of the reload."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
-    def stopping(self) -> None:
+    def send_stopping(self) -> None:
         """Send the message that the service is stopping."""
         self._send("STOPPING=1")
 
-    def send_watchdog(self, turns: Mapping[str, int], now_s: float) -> list[str]:
+    def send_watchdog(self, read_attempts: Mapping[str, int], now_s: float) -> list[str]:
         """Send a watchdog message if it is due and no reader is stuck.
 
         Parameters
         ----------
-        turns : mapping of str to int
+        read_attempts : mapping of str to int
             Number of read attempts of each reader.
         now_s : float
             Present time on the monotonic clock, in seconds.
@@ -99,7 +99,7 @@ class SystemdNotifier:
         """
         self._turns = {
             name: self._turns[name] if self._turns.get(name, (-1, 0.0))[0] == count else (count, now_s)
-            for name, count in turns.items()
+            for name, count in read_attempts.items()
         }
         stuck = [name for name, (_, since_s) in self._turns.items() if now_s - since_s > self._stuck_s]
         if self.watchdog_s is not None and not stuck and now_s >= self._next_beat_s:

@@ -117,7 +117,7 @@ class RecordingTrack:
         """True if more than a quarter of the queue is in use."""
         return self._queue_bytes > MAX_QUEUE_BYTES // 4
 
-    def enqueue(self, entries: Sequence[SampleBlock | Chunk], count_dropped: bool) -> None:
+    def queue_entries(self, entries: Sequence[SampleBlock | Chunk], count_dropped: bool) -> None:
         """Append entries to the queue. If the queue is full, drop the oldest entries.
 
         Parameters
@@ -138,7 +138,7 @@ class RecordingTrack:
                     self._dropped += rows + lost
                     self.missed += rows
 
-    def drop_recorded_rows(self) -> None:
+    def drop_rows_recorded_elsewhere(self) -> None:
         """Drop queued rows that another process has recorded; rows missing after these rows become a gap."""
         newest = self._find_newest_row()
         with self._lock:
@@ -204,7 +204,7 @@ class RecordingTrack:
         except ConfigError as error:  # pyarrow is not installed
             self._report_failure(str(error))
         except OSError as error:
-            self._report_failure(stopped_text(self.folder, error))
+            self._report_failure(recording_stopped_text(self.folder, error))
             self.close_segment()
         else:
             self._taken = []
@@ -212,7 +212,7 @@ class RecordingTrack:
                 self.trouble = ""
                 self.report_continuation()
 
-    def sync(self) -> None:
+    def sync_segment_to_disk(self) -> None:
         """Flush the open segment to disk."""
         if self._writer is None or not self._unsynced:
             return
@@ -220,7 +220,7 @@ class RecordingTrack:
         try:
             self._writer.flush_to_disk()
         except OSError as error:
-            self._report_failure(stopped_text(self.folder, error))
+            self._report_failure(recording_stopped_text(self.folder, error))
             self.close_segment()
 
     def close_segment(self, pack: bool = True) -> None:
@@ -231,11 +231,11 @@ class RecordingTrack:
         try:
             writer.close()
         except OSError as error:
-            self._report_failure(stopped_text(writer.path, error))
+            self._report_failure(recording_stopped_text(writer.path, error))
         if pack:
             self._finished.append(writer.path)
 
-    def suspend(self) -> None:
+    def suspend_recording(self) -> None:
         """Close the open segment while another process may create segments in the folder."""
         self.close_segment(pack=False)
         self._number = None
@@ -315,7 +315,7 @@ class RecordingTrack:
         self._stopped_s = time.monotonic()
 
 
-def stopped_text(path: Path, error: OSError) -> str:
+def recording_stopped_text(path: Path, error: OSError) -> str:
     """Return the message that an error of the file system has stopped the recording.
 
     Parameters

@@ -29,8 +29,14 @@ from drivers.recordings import segment_file as segment
 from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
-from monitor.daemon.storage.device_recording import RETRY_S, Opening, RecorderEvent, RecordingTrack, stopped_text
-from monitor.daemon.storage.recording_tail import RecordingTail, find_tail
+from monitor.daemon.storage.device_recording import (
+    RETRY_S,
+    Opening,
+    RecorderEvent,
+    RecordingTrack,
+    recording_stopped_text,
+)
+from monitor.daemon.storage.recording_tail import RecordingTail, read_recording_tail
 from monitor.settings.loading import Storage
 
 WRITE_INTERVAL_S: Final = 0.5
@@ -106,12 +112,16 @@ class Recorder:
         troubles = sorted({track.trouble for track in self._tracks.values() if track.trouble})
         if troubles:
             return troubles[0]
-        missed = f"{self.missed} rows are not in the recording: the disk was too slow or full" if self.missed else ""
+        missed = (
+            f"{self.missed_rows} rows are not in the recording: the disk was too slow or full"
+            if self.missed_rows
+            else ""
+        )
         warnings = "; ".join(filter(None, (self._note, self._folder_lock.warning, missed)))
         return f"ok, but {warnings}" if warnings else "ok"
 
     @property
-    def missed(self) -> int:
+    def missed_rows(self) -> int:
         """Number of samples and chunks that are missing in the recordings."""
         return sum(track.missed for track in self._tracks.values())
 
@@ -139,7 +149,7 @@ class Recorder:
             return None
         if self._thread.ident is None:
             self._acquire_folder()  # the lock prevents that another process adds segments
-        return find_tail(track.origin, track.folder)
+        return read_recording_tail(track.origin, track.folder)
 
     # --- called by the reader threads
 
@@ -161,7 +171,7 @@ class Recorder:
         if not isinstance(offset_ns, int) or offset_ns:
             t_ns = samples.t_ns + offset_ns
             samples = make_block(t_ns, samples.values, samples.temperature_c, samples.ticks, samples.lost)
-        track.enqueue([samples], not self._other_process)
+        track.queue_entries([samples], not self._other_process)
 
     def queue_chunks(self, device: str, chunks: Sequence[Chunk], offset_ns: int) -> None:
         """Queue received bytes for the recording.
@@ -178,7 +188,7 @@ class Recorder:
         track = self._tracks.get((device, "raw"))
         if track is not None:
             moved = [replace(one, t_ns=one.t_ns + offset_ns) if offset_ns else one for one in chunks]
-            track.enqueue(moved, not self._other_process)
+            track.queue_entries(moved, not self._other_process)
 
     def set_estimate_state(self, device: str, state: DaemonState) -> None:
         """Set the state of the estimate that is recorded with the next rows of a device.
@@ -233,7 +243,7 @@ class Recorder:
         try:
             holder = self._folder_lock.hold()
         except OSError as error:
-            reason = stopped_text(self._storage.folder, error)
+            reason = recording_stopped_text(self._storage.folder, error)
         else:
             reason = holder and f"{holder}; nothing is recorded here until it ends; {FOLDER_IN_USE_ADVICE}"
             self._other_process |= bool(holder)
@@ -248,7 +258,7 @@ class Recorder:
         self._packing = None
         self._finished.clear()
         for track in self._tracks.values():
-            track.suspend()
+            track.suspend_recording()
             if not self._lock_failure:
                 track.queue_event("recording_stopped", reason)
         self._lock_failure, self._lock_failed_s = reason, time.monotonic()
@@ -257,7 +267,7 @@ class Recorder:
         """Continue to record, without the rows that another process has recorded."""
         for track in self._tracks.values():
             if self._other_process:
-                track.drop_recorded_rows()
+                track.drop_rows_recorded_elsewhere()
             track.report_continuation()
         self._lock_failure, self._other_process = "", False
 
@@ -266,7 +276,7 @@ class Recorder:
         if time.monotonic() - self._synced_s >= SYNC_INTERVAL_S - WRITE_INTERVAL_S / 2:
             self._synced_s = time.monotonic()
             for track in self._tracks.values():
-                track.sync()
+                track.sync_segment_to_disk()
 
     def _pack(self) -> None:
         """Pack finished segments for a short time."""
@@ -291,7 +301,7 @@ class Recorder:
             retention.delete_old_segments(folders, self._storage.keep_s, self._storage.segment_s)
             self._disk_full = retention.delete_until_free(self._storage.folder, folders, self._storage.disk_share)
         except OSError as error:
-            self._disk_full = stopped_text(self._storage.folder, error)
+            self._disk_full = recording_stopped_text(self._storage.folder, error)
 
 
 def segment_metadata(

@@ -18,7 +18,7 @@ class RecordingTail:
     paths: tuple[Path, ...]  # oldest first
     newest: SegmentPiece
 
-    def pieces(self, span_s: float) -> Iterator[SegmentPiece]:
+    def read_pieces(self, span_s: float) -> Iterator[SegmentPiece]:
         """Yield the pieces of the last ``span_s`` seconds with the same axis mounting, oldest first."""
         begin_ns = int(self.newest.samples.t_ns[-1]) - round(span_s * 1e9)
         for path in self._segments_since(begin_ns):
@@ -44,7 +44,7 @@ class RecordingTail:
         return list(chosen)
 
 
-def find_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail | None:
+def read_recording_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail | None:
     """Return the end of the recording in a folder, or None if there is no recording to continue.
 
     Files that are not valid segments are skipped and left in place.

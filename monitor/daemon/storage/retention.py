@@ -39,14 +39,14 @@ def delete_old_segments(folders: Sequence[Path], keep_s: float, segment_s: float
                 _delete(path)
 
 
-def delete_until_free(folder: Path, folders: Sequence[Path], max_used_share: float) -> str:
+def delete_until_free(disk_folder: Path, segment_folders: Sequence[Path], max_used_share: float) -> str:
     """Delete the oldest segments while more than ``max_used_share`` of the disk is in use.
 
     Parameters
     ----------
-    folder : Path
+    disk_folder : Path
         Folder whose disk is measured. If the folder does not exist, no segment is deleted.
-    folders : sequence of Path
+    segment_folders : sequence of Path
         Folders of segments.
     max_used_share : float
         Largest share of the disk that may be in use, 0 to 1.
@@ -56,16 +56,16 @@ def delete_until_free(folder: Path, folders: Sequence[Path], max_used_share: flo
     str
         "" if at most ``max_used_share`` is in use, else a message with the reason.
     """
-    if not folder.is_dir():
+    if not disk_folder.is_dir():
         return ""
     olds: deque[Path] | None = None
-    while (taken := used_disk_share(folder)) > max_used_share:
+    while (taken := used_disk_share(disk_folder)) > max_used_share:
         if olds is None:
-            every = [path for one in folders for path in segment.list_segments(one)[:-MIN_KEPT_SEGMENTS]]
+            every = [path for one in segment_folders for path in segment.list_segments(one)[:-MIN_KEPT_SEGMENTS]]
             olds = deque(sorted(every, key=segment.parse_segment_start_s))
         if not olds:
             return (
-                f"{folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * max_used_share:.4g} %, "
+                f"{disk_folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * max_used_share:.4g} %, "
                 f"and no older segment is left to delete; recording stopped"
             )
         _delete(olds.popleft())

@@ -17,7 +17,7 @@ ramp. If the ramp rises by 20 000 times the noise, the error is 1e-10.
 
 One float64 per sample and axis is allocated in addition to the samples. The kernel releases the GIL and computes one
 axis per call. A thread pool can therefore compute the axes in parallel with ``overlapping_avar(values, factors,
-each=pool.map)``.
+map_axes=pool.map)``.
 
 A run is processed in blocks, and all τ of a block are computed together. Phase is then read from memory only once for
 all τ shorter than a block. At longer τ, each second difference needs three phase points, and two of them are still in
@@ -53,7 +53,7 @@ With this number, the set-up of a vector loop pays off, and the sums fit the fir
 """
 
 
-def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Floats, Ints]:
+def overlapping_avar(values: Floats, factors: Ints, map_axes: EachAxis = map) -> tuple[Floats, Ints]:
     """Return the overlapping Allan variance of rates and the number of terms.
 
     NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C). Here x is phase and C is the number
@@ -66,7 +66,7 @@ def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tup
         Rates of k axes. The array is not changed.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples, at least 1.
-    each : EachAxis
+    map_axes : EachAxis
         Function that maps over the axes. With the ``map`` method of a thread pool, the axes are computed in parallel.
 
     Returns
@@ -79,7 +79,7 @@ def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tup
     >>> overlapping_avar(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
     """
-    columns = list(each(lambda column: overlapping_avar_axis(column, factors), values.T))
+    columns = list(map_axes(lambda column: overlapping_avar_axis(column, factors), values.T))
     return np.stack([avar for avar, _ in columns], axis=1), np.stack([terms for _, terms in columns], axis=1)
 
 
@@ -98,7 +98,7 @@ def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
         return lanes.sum(axis=1) / (2.0 * m * m * terms), terms
 
 
-def slope_of_recording(values: Floats) -> Floats:
+def rate_slope_from_thirds(values: Floats) -> Floats:
     """Return the slope of the rates of a recording, estimated from the first and the last third.
 
     The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the duration T.
@@ -106,7 +106,7 @@ def slope_of_recording(values: Floats) -> Floats:
     random walk, the variances are 5/4 K²/T and 6/5 K²/T. The slope [k] of the rates [n, k] is in units per sample. It
     is NaN if more than 2 % of the samples are missing.
 
-    >>> slope_of_recording(0.5 * np.arange(9.0)[:, None]).tolist()
+    >>> rate_slope_from_thirds(0.5 * np.arange(9.0)[:, None]).tolist()
     [0.5]
     """
     third = len(values) // 3
@@ -199,9 +199,9 @@ def _sums_of_phase(values: Floats, mean: Floats, places: Ints) -> Floats:
     return result
 
 
-def octaves(longest: int) -> Ints:
-    """Return the powers of two 1, 2, 4, … up to ``longest``."""
-    return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
+def octave_cluster_sizes(largest: int) -> Ints:
+    """Return the powers of two 1, 2, 4, … up to ``largest``."""
+    return 2 ** np.arange(max(largest, 1).bit_length(), dtype=np.int64)
 
 
 def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints:
@@ -232,7 +232,7 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
     """
     longest = samples // 4
     if tau == "octave":
-        return octaves(longest)
+        return octave_cluster_sizes(longest)
     if tau == "decade10":
         exponents = np.arange(0, np.log10(max(longest, 1)) + 1e-9, 0.1)
         return np.unique(np.rint(10.0**exponents).astype(np.int64))

@@ -23,7 +23,7 @@ from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
 
 STEPS_PER_WINDOW: Final = 20
 """Default number of steps per window length."""
@@ -96,7 +96,7 @@ def compute_dynamic_allan(
     ends = _ends(len(values), length, rate_hz, step_s)
     factors = cluster_sizes(length, rate_hz, tau)
     window = AllanWindow(length, factors)
-    columns, covariances = make_design(factors, rate_hz), covariance_table(length, factors)
+    columns, covariances = make_design_matrix(factors, rate_hz), covariance_table(length, factors)
     steps, taus, axes = ends.size, factors.size, values.shape[1]
     deviation, lo, hi = np.full((3, steps, taus, axes), np.nan)
     value, value_lo, value_hi = np.full((3, steps, 5, axes), np.nan)
@@ -104,11 +104,11 @@ def compute_dynamic_allan(
     entered = np.zeros((5, axes), np.bool_)
     start = 0
     for row, end in enumerate(ends.tolist()):
-        window.update(values[start:end])
+        window.append_samples(values[start:end])
         start = end
-        avar, (slope, slopes) = window.avar(), window.slopes_of_axes_and_taus()
-        measured = MeasuredCurve(avar, window.terms(), slope * rate_hz, slopes * rate_hz, entered)
-        found = fit(columns, covariances, measured)
+        avar, (slope, slopes) = window.avar(), window.rate_slopes_per_axis_and_tau()
+        measured = MeasuredCurve(avar, window.term_counts(), slope * rate_hz, slopes * rate_hz, entered)
+        found = fit_coefficients(columns, covariances, measured)
         entered = found.entered
         deviation[row] = np.sqrt(avar)
         lo[row], hi[row] = deviation_intervals(avar, found.edf)

@@ -19,16 +19,16 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.batch import octaves
+from monitor.estimation.allan.batch import octave_cluster_sizes
 from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
-    Moments,
+    EstimatorMoments,
     PhaseRing,
-    correct_bias,
-    mean_squares,
+    correct_bias_and_compute_intervals,
     phase_autocovariance,
     quadrature_nodes,
-    theta_per_sample,
+    theta_in_sample_units,
+    variance_from_squared_differences,
 )
 
 SQUARED_WEIGHTS: Final = 6.0
@@ -63,33 +63,37 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> hadamard_variance(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
     [0.166666666667, 0.0]
     """
-    return mean_squares(values, factors, SQUARED_WEIGHTS, add_hadamard)
+    return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, add_hadamard_squares)
 
 
-def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
+def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
     """Return the Hadamard variance of a record with confidence intervals.
 
-    The parameters are those of ``total.total_curve``, with cluster sizes of up to n/3.
+    The parameters are those of ``total.compute_total_curve``, with cluster sizes of up to n/3.
     """
     n = len(values)
-    factors = octaves(n // 3) if factors is None else factors
-    raw, terms = hadamard_variance(values, factors)
-    return make_hadamard_curve([hadamard_moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
+    factors = octave_cluster_sizes(n // 3) if factors is None else factors
+    raw_variance, terms = hadamard_variance(values, factors)
+    return hadamard_curve_from_variance(
+        [hadamard_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms
+    )
 
 
-def make_hadamard_curve(
-    moments: Sequence[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints
+def hadamard_curve_from_variance(
+    moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
 ) -> HadamardCurve:
     """Compute degrees of freedom and confidence intervals of Hadamard variances.
 
-    The parameters are those of ``total.make_total_curve``.
+    The parameters are those of ``total.correct_total_variance``.
     """
-    _, edf, lo, hi = correct_bias(moments, theta_per_sample(theta, rate_hz), raw, terms)
+    _, edf, lo, hi = correct_bias_and_compute_intervals(
+        moments, theta_in_sample_units(theta, rate_hz), raw_variance, terms
+    )
     factors = np.array([one.factor for one in moments])
-    return HadamardCurve(factors / rate_hz, factors, raw, terms, edf, lo, hi)
+    return HadamardCurve(factors / rate_hz, factors, raw_variance, terms, edf, lo, hi)
 
 
-def hadamard_moments(n: int, factor: int) -> Moments:
+def hadamard_estimator_moments(n: int, factor: int) -> EstimatorMoments:
     """Return the mean and the covariance of the Hadamard variance at one cluster size, which takes a millisecond.
 
     The example computes edf for white noise at m = 1 and 35 000 terms. The result is 18/35 of the number of terms,
@@ -102,7 +106,7 @@ def hadamard_moments(n: int, factor: int) -> Moments:
     factor : int
         Cluster size in samples, at most n/3.
 
-    >>> one = hadamard_moments(35_002, 1)
+    >>> one = hadamard_estimator_moments(35_002, 1)
     >>> round(2 * one.mean[1] ** 2 / one.covariance[1, 1])
     18000
     """
@@ -116,11 +120,11 @@ def hadamard_moments(n: int, factor: int) -> Moments:
     mean, covariance = np.zeros(NUM_COEFFICIENTS), np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS))
     mean[:4] = scale * shared[:, np.argmin(lags)]
     covariance[:4, :4] = 2.0 * (scale / terms) ** 2 * (shared * pairs @ shared.T)
-    return Moments(n, factor, terms, mean, mean, covariance)
+    return EstimatorMoments(n, factor, terms, mean, mean, covariance)
 
 
 @compiled
-def add_hadamard(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
+def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
     """Add the squares of all terms of the Hadamard variance.
 
     Parameters

@@ -1,14 +1,14 @@
 """Total and Hadamard variance of the live window, computed one τ at a time.
 
-Computing both variances for every refit would take too long. Each call of ``step`` computes one τ of one of the two
-variances. A round covers all τ of both variances, by default octaves of the window. The results of a round are returned
-together when the last τ is complete. The thread that updates the window also calls ``step``, so the sums can read the
-phase of the window without a copy.
+Computing both variances for every refit would take too long. Each call of ``compute_next_tau`` computes one τ of one of
+the two variances. A round covers all τ of both variances, by default octaves of the window. The results of a round are
+returned together when the last τ is complete. The thread that updates the window also calls ``compute_next_tau``, so
+the sums can read the phase of the window without a copy.
 
 The results lag behind the window. A window of 3.6 million samples has 22 averaging times for the total variance and 21
-for the Hadamard variance. With ten steps per second, a round takes 4.3 s, and the oldest value returned by ``get`` is
-between 4.3 and 8.6 s old. The largest delay is 0.24 % of the window length, which is an hour at 1 kHz. Each value is
-exact for the window at the time of computation.
+for the Hadamard variance. With ten steps per second, a round takes 4.3 s, and the oldest value returned by
+``curves_of_last_round`` is between 4.3 and 8.6 s old. The largest delay is 0.24 % of the window length, which is an
+hour at 1 kHz. Each value is exact for the window at the time of computation.
 
 Except at the reflected ends, the terms of the total variance are also terms of the Allan variance. If the window
 computes the Allan variance of the same τ over the full length, only the reflected terms are added to the sum of the
@@ -28,9 +28,13 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
 from monitor.estimation.allan import hadamard, total
-from monitor.estimation.allan.batch import octaves
+from monitor.estimation.allan.batch import octave_cluster_sizes
 from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.squared_difference_moments import Moments, PhaseRing, variance_of_sums
+from monitor.estimation.allan.squared_difference_moments import (
+    EstimatorMoments,
+    PhaseRing,
+    variance_from_sums_of_squares,
+)
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
 from monitor.estimation.allan.window_kernel import AXES
@@ -54,7 +58,7 @@ class _Result:
 
     variance: Floats  # [6] squared unit of the axis, not corrected for bias
     terms: Ints  # [6] number of terms
-    moments: Moments
+    moments: EstimatorMoments
 
 
 class LiveTotalAndHadamard:
@@ -77,22 +81,22 @@ class LiveTotalAndHadamard:
 
     def __init__(self, window: AllanWindow, totals: Ints | None = None, hadamards: Ints | None = None) -> None:
         self._window = window
-        unit = window.view_ring()[3]
+        unit = window.view_phase_ring()[3]
         longest = int((2.0**63 * unit / (0.5 * np.array(FULL_SCALE[:AXES]))).min())
         limits = (min(window.length - 1, longest), min(window.length // 3, longest // 2))
-        given = [octaves(limits[0]) if totals is None else totals]
-        given.append(octaves(limits[1]) if hadamards is None else hadamards)
+        given = [octave_cluster_sizes(limits[0]) if totals is None else totals]
+        given.append(octave_cluster_sizes(limits[1]) if hadamards is None else hadamards)
         for factors, limit in zip(given, limits, strict=True):
             if factors.size == 0 or factors.min() < 1 or factors.max() > limit:
                 raise ConfigError(f"cluster sizes {factors.tolist()} must lie within 1 and {limit}")
         self._factors = [[int(m) for m in factors] for factors in given]
-        self._moments: list[dict[int, Moments]] = [{}, {}]
+        self._moments: list[dict[int, EstimatorMoments]] = [{}, {}]
         self.rounds = 0  # number of complete rounds
         self._window_resets = window.resets
         self._round = self._steps()
         self._last: tuple[list[_Result], list[_Result]] | None = None
 
-    def step(self) -> None:
+    def compute_next_tau(self) -> None:
         """Compute one τ of one statistic, or nothing while the window is nearly empty.
 
         If the window has been emptied, the round starts again and the results of the last round are discarded.
@@ -103,7 +107,7 @@ class LiveTotalAndHadamard:
         self._window_resets = self._window.resets
         next(self._round)
 
-    def get(self, rate_hz: float, theta: Floats) -> tuple[TotalCurve, HadamardCurve] | None:
+    def curves_of_last_round(self, rate_hz: float, theta: Floats) -> tuple[TotalCurve, HadamardCurve] | None:
         """Return the last complete round as curves, or None before the first round is complete.
 
         Parameters
@@ -118,8 +122,10 @@ class LiveTotalAndHadamard:
             return None
         totals, hadamards = self._last
         return (
-            total.make_total_curve([one.moments for one in totals], rate_hz, theta, *_stack(totals)),
-            hadamard.make_hadamard_curve([one.moments for one in hadamards], rate_hz, theta, *_stack(hadamards)),
+            total.correct_total_variance([one.moments for one in totals], rate_hz, theta, *_stack(totals)),
+            hadamard.hadamard_curve_from_variance(
+                [one.moments for one in hadamards], rate_hz, theta, *_stack(hadamards)
+            ),
         )
 
     def _steps(self) -> Iterator[None]:
@@ -153,24 +159,24 @@ class LiveTotalAndHadamard:
         inner = np.flatnonzero((self._window.factors == m) & (self._window.spans == self._window.length))
         if inner.size and 2 * m <= n:
             row = inner[0]
-            terms += self._window.terms()[row]
+            terms += self._window.term_counts()[row]
             sums += np.nan_to_num(self._window.avar()[row]) * terms * 2.0 * (m / unit) ** 2
-            total.add_total(ring, m, 1, m, sums, terms)
-            total.add_total(ring, m, n - m + 1, n, sums, terms)
+            total.add_total_variance_squares(ring, m, 1, m, sums, terms)
+            total.add_total_variance_squares(ring, m, n - m + 1, n, sums, terms)
         else:
-            total.add_total(ring, m, 1, n, sums, terms)
+            total.add_total_variance_squares(ring, m, 1, n, sums, terms)
         return self._result(TOTAL, n, m, sums, terms)
 
     def _hadamard(self, m: int) -> _Result:
         """Compute the Hadamard variance at one cluster size."""
         ring, _ = self._ring()
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
-        hadamard.add_hadamard(ring, m, sums, terms)
+        hadamard.add_hadamard_squares(ring, m, sums, terms)
         return self._result(HADAMARD, ring.n, m, sums, terms)
 
     def _ring(self) -> tuple[PhaseRing, Floats]:
         """Return the phase of the window, and the size of one unit of phase of each axis in SI."""
-        phase, missing, first, unit = self._window.view_ring()
+        phase, missing, first, unit = self._window.view_phase_ring()
         return PhaseRing(phase, missing, first, self._window.samples_in_window), unit
 
     def _result(self, statistic: int, n: int, m: int, sums: Floats, terms: Ints) -> _Result:
@@ -178,15 +184,17 @@ class LiveTotalAndHadamard:
         _, unit = self._ring()
         sums[sums <= MAX_ROUNDING_SQUARE[statistic] * terms] = 0.0
         weights = (total, hadamard)[statistic].SQUARED_WEIGHTS
-        variance = variance_of_sums((sums * unit**2)[None], terms[None], np.array([m]), weights)[0]
+        variance = variance_from_sums_of_squares((sums * unit**2)[None], terms[None], np.array([m]), weights)[0]
         return _Result(variance, terms, self._cached_moments(statistic, n, m))
 
-    def _cached_moments(self, statistic: int, n: int, m: int) -> Moments:
+    def _cached_moments(self, statistic: int, n: int, m: int) -> EstimatorMoments:
         """Return moments for about n samples, or for exactly n once the window is full."""
         known = self._moments[statistic].get(m)
         full = n == self._window.length
         if known is None or not (known.n == n or (known.n < n < MOMENTS_RENEWAL_RATIO * known.n and not full)):
-            known = total.total_moments(n, m) if statistic == TOTAL else hadamard.hadamard_moments(n, m)
+            known = (
+                total.total_estimator_moments(n, m) if statistic == TOTAL else hadamard.hadamard_estimator_moments(n, m)
+            )
             self._moments[statistic][m] = known
         return known
 

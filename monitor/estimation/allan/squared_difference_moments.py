@@ -8,10 +8,10 @@ The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q
 of phase, see ``phase_autocovariance``. This formula also holds for points reflected at the ends of a record. For
 Gaussian noise, the theorem of Isserlis gives Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
 
-For one cluster size and unit coefficients, ``Moments`` contains the expectation of the variance estimate and the Allan
-variance. ``Moments`` also contains the quadratic form that gives the variance of the estimate. A ramp adds a known
-offset to each second difference. The square of the offset increases the mean, and the product of offset and noise
-increases the variance of the estimate. A ramp without noise adds no variance.
+For one cluster size and unit coefficients, ``EstimatorMoments`` contains the expectation of the variance estimate and
+the Allan variance. ``EstimatorMoments`` also contains the quadratic form that gives the variance of the estimate. A
+ramp adds a known offset to each second difference. The square of the offset increases the mean, and the product of
+offset and noise increases the variance of the estimate. A ramp without noise adds no variance.
 
 All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
 """
@@ -36,7 +36,7 @@ _BLOCK_GROWTH: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Moments:
+class EstimatorMoments:
     """Moments of one variance estimate at one cluster size for a record of ``n`` samples without gaps."""
 
     n: int  # samples in the record
@@ -72,7 +72,7 @@ def _integrate_to_phase(values: Floats) -> PhaseRing:
     return PhaseRing(phase, missing, 0, len(values))
 
 
-def mean_squares(
+def variance_from_squared_differences(
     values: Floats, factors: Ints, squared_weights: float, add_squares: Callable[[PhaseRing, int, Floats, Ints], None]
 ) -> tuple[Floats, Ints]:
     """Return the variances [m, k] of rates [n, k] and the number of terms [m, k].
@@ -84,7 +84,7 @@ def mean_squares(
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
     squared_weights : float
-        Factor of the variance definition, see ``variance_of_sums``.
+        Factor of the variance definition, see ``variance_from_sums_of_squares``.
     add_squares : callable
         Function that adds the squared differences at one cluster size to the sums [k] and the numbers of terms [k].
     """
@@ -93,10 +93,10 @@ def mean_squares(
     terms = np.zeros(sums.shape, np.int64)
     for i, m in enumerate(factors):
         add_squares(ring, int(m), sums[i], terms[i])
-    return variance_of_sums(sums, terms, factors, squared_weights), terms
+    return variance_from_sums_of_squares(sums, terms, factors, squared_weights), terms
 
 
-def variance_of_sums(sums: Floats, terms: Ints, factors: Ints, squared_weights: float) -> Floats:
+def variance_from_sums_of_squares(sums: Floats, terms: Ints, factors: Ints, squared_weights: float) -> Floats:
     """Convert sums of squared differences of phase to variances.
 
     Parameters
@@ -114,7 +114,7 @@ def variance_of_sums(sums: Floats, terms: Ints, factors: Ints, squared_weights: 
         return np.asarray(np.where(terms > 0, sums / (squared_weights * factors[:, None] ** 2 * terms), np.nan))
 
 
-def theta_per_sample(theta: Floats, rate_hz: float) -> Floats:
+def theta_in_sample_units(theta: Floats, rate_hz: float) -> Floats:
     """Convert θ of a fit from SI to units of one sample. A negative Q², which represents a band limit, becomes 0.
 
     Parameters
@@ -127,8 +127,8 @@ def theta_per_sample(theta: Floats, rate_hz: float) -> Floats:
     return np.asarray(np.maximum(theta, 0.0) * (rate_hz ** (-2.0 * TO_SI))[:, None])
 
 
-def correct_bias(
-    moments: Sequence[Moments], theta: Floats, variance: Floats, terms: Ints
+def correct_bias_and_compute_intervals(
+    moments: Sequence[EstimatorMoments], theta: Floats, variance: Floats, terms: Ints
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Correct measured variances for bias, and compute their degrees of freedom and intervals.
 
@@ -137,7 +137,7 @@ def correct_bias(
 
     Parameters
     ----------
-    moments : sequence of Moments
+    moments : sequence of EstimatorMoments
         Moments of the m cluster sizes.
     theta : ndarray of float64, shape (5, k)
         Q² N² B² K² R² in units of one sample; NaN means unknown.

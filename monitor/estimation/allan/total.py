@@ -10,11 +10,11 @@ x*_{i-m} − 2 x*_i + x*_{i+m}, at every inner point i. The reflected phase befo
 phase after the end is reflected in the same way. For m ≤ i ≤ n − m, the terms are the same as in the overlapping Allan
 variance.
 
-``total_variance`` returns uncorrected variances. ``total_curve`` corrects the bias with respect to the Allan variance
-of the same noise. The expectation of the total variance is computed exactly for any mixture of noise terms. For τ ≤
-T/2, the expectation is the Allan variance times 1 − a τ/T. The factor a is 0 for white noise, 0.481 for flicker noise,
-0.750 for random walk (SP 1065 table 7) and −4/3 for quantization noise. The degrees of freedom are exact as well. For
-mixed noise, formulas for a single power law are inaccurate.
+``total_variance`` returns uncorrected variances. ``compute_total_curve`` corrects the bias with respect to the Allan
+variance of the same noise. The expectation of the total variance is computed exactly for any mixture of noise terms.
+For τ ≤ T/2, the expectation is the Allan variance times 1 − a τ/T. The factor a is 0 for white noise, 0.481 for flicker
+noise, 0.750 for random walk (SP 1065 table 7) and −4/3 for quantization noise. The degrees of freedom are exact as
+well. For mixed noise, formulas for a single power law are inaccurate.
 
 The χ² intervals are given for τ up to T/2. The bias correction uses the noise that was fitted to the same record.
 Beyond T/2, nominal 95 % intervals therefore contain the true value in only 67 to 92 of 100 records, so the value is
@@ -34,16 +34,16 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.batch import octaves
+from monitor.estimation.allan.batch import octave_cluster_sizes
 from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
-    Moments,
+    EstimatorMoments,
     PhaseRing,
-    correct_bias,
-    mean_squares,
+    correct_bias_and_compute_intervals,
     phase_autocovariance,
     quadrature_nodes,
-    theta_per_sample,
+    theta_in_sample_units,
+    variance_from_squared_differences,
 )
 
 MIN_SHARE: Final = 0.5
@@ -98,10 +98,10 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> total_variance(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
     """
-    return mean_squares(values, factors, SQUARED_WEIGHTS, _add_all_terms)
+    return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, _add_all_terms)
 
 
-def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> TotalCurve:
+def compute_total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> TotalCurve:
     """Return the bias-corrected total variance of a record with confidence intervals.
 
     Parameters
@@ -116,36 +116,42 @@ def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | N
         Cluster sizes in samples, below n. None means octaves.
     """
     n = len(values)
-    factors = octaves(n - 1) if factors is None else factors
-    raw, terms = total_variance(values, factors)
-    return make_total_curve([total_moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
+    factors = octave_cluster_sizes(n - 1) if factors is None else factors
+    raw_variance, terms = total_variance(values, factors)
+    return correct_total_variance(
+        [total_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms
+    )
 
 
-def make_total_curve(moments: Sequence[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> TotalCurve:
+def correct_total_variance(
+    moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
+) -> TotalCurve:
     """Correct total variances for bias, and compute degrees of freedom and confidence intervals.
 
     Parameters
     ----------
-    moments : sequence of Moments
+    moments : sequence of EstimatorMoments
         Moments of the m cluster sizes.
     rate_hz : float
         Sample rate in Hz.
     theta : ndarray of float64, shape (5, k)
         Fitted Q² N² B² K² R² in SI; NaN means unknown.
-    raw : ndarray of float64, shape (m, k)
+    raw_variance : ndarray of float64, shape (m, k)
         Uncorrected total variances.
     terms : ndarray of int64, shape (m, k)
         Number of terms.
     """
     enough = terms >= MIN_SHARE * np.array([one.terms for one in moments])[:, None]
-    tvar, edf, lo, hi = correct_bias(moments, theta_per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
+    tvar, edf, lo, hi = correct_bias_and_compute_intervals(
+        moments, theta_in_sample_units(theta, rate_hz), np.where(enough, raw_variance, np.nan), terms
+    )
     factors = np.array([one.factor for one in moments])
     unsure = 2 * factors > np.array([one.n for one in moments])
     lo[unsure] = hi[unsure] = np.nan
     return TotalCurve(factors / rate_hz, factors, tvar, terms, edf, lo, hi)
 
 
-def total_moments(n: int, factor: int) -> Moments:
+def total_estimator_moments(n: int, factor: int) -> EstimatorMoments:
     """Return the mean and the covariance of the total variance at one cluster size, which takes a few milliseconds.
 
     Parameters
@@ -155,7 +161,7 @@ def total_moments(n: int, factor: int) -> Moments:
     factor : int
         Cluster size in samples, from 1 to n − 1.
 
-    >>> one = total_moments(100_000, 50_000)               # random walk at T/2: 1 − 0.750/2
+    >>> one = total_estimator_moments(100_000, 50_000)               # random walk at T/2: 1 − 0.750/2
     >>> print(f"{one.mean[3] / one.allan[3]:.3f}")
     0.625
     """
@@ -164,7 +170,7 @@ def total_moments(n: int, factor: int) -> Moments:
     half = 0.5 / factor**2
     mean = half / (n - 1) * (_squares(points, signs) @ weights)
     inner = _squares(factor * np.array([[-1.0, 0.0, 1.0]]), np.array([[1.0, -2.0, 1.0]]))
-    return Moments(n, factor, n - 1, mean, half * inner[:, 0], _covariance(n, factor))
+    return EstimatorMoments(n, factor, n - 1, mean, half * inner[:, 0], _covariance(n, factor))
 
 
 def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
@@ -242,11 +248,11 @@ def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
 def _add_all_terms(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
     """Add the squares of all terms of the total variance. There are none if the cluster is as long as the record."""
     if m < ring.n:
-        add_total(ring, m, 1, ring.n, sums, terms)
+        add_total_variance_squares(ring, m, 1, ring.n, sums, terms)
 
 
 @compiled
-def add_total(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
+def add_total_variance_squares(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
     """Add the squares of a range of terms of the total variance.
 
     Parameters

@@ -64,7 +64,7 @@ class CovarianceTable:
     factors: Ints  # [m] cluster sizes in samples
     terms: Ints  # [m] number of second differences in a window without gaps; ≤ 0 if the window is too short
     covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN if the window is too short
-    slope: Floats  # [4] variance of ``batch.slope_of_recording``, for unit θ
+    slope: Floats  # [4] variance of ``batch.rate_slope_from_thirds``, for unit θ
     bend: Floats  # [m, 4] covariance of this slope with ``batch.rate_slope_per_tau``
 
 
@@ -86,7 +86,7 @@ class AxisCovarianceTables:
         self._capacity = capacity
         self._tables: dict[int | None, CovarianceTable] = {}  # by restarted axis, or None for the whole window
 
-    def at(self, axis: int, n: int, window_samples: int) -> CovarianceTable:
+    def table_of_axis(self, axis: int, n: int, window_samples: int) -> CovarianceTable:
         """Return the table of an axis. While the window grows, a table for up to 10 % fewer samples is used.
 
         Parameters
@@ -104,7 +104,7 @@ class AxisCovarianceTables:
             known = self._tables[key] = covariance_table(n, self._factors)
         return known
 
-    def remaining_valid_samples(self, table: CovarianceTable, n: int) -> int:
+    def samples_until_table_expires(self, table: CovarianceTable, n: int) -> int:
         """Return for how many samples a table stays valid, including sample n.
 
         The table of a full window stays valid without limit, so the result is ``UNLIMITED_SAMPLES``.
@@ -162,7 +162,7 @@ def _sampled_flicker(m: int) -> float:
 
 
 def _slope_variance(n: int) -> Floats:
-    """Return the variance [4] of ``batch.slope_of_recording`` for Q, N, B and K of size one at τ0 = 1.
+    """Return the variance [4] of ``batch.rate_slope_from_thirds`` for Q, N, B and K of size one at τ0 = 1.
 
     The slope is a weighted sum of four phase points with the spacing τ = n/3. The autocovariances of phase give the
     variances 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3 of this sum. They are divided by (2τ²)².
@@ -175,7 +175,8 @@ def _slope_variance(n: int) -> Floats:
 
 
 def _bend_covariance(n: int, m: int) -> Floats:
-    """Return the covariance [4] of ``batch.slope_of_recording`` and ``batch.rate_slope_per_tau`` at one cluster size.
+    """Return the covariance [4] of ``batch.rate_slope_from_thirds`` and ``batch.rate_slope_per_tau`` at one cluster
+    size.
 
     The coefficients Q, N, B and K have the size one, and τ0 = 1. Each of the two slopes is a weighted sum of phase
     points, so the covariance is a sum of autocovariances of phase. About sixty phase points represent each block of m

@@ -44,10 +44,10 @@ from monitor.estimation.allan.window_kernel import (
     TOTAL,
     WIDTH,
     WindowBuffers,
-    advance,
+    append_staged_samples,
     keep_newest,
-    slopes_of_axes_and_taus,
-    view_arrays,
+    rate_slopes_per_axis_and_tau,
+    view_window_arrays,
 )
 
 MIN_LENGTH: Final = 100
@@ -74,7 +74,7 @@ QUICK_CLUSTERS: Final = 16
 """
 
 
-def display_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
+def samples_per_displayed_tau(factors: Ints, rate_hz: float, window_samples: int) -> Ints:
     """Return the number of newest samples that each displayed deviation uses.
 
     The span of each τ is 16 τ, at least 10 s and at most the whole window. A change of N is then fully visible within a
@@ -88,7 +88,7 @@ def display_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
         Cluster sizes in samples.
     rate_hz : float
         Sample rate in Hz.
-    length : int
+    window_samples : int
         Window length in samples.
 
     Returns
@@ -96,18 +96,18 @@ def display_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
     ndarray of int64, shape (m,)
         Span of each cluster size in samples.
 
-    >>> display_spans(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
+    >>> samples_per_displayed_tau(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
     [1000, 1600, 100000]
     """
-    return np.minimum(np.maximum(QUICK_CLUSTERS * factors, round(QUICK_S * rate_hz)), length)
+    return np.minimum(np.maximum(QUICK_CLUSTERS * factors, round(QUICK_S * rate_hz)), window_samples)
 
 
-def phase_scale(longest: int) -> Floats:
-    """Return the scale 2^s [LANES] from samples to integer phase, for clusters of up to ``longest`` samples.
+def integer_phase_scale(largest_cluster: int) -> Floats:
+    """Return the scale 2^s [LANES] from samples to integer phase, for clusters of up to ``largest_cluster`` samples.
 
     A second difference is at most 2 m times full scale. The scaled value must stay below 2⁶³.
     """
-    bits = 62 - np.ceil(np.log2(2.0 * longest * np.array(FULL_SCALE)))
+    bits = 62 - np.ceil(np.log2(2.0 * largest_cluster * np.array(FULL_SCALE)))
     return np.asarray(np.exp2(np.minimum(bits, 48.0)))
 
 
@@ -130,7 +130,7 @@ class AllanWindow:
         If the length, a cluster size or a span is out of range.
 
     >>> window = AllanWindow(100, np.array([1, 2]))
-    >>> window.update(np.tile([[1.0], [2.0]], (50, 6)))   # 1, 2, 1, 2, … : σ²(1) = 1/2, σ²(2) = 0
+    >>> window.append_samples(np.tile([[1.0], [2.0]], (50, 6)))   # 1, 2, 1, 2, … : σ²(1) = 1/2, σ²(2) = 0
     >>> window.avar()[:, 0].tolist()
     [0.5, 0.0]
     """
@@ -150,20 +150,20 @@ class AllanWindow:
         self.factors = factors.astype(np.int64)
         self.spans = spans.astype(np.int64)
         self._taus = int(factors.size)
-        self._scale = phase_scale(int(factors.max()))
-        # Three arrays hold everything, because each array passed to the kernel costs 50 ns. See view_arrays.
+        self._scale = integer_phase_scale(int(factors.max()))
+        # Three arrays hold everything, because each array passed to the kernel costs 50 ns. See view_window_arrays.
         taus, places = self._taus, length + 1 + RUN_SAMPLES
         self._ints = _aligned(LANES + -(-2 * taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
         self._floats = _aligned((2 + 2 * RUN_SAMPLES + 2 * taus + STAGE_SAMPLES) * LANES, np.float64)
         self._missing = np.zeros(places * LANES, np.int32)
-        arrays = view_arrays(self._ints, self._floats, self._missing, taus)
+        arrays = view_window_arrays(self._ints, self._floats, self._missing, taus)
         self._state, self._phase, self._scaling = arrays.state, arrays.phase, arrays.scaling
         arrays.factors[:], arrays.spans[:] = self.factors, self.spans
         self._terms = arrays.terms.reshape(taus, LANES)
         self._sums, self._rest = arrays.sums.reshape(taus, LANES), arrays.rest.reshape(taus, LANES)
         self._stage = arrays.stage[: STAGE_SAMPLES * AXES].reshape(STAGE_SAMPLES, AXES)
         self.resets = -1  # number of times the window has been emptied; the call below sets it to 0
-        self.reset()
+        self.discard_samples()
 
     @property
     def samples_in_window(self) -> int:
@@ -175,7 +175,7 @@ class AllanWindow:
         """Number of samples since the last reset, including missing ones."""
         return int(self._state[TOTAL])
 
-    def reset(self) -> None:
+    def discard_samples(self) -> None:
         """Discard all samples.
 
         Phase and the running count of missing samples are kept, because only differences of them are used.
@@ -186,7 +186,7 @@ class AllanWindow:
         self._scaling[:LANES] = self._scale
         self._state[[TOTAL, LAST_MISSING, WIDTH]] = (0, -(1 << 62), LANES)
 
-    def update(self, values: Floats) -> None:
+    def append_samples(self, values: Floats) -> None:
         """Advance the window by samples.
 
         Parameters
@@ -207,29 +207,29 @@ class AllanWindow:
         n = shape[0]
         if n > STAGE_SAMPLES:
             for start in range(0, n, STAGE_SAMPLES):
-                self.update(rows[start : start + STAGE_SAMPLES])
+                self.append_samples(rows[start : start + STAGE_SAMPLES])
             return
         self._stage[:n] = rows  # A call of ``stage`` would slow down a single sample by 3 %.
-        advance(self._ints, self._floats, self._missing, self._taus, 0, n)
+        append_staged_samples(self._ints, self._floats, self._missing, self._taus, 0, n)
 
-    def stage(self, values: Floats) -> None:
+    def copy_to_input_buffer(self, values: Floats) -> None:
         """Copy up to ``STAGE_SAMPLES`` samples [n, 6] to the input buffer of compiled code (``buffers``)."""
         # A copy, because each new memory layout or access flag of an array triggers a compilation of seconds.
         self._stage[: len(values)] = values
 
-    def buffers(self) -> WindowBuffers:
+    def kernel_buffers(self) -> WindowBuffers:
         """Return the arrays of the window for compiled code."""
         return WindowBuffers(self._ints, self._floats, self._missing, self._taus, self.length)
 
-    def skip(self, n: int) -> None:
+    def append_missing_samples(self, n: int) -> None:
         """Advance by n missing samples. If n exceeds the window length, the window is emptied."""
         if n > self.length:
-            self.reset()
+            self.discard_samples()
             return
         # In blocks, so that a long outage does not need a long array.
         hole = np.full((min(n, SKIP_BLOCK_ROWS), AXES), np.nan)
         for start in range(0, n, SKIP_BLOCK_ROWS):
-            self.update(hole[: n - start])
+            self.append_samples(hole[: n - start])
 
     def keep_newest(self, axis: int, n: int) -> None:
         """Discard all but the newest samples of one axis, and count the older ones as missing.
@@ -256,10 +256,10 @@ class AllanWindow:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
 
-    def slopes_of_axes_and_taus(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
+    def rate_slopes_per_axis_and_tau(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
         """Return the slope of the rate of each axis, and the slope that contributes to the Allan variance at each τ.
 
-        The definitions are those of ``batch.slope_of_recording`` and ``batch.rate_slope_per_tau``.
+        The definitions are those of ``batch.rate_slope_from_thirds`` and ``batch.rate_slope_per_tau``.
 
         Parameters
         ----------
@@ -275,10 +275,10 @@ class AllanWindow:
         """
         slope, slopes = np.empty(AXES), np.empty((self._taus, AXES))
         lengths = np.full(AXES, self.samples_in_window) if lengths is None else lengths
-        slopes_of_axes_and_taus(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
+        rate_slopes_per_axis_and_tau(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
         return slope / self._scale[:AXES], slopes / self._scale[:AXES]
 
-    def terms(self) -> Ints:
+    def term_counts(self) -> Ints:
         """Return the number of second differences averaged, shape (m, 6)."""
         return self._terms[:, :AXES].copy()
 
@@ -297,7 +297,7 @@ class AllanWindow:
         phase, missing = self._phase[at * LANES + axis], self._missing[at * LANES + axis]
         return np.where(np.diff(missing) > 0, np.nan, np.diff(phase) / self._scale[axis])
 
-    def view_ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
+    def view_phase_ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
         """Return a view of the ring buffer of phase. The view is valid until the next update.
 
         Returns

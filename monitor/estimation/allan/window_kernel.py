@@ -47,8 +47,8 @@ The error of the sum is 1 % of the standard deviation of the sum.
 class WindowBuffers(NamedTuple):
     """Memory of a window in the three arrays that Python passes to compiled code."""
 
-    ints: Ints  # see ``view_arrays``
-    floats: Floats  # see ``view_arrays``
+    ints: Ints  # see ``view_window_arrays``
+    floats: Floats  # see ``view_window_arrays``
     missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
     taus: int  # number of cluster sizes
     length: int  # samples in the full window
@@ -70,7 +70,7 @@ class WindowArrays(NamedTuple):
     missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
 
 
-def view_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int) -> WindowArrays:
+def view_window_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int) -> WindowArrays:
     """Return views of the memory of a window.
 
     Parameters
@@ -88,12 +88,14 @@ def view_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: in
     )  # fmt: skip
 
 
-cut_arrays = compiled(view_arrays)
-"""Compiled version of ``view_arrays`` for kernels."""
+compiled_view_window_arrays = compiled(view_window_arrays)
+"""Compiled version of ``view_window_arrays`` for kernels."""
 
 
 @compiled
-def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int) -> None:
+def append_staged_samples(
+    ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int
+) -> None:
     """Advance the window by n samples of the input buffer, starting at row ``start``.
 
     The kernel first appends the phase of up to ``RUN_SAMPLES`` samples. It then updates the sums of one τ after another
@@ -110,7 +112,7 @@ def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, s
         Number of rows.
     """
     # One statement, because each access to a field changes a reference count.
-    state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = cut_arrays(
+    state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = compiled_view_window_arrays(
         ints, floats, missing, taus
     )
     places = phase.size // LANES
@@ -212,8 +214,8 @@ def _slide(
     """
     places = phase.size // LANES
     old = now - span - 1
-    new1, new2 = place(now - m, places), place(now - 2 * m, places)
-    old0, old1, old2 = place(old + 2 * m, places), place(old + m, places), place(old, places)
+    new1, new2 = ring_row(now - m, places), ring_row(now - 2 * m, places)
+    old0, old1, old2 = ring_row(old + 2 * m, places), ring_row(old + m, places), ring_row(old, places)
     run = min(rows, places - max(now, new1, new2, old0, old1, old2))
     n = run * LANES
     added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
@@ -233,17 +235,17 @@ def _slide(
 
 
 @compiled
-def place(index: int, places: int) -> int:
+def ring_row(index: int, rows: int) -> int:
     """Return the row of a phase point in the ring buffer.
 
     Parameters
     ----------
     index : int
         Row of the point, or a negative number of rows before the start of the ring.
-    places : int
+    rows : int
         Number of rows in the ring.
     """
-    return index if index >= 0 else index + places
+    return index if index >= 0 else index + rows
 
 
 @compiled
@@ -301,9 +303,9 @@ def _replace_terms(
     at0 = np.uintp(now * LANES)
     for i in range(factors.size):
         m, old = factors[i], now - spans[i] - 1
-        at1, at2 = np.uintp(place(now - m, places) * LANES), np.uintp(place(now - 2 * m, places) * LANES)
-        old0, old1 = np.uintp(place(old + 2 * m, places) * LANES), np.uintp(place(old + m, places) * LANES)
-        old2 = np.uintp(place(old, places) * LANES)
+        at1, at2 = np.uintp(ring_row(now - m, places) * LANES), np.uintp(ring_row(now - 2 * m, places) * LANES)
+        old0, old1 = np.uintp(ring_row(old + 2 * m, places) * LANES), np.uintp(ring_row(old + m, places) * LANES)
+        old2 = np.uintp(ring_row(old, places) * LANES)
         out = np.uintp(i * LANES)
         for lane in range(np.uintp(AXES)):
             d = float(phase[at0 + lane] - 2 * phase[at1 + lane] + phase[at2 + lane])
@@ -327,12 +329,12 @@ def keep_newest(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: in
     n : int
         Number of newest samples to keep.
     """
-    w = cut_arrays(ints, floats, missing, taus)
+    w = compiled_view_window_arrays(ints, floats, missing, taus)
     state, places = w.state, w.phase.size // LANES
     # The count of missing samples changes at every older point, so every term that contains one is incomplete.
-    oldest = place(state[NEWEST] - n, places) * LANES + axis
+    oldest = ring_row(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
-        missing[place(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
+        missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
     state[LAST_MISSING] = max(state[LAST_MISSING], state[TOTAL] - n)
     for i in range(taus):
         _recompute_sum(w, i, axis, n)
@@ -345,8 +347,8 @@ def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
     total, left, count = 0.0, 0.0, 0
     for back in range(min(n, w.spans[i]) - 2 * m, -1, -1):
         at = w.state[NEWEST] - back
-        at0, at1 = place(at, places) * LANES + axis, place(at - m, places) * LANES + axis
-        at2 = place(at - 2 * m, places) * LANES + axis
+        at0, at1 = ring_row(at, places) * LANES + axis, ring_row(at - m, places) * LANES + axis
+        at2 = ring_row(at - 2 * m, places) * LANES + axis
         if missing[at0] == missing[at2]:
             d = float(phase[at0] - 2 * phase[at1] + phase[at2])
             s = total + d * d
@@ -364,13 +366,13 @@ def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: in
     The sum of the differences from this mean fits into 64 bits.
     """
     places = phase.size // LANES
-    last, first = newest * LANES + axis, place(newest - min(n, LEVEL), places) * LANES + axis
+    last, first = newest * LANES + axis, ring_row(newest - min(n, LEVEL), places) * LANES + axis
     present = min(n, LEVEL) - (missing[last] - missing[first])
     return (phase[last] - phase[first]) // present if present > 0 else NEVER
 
 
 @inlined
-def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
+def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
     """Return the slope of the rate over the last n samples, from the means of the first and the last third.
 
     Parameters
@@ -395,8 +397,8 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
     middle = _reference_level(phase, missing, newest, n, axis)
     if third == 0 or middle == NEVER:
         return np.nan
-    at0, at1 = newest * LANES + axis, place(newest - third, places) * LANES + axis
-    at2, at3 = place(newest - 2 * third, places) * LANES + axis, place(newest - 3 * third, places) * LANES + axis
+    at0, at1 = newest * LANES + axis, ring_row(newest - third, places) * LANES + axis
+    at2, at3 = ring_row(newest - 2 * third, places) * LANES + axis, ring_row(newest - 3 * third, places) * LANES + axis
     late, early = third - (missing[at0] - missing[at1]), third - (missing[at2] - missing[at3])
     if (
         min(late, early) < MIN_PRESENT_SHARE * third
@@ -410,7 +412,7 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
 
 
 @compiled
-def slopes_of_axes_and_taus(
+def rate_slopes_per_axis_and_tau(
     ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, lengths: Ints, slope: Floats, slopes: Floats
 ) -> None:
     """Compute the slope of the rate of each axis, and the slope that contributes to the Allan variance at each τ.
@@ -422,14 +424,14 @@ def slopes_of_axes_and_taus(
     lengths : ndarray of int64, shape (6,)
         Number of newest samples of each axis.
     slope : ndarray of float64, shape (6,)
-        Result of ``slope_of_thirds`` for each axis.
+        Result of ``integer_slope_from_thirds`` for each axis.
     slopes : ndarray of float64, shape (m, 6)
         Result of ``mean_second_difference`` for each τ and axis.
     """
-    w = cut_arrays(ints, floats, missing, taus)
+    w = compiled_view_window_arrays(ints, floats, missing, taus)
     for axis in range(AXES):
         n, newest = lengths[axis], w.state[NEWEST]
-        slope[axis] = slope_of_thirds(w.phase, w.missing, newest, n, axis)
+        slope[axis] = integer_slope_from_thirds(w.phase, w.missing, newest, n, axis)
         for i in range(w.factors.size):
             slopes[i, axis] = mean_second_difference(w.phase, w.missing, newest, n, w.factors[i], axis)
 
@@ -443,19 +445,19 @@ def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int,
     by the mean of the newest samples.
 
     The result is the slope of the rate in integer units per sample, or NaN if too many samples are missing. The
-    parameters are those of ``slope_of_thirds``, with the cluster size m in samples.
+    parameters are those of ``integer_slope_from_thirds``, with the cluster size m in samples.
     """
     places = phase.size // LANES
-    last, first = newest * LANES + axis, place(newest - n, places) * LANES + axis
+    last, first = newest * LANES + axis, ring_row(newest - n, places) * LANES + axis
     middle = _reference_level(phase, missing, newest, n, axis)
     if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < MIN_PRESENT_SHARE * n:
         return np.nan
     stride = max(1, m // BEND_POINTS)
     total = 0.0
     for k in range(0, m, stride):
-        at0, at1 = place(newest - k, places) * LANES + axis, place(newest - m - k, places) * LANES + axis
-        at2 = place(newest - n + 2 * m - 1 - k, places) * LANES + axis
-        at3 = place(newest - n + m - 1 - k, places) * LANES + axis
+        at0, at1 = ring_row(newest - k, places) * LANES + axis, ring_row(newest - m - k, places) * LANES + axis
+        at2 = ring_row(newest - n + 2 * m - 1 - k, places) * LANES + axis
+        at3 = ring_row(newest - n + m - 1 - k, places) * LANES + axis
         absent = missing[at0] - missing[at1] - missing[at2] + missing[at3]
         total += float(phase[at0] - phase[at1] - phase[at2] + phase[at3] + middle * absent)
     points = (m + stride - 1) // stride

@@ -113,7 +113,7 @@ class PreparedModel:
             n = samples_of_axis(curve, i)
             if n < MIN_SAMPLES:
                 continue
-            edf = expected.edf(tables.at(i, n, curve.n), terms)
+            edf = expected.edf(tables.table_of_axis(i, n, curve.n), terms)
             one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, edf, n, len(self._expected))
             if one is not None:
                 found[axis] = one

@@ -60,7 +60,7 @@ THRESHOLDS_WATCHED: Final = (3.0, 1.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Design:
+class DesignMatrix:
     """Columns of the fit for one list of cluster sizes."""
 
     factors: Ints  # [m] cluster sizes in samples
@@ -83,7 +83,7 @@ class Fit:
     k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
 
 
-def make_design(factors: Ints, rate_hz: float) -> Design:
+def make_design_matrix(factors: Ints, rate_hz: float) -> DesignMatrix:
     """Return the columns of the fit from the Allan variances of the noise terms.
 
     Parameters
@@ -95,32 +95,37 @@ def make_design(factors: Ints, rate_hz: float) -> Design:
     """
     m = np.asarray(factors, np.float64)
     columns = np.ascontiguousarray(unit_allan_variances(m, 1.0))
-    return Design(factors, rate_hz, columns)
+    return DesignMatrix(factors, rate_hz, columns)
 
 
-def shared_inputs(
-    design: Design, table: CovarianceTable, blind: Floats | None = None, ask: bool = True
+def make_shared_inputs(
+    design: DesignMatrix,
+    table: CovarianceTable,
+    ignored_direction: Floats | None = None,
+    may_drop_short_taus: bool = True,
 ) -> SharedInputs:
     """Return the inputs of a fit that depend only on the window length.
 
     Parameters
     ----------
-    design : Design
+    design : DesignMatrix
         Columns for the cluster sizes of the curve.
     table : Table
         Covariances for the window length.
-    blind : ndarray of float64, shape (m,), or None
+    ignored_direction : ndarray of float64, shape (m,), or None
         Direction of the curve that the fit ignores, in units of one sample. None means no such direction.
-    ask : bool
+    may_drop_short_taus : bool
         True to leave out the shortest τ that contradict the fit.
     """
     flat = design.columns.copy()
     # The slope includes noise, so the subtraction of the slope reduces the expected contribution of each noise term.
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
     flat[:, ~design.columns.any(axis=0)] = 0.0  # terms that are not fitted
-    blind = np.zeros(design.factors.size) if blind is None else blind
+    ignored_direction = np.zeros(design.factors.size) if ignored_direction is None else ignored_direction
     whole = table.terms.astype(np.float64)
-    return SharedInputs(design.columns, flat, table.covariance, whole, table.slope, blind, ask)
+    return SharedInputs(
+        design.columns, flat, table.covariance, whole, table.slope, ignored_direction, may_drop_short_taus
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,11 +134,11 @@ class MeasuredCurve:
 
     avar: Floats  # [m, k] Allan variance, squared unit of the axis; NaN if the window is too short
     terms: Ints  # [m, k] number of second differences averaged
-    slope: Floats | None = None  # [k] unit/s, ``batch.slope_of_recording``; None or NaN: a ramp is only bounded
+    slope: Floats | None = None  # [k] unit/s, ``batch.rate_slope_from_thirds``; None or NaN: a ramp is only bounded
     slopes: Floats | None = None  # [m, k] unit/s, ``batch.rate_slope_per_tau``; None: a strong ramp biases K
     entered_before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the previous fit; None for a single fit
 
-    def axis(self, column: int) -> "MeasuredCurve":
+    def select_axis(self, column: int) -> "MeasuredCurve":
         """Return the data of one axis."""
         one = slice(column, column + 1)
         slope = None if self.slope is None else self.slope[one]
@@ -142,14 +147,14 @@ class MeasuredCurve:
         return MeasuredCurve(self.avar[:, one], self.terms[:, one], slope, slopes, before)
 
 
-def fit(
-    design: Design,
+def fit_coefficients(
+    design: DesignMatrix,
     table: CovarianceTable,
     measured: MeasuredCurve,
-    full: bool = True,
-    start: Floats | None = None,
-    blind: Floats | None = None,
-    ask: bool = True,
+    full_covariance: bool = True,
+    start_theta: Floats | None = None,
+    ignored_direction: Floats | None = None,
+    may_drop_short_taus: bool = True,
 ) -> Fit:
     """Fit the coefficients of k axes to overlapping Allan variances.
 
@@ -158,20 +163,20 @@ def fit(
 
     Parameters
     ----------
-    design : Design
+    design : DesignMatrix
         Columns for the cluster sizes of the curve.
     table : CovarianceTable
         Covariances for the window length.
     measured : MeasuredCurve
         Measured curve and slopes.
-    full : bool
+    full_covariance : bool
         True to weight by the covariances of all τ, False to weight by the variances alone.
-    start : ndarray of float64, shape (5, k), or None
+    start_theta : ndarray of float64, shape (5, k), or None
         ``theta`` of a recent fit, from which the first weights are computed. A fit from a start takes a third of the
         time.
-    blind : ndarray of float64, shape (m,), or None
+    ignored_direction : ndarray of float64, shape (m,), or None
         Direction of the curve that the fit ignores.
-    ask : bool
+    may_drop_short_taus : bool
         True to leave out short τ that contradict the fit.
     """
     avar, terms, before = measured.avar, measured.terms, measured.entered_before
@@ -180,13 +185,15 @@ def fit(
         axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C")
     )
     maps = empty_solution_maps(axes, m)
-    if start is not None:
-        found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
+    if start_theta is not None:
+        found.theta[:] = start_theta.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
     slope = np.full(axes, np.nan) if measured.slope is None else measured.slope / design.rate_hz
     slopes = np.tile(slope, (m, 1)).T if measured.slopes is None else measured.slopes.T / design.rate_hz
-    options = FitOptions(*(THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED), full, start is not None)
-    shared = shared_inputs(design, table, blind, ask)
+    options = FitOptions(
+        *(THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED), full_covariance, start_theta is not None
+    )
+    shared = make_shared_inputs(design, table, ignored_direction, may_drop_short_taus)
     fit_axes(0, axes, shared, CurvesOfAxes(curves, counts, slope, np.ascontiguousarray(slopes)), options, found, maps)
     to_si = design.rate_hz**TO_SI
     value = np.where(found.status == Status.ESTIMATED, np.sqrt(np.maximum(found.theta, 0.0)), np.nan)
@@ -201,25 +208,25 @@ def fit(
     )  # fmt: skip
 
 
-def replace_axis(whole: Fit, axis: int, one: Fit) -> Fit:
+def replace_axis_results(all_axes: Fit, axis: int, axis_fit: Fit) -> Fit:
     """Return a fit in which the results of one axis are replaced.
 
     Parameters
     ----------
-    whole : Fit
+    all_axes : Fit
         Fit of all axes.
     axis : int
         Index of the axis to replace.
-    one : Fit
+    axis_fit : Fit
         Fit of this axis alone.
     """
 
-    def put(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def replace_column(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         result = parts[0].copy()
         result[..., axis] = parts[1][..., 0]
         return result
 
-    return _combine((whole, one), put)
+    return _combine((all_axes, axis_fit), replace_column)
 
 
 def concatenate_fits(fits: Sequence[Fit], axes: Ints) -> Fit:
@@ -261,7 +268,7 @@ def empty_fit(avar: Floats) -> Fit:
     )
 
 
-def _white_edf(design: Design, table: CovarianceTable, terms: Ints) -> Floats:
+def _white_edf(design: DesignMatrix, table: CovarianceTable, terms: Ints) -> Floats:
     """Return the degrees of freedom for white noise, used until there is a fit.
 
     In the first seconds, the noise of a sensor is mostly white.

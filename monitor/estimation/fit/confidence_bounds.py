@@ -43,7 +43,7 @@ def pearson_quantile(z: float, skewness: float) -> float:
 
 
 @compiled
-def interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> float:
+def confidence_interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> float:
     """Return one end of the confidence interval of a coefficient.
 
     The end is √t, where t is the true squared coefficient for which the estimate û lies k standard deviations √v(t)
@@ -70,21 +70,23 @@ def interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> 
 
 
 @compiled
-def limit_by_curve(curve: Floats, edf: Floats, rows: Ints, columns: Floats, memory: int, terms: TermResults) -> None:
+def limit_terms_by_measured_avar(
+    avar: Floats, edf: Floats, rows: Ints, unit_avar: Floats, filter_memory: int, terms: TermResults
+) -> None:
     """Limit the coefficients of a curve that the five terms do not explain.
 
     The contribution of a single term must not exceed the measured Allan variance at any τ. N is only limited at τ of
-    more than ``memory`` samples, because a filter of the sensor may have removed white noise at shorter τ.
+    more than ``filter_memory`` samples, because a filter of the sensor may have removed white noise at shorter τ.
 
     Parameters
     ----------
-    curve, edf : ndarray of float64, shape (m,)
+    avar, edf : ndarray of float64, shape (m,)
         Allan variance and its degrees of freedom.
     rows : ndarray of int64
         Indices of the τ in use.
-    columns : ndarray of float64, shape (m, 5)
+    unit_avar : ndarray of float64, shape (m, 5)
         Allan variance of unit coefficients.
-    memory : int
+    filter_memory : int
         Memory of the filter in samples.
     terms : TermResults
         Results of the fit, updated in place.
@@ -92,8 +94,8 @@ def limit_by_curve(curve: Floats, edf: Floats, rows: Ints, columns: Floats, memo
     for a in range(5):
         most = np.inf
         for i in rows:
-            if columns[i, a] > 0.0 and (a != N or columns[i, N] * memory < 1.0):
-                most = min(most, upper_limit(curve[i], edf[i], EXCLUSION_SIGMA) / columns[i, a])
+            if unit_avar[i, a] > 0.0 and (a != N or unit_avar[i, N] * filter_memory < 1.0):
+                most = min(most, avar_upper_limit(avar[i], edf[i], EXCLUSION_SIGMA) / unit_avar[i, a])
         most = np.sqrt(most)
         if terms.status[a] == 0 or terms.hi[a] <= most:
             continue
@@ -103,7 +105,7 @@ def limit_by_curve(curve: Floats, edf: Floats, rows: Ints, columns: Floats, memo
 
 
 @compiled
-def upper_limit(avar: float, edf: float, z: float) -> float:
+def avar_upper_limit(avar: float, edf: float, z: float) -> float:
     """Return the upper limit of the true variance at z σ (Wilson & Hilferty).
 
     The limit is infinite with too few degrees of freedom.
@@ -123,17 +125,17 @@ def upper_limit(avar: float, edf: float, z: float) -> float:
 
 
 @compiled
-def bound_by_first_point(avar: float, edf: float, column: float, terms: TermResults) -> None:
+def bound_q_by_first_point(avar: float, edf: float, unit_avar: float, terms: TermResults) -> None:
     """Bound Q by the first measured Allan variance, because the band limit of the sensor hides Q.
 
     Parameters
     ----------
     avar, edf : float
         First measured Allan variance, and the degrees of freedom.
-    column : float
+    unit_avar : float
         Allan variance of Q = 1 at the same τ.
     terms : TermResults
         Results of the fit, updated in place.
     """
     terms.entered[Q], terms.status[Q] = False, 1
-    terms.lo[Q], terms.hi[Q] = 0.0, np.sqrt(upper_limit(avar, edf, UPPER_BOUND_Z) / column)
+    terms.lo[Q], terms.hi[Q] = 0.0, np.sqrt(avar_upper_limit(avar, edf, UPPER_BOUND_Z) / unit_avar)

@@ -38,12 +38,12 @@ from monitor.estimation.allan.window_kernel import (
     TOTAL,
     WindowArrays,
     WindowBuffers,
-    advance,
-    cut_arrays,
+    append_staged_samples,
+    compiled_view_window_arrays,
+    integer_slope_from_thirds,
     mean_second_difference,
-    slope_of_thirds,
 )
-from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, Design, shared_inputs
+from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, DesignMatrix, make_shared_inputs
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.estimation.fit.fit_kernel import fit_axes
 from monitor.estimation.fit.fit_kernel_types import (
@@ -65,7 +65,7 @@ PATIENCE: Final = 64
 
 The linear map cannot show that a band limit, a spectral line or a transient has disappeared.
 """
-OPTIONS: Final = FitOptions(*THRESHOLDS_WATCHED, full=False, warm=True)
+OPTIONS: Final = FitOptions(*THRESHOLDS_WATCHED, full_covariance=False, warm=True)
 """Options of the fits that recompute the linear maps."""
 
 U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
@@ -105,32 +105,32 @@ class ContinuousRefit:
         avar, terms, slopes = np.zeros((3, AXES, rows))
         self._curves = CurvesOfAxes(avar, terms, np.zeros(AXES), slopes)
         self._ages = np.zeros(AXES, np.int64)
-        self.reset()
+        self.restart_all_fits()
 
-    def reset(self) -> None:
+    def restart_all_fits(self) -> None:
         """Restart the fits of all axes. No term is in the new fits."""
         output = empty_fit_output(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
         self._state = RefitState(self._curves, output, empty_solution_maps(AXES, self._rows), self._ages)
         self._used: list[CovarianceTable | None] = [None] * AXES  # tables from which ``_known`` was computed
         self._known: list[SharedInputs] = []
 
-    def restart(self, axis: int) -> None:
+    def restart_fit_of_axis(self, axis: int) -> None:
         """Restart the fit of one axis. The axis is fitted at the next sample."""
         output = self._state.output
         output.entered[axis], output.status[axis], output.theta[axis] = False, 0, np.nan
         self._request_fit(axis)
 
     @property
-    def entered(self) -> NDArray[np.bool_]:
+    def terms_in_fit(self) -> NDArray[np.bool_]:
         """Boolean array of shape (5, 6), True for the terms in the fit."""
         return self._state.output.entered.T
 
-    def advance_and_refit(self, design: Design, samples: Floats, lengths: Ints) -> Floats:
+    def advance_and_refit(self, design: DesignMatrix, samples: Floats, lengths: Ints) -> Floats:
         """Advance the window by samples, and return the coefficients after each sample.
 
         Parameters
         ----------
-        design : Design
+        design : DesignMatrix
             Columns of the fit.
         samples : ndarray of float64, shape (n, 6)
             Samples in rad/s and m/s²; NaN means missing.
@@ -148,15 +148,17 @@ class ContinuousRefit:
             self._advance(design, samples[part], lengths, coefficients[part])
         return coefficients
 
-    def _advance(self, design: Design, values: Floats, lengths: Ints, coefficients: Floats) -> None:
+    def _advance(self, design: DesignMatrix, values: Floats, lengths: Ints, coefficients: Floats) -> None:
         """Advance by up to ``STAGE_SAMPLES`` samples and write the coefficients [n, 5, 6]."""
-        self._window.stage(values)
+        self._window.copy_to_input_buffer(values)
         to_si = design.rate_hz**TO_SI
         done = 0
         while done < len(values):
             until = done + min(len(values) - done, self._find_tables(design, lengths))
             while done < until:
-                done, due = _follow(self._window.buffers(), self._state, lengths, to_si, done, until, coefficients)
+                done, due = _follow(
+                    self._window.kernel_buffers(), self._state, lengths, to_si, done, until, coefficients
+                )
                 if due:
                     self._fit([axis for axis in range(AXES) if due >> axis & 1], to_si, coefficients[done - 1])
 
@@ -168,18 +170,18 @@ class ContinuousRefit:
         size = np.sqrt(np.maximum(output.theta[axes], 0.0)) * to_si
         coefficients[:, axes] = np.where(output.status[axes] == Status.ESTIMATED, size, np.nan).T
 
-    def _find_tables(self, design: Design, lengths: Ints) -> int:
+    def _find_tables(self, design: DesignMatrix, lengths: Ints) -> int:
         """Find the covariance table of every axis, and return for how many samples all tables stay valid."""
         filled = min(self._window.samples_in_window + 1, self._window.length)
         lasts = UNLIMITED_SAMPLES
         for axis in range(AXES):
             n = min(int(lengths[axis]) + 1, filled)
-            table = self._tables.at(axis, n, filled)
+            table = self._tables.table_of_axis(axis, n, filled)
             if table is not self._used[axis]:
                 self._used[axis] = table
                 self._request_fit(axis)
-                self._known[axis : axis + 1] = [shared_inputs(design, table)]
-            lasts = min(lasts, self._tables.remaining_valid_samples(table, n))
+                self._known[axis : axis + 1] = [make_shared_inputs(design, table)]
+            lasts = min(lasts, self._tables.samples_until_table_expires(table, n))
         return lasts
 
     def _request_fit(self, axis: int) -> None:
@@ -197,7 +199,7 @@ def _follow(
     Rows ``start`` to ``end`` of the buffer are processed. If axes must be fitted after a row, the function stops and
     copies the curves of these axes to ``state.curves``. It returns the next row and the bit set of the axes to fit.
     """
-    w = cut_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
+    w = compiled_view_window_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
     curves, output, maps, ages = state
     ints, floats, missing, taus, window = buffers
     # Local names, because each access to a field in a loop changes a reference count.
@@ -212,11 +214,13 @@ def _follow(
     scale = SumsToVariances(unit, inverse)
     for row in range(start, end):
         due = 0
-        advance(ints, floats, missing, taus, row, 1)
+        append_staged_samples(ints, floats, missing, taus, row, 1)
         filled = min(counters[TOTAL], window)
         for axis in range(AXES):
             lengths[axis] = min(lengths[axis] + 1, filled)
-            slope[axis] = slope_of_thirds(phase, missing, counters[NEWEST], lengths[axis], axis) / scaling[axis]
+            slope[axis] = (
+                integer_slope_from_thirds(phase, missing, counters[NEWEST], lengths[axis], axis) / scaling[axis]
+            )
         _project(w, scale, curves, maps, right)
         _apply_maps(right, slope, maps, output, valid)
         for axis in range(AXES):

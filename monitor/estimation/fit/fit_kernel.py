@@ -14,7 +14,7 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES, PAIRS
-from monitor.estimation.fit.confidence_bounds import bound_by_first_point, limit_by_curve
+from monitor.estimation.fit.confidence_bounds import bound_q_by_first_point, limit_terms_by_measured_avar
 from monitor.estimation.fit.fit_kernel_types import (
     CurvesOfAxes,
     FitOptions,
@@ -66,19 +66,19 @@ WHITE: Final = PAIRS.index((N, N))
 
 @compiled
 def fit_axes(
-    first: int,
-    end: int,
+    first_axis: int,
+    end_axis: int,
     shared: SharedInputs,
     curves: CurvesOfAxes,
     options: FitOptions,
     output: FitOutput,
     maps: SolutionMaps,
 ) -> None:
-    """Fit the axes first ≤ axis < end.
+    """Fit the axes first_axis ≤ axis < end_axis.
 
     Parameters
     ----------
-    first, end : int
+    first_axis, end_axis : int
         Range of axes.
     shared : SharedInputs
         Inputs that are the same for all axes.
@@ -91,7 +91,7 @@ def fit_axes(
     maps : SolutionMaps
         Linear map of the solution, updated in place.
     """
-    for axis in range(first, end):
+    for axis in range(first_axis, end_axis):
         _fit_axis(axis, shared, curves, options, output, maps)
 
 
@@ -104,8 +104,8 @@ def _fit_axis(
     straight = slope == slope
     terms = TermResults(output.entered[axis], output.theta[axis], output.lo[axis], output.hi[axis], output.status[axis])
     problem = LeastSquares(
-        np.empty(m), np.empty(m), shared.flat if straight else shared.columns, shared.covariance, shared.blind,
-        np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
+        np.empty(m), np.empty(m), shared.flat if straight else shared.columns, shared.covariance,
+        shared.ignored_direction, np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
     rows = _prepare_rows(axis, shared, curves, problem)
     maps.used[axis, 0] = maps.used[axis, 1] = 0
@@ -115,7 +115,7 @@ def _fit_axis(
         for a in range(5):
             terms.entered[a], terms.status[a] = False, 0
         return
-    first, free = _fit_or_fall_back(axis, rows, problem, curve, shared.ask, options, output)
+    first, free = _fit_or_fall_back(axis, rows, problem, curve, shared.may_drop_short_taus, options, output)
     used, misfit = rows[first:], output.misfit[axis]
     for a in range(5):
         terms.lo[a], terms.hi[a], terms.status[a] = np.nan, np.nan, 0
@@ -131,10 +131,10 @@ def _fit_axis(
     if store_linear_map(axis, used, problem, curves, output, maps):
         compute_map_validity_limits(maps.low[axis], maps.high[axis], options, tests, most, terms)
     if misfit > 1.0:
-        limit_by_curve(curve, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms)
+        limit_terms_by_measured_avar(curve, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms)
     if free:
         i = rows[0]
-        bound_by_first_point(curve[i], output.edf[axis, i], shared.columns[i, Q], terms)
+        bound_q_by_first_point(curve[i], output.edf[axis, i], shared.columns[i, Q], terms)
 
 
 @compiled
@@ -154,19 +154,27 @@ def _prepare_rows(axis: int, shared: SharedInputs, curves: CurvesOfAxes, problem
 
 @compiled
 def _fit_or_fall_back(
-    axis: int, rows: Ints, problem: LeastSquares, curve: Floats, ask: bool, options: FitOptions, output: FitOutput
+    axis: int,
+    rows: Ints,
+    problem: LeastSquares,
+    curve: Floats,
+    may_drop_short_taus: bool,
+    options: FitOptions,
+    output: FitOutput,
 ) -> tuple[int, bool]:
     """Fit with the requested weights, or with the variances alone if the misfit is too large.
 
     Return how many of the shortest τ were left out, and whether Q² was allowed to be negative.
     """
-    full, theta = options.full, output.theta[axis]
+    full_covariance, theta = options.full_covariance, output.theta[axis]
     while True:
-        first, free = _fit_terms(curve, rows, problem, ask, full, options.warm, theta)
+        first, free = _fit_terms(curve, rows, problem, may_drop_short_taus, full_covariance, options.warm, theta)
         scatter, limit = _misfit(problem, rows[first:], theta)
-        if not full or scatter <= limit:
+        if not full_covariance or scatter <= limit:
             break
-        full = False  # with the wrong covariances, a fit to other noise than the five terms may miss all points
+        full_covariance = (
+            False  # with the wrong covariances, a fit to other noise than the five terms may miss all points
+        )
     output.left_out[axis], output.scatter[axis] = first, scatter
     output.misfit[axis] = scatter if scatter > limit else 1.0
     return first, free
@@ -190,7 +198,13 @@ def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats
 
 @compiled
 def _fit_terms(
-    curve: Floats, rows: Ints, problem: LeastSquares, ask: bool, full: bool, warm: bool, theta: Floats
+    curve: Floats,
+    rows: Ints,
+    problem: LeastSquares,
+    may_drop_short_taus: bool,
+    full_covariance: bool,
+    warm: bool,
+    theta: Floats,
 ) -> tuple[int, bool]:
     """Fit Q N B K with re-weighting.
 
@@ -201,7 +215,7 @@ def _fit_terms(
     while True:
         used = rows[first:]
         if warm:
-            compute_weights(problem, used, theta, full)
+            compute_weights(problem, used, theta, full_covariance)
         else:
             for i in used:  # start with white noise of the level of the curve
                 variance = curve[i] * curve[i] * problem.covariance[i, i, WHITE] / problem.columns[i, N] ** 2
@@ -210,16 +224,16 @@ def _fit_terms(
         for _ in range(WARM_PASSES if warm else COLD_PASSES):
             compute_normal_equations(problem, used)
             solve_nonnegative(problem.normal, problem.right, free, theta)
-            compute_weights(problem, used, theta, full)
+            compute_weights(problem, used, theta, full_covariance)
         limit = REPEATED_MISFIT_SIGMA if free else MISFIT_SIGMA
-        if not ask or not _is_contradicted(problem, used[:SHORT_ROWS], theta, limit):
+        if not may_drop_short_taus or not _is_contradicted(problem, used[:SHORT_ROWS], theta, limit):
             break
         if not free:
             free = True
         elif used.size > MIN_ROWS and problem.columns[used[0], N] * FILTER_MEMORY >= 1.0:
             first += 1
         else:  # The cause is not a filter but a spectral line, motion, or another effect outside the five terms.
-            first, free, ask = 0, False, False
+            first, free, may_drop_short_taus = 0, False, False
     compute_normal_equations(problem, used)
     solve_nonnegative(problem.normal, problem.right, free, theta)
     return first, free

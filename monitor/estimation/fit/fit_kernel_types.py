@@ -24,8 +24,8 @@ class SharedInputs(NamedTuple):
     covariance: Floats  # [m, m, 10] ``CovarianceTable.covariance``
     whole: Floats  # [m] number of terms in a window without gaps
     slope_variance: Floats  # [4] variance of the slope of the rate, for unit θ
-    blind: Floats  # [m] direction of the curve that the fit ignores, larger than any noise; zero means none
-    ask: bool  # True to leave out short τ that contradict the fit
+    ignored_direction: Floats  # [m] direction of the curve that the fit ignores, larger than any noise; zero means none
+    may_drop_short_taus: bool  # True to leave out short τ that contradict the fit
 
 
 class CurvesOfAxes(NamedTuple):
@@ -42,7 +42,7 @@ class FitOptions(NamedTuple):
 
     enter: float  # threshold in σ to add a term
     leave: float  # threshold in σ to drop a term
-    full: bool  # True to weight by the covariances of all τ, False to weight by their variances alone
+    full_covariance: bool  # True to weight by the covariances of all τ, False to weight by their variances alone
     warm: bool  # True to start with the weights of ``FitOutput.theta``
 
 
@@ -78,7 +78,7 @@ class LeastSquares(NamedTuple):
     stretch: Floats  # [m] square root of the ratio of the terms without gaps to the present terms
     columns: Floats  # [m, 5] columns X
     covariance: Floats  # [m, m, 10] ``CovarianceTable.covariance``
-    blind: Floats  # [m] direction that the fit ignores; ``blind`` blindᵀ is added to the covariance V
+    ignored_direction: Floats  # [m] direction that the fit ignores; the outer product is added to the covariance V
     variance: Floats  # [m] variances of the observations under the model
     weighted: Floats  # [m, 5] V⁻¹ X
     normal: Floats  # [5, 5] Xᵀ V⁻¹ X

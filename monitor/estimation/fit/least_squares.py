@@ -53,7 +53,7 @@ def compute_observation_variances(problem: LeastSquares, rows: Ints, theta: Floa
 
 
 @compiled
-def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool) -> None:
+def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full_covariance: bool) -> None:
     """Compute V⁻¹ X with the covariance V of the observations under a model, or with its diagonal.
 
     Parameters
@@ -64,11 +64,11 @@ def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool
         Indices of the τ in use.
     theta : ndarray of float64, shape (5,)
         Squared coefficients of the model.
-    full : bool
+    full_covariance : bool
         True to use the covariances, False to use the variances alone.
     """
     compute_observation_variances(problem, rows, theta)
-    if full and _whiten(problem, rows, theta):
+    if full_covariance and _whiten(problem, rows, theta):
         return
     weighted, columns, variance = problem.weighted, problem.columns, problem.variance
     for i in rows:
@@ -80,13 +80,16 @@ def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool
 def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
     """Compute V⁻¹ X by Cholesky decomposition. Return False if the correlation matrix is not positive definite."""
     # Local names, because each access to a field in a loop changes a reference count.
-    m, variance, stretch, blind = rows.size, problem.variance, problem.stretch, problem.blind
+    m, variance, stretch, ignored_direction = rows.size, problem.variance, problem.stretch, problem.ignored_direction
     covariance, columns, weighted = problem.covariance, problem.columns, problem.weighted
     factor, column = np.empty((m, m)), np.empty(m)
     for k in range(m):
         for j in range(k + 1):
             i, h = rows[k], rows[j]
-            x = _allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
+            x = (
+                _allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h]
+                + ignored_direction[i] * ignored_direction[h]
+            )
             factor[k, j] = x / np.sqrt(variance[i] * variance[h])
     if not _factorize(factor, m, SINGULAR_COVARIANCE):
         return False
@@ -131,7 +134,7 @@ def compute_normal_equations(problem: LeastSquares, rows: Ints) -> None:
 
 
 @compiled
-def solve_nonnegative(normal: Floats, right: Floats, free: bool, theta: Floats) -> None:
+def solve_nonnegative(normal: Floats, right_side: Floats, q_may_be_negative: bool, theta: Floats) -> None:
     """Solve least squares with non-negative Q N B K by finding the subset that meets the Kuhn–Tucker conditions.
 
     The terms in the subset are positive, and the error would not decrease if another term grew.
@@ -140,41 +143,41 @@ def solve_nonnegative(normal: Floats, right: Floats, free: bool, theta: Floats) 
     ----------
     normal : ndarray of float64, shape (5, 5)
         Normal matrix.
-    right : ndarray of float64, shape (5,)
+    right_side : ndarray of float64, shape (5,)
         Right-hand side.
-    free : bool
+    q_may_be_negative : bool
         True if Q² may be negative.
     theta : ndarray of float64, shape (5,)
         Solution.
     """
     for subset in range(2**NOISES - 1, 0, -1):
-        if not solve_on_subset(normal, right, subset, theta):
+        if not solve_on_subset(normal, right_side, subset, theta):
             continue
         allowed = True
         for a in range(NOISES):
             if subset >> a & 1:
-                allowed = allowed and (theta[a] >= 0.0 or (free and a == Q))
+                allowed = allowed and (theta[a] >= 0.0 or (q_may_be_negative and a == Q))
             else:
-                pull = right[a]
+                pull = right_side[a]
                 for b in range(NOISES):
                     pull -= normal[a, b] * theta[b]
-                allowed = allowed and pull <= 1e-9 * abs(right[a])
+                allowed = allowed and pull <= 1e-9 * abs(right_side[a])
         if allowed:
             return
     for a in range(5):
         theta[a] = 0.0
-    theta[N] = right[N] / normal[N, N]
+    theta[N] = right_side[N] / normal[N, N]
 
 
 @compiled
-def solve_on_subset(normal: Floats, right: Floats, subset: int, solution: Floats) -> bool:
+def solve_on_subset(normal: Floats, right_side: Floats, subset: int, solution: Floats) -> bool:
     """Solve the normal equations on a subset of the columns by Cholesky decomposition, each column scaled to one.
 
     Parameters
     ----------
     normal : ndarray of float64, shape (5, 5)
         Normal matrix.
-    right : ndarray of float64, shape (5,)
+    right_side : ndarray of float64, shape (5,)
         Right-hand side.
     subset : int
         Bit set of the columns.
@@ -194,7 +197,7 @@ def solve_on_subset(normal: Floats, right: Floats, subset: int, solution: Floats
             n += 1
     for k in range(n):
         a = terms[k]
-        scaled[k] = right[a] / np.sqrt(normal[a, a])
+        scaled[k] = right_side[a] / np.sqrt(normal[a, a])
         for j in range(k + 1):
             b = terms[j]
             factor[k, j] = normal[a, b] / np.sqrt(normal[a, a] * normal[b, b])

@@ -5,7 +5,7 @@ recording of a day determines this Allan variance to 0.04 %, so a model error of
 column of N is the Allan variance of white noise after a Butterworth low-pass filter of order 1 to 4. The filter is
 either a digital filter at the sample rate or an analogue filter before sampling. The cutoff and the order with the
 smallest misfit are used. The fit allows for the uncertainty of the cutoff, so that no interval becomes too narrow. If
-no low-pass filter explains the Allan variance, the result of ``fit`` without the shortest τ is kept.
+no low-pass filter explains the Allan variance, the result of ``fit_coefficients`` without the shortest τ is kept.
 
 The filters have a flat passband, so N is the level of the white noise in the passband. Q is only bounded, because
 almost any filter together with Q explains almost any Allan variance. A filter must also be visible in the spectrum. If
@@ -23,9 +23,15 @@ from drivers.data_types import Floats, Ints
 from monitor.common.minimization import golden_section
 from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
 from monitor.estimation.allan.uncertainty import CovarianceTable
-from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit, replace_axis
+from monitor.estimation.fit.coefficient_fit import (
+    DesignMatrix,
+    Fit,
+    MeasuredCurve,
+    fit_coefficients,
+    replace_axis_results,
+)
 from monitor.estimation.fit.coefficient_values import Status
-from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, upper_limit
+from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, avar_upper_limit
 from monitor.estimation.fit.least_squares import N, Q
 
 Kind = Literal["digital", "sampled"]
@@ -139,7 +145,7 @@ def power_spectrum(rates: Floats) -> Floats:
     return np.asarray((turned.real**2 + turned.imag**2).mean(axis=0))
 
 
-def is_seen_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
+def is_visible_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
     """Return True if a measured spectrum decreases above the cutoff as expected for the filter.
 
     Medians of the passband and the stopband are compared, so that spectral lines have no effect.
@@ -163,21 +169,21 @@ def is_seen_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
     )
 
 
-def apply_low_passes(
-    design: Design, table: CovarianceTable, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
+def refit_with_low_passes(
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
 ) -> tuple[Fit, list[LowPass | None]]:
     """Replace the fit of each axis that the five terms do not explain by a fit with a low-pass filter.
 
     Parameters
     ----------
-    design : Design
-        Columns that were passed to ``fit``.
+    design : DesignMatrix
+        Columns that were passed to ``fit_coefficients``.
     table : CovarianceTable
-        Covariances that were passed to ``fit``.
+        Covariances that were passed to ``fit_coefficients``.
     measured : MeasuredCurve
-        Measured curve that was passed to ``fit``.
+        Measured curve that was passed to ``fit_coefficients``.
     found : Fit
-        Result of ``fit``.
+        Result of ``fit_coefficients``.
     filters : sequence of LowPass or None
         Filter of each axis from ``find_low_pass``, or None. A filter is accepted if the fit explains the curve.
 
@@ -190,24 +196,24 @@ def apply_low_passes(
     """
     used: list[LowPass | None] = [None] * len(filters)
     for axis, low_pass in enumerate(filters):
-        if low_pass is not None and is_contradicted(found, axis):
-            better = _fit_low_pass(design, table, measured.axis(axis), low_pass)
+        if low_pass is not None and is_contradicted_by_curve(found, axis):
+            better = _fit_low_pass(design, table, measured.select_axis(axis), low_pass)
             if better.scatter[0] < MAX_SCATTER:
-                _bound_q(design, better, measured.axis(axis))
-                found = replace_axis(found, axis, better)
+                _bound_q(design, better, measured.select_axis(axis))
+                found = replace_axis_results(found, axis, better)
                 used[axis] = low_pass
     return found, used
 
 
-def _bound_q(design: Design, found: Fit, measured: MeasuredCurve) -> None:
+def _bound_q(design: DesignMatrix, found: Fit, measured: MeasuredCurve) -> None:
     """Bound Q by the first measured Allan variance, because a fit with a filter cannot determine Q."""
     c, first = found.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
-    most = upper_limit(measured.avar[first, 0], found.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
+    most = avar_upper_limit(measured.avar[first, 0], found.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
     if np.isfinite(most):
         c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 
 
-def is_contradicted(found: Fit, axis: int) -> bool:
+def is_contradicted_by_curve(found: Fit, axis: int) -> bool:
     """Return True if the five terms do not explain the curve of an axis.
 
     Parameters
@@ -220,12 +226,14 @@ def is_contradicted(found: Fit, axis: int) -> bool:
     return bool(found.left_out[axis] > 0 or found.theta[0, axis] < 0.0 or found.misfit[axis] > 1.0)
 
 
-def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurve, power: Floats) -> LowPass | None:
+def find_low_pass(
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, power: Floats
+) -> LowPass | None:
     """Return the low-pass filter with the smallest misfit for one axis, or None if no filter explains the curve.
 
     Parameters
     ----------
-    design : Design
+    design : DesignMatrix
         Columns for the cluster sizes of the curve.
     table : CovarianceTable
         Covariances for the window length.
@@ -234,7 +242,7 @@ def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurv
     power : ndarray of float64
         Spectrum of the axis, from ``power_spectrum``.
     """
-    search = search_low_pass(design, table, measured, power)
+    search = search_low_pass_in_steps(design, table, measured, power)
     while True:
         try:
             next(search)
@@ -243,8 +251,8 @@ def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurv
             return found
 
 
-def search_low_pass(
-    design: Design, table: CovarianceTable, measured: MeasuredCurve, power: Floats
+def search_low_pass_in_steps(
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, power: Floats
 ) -> Generator[None, None, LowPass | None]:
     """Do the search of ``find_low_pass`` in steps of a few milliseconds, for callers that must not block.
 
@@ -265,17 +273,17 @@ def search_low_pass(
         at = int(np.argmin(grids[family]))
         ends = np.log(CUTOFFS[[max(at - 1, 0), min(at + 1, CUTOFFS.size - 1)]])
 
-        def of(log_cutoff: float, kind: Kind = kind, order: int = order) -> float:
+        def scatter_at(log_cutoff: float, kind: Kind = kind, order: int = order) -> float:
             column = LowPass(kind, order, float(np.exp(log_cutoff))).avar(design.factors)
             return float(_fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
 
         least, log_cutoff = yield from _yield_after_several_steps(
-            golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
+            golden_section(scatter_at, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
         )
         found.append((least, LowPass(kind, order, float(np.exp(log_cutoff)))))
         yield
     least, low_pass = min(found, key=lambda one: one[0])
-    return low_pass if least < MAX_SCATTER and is_seen_in_spectrum(low_pass, power) else None
+    return low_pass if least < MAX_SCATTER and is_visible_in_spectrum(low_pass, power) else None
 
 
 def _yield_after_several_steps(
@@ -294,19 +302,19 @@ def _yield_after_several_steps(
             yield
 
 
-def _fit_columns(design: Design, table: CovarianceTable, measured: MeasuredCurve) -> Fit:
+def _fit_columns(design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve) -> Fit:
     """Fit quickly with exactly these columns and all τ."""
-    return fit(design, table, measured, full=False, ask=False)
+    return fit_coefficients(design, table, measured, full_covariance=False, may_drop_short_taus=False)
 
 
-def _with_noise_column(design: Design, column: Floats) -> Design:
+def _with_noise_column(design: DesignMatrix, column: Floats) -> DesignMatrix:
     """Return the design with the given column for N, and with a column of zeros for Q."""
     columns = design.columns.copy()
     columns[:, N], columns[:, Q] = column, 0.0
     return replace(design, columns=columns)
 
 
-def _fit_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
+def _fit_low_pass(design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
     """Return the fit with a filter. The fit ignores changes of the curve that a change of the cutoff would cause."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     up, down = (
@@ -315,5 +323,5 @@ def _fit_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurv
     own = _with_noise_column(design, _column(low_pass, factors))
     rough = _fit_columns(own, table, measured)
     level = max(float(rough.theta[N, 0]) * design.rate_hz, 0.0)
-    blind = level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
-    return fit(own, table, measured, blind=blind, ask=False)
+    ignored_direction = level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
+    return fit_coefficients(own, table, measured, ignored_direction=ignored_direction, may_drop_short_taus=False)

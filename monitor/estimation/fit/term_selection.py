@@ -12,7 +12,7 @@ from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.uncertainty import NOISES
-from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, interval_end, pearson_quantile
+from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, confidence_interval_end, pearson_quantile
 from monitor.estimation.fit.fit_kernel_types import (
     LIMIT_COUNT,
     CurvesOfAxes,
@@ -93,12 +93,12 @@ def _select_term(
 ) -> None:
     """Decide whether one term is in the fit, and compute its interval or its bound."""
     threshold = options.leave if terms.entered[a] else options.enter
-    low = interval_end(estimate, c0, c1, c2, Z95)
-    high = interval_end(estimate, c0, c1, c2, -Z95)
+    low = confidence_interval_end(estimate, c0, c1, c2, Z95)
+    high = confidence_interval_end(estimate, c0, c1, c2, -Z95)
     if terms.theta[a] > 0.0 and not low < np.sqrt(terms.theta[a]) < high:
         # Other terms are fixed at zero, so θ differs from û. The interval must also cover the interval of θ.
-        low = min(low, interval_end(terms.theta[a], c0, c1, c2, Z95))
-        high = max(high, interval_end(terms.theta[a], c0, c1, c2, -Z95))
+        low = min(low, confidence_interval_end(terms.theta[a], c0, c1, c2, Z95))
+        high = max(high, confidence_interval_end(terms.theta[a], c0, c1, c2, -Z95))
     # A term that is not in the fit is not added while the interval includes zero.
     seen = terms.entered[a] or low > 0.0
     terms.entered[a] = seen and a != R and terms.theta[a] > 0.0 and estimate > threshold * np.sqrt(c0)
@@ -107,7 +107,7 @@ def _select_term(
     else:
         # The bound is never tighter than the bound from an estimate of zero.
         terms.status[a], terms.lo[a] = 1, 0.0
-        terms.hi[a] = interval_end(max(estimate, 0.0), c0, c1, c2, -UPPER_BOUND_Z)
+        terms.hi[a] = confidence_interval_end(max(estimate, 0.0), c0, c1, c2, -UPPER_BOUND_Z)
 
 
 @compiled
@@ -133,7 +133,7 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
     """
     m = problem.level.size
     own = LeastSquares(
-        problem.level, problem.stretch, problem.columns, problem.covariance, problem.blind,
+        problem.level, problem.stretch, problem.columns, problem.covariance, problem.ignored_direction,
         np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
     supposed, gain = np.empty(5), np.empty((1, rows.size))
@@ -148,7 +148,7 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
         if _map_to_term(a, own, rows, gain[0]):
             c = _variance_forms(a, a + 1, gain, rows, terms.theta, own.covariance)[0]
             estimate = max(_estimate(gain[0], own, rows), 0.0)
-            terms.hi[a] = interval_end(estimate, misfit * c[0], misfit * c[1], c[2], -UPPER_BOUND_Z)
+            terms.hi[a] = confidence_interval_end(estimate, misfit * c[0], misfit * c[1], c[2], -UPPER_BOUND_Z)
 
 
 @compiled
