@@ -44,7 +44,7 @@ class CompilationProgress:
 
     Examples
     --------
-    >>> print(CompilationProgress(2, 8, ("change detection",)), CompilationProgress(2, 8).bar)
+    >>> print(CompilationProgress(2, 8, ("change detection",)), CompilationProgress(2, 8).progress_bar_text)
     compiling 3 of 8: change detection ███░░░░░░░░░
     """
 
@@ -63,7 +63,7 @@ class CompilationProgress:
 
     @property
     def progress_bar_text(self) -> str:
-        """Text bar that shows ``share``."""
+        """Text of the progress bar."""
         filled = round(BAR_LENGTH * self.compiled_share)
         return "█" * filled + "░" * (BAR_LENGTH - filled)
 
