@@ -13,7 +13,7 @@ _log = structlog.get_logger("imu-monitor")
 
 
 class CommandHandler:
-    """Executor of the zenoh commands for all devices.
+    """Handler of the zenoh commands for all devices.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class CommandHandler:
         self._reconciler = reconciler
 
     def handle_commands(self, workers: Mapping[str, DeviceWorker]) -> None:
-        """Execute the commands that arrived since the last call, for the workers by device name."""
+        """Execute the commands that have arrived since the last call."""
         while not self._zenoh.commands.empty():
             command = self._zenoh.commands.get_nowait()
             if command.device in workers:
@@ -43,11 +43,10 @@ class CommandHandler:
                 workers[finished.device].publish_event("reconciled", finished.text)
 
     def abort_reconciliations(self) -> None:
-        """Kill the running reconciliations, and refuse their queries."""
+        """Kill the running reconciliations, and refuse the pending queries."""
         self._reconciler.abort_reconciliations()
 
     def _execute(self, command: Command, worker: DeviceWorker) -> None:
-        """Execute and answer one command for a device."""
         match command.verb:
             case "reset":
                 worker.empty_window()
@@ -60,7 +59,7 @@ class CommandHandler:
                 command.reply_refusal(f'unknown command "{other}"; known commands are reset and reconcile')
 
     def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
-        """Start a reconciliation with a copy of the window. A new thread sends the answer."""
+        """Reconcile a copy of the window in the background."""
         window = worker.copy_window_and_temperature()
         if window is None:
             command.reply_refusal("no samples yet")

@@ -1,6 +1,6 @@
 """Publication of the results of one device to all outputs.
 
-The main loop calls the outputs in order. An output never blocks. It has a queue or drops data.
+The main loop calls the outputs, which must not block.
 """
 
 import time
@@ -26,13 +26,13 @@ from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings.loading import Device
 
 MAX_BATCH_S: Final = 0.1
-"""Longest time for which samples are collected into one batch."""
+"""Maximum duration of a batch of samples in seconds."""
 TOTAL_INTERVAL_S: Final = 0.1
-"""Shortest interval between two steps of the total and Hadamard deviations."""
+"""Minimum interval between two steps of the total and Hadamard deviations."""
 TOTAL_CPU_SHARE: Final = 0.005
-"""Largest share of one processor for the total and Hadamard deviations of a device."""
+"""Maximum fraction of one processor for the total and Hadamard deviations of a device."""
 INTERPRETED_REFIT_S: Final = 1.0
-"""Minimum time between two fits with interpreted kernels, because the compilation needs the processors."""
+"""Minimum interval between two fits with interpreted kernels."""
 
 
 class ResultPublisher:
@@ -43,7 +43,7 @@ class ResultPublisher:
     device : Device
         Settings of the device.
     driver : Driver
-        Driver of the device, which counts the received samples.
+        Driver of the device.
     pipeline : DevicePipeline
         Pipeline that computes the results.
     limits : LimitMonitor
@@ -71,7 +71,7 @@ class ResultPublisher:
         self.published = 0
         """Number of published samples."""
         self.withholds_coefficients = False
-        """True while coefficients are withheld, because the sample rate is in doubt."""
+        """True while coefficients are withheld because the sample rate is uncertain."""
         self._agreement = ModelAgreement()
         self._batch: list[SampleBlock] = []  # samples that are not published yet
         self._refitted = False  # True if the fit was updated since the last publication
@@ -83,7 +83,7 @@ class ResultPublisher:
                 output.publish_event(self.device.name, self._unix_s(event.t_ns), self._received, event)
 
     def publish_samples_if_due(self, blocks: Sequence[SampleBlock]) -> bool:
-        """Collect new samples, and publish the collected batch if it is due; return True if it was published."""
+        """Add samples to the batch, and publish the batch if it is due; return True if it was published."""
         self._batch += blocks
         interval_s = min(self.device.publish_s, MAX_BATCH_S)
         if not self._batch or not self.schedule.claim_if_due("samples", interval_s):
@@ -100,7 +100,7 @@ class ResultPublisher:
         return True
 
     def publish_estimate_if_due(self) -> bool:
-        """Update the fit if it is due, and publish the estimate if it is due; return True if it was published."""
+        """Update the fit and publish the estimate if they are due; return True if the estimate was published."""
         self._refit()
         if (
             self.latest is None
@@ -128,7 +128,7 @@ class ResultPublisher:
             self._result(self.pipeline.newest_ns, SlowStatistics(*deviations))
 
     def publish_thermal_intervals(self) -> None:
-        """Publish the thermal intervals that were completed since the last call."""
+        """Publish the thermal intervals that have been completed since the last call."""
         for interval in self.pipeline.take_thermal_intervals():
             self._result(interval.t_ns, interval)
 
@@ -140,12 +140,11 @@ class ResultPublisher:
         return self.timeline.to_unix_s(t_ns)
 
     def _result(self, t_ns: int, result: Any) -> None:
-        """Publish a result with the sample time ``t_ns``."""
         for output in self.outputs:
             output.publish_result(self.device.name, self._unix_s(t_ns), self._received, result)
 
     def _compensated(self, live: LiveCompensation, samples: SampleBlock) -> None:
-        """Publish samples without gyroscope drift, and the state of the drift compensation."""
+        """Publish samples after drift compensation, and the state of the drift compensation."""
         at = 0
         while at < len(samples):
             piece = samples[at : at + live.compensator.samples_to_interval_end]
@@ -161,14 +160,13 @@ class ResultPublisher:
             self._result(drift.t_ns, drift)
 
     def _refit(self) -> None:
-        """Update the fit and the newest estimate, if a refit is due."""
-        # with a refit at every sample, ``get`` is called only for a publication, because ``get`` empties the history
+        # with a refit at every sample, ``get`` empties the history, so ``get`` is only called for a publication
         interval_s = self.device.refit_s or self.device.publish_s
         pipeline = self.pipeline
         if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim_if_due("refit", interval_s):
             return
         fitted = pipeline.fit_kernels_ready
-        pipeline.advanced = not fitted  # a curve without coefficients is fitted as soon as the kernels are ready
+        pipeline.advanced = not fitted  # the curve is fitted as soon as the kernels are ready
         try:
             latest = pipeline.estimator.get(fitted=fitted)
         except NotReady:
@@ -179,7 +177,6 @@ class ResultPublisher:
         self._refitted = True
 
     def _model_gap(self, gap: ModelGap) -> None:
-        """Publish the comparison of the window with the noise model, and the resulting events."""
         if self.withholds_coefficients:
             gap = replace(gap, axes={})
         events = self._agreement.update(gap)

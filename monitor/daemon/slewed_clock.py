@@ -1,8 +1,7 @@
 """Unix time of samples, from the monotonic clock, slewed towards the host clock.
 
-NTP or an operator may set the host clock. To avoid a gap in a recording, the Unix time of the samples then approaches
-the host clock gradually. The offset between Unix time and monotonic time is a continuous, piecewise linear function of
-the monotonic time. Its slope is at most MAX_SLEW_RATE, so the Unix times increase from sample to sample.
+If the host clock is set, the Unix time of the samples approaches the host clock gradually. The slope of the correction
+is at most MAX_SLEW_RATE, so the Unix times increase from sample to sample.
 """
 
 from typing import Final
@@ -12,13 +11,13 @@ import numpy as np
 from drivers.data_types import Ints
 
 MAX_SLEW_RATE: Final = 5e-4
-"""Maximum rate of a correction, 0.5 ms per second."""
+"""Maximum rate of a correction, which is 0.5 ms per second."""
 MAX_KNOTS: Final = 100
-"""Number of kept corrections. With one correction per second, samples of the last minute can be converted."""
+"""Number of stored corrections. Samples of the last minute can be converted with one correction per second."""
 
 
 class SlewedClock:
-    """Conversion of monotonic time to Unix time, in nanoseconds.
+    """Clock that converts monotonic time to slewed Unix time, in nanoseconds.
 
     Parameters
     ----------
@@ -47,11 +46,11 @@ class SlewedClock:
 
     @property
     def lag_behind_host_ns(self) -> int:
-        """Time by which the slewed Unix time is behind the host clock, in nanoseconds."""
+        """Time in nanoseconds by which the slewed Unix time lags behind the host clock."""
         return self._host_ns - self.unix_offset_ns(self._slewed_at_ns)
 
     def slew_and_return_host_step(self, monotonic_ns: int, unix_ns: int) -> int:
-        """Start to slew towards the host clock. This method is called about once a second.
+        """Start to slew towards the host clock, and return the last step of the host clock.
 
         Returns
         -------
@@ -69,11 +68,11 @@ class SlewedClock:
         return self._host_ns - before_ns
 
     def unix_offset_ns(self, monotonic_ns: int) -> int:
-        """Return the difference between Unix time and monotonic time at a monotonic time."""
+        """Return the offset from a monotonic time to the Unix time, in nanoseconds."""
         return int(self.unix_offsets_ns(np.array([monotonic_ns], np.int64))[0])
 
     def unix_offsets_ns(self, monotonic_ns: Ints) -> Ints:
-        """Return the difference between Unix time and monotonic time at each monotonic time [n]."""
+        """Return the offsets [n] from monotonic times to Unix times, in nanoseconds."""
         knots = self._knots
         begun_ns, offset_ns, correction_ns = knots[np.searchsorted(knots[1:, 0], monotonic_ns, side="right")].T
         most_ns = (MAX_SLEW_RATE * np.maximum(monotonic_ns - begun_ns, 0)).astype(np.int64)
@@ -81,5 +80,5 @@ class SlewedClock:
         return offsets
 
     def to_unix_ns(self, monotonic_ns: int) -> int:
-        """Return the Unix time of a monotonic time."""
+        """Convert a monotonic time to Unix time, in nanoseconds."""
         return monotonic_ns + self.unix_offset_ns(monotonic_ns)

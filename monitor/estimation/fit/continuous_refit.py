@@ -58,8 +58,7 @@ from monitor.estimation.fit.least_squares import Q, R, invert_on_subset, nonzero
 REFRESH: Final = 2
 """Minimum number of fits of an axis within one window length."""
 PATIENCE: Final = 64
-"""Minimum number of fits within one window length for an axis without a solution or with a misfit.
-"""
+"""Minimum number of fits within one window length for an axis without a solution or with a misfit."""
 OPTIONS: Final = FitOptions(*THRESHOLDS_WATCHED, full_covariance=False, warm=True)
 """Options of the fits that recompute the linear maps."""
 

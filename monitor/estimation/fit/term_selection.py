@@ -35,8 +35,7 @@ from monitor.estimation.fit.least_squares import (
 )
 
 MAX_THETA_CHANGE: Final = 0.4
-"""Relative change of θ above which the linear map is recomputed, if the change also exceeds ``MAX_THETA_SIGMA``.
-"""
+"""Relative change of θ above which the linear map is recomputed, if the change also exceeds ``MAX_THETA_SIGMA``."""
 MAX_THETA_SIGMA: Final = 1.0
 """Change of θ in standard deviations up to which the linear map is not recomputed."""
 DETECTABLE_SIGMA: Final = 3.0
