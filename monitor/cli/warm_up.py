@@ -27,8 +27,8 @@ def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True
     begun_s = time.monotonic()
     with output.show_progress_bar() as show:
 
-        def report_progress(progress: kernel_compilation.Progress) -> None:
-            show(str(progress), progress.share)
+        def report_progress(progress: kernel_compilation.CompilationProgress) -> None:
+            show(str(progress), progress.compiled_share)
             if not sys.stderr.isatty():
                 typer.echo(progress, err=True)
 

@@ -19,8 +19,8 @@ from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature_effect, temperature_varied
 from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
-from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
-from monitor.estimation.allan.total import TotalCurve, total_curve
+from monitor.estimation.allan.hadamard import HadamardCurve, compute_hadamard_curve
+from monitor.estimation.allan.total import TotalCurve, compute_total_curve
 from monitor.estimation.analysis import RecordingAnalysis, analyze, detect_events
 from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.publishing.plots.allan_figure import additional_deviations
@@ -188,7 +188,7 @@ def _total_and_hadamard(result: RecordingAnalysis, tau: TauGrid) -> tuple[TotalC
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors
     short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]
-    total = total_curve(values, rate_hz, theta, listed)
+    total = compute_total_curve(values, rate_hz, theta, listed)
     if short is not None and not np.size(short):
         return total, None
-    return total, hadamard_curve(values, rate_hz, theta, short)
+    return total, compute_hadamard_curve(values, rate_hz, theta, short)

@@ -36,10 +36,10 @@ def _problems(use: ModelDependentSettings) -> Iterator[str]:
     """Yield the mistakes in the noise model of a device and in the model of a simulated sensor."""
     try:
         if use.model is not None:
-            from monitor.daemon.operations.coefficient_limits import make_bounds
+            from monitor.daemon.operations.coefficient_limits import make_axis_limits
             from monitor.noise.model_loading import read_model
 
-            make_bounds(use.limits, read_model(use.model))
+            make_axis_limits(use.limits, read_model(use.model))
     except ConfigError as error:
         yield from error.lines
     try:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import structlog
 
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.operations.reconcile_on_request import Job, Reconciler
+from monitor.daemon.operations.reconcile_on_request import ReconcileJob, Reconciler
 from monitor.publishing.messages.results import ResetReply
 from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 
@@ -13,7 +13,7 @@ _log = structlog.get_logger("imu-monitor")
 
 
 class CommandHandler:
-    """Executor of the zenoh commands for all devices.
+    """Handler of the zenoh commands for all devices.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class CommandHandler:
         self._reconciler = reconciler
 
     def handle_commands(self, workers: Mapping[str, DeviceWorker]) -> None:
-        """Execute the commands that arrived since the last call, for the workers by device name."""
+        """Execute the commands that have arrived since the last call."""
         while not self._zenoh.commands.empty():
             command = self._zenoh.commands.get_nowait()
             if command.device in workers:
@@ -38,16 +38,15 @@ class CommandHandler:
 
     def publish_reconciled(self, workers: Mapping[str, DeviceWorker]) -> None:
         """Publish an event for each reconciliation that has finished since the last call."""
-        for finished in self._reconciler.take_finished():
+        for finished in self._reconciler.take_finished_reconciliations():
             if finished.device in workers:
                 workers[finished.device].publish_event("reconciled", finished.text)
 
-    def close(self) -> None:
-        """Kill the running reconciliations, and refuse their queries."""
-        self._reconciler.close()
+    def abort_reconciliations(self) -> None:
+        """Kill the running reconciliations, and refuse the pending queries."""
+        self._reconciler.abort_reconciliations()
 
     def _execute(self, command: Command, worker: DeviceWorker) -> None:
-        """Execute and answer one command for a device."""
         match command.verb:
             case "reset":
                 worker.empty_window()
@@ -62,12 +61,12 @@ class CommandHandler:
                 command.reply_refusal(f'unknown command "{other}"; known commands are reset and reconcile')
 
     def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
-        """Start a reconciliation with a copy of the window. A new thread sends the answer."""
+        """Reconcile a copy of the window in the background."""
         window = worker.copy_window_and_temperature()
         if window is None:
             command.reply_refusal("no samples yet")
             return
         received, device = worker.driver.counts.received, worker.device
-        newest_s = worker.timeline.unix_s(worker.pipeline.newest_ns)
-        job = Job(worker.name, newest_s, received, *window, device.model, device.reconcile_folder)
-        self._reconciler.start(job, command)
+        newest_s = worker.timeline.to_unix_s(worker.pipeline.newest_ns)
+        job = ReconcileJob(worker.name, newest_s, received, *window, device.model, device.reconcile_folder)
+        self._reconciler.start_reconciliation(job, command)

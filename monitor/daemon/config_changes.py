@@ -1,11 +1,11 @@
 """Comparison of the running configuration with the configuration file, for a reload without a restart.
 
-This module reads the file and returns the changes. The service applies the changes. Devices are identified by name. If
-the table of a device and its noise model are unchanged, the device continues. If only the limits differ, only the
-limits are replaced. After any other change, the device is stopped and started again.
+The module computes the changes, and the service applies the changes. If the table of a device and the noise model are
+unchanged, the device continues. If only the limits differ, the limits are replaced. After any other change, the device
+is restarted.
 
-The log level and the hooks are replaced as a whole. Changes of all other tables are only reported, because these tables
-take effect at the start of the service. A file with a mistake changes nothing.
+Changes of tables other than devices, hooks and the log level are only reported, because these tables take effect at the
+start of the service. If the file contains an error, the running configuration is kept.
 """
 
 from collections.abc import Mapping
@@ -19,20 +19,20 @@ from monitor.settings import loading
 from monitor.settings.loading import Config, Device
 
 RELOADABLE_TABLES: Final = ("device", "hook", "log")
-"""Tables that can change while the service runs. In ``log``, only the level can change."""
+"""Tables that can change while the service runs."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigChange:
-    """Differences between the running configuration and the file."""
+    """Differences between the running configuration and the configuration file."""
 
     config: Config  # configuration after the reload
-    removed: tuple[str, ...]  # names of removed and changed devices
-    added: tuple[Device, ...]  # added and changed devices
-    limited: tuple[Device, ...]  # devices in which only the limits differ
+    removed: tuple[str, ...]  # names of removed devices and devices to restart
+    added: tuple[Device, ...]  # added devices and devices to restart
+    limited: tuple[Device, ...]  # devices of which only the limits differ
     restart: tuple[str, ...]  # changed tables that take effect only after a restart
 
-    def text(self) -> str:
+    def describe_changes(self) -> str:
         """Return the changes in one sentence."""
         new = {device.name for device in self.added}
         parts = {
@@ -53,9 +53,9 @@ def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) 
     Parameters
     ----------
     running : Config
-        Running configuration, as read from its file.
+        Running configuration.
     models : mapping of str to NoiseModel or None
-        Noise model of each device, as read when the device was started.
+        Noise model that each running device uses.
 
     Returns
     -------
@@ -65,7 +65,7 @@ def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) 
     Raises
     ------
     ConfigError
-        If the file has a mistake, or if the running configuration was not read from a file.
+        If the file contains an error, or if the running configuration was not read from a file.
     """
     if running.path is None:
         raise ConfigError("the running configuration was not read from a file; there is no file to read again")
@@ -86,12 +86,10 @@ def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) 
 
 
 def _by_name(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Return the tables of the devices by name."""
     return {str(one.get("name")): one for one in table.get("device", ())}
 
 
 def _without_limits(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table of a device without its limits."""
     return {key: value for key, value in table.items() if key != "limit"}
 
 

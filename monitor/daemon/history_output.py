@@ -1,4 +1,4 @@
-"""Output that writes the history file of the service, and reads the file for the viewer and for zenoh queries."""
+"""Output that writes results to the history file and answers queries from the history file."""
 
 import time
 from collections import defaultdict
@@ -22,7 +22,7 @@ from monitor.publishing.messages.results import event_start_s
 
 
 class HistoryOutput(Output):
-    """Output that aggregates the results per minute, and writes them with the events to the history file.
+    """Output that writes results per minute and events to the history file.
 
     Parameters
     ----------
@@ -37,15 +37,15 @@ class HistoryOutput(Output):
 
     @property
     def state(self) -> str:
-        """Status message of the writer."""
+        """Status message of the history writer."""
         return self.writer.state
 
     def start(self) -> None:
-        """Start the writer."""
+        """Start the history writer."""
         self.writer.start()
 
     def close(self) -> None:
-        """Store the incomplete minutes of all devices, and close the file."""
+        """Store the incomplete minutes of all devices, and close the history file."""
         for device, minutes in self._minutes.items():
             self.writer.queue_item(device, minutes.flush())
         self.writer.close()
@@ -56,33 +56,33 @@ class HistoryOutput(Output):
         self.writer.queue_item(device, self._minutes[device].add_temperature(unix_s, samples.temperature_c))
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Aggregate the coefficients and the deviations of an estimate."""
+        """Aggregate the coefficients and the Allan deviations of an estimate."""
         if isinstance(result, Estimate):
             self.writer.queue_item(device, self._minutes[device].add_estimate(unix_s, result))
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Store an event."""
-        # SQLite does not accept NumPy scalars, so they are converted to plain numbers
+        """Store an event in the history file."""
+        # SQLite does not accept NumPy scalars
         what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.values.items()}
         sigma, since_s = None if event.sigma is None else float(event.sigma), event_start_s(unix_s, event)
         self.writer.queue_item(device, StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma))
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Aggregate counts and state, once the time of the first sample is known."""
+        """Aggregate the sample counts and the state of a device, if the time of the samples is known."""
         self._received[device] = health.received
         if unix_s is not None:
             self.writer.queue_item(device, self._minutes[device].add_health(unix_s, health))
 
     def remove_device(self, device: str) -> None:
-        """Store the last minute of a removed device."""
+        """Store the incomplete minute of a removed device."""
         self._received.pop(device, None)
         if device in self._minutes:
             self.writer.queue_item(device, self._minutes.pop(device).flush())
 
     # --- reading
 
-    def read_newest(self, device: str, span_s: float) -> HistoryTable | None:
-        """Return the results of the last ``span_s`` seconds of a device, or None if there are no results.
+    def read_recent_history(self, device: str, span_s: float) -> HistoryTable | None:
+        """Return the stored results of the last ``span_s`` seconds of a device, or None if there are no results.
 
         Parameters
         ----------
@@ -95,23 +95,23 @@ class HistoryOutput(Output):
         try:
             with open_history(self.writer.path) as reader:
                 return read_history(reader, device, TimeRange(now_s - span_s, now_s))
-        except (NotReady, RecordingError):  # no results yet; the writer reports errors of the file
+        except (NotReady, RecordingError):  # errors of the file are reported by the writer
             return None
 
     def answer_query(self, device: str, parameters: str) -> bytes:
-        """Return the answer to a zenoh query for the history of a device. Each query has its own thread.
+        """Return the answer to a zenoh query for the history of a device.
 
         Parameters
         ----------
         device : str
             Name of the device.
         parameters : str
-            Parameters of the zenoh selector.
+            Parameters of the query.
 
         Raises
         ------
         ImuError
-            If the query is invalid, or if the history has no data to answer the query.
+            If the query is invalid, or if the history contains no matching data.
         """
         query = parse_query(parameters, time.time())
         with open_history(self.writer.path) as reader:

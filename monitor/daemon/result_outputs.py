@@ -1,4 +1,4 @@
-"""Classes of the outputs of the daemon: zenoh messages, viewer, log lines, and the table in the terminal.
+"""Outputs of the daemon: zenoh messages, viewer, log lines, and the table in the terminal.
 
 ``monitor.daemon.output.Output`` describes the parameters of the methods. ``monitor.publishing.result_kinds`` lists the
 messages and drawings of each kind of result.
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from monitor.publishing.rerun.queued_view import RerunView
 
 PREFIX: Final = "imu"
-"""First part of the keys under which the table in the terminal receives its messages."""
+"""First part of the keys of the messages for the table in the terminal."""
 _log = structlog.get_logger("imu-monitor")
 
 
@@ -65,7 +65,6 @@ class ZenohOutput(Output):
         self._publish_messages(device, unix_s, health.received, health)
 
     def _publish_messages(self, device: str, unix_s: float | None, received: int, result: Any) -> None:
-        """Publish the messages that belong to the kind of a result."""
         for message in kind_of(result).messages:
             self._zenoh.put(message.topic, device, message.from_result(device, unix_s, received, result).encode())
 
@@ -77,7 +76,7 @@ class ViewerOutput(Output):
         self._view = view
 
     def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
-        """Show the measured samples."""
+        """Show the measured samples in the viewer."""
         unix_s = (samples.t_ns + offset_ns) / 1e9
         self._view.put(device, float(unix_s[-1]), SampleRows(unix_s, samples.values, samples.temperature_c))
 
@@ -97,13 +96,13 @@ class ViewerOutput(Output):
         self._view.put(device, unix_s, event)
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Show the status, once the time of the first sample is known, because the viewer has a single time axis."""
+        """Show the status of a device if the present time is known."""
         if unix_s is not None:
             self._view.put(device, unix_s, health)
 
 
 class LogOutput(Output):
-    """Output that writes events and changes of state as log lines."""
+    """Output that writes events and changes of the status as log lines."""
 
     def __init__(self) -> None:
         self._last_status: dict[str, tuple[str, str]] = {}
@@ -113,7 +112,7 @@ class LogOutput(Output):
         _log.info(event.kind, device=device, axis=event.axis, text=event.text)
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Write a log line if the state of the device or the status message has changed."""
+        """Write a log line if the state or the status message of a device has changed."""
         now = (health.state, health.text)
         if self._last_status.get(device) != now:
             self._last_status[device] = now
@@ -121,7 +120,7 @@ class LogOutput(Output):
             write("status", device=device, state=health.state, text=health.text, received=health.received)
 
     def remove_device(self, device: str) -> None:
-        """Forget the state of a removed device, so that a new device with the same name is logged again."""
+        """Remove the stored status of a device."""
         self._last_status.pop(device, None)
 
 
@@ -133,7 +132,7 @@ class TableOutput(Output):
     states : DeviceStates
         Content of the table.
     request_redraw : callable, optional
-        Asks another thread to draw the table. Called once a second for each device.
+        Function that requests another thread to draw the table.
     """
 
     def __init__(self, states: DeviceStates, request_redraw: Callable[[], None] | None = None) -> None:
@@ -142,11 +141,11 @@ class TableOutput(Output):
         self._newest: dict[str, dict[type[Message], tuple[float, int, Any]]] = {}  # results since the last status
 
     def set_viewer_url(self, url: str) -> None:
-        """Show the address of the viewer's web page above the table; "" removes the line."""
+        """Show the URL of the viewer above the table, or remove the line if the URL is ""."""
         self.states.note = f"viewer: {url}" if url else ""
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Keep the newest estimate and the newest comparison with the noise model until the next status."""
+        """Store the newest estimate and the newest comparison with the noise model until the next status."""
         if isinstance(result, Estimate | ModelComparison):
             message: type[Message] = CoefficientsMessage if isinstance(result, Estimate) else ModelGapMessage
             self._newest.setdefault(device, {})[message] = (unix_s, received, result)
@@ -169,5 +168,4 @@ class TableOutput(Output):
         self.states.remove_device(topics.STATUS.key(PREFIX, device))
 
     def _process(self, message: Message) -> None:
-        """Pass a message to the table."""
         self.states.process_message(message.topic.key(PREFIX, message.device), message.encode())

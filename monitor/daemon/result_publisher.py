@@ -1,6 +1,6 @@
 """Publication of the results of one device to all outputs.
 
-The main loop calls the outputs in order. An output never blocks. It has a queue or drops data.
+The main loop calls the outputs, which must not block.
 """
 
 import time
@@ -26,13 +26,13 @@ from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings.loading import Device
 
 MAX_BATCH_S: Final = 0.1
-"""Longest time for which samples are collected into one batch."""
+"""Maximum duration of a batch of samples in seconds."""
 TOTAL_INTERVAL_S: Final = 0.1
-"""Shortest interval between two steps of the total and Hadamard deviations."""
+"""Minimum interval between two steps of the total and Hadamard deviations."""
 TOTAL_CPU_SHARE: Final = 0.005
-"""Largest share of one processor for the total and Hadamard deviations of a device."""
+"""Maximum fraction of one processor for the total and Hadamard deviations of a device."""
 INTERPRETED_REFIT_S: Final = 1.0
-"""Minimum time between two fits with interpreted kernels, because the compilation needs the processors."""
+"""Minimum interval between two fits with interpreted kernels."""
 
 
 class ResultPublisher:
@@ -43,7 +43,7 @@ class ResultPublisher:
     device : Device
         Settings of the device.
     driver : Driver
-        Driver of the device, which counts the received samples.
+        Driver of the device.
     pipeline : DevicePipeline
         Pipeline that computes the results.
     limits : LimitMonitor
@@ -71,7 +71,7 @@ class ResultPublisher:
         self.published = 0
         """Number of published samples."""
         self.withholds_coefficients = False
-        """True while coefficients are withheld, because the sample rate is in doubt."""
+        """True while coefficients are withheld because the sample rate is uncertain."""
         self._agreement = ModelAgreementMonitor()
         self._batch: list[SampleBlock] = []  # samples that are not published yet
         self._refitted = False  # True if the fit was updated since the last publication
@@ -83,16 +83,16 @@ class ResultPublisher:
                 output.publish_event(self.device.name, self._unix_s(event.t_ns), self._received, event)
 
     def publish_samples_if_due(self, blocks: Sequence[SampleBlock]) -> bool:
-        """Collect new samples, and publish the collected batch if it is due; return True if it was published."""
+        """Add samples to the batch, and publish the batch if it is due; return True if it was published."""
         self._batch += blocks
         interval_s = min(self.device.publish_s, MAX_BATCH_S)
-        if not self._batch or not self.schedule.claim("samples", interval_s):
+        if not self._batch or not self.schedule.claim_if_due("samples", interval_s):
             return False
         batch, self._batch = self._batch, []
         compensation = self.pipeline.compensation
         for samples in merge_contiguous_blocks(batch):
             self.published += len(samples)
-            offsets_ns = self.timeline.offsets_ns(samples)
+            offsets_ns = self.timeline.unix_offsets_ns(samples)
             for output in self.outputs:
                 output.publish_samples(self.device.name, self.published, samples, offsets_ns)
             if compensation is not None and np.isfinite(samples.values[:, :3]).any():
@@ -100,9 +100,13 @@ class ResultPublisher:
         return True
 
     def publish_estimate_if_due(self) -> bool:
-        """Update the fit if it is due, and publish the estimate if it is due; return True if it was published."""
+        """Update the fit and publish the estimate if they are due; return True if the estimate was published."""
         self._refit()
-        if self.latest is None or not self._refitted or not self.schedule.claim("publish", self.device.publish_s):
+        if (
+            self.latest is None
+            or not self._refitted
+            or not self.schedule.claim_if_due("publish", self.device.publish_s)
+        ):
             return False
         self._refitted = False
         self._result(self.latest.t_ns, self.latest)
@@ -124,7 +128,7 @@ class ResultPublisher:
             self._result(self.pipeline.newest_ns, TotalAndHadamardCurves(*deviations))
 
     def publish_thermal_intervals(self) -> None:
-        """Publish the thermal intervals that were completed since the last call."""
+        """Publish the thermal intervals that have been completed since the last call."""
         for interval in self.pipeline.take_thermal_intervals():
             self._result(interval.t_ns, interval)
 
@@ -133,22 +137,21 @@ class ResultPublisher:
         return self.driver.counts.received
 
     def _unix_s(self, t_ns: int) -> float:
-        return self.timeline.unix_s(t_ns)
+        return self.timeline.to_unix_s(t_ns)
 
     def _result(self, t_ns: int, result: Any) -> None:
-        """Publish a result with the sample time ``t_ns``."""
         for output in self.outputs:
             output.publish_result(self.device.name, self._unix_s(t_ns), self._received, result)
 
     def _compensated(self, live: LiveCompensation, samples: SampleBlock) -> None:
-        """Publish samples without gyroscope drift, and the state of the drift compensation."""
+        """Publish samples after drift compensation, and the state of the drift compensation."""
         at = 0
         while at < len(samples):
             piece = samples[at : at + live.compensator.samples_to_interval_end]
             at += len(piece)
             compensated = live.compensate_block(piece)
             self.pipeline.update_drift_models()
-            offsets_ns = self.timeline.offsets_ns(compensated)
+            offsets_ns = self.timeline.unix_offsets_ns(compensated)
             for output in self.outputs:
                 output.publish_compensated_samples(
                     self.device.name, self.published - len(samples) + at, compensated, offsets_ns
@@ -157,14 +160,13 @@ class ResultPublisher:
             self._result(drift.t_ns, drift)
 
     def _refit(self) -> None:
-        """Update the fit and the newest estimate, if a refit is due."""
-        # with a refit at every sample, ``get`` is called only for a publication, because ``get`` empties the history
+        # with a refit at every sample, ``get`` empties the history, so ``get`` is only called for a publication
         interval_s = self.device.refit_s or self.device.publish_s
         pipeline = self.pipeline
-        if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim("refit", interval_s):
+        if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim_if_due("refit", interval_s):
             return
         fitted = pipeline.fit_kernels_ready
-        pipeline.advanced = not fitted  # a curve without coefficients is fitted as soon as the kernels are ready
+        pipeline.advanced = not fitted  # the curve is fitted as soon as the kernels are ready
         try:
             latest = pipeline.estimator.get_estimate(fit_coefficients=fitted)
         except NotReady:
@@ -175,7 +177,6 @@ class ResultPublisher:
         self._refitted = True
 
     def _model_gap(self, gap: ModelComparison) -> None:
-        """Publish the comparison of the window with the noise model, and the resulting events."""
         if self.withholds_coefficients:
             gap = replace(gap, axes={})
         events = self._agreement.update_decisions(gap)

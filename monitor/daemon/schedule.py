@@ -6,7 +6,7 @@ Task = Literal["refit", "publish", "samples", "total", "thermal"]
 
 
 class Schedule:
-    """Time of the next run of each periodic task of one device, on the monotonic clock."""
+    """Schedule of the periodic tasks of one device, on the monotonic clock."""
 
     def __init__(self) -> None:
         self._next_s: dict[Task, float] = {}
@@ -21,7 +21,7 @@ class Schedule:
         now_s : float
             Present time on the monotonic clock, in seconds.
         drain : bool
-            True if all results are published in this round, because the device stops.
+            True if all tasks run in this round, because the device stops.
         """
         self._now_s, self._drain = now_s, drain
 
@@ -29,8 +29,8 @@ class Schedule:
         """Return True if a task is due in this round."""
         return self._now_s >= self._next_s.get(task, 0.0)
 
-    def claim(self, task: Task, interval_s: float) -> bool:
-        """Return True if a task is to run in this round, and schedule its next run.
+    def claim_if_due(self, task: Task, interval_s: float) -> bool:
+        """Return True if a task must run in this round, and schedule the next run.
 
         Parameters
         ----------
@@ -41,7 +41,7 @@ class Schedule:
         """
         if not self.is_due(task):
             return self._drain
-        # keep the interval, but do not catch up after a pause
+        # missed runs after a pause are skipped
         self._next_s[task] = max(self._next_s.get(task, 0.0) + interval_s, self._now_s + 0.5 * interval_s)
         return True
 

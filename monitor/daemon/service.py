@@ -1,13 +1,10 @@
 """Main service of the daemon: starts the device workers and outputs, runs the main loop, and stops.
 
-In each round, ``Service.loop`` calls every device worker. The worker takes the new samples, updates the estimate and
-publishes the results. Between two rounds, the loop sleeps until a reader thread has pushed samples.
+In each round, ``Service.run_main_loop`` calls every device worker, which processes the new samples and publishes the
+results. If an output fails, the status of every device reports the problem, and sampling continues. systemd receives
+the readiness message after the first attempt to start each output.
 
-If an output cannot start or is too slow, the status of every device reports this problem, and sampling continues.
-systemd receives the readiness message as soon as the service has tried to start every output.
-
-To stop, the service first stops the readers. It then processes and publishes the samples that are left in the ring
-buffers, and finally closes the outputs.
+To stop, the service stops the readers, processes the remaining samples, and closes the outputs.
 """
 
 import sys
@@ -49,15 +46,15 @@ if TYPE_CHECKING:
 MAX_IDLE_S: Final = 0.05
 """Longest sleep of the main loop if no samples arrive."""
 ROUND_PAUSE_S: Final = 0.02
-"""Pause between two rounds if no device is configured to publish every block."""
+"""Pause between two rounds if no device publishes every block."""
 STATUS_INTERVAL_S: Final = 1.0
 """Interval of the status messages."""
 STARTING_STATES: Final = ("not open yet", "starting")
 """States of an output before the first attempt to start it."""
 READY_TIMEOUT_S: Final = 30.0
-"""After this time the service reports readiness to systemd, even if an output has not been tried yet."""
+"""Time after which readiness is reported to systemd, even if an output has not been started."""
 JOIN_TIMEOUT_S: Final = 3.0
-"""Longest wait for a reader thread to end."""
+"""Longest wait for the end of a reader thread."""
 
 _log = structlog.get_logger("imu-monitor")
 
@@ -70,18 +67,18 @@ class Service:
     config : Config
         Configuration to run.
     more : sequence of Output, optional
-        Further outputs, for example the table in the terminal.
+        Additional outputs, for example the table in the terminal.
     reconciler : Reconciler, optional
-        Executes ``command/reconcile``. By default a new ``Reconciler``.
+        Runner of ``command/reconcile``.
     unit : SystemdNotifier, optional
-        Sends messages to systemd. By default no message is sent.
+        Notifier of systemd. By default, no message is sent.
     writers : mapping of str to QueuedWriter, optional
-        Text outputs by name, such as "terminal" and "log". The status contains the states of these outputs.
+        Text outputs by name, such as "terminal" and "log".
 
     Raises
     ------
     ConfigError
-        If a simulated sensor or a model in force cannot be used.
+        If the settings of a simulated sensor or a noise model are invalid.
     """
 
     def __init__(
@@ -109,7 +106,7 @@ class Service:
         self.zenoh = ZenohPublisher(config.zenoh, [worker.name for worker in self.workers], answer_query)
         self._commands = CommandHandler(self.zenoh, reconciler or Reconciler())
         self.viewer = _build_view(config, self._read_viewer_history)
-        self._viewer_url = ""  # address of the viewer's web page that was announced last
+        self._viewer_url = ""  # last announced URL of the web viewer
         self.hooks = Hooks(config.hooks, self.zenoh.publish_json_return_error)
         self.metrics = _build_metrics_output(config)
         self.outputs += [ZenohOutput(self.zenoh), self.hooks, *more]
@@ -121,26 +118,25 @@ class Service:
             self.outputs.append(self.history)
 
     def request_stop(self) -> None:
-        """Request the end of the main loop. Any thread may call this method."""
+        """Request the end of the main loop, from any thread."""
         self._stop.set()
         self._wake.set()
 
     def request_reload(self) -> None:
-        """Request that the main loop reads the configuration file again. Any thread may call this method."""
+        """Request a reload of the configuration file, from any thread."""
         self._reload_asked = True
         self._wake.set()
 
     def run(self, seconds: float | None = None) -> None:
-        """Run the service for a number of seconds, by default until ``request_stop`` or the end of all replays."""
-        threading.Thread(target=self._ready.compile, args=(self._wake,), name="warm-up", daemon=True).start()
+        """Run the service until ``request_stop``, the end of all replays, or a number of seconds has passed."""
+        threading.Thread(target=self._ready.compile_kernels, args=(self._wake,), name="warm-up", daemon=True).start()
         try:
             self._start()
-            self.loop(None if seconds is None else time.monotonic() + seconds)
+            self.run_main_loop(None if seconds is None else time.monotonic() + seconds)
         finally:
             self._close()
 
     def _start(self) -> None:
-        """Start all outputs, devices and background threads."""
         for output in (self.history, self.zenoh, self.metrics, self.viewer):
             if output is not None:
                 output.start()
@@ -150,7 +146,7 @@ class Service:
             self.recorder.start()
             threading.Thread(target=self._rebuild_windows, args=(self.workers,), name="rebuild", daemon=True).start()
 
-    def loop(self, until_s: float | None) -> None:
+    def run_main_loop(self, until_s: float | None) -> None:
         """Process the samples of all devices in rounds, and publish the status once a second.
 
         The loop ends after ``request_stop``, at the end of all replays, or at the monotonic time ``until_s``.
@@ -178,13 +174,12 @@ class Service:
                 self._stop.wait(ROUND_PAUSE_S)
 
     def _work_devices(self, now_s: float) -> None:
-        """Process the new samples of every device, and announce the running devices on zenoh."""
         for worker in self.workers:
             worker.process_new_samples(now_s)
             self.zenoh.set_alive(worker.name, worker.driver.state == "running")
 
     def output_states(self) -> dict[str, str]:
-        """Return the state of each output by its name: "ok", or a text that describes the problem."""
+        """Return the state of each output by name: "ok", or a description of the problem."""
         outputs = {
             "zenoh": self.zenoh,
             "viewer": self.viewer,
@@ -197,26 +192,23 @@ class Service:
         return {name: output.state for name, output in outputs.items() if output is not None}
 
     def _read_viewer_history(self, device: str) -> HistoryTable | None:
-        """Return the stored results that the viewer shows when it opens, or None if there are none.
+        """Return the stored results that the viewer shows at the start, or None if there are no results.
 
-        The thread of the viewer calls this function. For a device with its own time stamps, such as a replayed
-        recording, the function returns None.
+        Results of a device with its own time stamps, such as a replayed recording, are not shown.
         """
         history_s = self.config.viewer.history
         self_timed = any(worker.name == device and worker.driver.times_are_unix for worker in self.workers)
         if self.history is None or history_s is None or self_timed:
             return None
         assert isinstance(history_s, float)
-        return self.history.read_newest(device, history_s)
+        return self.history.read_recent_history(device, history_s)
 
     def _rebuild_windows(self, workers: Sequence[DeviceWorker]) -> None:
-        """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
         self._ready.all.wait()
         for worker in workers:
             worker.rebuild_window()
 
     def _build_worker(self, device: Device) -> DeviceWorker:
-        """Build the worker of a device, with the simulated sensor if there is one, without opening anything."""
         link, simulated = device.link, None
         if isinstance(link, VirtualTable):
             from monitor.simulator import SimulatedDevice
@@ -228,8 +220,8 @@ class Service:
     # --- reload of the configuration
 
     def _reload(self) -> None:
-        """Read the configuration file again and apply the changes. A file with a mistake changes nothing."""
-        self._unit.reloading()
+        """Read the configuration file again, and apply the changes if the file contains no error."""
+        self._unit.send_reloading()
         try:
             change = reload.compare_with_file(self.config, {worker.name: worker.model for worker in self.workers})
             built = [self._build_worker(device) for device in change.added]
@@ -237,19 +229,18 @@ class Service:
             _log.error("not reloaded, the running configuration stays in force", error=str(error))
         else:
             self._apply(change, built)
-            (_log.warning if change.restart else _log.info)("reloaded", text=change.text())
+            (_log.warning if change.restart else _log.info)("reloaded", text=change.describe_changes())
         if self._unit.ready_sent:
-            self._unit.ready()
+            self._unit.send_ready()
 
     def _apply(self, change: ConfigChange, built: Sequence[DeviceWorker]) -> None:
-        """Stop the removed devices, replace the changed limits, and start the added devices."""
         leaving = [worker for worker in self.workers if worker.name in change.removed]
         for worker in leaving:
-            worker.stop()  # all readers stop at the same time, because each may take a moment
+            worker.stop()  # all readers stop in parallel
         for worker in leaving:
             self._remove(worker)
         for device in change.limited:
-            next(worker for worker in self.workers if worker.name == device.name).set_limits(device)
+            next(worker for worker in self.workers if worker.name == device.name).replace_limits(device)
         self.config = change.config
         self.hooks.hooks = change.config.hooks
         set_log_level(change.config.log.level)
@@ -261,7 +252,6 @@ class Service:
             self._start_added(worker)
 
     def _start_added(self, worker: DeviceWorker) -> None:
-        """Start an added device while the other devices continue."""
         self.zenoh.add_device(worker.name)
         if self.recorder is not None:
             self.recorder.add_recordings(_segment_origins(self.config.storage, worker.device))
@@ -270,8 +260,8 @@ class Service:
             threading.Thread(target=self._rebuild_windows, args=([worker],), name="rebuild", daemon=True).start()
 
     def _remove(self, worker: DeviceWorker) -> None:
-        """Remove a stopped device and publish its remaining samples, while the other devices continue."""
-        if not self._work_until(lambda: worker.join(0.0) and not worker.restore.active):
+        """Publish the remaining samples of a stopped device and remove the device, while other devices continue."""
+        if not self._work_until(lambda: worker.join_reader_thread(0.0) and not worker.restore.active):
             _log.warning("reader did not end in time", device=worker.name)
         worker.process_new_samples(time.monotonic(), drain=True)
         self.workers = [one for one in self.workers if one is not worker]
@@ -283,7 +273,9 @@ class Service:
             output.remove_device(worker.name)
 
     def _work_until(self, done: Callable[[], bool]) -> bool:
-        """Process all devices until ``done`` returns True, or for JOIN_TIMEOUT_S; return the last value of ``done``."""
+        """Process all devices until ``done`` returns True or JOIN_TIMEOUT_S has passed; return the value of
+        ``done``.
+        """
         until_s = time.monotonic() + JOIN_TIMEOUT_S
         while not (ended := done()) and time.monotonic() < until_s:
             self._work_devices(time.monotonic())
@@ -293,7 +285,6 @@ class Service:
     # --- status and commands
 
     def _publish_status(self) -> None:
-        """Publish the status of all devices, and notify systemd."""
         self._publish_recorder_events()
         states, memory = self.output_states(), _measure_memory_bytes()
         self._announce_viewer_url()
@@ -301,26 +292,24 @@ class Service:
         self._notify_systemd(healths, states)
 
     def _notify_systemd(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
-        """Send the readiness, the overall status and the watchdog message to systemd."""
         now_s = time.monotonic()
         tried = (
             not any(state in STARTING_STATES for state in states.values()) or now_s - self._started_s > READY_TIMEOUT_S
         )
         if tried and not self._unit.ready_sent:
-            self._unit.ready()
+            self._unit.send_ready()
         turns = {worker.name: worker.read_attempts for worker in self.workers}
         stuck = self._unit.send_watchdog({name: count for name, count in turns.items() if count is not None}, now_s)
-        self._unit.status(format_service_status(healths, states, stuck))
+        self._unit.send_status(format_service_status(healths, states, stuck))
 
     def _publish_recorder_events(self) -> None:
-        """Publish the events of the recorder as events of the devices."""
         workers = {worker.name: worker for worker in self.workers}
         for event in self.recorder.take_events() if self.recorder is not None else ():
             if event.device in workers:
                 workers[event.device].publish_event(event.kind, event.text)
 
     def _announce_viewer_url(self) -> None:
-        """Log the address of the viewer's web page each time it changes. A viewer in a window has no address."""
+        """Log the URL of the web viewer each time the URL changes."""
         url = self.viewer.url if self.viewer is not None else ""
         page = url if url.startswith("http://") else ""
         if page == self._viewer_url:
@@ -333,27 +322,25 @@ class Service:
                 output.set_viewer_url(page)
 
     def _close(self) -> None:
-        """Stop the devices, publish their remaining samples, and close all outputs."""
-        self._unit.stopping()
+        self._unit.send_stopping()
         try:
             self._drain()
         finally:
-            self._commands.close()
+            self._commands.abort_reconciliations()
             self._commands.publish_reconciled({worker.name: worker for worker in self.workers})
             for output in (self.recorder, self.hooks, self.metrics, self.viewer, self.zenoh, self.history):
                 if output is not None:
                     output.close()
 
     def _drain(self) -> None:
-        """Stop the readers, and publish the samples that are still in the ring buffers."""
         for worker in self.workers:
             worker.stop()
         if any(worker.waits_for_all for worker in self.workers):
-            self._ready.all.wait()  # the samples of these devices are still in the ring buffer
+            self._ready.all.wait()  # the samples are still in the ring buffer
         for worker in self.workers:
             until_s = time.monotonic() + JOIN_TIMEOUT_S
-            while not (ended := worker.join(ROUND_PAUSE_S)) and time.monotonic() < until_s:
-                worker.process_new_samples(time.monotonic())  # a replay waits for space in its ring buffer
+            while not (ended := worker.join_reader_thread(ROUND_PAUSE_S)) and time.monotonic() < until_s:
+                worker.process_new_samples(time.monotonic())  # a replay waits for space in the ring buffer
             if not ended:
                 _log.warning("reader did not end in time", device=worker.name)
             worker.process_new_samples(time.monotonic(), drain=True)
@@ -362,14 +349,13 @@ class Service:
 
 
 def _build_recorder(config: Config) -> Recorder | None:
-    """Return the recorder of the service, or None if nothing is to be recorded."""
     storage = config.storage
     origins = [one for device in config.devices for one in _segment_origins(storage, device)]
     return Recorder(storage, origins) if storage is not None and origins else None
 
 
 def _segment_origins(storage: Storage | None, device: Device) -> list[SegmentMetadata]:
-    """Return the recordings to write for a device: samples, raw bytes, both, or none for a replay."""
+    """Return the metadata of the recordings to write for a device, or an empty list for a replay."""
     if storage is None or isinstance(device.link, ReplayLink):
         return []
     origins = [segment_metadata(device.name, device.axes)] if storage.record else []
@@ -379,18 +365,16 @@ def _segment_origins(storage: Storage | None, device: Device) -> list[SegmentMet
 
 
 def _measure_memory_bytes() -> int:
-    """Return the resident memory of this process, in bytes."""
     import resource  # missing on Windows
 
     try:
         return int(Path("/proc/self/statm").read_text("ascii").split()[1]) * resource.getpagesize()
-    except OSError:  # outside Linux only the peak is available
+    except OSError:  # only the peak is available outside Linux
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak if sys.platform == "darwin" else peak * 1024
 
 
 def _build_metrics_output(config: Config) -> "MetricsOutput | None":
-    """Return the output for Prometheus, or None if it is not configured."""
     if config.metrics is None:
         return None
     from monitor.daemon.operations.prometheus_metrics import (
@@ -401,7 +385,6 @@ def _build_metrics_output(config: Config) -> "MetricsOutput | None":
 
 
 def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) -> "RerunView | None":
-    """Return the Rerun view, or None if the viewer is off."""
     if config.viewer.mode == "none":
         return None
     from monitor.publishing.rerun.queued_view import RerunView
@@ -413,7 +396,6 @@ def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) ->
 
 
 def _device_infos(devices: Sequence[Device]) -> list[DeviceInfo]:
-    """Return the descriptions of the devices for the viewer."""
     return [
         DeviceInfo(
             device.name,

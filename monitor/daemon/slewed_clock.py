@@ -1,8 +1,7 @@
 """Unix time of samples, from the monotonic clock, slewed towards the host clock.
 
-NTP or an operator may set the host clock. To avoid a gap in a recording, the Unix time of the samples then approaches
-the host clock gradually. The offset between Unix time and monotonic time is a continuous, piecewise linear function of
-the monotonic time. Its slope is at most MAX_SLEW_RATE, so the Unix times increase from sample to sample.
+If the host clock is set, the Unix time of the samples approaches the host clock gradually. The slope of the correction
+is at most MAX_SLEW_RATE, so the Unix times increase from sample to sample.
 """
 
 from typing import Final
@@ -12,13 +11,13 @@ import numpy as np
 from drivers.data_types import Ints
 
 MAX_SLEW_RATE: Final = 5e-4
-"""Maximum rate of a correction, 0.5 ms per second."""
+"""Maximum rate of a correction, which is 0.5 ms per second."""
 MAX_KNOTS: Final = 100
-"""Number of kept corrections. With one correction per second, samples of the last minute can be converted."""
+"""Number of stored corrections. Samples of the last minute can be converted with one correction per second."""
 
 
 class SlewedClock:
-    """Conversion of monotonic time to Unix time, in nanoseconds.
+    """Clock that converts monotonic time to slewed Unix time, in nanoseconds.
 
     Parameters
     ----------
@@ -28,11 +27,11 @@ class SlewedClock:
     Examples
     --------
     >>> clock = SlewedClock(monotonic_ns=5_000_000_000, unix_ns=1_700_000_000_000_000_000)
-    >>> clock.unix_ns(6_000_000_000)
+    >>> clock.to_unix_ns(6_000_000_000)
     1700000001000000000
     >>> clock.slew_and_return_host_step(6_000_000_000, 1_700_000_003_000_000_000)  # set forward by 2 s
     2000000000
-    >>> clock.unix_ns(7_000_000_000)
+    >>> clock.to_unix_ns(7_000_000_000)
     1700000002000500000
     """
 
@@ -46,12 +45,12 @@ class SlewedClock:
         self._knots: Ints = np.array([[monotonic_ns, self._host_ns, 0]], np.int64)
 
     @property
-    def behind_ns(self) -> int:
-        """Time by which the slewed Unix time is behind the host clock, in nanoseconds."""
-        return self._host_ns - self.offset_ns(self._slewed_at_ns)
+    def lag_behind_host_ns(self) -> int:
+        """Time in nanoseconds by which the slewed Unix time lags behind the host clock."""
+        return self._host_ns - self.unix_offset_ns(self._slewed_at_ns)
 
     def slew_and_return_host_step(self, monotonic_ns: int, unix_ns: int) -> int:
-        """Start to slew towards the host clock. This method is called about once a second.
+        """Start to slew towards the host clock, and return the last step of the host clock.
 
         Returns
         -------
@@ -62,24 +61,24 @@ class SlewedClock:
         begun_ns, offset_ns, correction_ns = self._knots[-1].tolist()
         self._slewed_at_ns = max(monotonic_ns, begun_ns)
         if offset_ns + correction_ns != self._host_ns:
-            now_ns = self.offset_ns(self._slewed_at_ns)
+            now_ns = self.unix_offset_ns(self._slewed_at_ns)
             knot = np.array([[self._slewed_at_ns, now_ns, self._host_ns - now_ns]], np.int64)
             kept = self._knots[:-1] if self._slewed_at_ns == begun_ns else self._knots
             self._knots = np.concatenate([kept[1 - MAX_KNOTS :], knot])
         return self._host_ns - before_ns
 
-    def offset_ns(self, monotonic_ns: int) -> int:
-        """Return the difference between Unix time and monotonic time at a monotonic time."""
-        return int(self.offsets_ns(np.array([monotonic_ns], np.int64))[0])
+    def unix_offset_ns(self, monotonic_ns: int) -> int:
+        """Return the offset from a monotonic time to the Unix time, in nanoseconds."""
+        return int(self.unix_offsets_ns(np.array([monotonic_ns], np.int64))[0])
 
-    def offsets_ns(self, monotonic_ns: Ints) -> Ints:
-        """Return the difference between Unix time and monotonic time at each monotonic time [n]."""
+    def unix_offsets_ns(self, monotonic_ns: Ints) -> Ints:
+        """Return the offsets [n] from monotonic times to Unix times, in nanoseconds."""
         knots = self._knots
         begun_ns, offset_ns, correction_ns = knots[np.searchsorted(knots[1:, 0], monotonic_ns, side="right")].T
         most_ns = (MAX_SLEW_RATE * np.maximum(monotonic_ns - begun_ns, 0)).astype(np.int64)
         offsets: Ints = offset_ns + np.clip(correction_ns, -most_ns, most_ns)
         return offsets
 
-    def unix_ns(self, monotonic_ns: int) -> int:
-        """Return the Unix time of a monotonic time."""
-        return monotonic_ns + self.offset_ns(monotonic_ns)
+    def to_unix_ns(self, monotonic_ns: int) -> int:
+        """Convert a monotonic time to Unix time, in nanoseconds."""
+        return monotonic_ns + self.unix_offset_ns(monotonic_ns)

@@ -21,8 +21,8 @@ from monitor.estimation.allan.batch import (
     TauGrid,
     cluster_sizes,
     overlapping_avar,
+    rate_slope_from_thirds,
     rate_slope_per_tau,
-    slope_of_recording,
 )
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
@@ -30,14 +30,14 @@ from monitor.estimation.detection.change_detection import Change, ChangeDetector
 from monitor.estimation.detection.line_and_outlier_detection import detect_spectral_lines, outlier_share_of_axes
 from monitor.estimation.detection.motion_detection import Motion, detect_motion
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
-    apply_low_passes,
     find_low_pass,
-    is_contradicted,
+    is_contradicted_by_curve,
     power_spectrum,
+    refit_with_low_passes,
 )
 from monitor.estimation.regular_grid import resample_to_grid
 
@@ -183,17 +183,17 @@ def _fit_curve(
 ) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
     n = len(values)
     avar, terms = overlapping_avar(values, factors, each)
-    columns, covariances = make_design(factors, rate_hz), covariance_table(n, factors)
+    columns, covariances = make_design_matrix(factors, rate_hz), covariance_table(n, factors)
     measured = MeasuredCurve(
-        avar, terms, slope_of_recording(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
+        avar, terms, rate_slope_from_thirds(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
     )
-    found = fit(columns, covariances, measured)
+    found = fit_coefficients(columns, covariances, measured)
     filters = [
-        find_low_pass(columns, covariances, measured.axis(axis), power_spectrum(values[:, axis]))
-        if is_contradicted(found, axis)
+        find_low_pass(columns, covariances, measured.select_axis(axis), power_spectrum(values[:, axis]))
+        if is_contradicted_by_curve(found, axis)
         else None
         for axis in range(values.shape[1])
     ]
-    found, filters = apply_low_passes(columns, covariances, measured, found, filters)
+    found, filters = refit_with_low_passes(columns, covariances, measured, found, filters)
     lo, hi = deviation_intervals(avar, found.edf)
     return AllanCurve(factors / rate_hz, factors, avar, terms, found.edf, lo, hi, n), found, filters

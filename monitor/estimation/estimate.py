@@ -40,7 +40,9 @@ class Estimate:
     fitted: Floats  # [m, 6] Allan variance of the fitted model; NaN without a fit or at excluded averaging times
     coefficients: Coefficients
     k_or_r: NDArray[np.bool_]  # [6] True if rate random walk and rate ramp cannot be distinguished
-    display_curve: AllanCurve | None = None  # Allan curve of the newest samples, see ``window.display_spans``
+    display_curve: AllanCurve | None = (
+        None  # Allan curve of the newest samples, see ``window.samples_per_displayed_tau``
+    )
     history: PerSampleCoefficients | None = (
         None  # coefficients since the previous estimate, if computed after every sample
     )

@@ -24,16 +24,23 @@ from monitor.estimation.allan.uncertainty import (
     PerTauSpanDegreesOfFreedom,
     deviation_intervals,
 )
-from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, display_spans
+from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, samples_per_displayed_tau
 from monitor.estimation.estimate import Estimate, PerSampleCoefficients, concatenate_coefficients
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, empty_fit, fit, make_design
+from monitor.estimation.fit.coefficient_fit import (
+    Fit,
+    MeasuredCurve,
+    concatenate_fits,
+    empty_fit,
+    fit_coefficients,
+    make_design_matrix,
+)
 from monitor.estimation.fit.continuous_refit import ContinuousRefit
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
-    apply_low_passes,
-    is_contradicted,
+    is_contradicted_by_curve,
     power_spectrum,
-    search_low_pass,
+    refit_with_low_passes,
+    search_low_pass_in_steps,
 )
 from monitor.estimation.window_snapshot import WindowSnapshot, copy_window
 
@@ -72,13 +79,13 @@ class Estimator:
         length = min(max(round(window_s * rate_hz), MIN_LENGTH), MAX_LENGTH)
         self.window_s = length / rate_hz
         factors = cluster_sizes(length, rate_hz, tau)
-        spans = display_spans(factors, rate_hz, length)
+        spans = samples_per_displayed_tau(factors, rate_hz, length)
         self._m = factors.size
         # The first m rows are used for the fit, and the other m rows for the display.
         rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
-        self._design = make_design(factors, rate_hz)
+        self._design = make_design_matrix(factors, rate_hz)
         self._tables = AxisCovarianceTables(factors, length)
         self._spans = PerTauSpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
@@ -120,11 +127,11 @@ class Estimator:
         if samples.lost > self._window.length:
             self.empty_window()
         elif samples.lost:
-            self._window.skip(samples.lost)
+            self._window.append_missing_samples(samples.lost)
             self._lengths += samples.lost
         np.minimum(self._lengths, self._window.samples_in_window, out=self._lengths)
         if self._refit is None:
-            self._window.update(samples.values)
+            self._window.append_samples(samples.values)
             self._lengths += len(samples)
         else:
             self._history.append(
@@ -140,11 +147,11 @@ class Estimator:
 
     def empty_window(self) -> None:
         """Remove all samples from the window."""
-        self._window.reset()
+        self._window.discard_samples()
         self._lengths[:], self._theta[:] = 0, np.nan
         self._entered[:] = False
         if self._refit is not None:
-            self._refit.reset()
+            self._refit.restart_all_fits()
 
     def restart_axis(self, axis: int, samples_to_keep: int) -> None:
         """Discard old samples of one axis after a change of the noise.
@@ -160,14 +167,14 @@ class Estimator:
         self._lengths[axis] = min(samples_to_keep, self._lengths[axis])
         self._entered[:, axis], self._theta[:, axis] = False, np.nan
         if self._refit is not None:
-            self._refit.restart(axis)
+            self._refit.restart_fit_of_axis(axis)
 
     def fit_state(self) -> tuple[NDArray[np.bool_], Floats]:
         """Return the fitted noise terms and the squared coefficients in SI units.
 
         Both arrays have the shape (5, 6). ``restore_fit`` accepts both arrays.
         """
-        return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
+        return (self._entered if self._refit is None else self._refit.terms_in_fit).copy(), self._theta.copy()
 
     def restore_fit(self, terms_in_fit: NDArray[np.bool_], theta: Floats) -> None:
         """Continue with a fit from before a restart of the program.
@@ -194,7 +201,7 @@ class Estimator:
         """
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
-        self._design = make_design(self._factors, rate_hz)
+        self._design = make_design_matrix(self._factors, rate_hz)
 
     def get_estimate(self, fit_coefficients: bool = True) -> Estimate:
         """Return the Allan deviations of the window and the fitted noise coefficients.
@@ -212,7 +219,7 @@ class Estimator:
         n = self._window.samples_in_window
         if n < MIN_SAMPLES:
             raise NotReady(f"{n} of at least {MIN_SAMPLES} samples")
-        avar, terms = self._window.avar(), self._window.terms()
+        avar, terms = self._window.avar(), self._window.term_counts()
         own, recent = slice(0, self._m), slice(self._m, None)
         result = self._fit(avar[own], terms[own]) if fit_coefficients else empty_fit(avar[own])
         curve = self._curve(avar[own], terms[own], result.edf, n)
@@ -235,10 +242,10 @@ class Estimator:
             Total and Hadamard deviations if the step completes the computation, otherwise None.
         """
         rounds = self._total_hadamard.rounds
-        self._total_hadamard.step()
+        self._total_hadamard.compute_next_tau()
         self._step_low_pass_search()
         return (
-            self._total_hadamard.get(self.rate_hz, np.where(self._entered, self._theta, 0.0))
+            self._total_hadamard.curves_of_last_round(self.rate_hz, np.where(self._entered, self._theta, 0.0))
             if self._total_hadamard.rounds > rounds
             else None
         )
@@ -246,25 +253,27 @@ class Estimator:
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
         """Fit restarted axes separately, because the covariances depend on the number of samples."""
         lengths = np.minimum(self._lengths, self._window.samples_in_window)
-        slope, slopes = self._window.slopes_of_axes_and_taus(lengths)
-        before = self._entered if self._refit is None else self._refit.entered
+        slope, slopes = self._window.rate_slopes_per_axis_and_tau(lengths)
+        before = self._entered if self._refit is None else self._refit.terms_in_fit
         shorter = [axis for axis in range(len(lengths)) if lengths[axis] < self._window.samples_in_window]
         groups = [np.flatnonzero(lengths == self._window.samples_in_window), *(np.array([axis]) for axis in shorter)]
         groups = [axes for axes in groups if axes.size]
         fits = []
         for axes in groups:
             n = int(lengths[axes[0]])
-            table = self._tables.at(int(axes[0]), n, self._window.samples_in_window)
+            table = self._tables.table_of_axis(int(axes[0]), n, self._window.samples_in_window)
             measured = MeasuredCurve(
                 avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[: self._m, axes] * self.rate_hz,
                 before[:, axes],
             )  # fmt: skip
-            one = fit(self._design, table, measured, start=self._theta[:, axes])
+            one = fit_coefficients(self._design, table, measured, start_theta=self._theta[:, axes])
             self._theta[:, axes] = one.theta
             for column, axis in enumerate(axes.tolist()):
-                self._contradicting[axis] = (table, measured.axis(column)) if is_contradicted(one, column) else None
+                self._contradicting[axis] = (
+                    (table, measured.select_axis(column)) if is_contradicted_by_curve(one, column) else None
+                )
             fits.append(
-                apply_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
+                refit_with_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
             )
         result = fits[0] if len(fits) == 1 else concatenate_fits(fits, np.concatenate(groups))
         self._entered = result.entered
@@ -282,7 +291,7 @@ class Estimator:
             self._search_axis = (self._search_axis + 1) % len(self._contradicting)
             contradicting = self._contradicting[self._search_axis]
             if contradicting is not None:
-                self._search = search_low_pass(
+                self._search = search_low_pass_in_steps(
                     self._design,
                     *contradicting,
                     power_spectrum(self._window.newest_samples(self._search_axis, SPECTRUM_SAMPLES)),

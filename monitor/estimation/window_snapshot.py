@@ -65,7 +65,7 @@ def copy_window(window: AllanWindow, rate_hz: float) -> WindowSnapshot:
     rate_hz : float
         Sample rate in Hz.
     """
-    phase, missing, first, unit = window.view_ring()
+    phase, missing, first, unit = window.view_phase_ring()
     end = first + window.samples_in_window + 1
     # The window may wrap around the end of the ring buffer.
     rows = [slice(first, min(end, len(phase))), slice(0, max(end - len(phase), 0))]

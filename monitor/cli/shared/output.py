@@ -89,7 +89,7 @@ def compile_analysis_kernels(report_progress: ProgressCallback) -> None:
         if not kernel_compilation.is_warm(group):
             with contextlib.suppress(OSError):  # without a cache, kernels are compiled at the first call
                 for _ in kernel_compilation.prepare_kernels(
-                    group, lambda progress: report_progress(str(progress), progress.share)
+                    group, lambda progress: report_progress(str(progress), progress.compiled_share)
                 ):
                     pass
 

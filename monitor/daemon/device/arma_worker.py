@@ -1,6 +1,6 @@
 """Identification of ARMA drift models in the background.
 
-The identification of one axis takes about 50 ms. In the main loop, the identification would delay the samples.
+The identification for one axis takes about 50 ms and would delay the samples in the main loop.
 """
 
 import threading
@@ -13,14 +13,14 @@ from monitor.drift.compensation.live_compensation import LiveCompensation
 
 
 class ArmaWorker:
-    """Worker that identifies the ARMA models of one device, one axis after the other, each in a new thread.
+    """Worker that identifies the ARMA models of one device in the background, one axis at a time.
 
     Parameters
     ----------
     name : str
         Name of the threads.
     synchronous : bool
-        True if models are identified in the calling thread, because a replayed recording can wait.
+        True if models are identified in the calling thread, as for a replayed recording.
     """
 
     def __init__(self, name: str, synchronous: bool) -> None:
@@ -29,7 +29,7 @@ class ArmaWorker:
         self._work: _Identification | None = None
 
     def adopt_and_start_models(self, live: LiveCompensation) -> None:
-        """Adopt the model that has been identified, and start to identify the next axis that is due."""
+        """Adopt an identified model, and start the next identification that is due."""
         if self._work is not None:
             if self._work.thread.is_alive():
                 return
@@ -47,8 +47,6 @@ class ArmaWorker:
 
 
 class _Identification:
-    """Identification of the model of one axis."""
-
     def __init__(self, of: Compensator, axis: int, name: str) -> None:
         self.of, self.axis = of, axis
         self.found: ArmaModel | None = None
@@ -56,8 +54,8 @@ class _Identification:
         self.thread = threading.Thread(target=self.identify_model, name=name, daemon=True)
 
     def identify_model(self) -> None:
-        """Identify the model; ``found`` stays None if the data do not determine a model."""
+        """Identify the model of one axis, and store the model or None in ``found``."""
         try:
             self.found = fit_arma(*self._window)
-        except NotReady:  # all values are equal, or there are too few; a later attempt may succeed
+        except NotReady:  # a later attempt may succeed
             self.found = None

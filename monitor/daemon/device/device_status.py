@@ -1,4 +1,4 @@
-"""Status report of one device, with counts, latency, and a message about the most important problem."""
+"""Status report of one device, with sample counts, latency, and a message about a problem."""
 
 import time
 
@@ -10,7 +10,7 @@ from monitor.daemon.result_publisher import ResultPublisher
 
 
 class DeviceStatus:
-    """Status report of one device. The report does not change the other parts of the device worker.
+    """Status report of one device.
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ class DeviceStatus:
     ring : RingBuffer
         Ring buffer of the device.
     restore : WindowRestore
-        Restore of the window after a restart.
+        Restore of the window after a restart of the program.
     """
 
     def __init__(self, publisher: ResultPublisher, ring: RingBuffer, restore: WindowRestore) -> None:
@@ -32,17 +32,17 @@ class DeviceStatus:
         self._started_s = time.monotonic()
 
     def build_health(self, states: dict[str, str], memory_bytes: int) -> Health:
-        """Return the present status of the device.
+        """Return the current status of the device.
 
         Parameters
         ----------
         states : dict of str to str
-            State of each output of the service, by its name.
+            State of each output of the service, by name.
         memory_bytes : int
             Resident memory of the process.
         """
         driver, clock, signal_monitor = self._driver, self._driver.clock, self._pipeline.signal_monitor
-        median_s, high_s = self.latency.take_quantiles()
+        median_s, high_s = self.latency.take_latency_quantiles()
         return Health(
             state=driver.state,
             rate_hz=clock.measured_hz if driver.state == "running" else None,
@@ -64,7 +64,7 @@ class DeviceStatus:
         )
 
     def _text(self) -> str:
-        """Return the status message of the device; empty if there is nothing to report."""
+        """Return the status message of the device, or "" if there is no problem."""
         driver, ready = self._driver, self._pipeline.ready
         if driver.state == "running":
             if self._restore.active and ready.all.is_set():
@@ -80,7 +80,7 @@ class DeviceStatus:
         return lacking or driver.late_frames_hint or self._publisher.timeline.host_clock_offset_text()
 
     def _missing_estimate_text(self) -> str:
-        """Return the reason why coefficients are not possible; empty if they are possible."""
+        """Return the reason why coefficients cannot be estimated, or "" if they can."""
         clock = self._driver.clock
         measured_hz = clock.contradicting_rate_hz
         if measured_hz is not None:

@@ -1,8 +1,8 @@
-"""Timeline of the samples of one device: Unix time, present time, and events without a time.
+"""Timeline of the samples of one device: Unix time, present time, and events that wait for a time.
 
-The samples of a live sensor carry host monotonic times. ``SlewedClock`` converts these times to Unix time. The samples
-of a recording, or of a device with its own time stamps, carry Unix times. Such a timeline is unknown before the first
-sample, and the events of the device wait for the first sample.
+The samples of a live sensor carry host monotonic times, which ``SlewedClock`` converts to Unix time. The samples of a
+recording, or of a device with its own time stamps, carry Unix times. For such a device, events wait for the first
+sample, because the present time on the timeline is unknown before.
 """
 
 import time
@@ -14,9 +14,9 @@ from drivers.driver import Driver
 from monitor.daemon.slewed_clock import MAX_SLEW_RATE, SlewedClock
 
 MAX_UNTIMED_EVENTS: Final = 100
-"""Largest number of events that wait for the first sample. If there are more, the oldest events are dropped."""
+"""Maximum number of events that wait for the first sample. The oldest events are dropped first."""
 MIN_CLOCK_STEP_S: Final = 1.0
-"""Smallest reported step of the host clock, and smallest reported offset between sample times and host clock."""
+"""Smallest reported step of the host clock, and smallest reported offset of the sample times."""
 
 
 class DeviceTimeline:
@@ -25,7 +25,7 @@ class DeviceTimeline:
     Parameters
     ----------
     driver : Driver
-        Driver of the device. The present time advances with the host clock while the driver waits or its link is lost.
+        Driver of the device.
     """
 
     def __init__(self, driver: Driver) -> None:
@@ -33,26 +33,26 @@ class DeviceTimeline:
         self._replayed = driver.link.epoch == "unix"
         self._clock = SlewedClock(time.monotonic_ns(), time.time_ns())
         self._newest_ns: int | None = None  # time of the newest sample from the ring buffer
-        self._taken_ns = 0  # monotonic time of the host when that sample was taken
+        self._taken_ns = 0  # monotonic time at which the newest sample was taken
         self._events: list[Event] = []
         self._untimed: deque[tuple[str, str]] = deque(maxlen=MAX_UNTIMED_EVENTS)  # kind and text
 
     # --- conversion of times
 
-    def offset_ns(self, t_ns: int) -> int:
-        """Return the difference between Unix time and a sample time, in nanoseconds."""
-        return 0 if self._driver.times_are_unix else self._clock.offset_ns(t_ns)
+    def unix_offset_ns(self, t_ns: int) -> int:
+        """Return the offset that converts a sample time to Unix time, in nanoseconds."""
+        return 0 if self._driver.times_are_unix else self._clock.unix_offset_ns(t_ns)
 
-    def offsets_ns(self, samples: SampleBlock) -> Ints | int:
-        """Return the difference between Unix time and the time of each sample, int64 [n] or one number for all.
+    def unix_offsets_ns(self, samples: SampleBlock) -> Ints | int:
+        """Return the offsets that convert sample times to Unix time in nanoseconds, int64 [n] or one number.
 
-        The resulting Unix times increase even if the host clock was set back.
+        The Unix times of successive samples increase even if the host clock was set back.
         """
-        return 0 if self._driver.times_are_unix else self._clock.offsets_ns(samples.t_ns)
+        return 0 if self._driver.times_are_unix else self._clock.unix_offsets_ns(samples.t_ns)
 
-    def unix_s(self, t_ns: int) -> float:
+    def to_unix_s(self, t_ns: int) -> float:
         """Convert a sample time in nanoseconds to Unix time in seconds."""
-        return (t_ns + self.offset_ns(t_ns)) / 1e9
+        return (t_ns + self.unix_offset_ns(t_ns)) / 1e9
 
     # --- present time
 
@@ -61,38 +61,36 @@ class DeviceTimeline:
         self._newest_ns, self._taken_ns = t_ns, time.monotonic_ns()
 
     def now_unix_s(self) -> float | None:
-        """Return the present time on the timeline of the device's samples, in Unix seconds.
+        """Return the present time on the timeline of the samples, in Unix seconds.
 
         Returns
         -------
         float or None
-            Time of the newest sample. While the device waits or is lost, this time advances with the host clock. None
-            before the first sample of a device with its own time stamps.
+            Time of the newest sample. The time advances with the host clock while no samples arrive. None if the time
+            is unknown.
         """
         now_ns = self._now_ns()
-        return None if now_ns is None else self.unix_s(now_ns)
+        return None if now_ns is None else self.to_unix_s(now_ns)
 
     def _now_ns(self) -> int | None:
-        """Return the present time on the timeline of the samples, in nanoseconds; None if it is unknown."""
+        """Return the present time on the timeline of the samples in nanoseconds, or None if it is unknown."""
         newest_ns, now_ns = self._newest_ns, time.monotonic_ns()
         if newest_ns is not None and (self._replayed or self._driver.state in ("running", "ended")):
             return newest_ns
         if not self._driver.times_are_unix:
             return now_ns
-        if (
-            newest_ns is None
-        ):  # samples may wait in the ring buffer, and only the first time is not later than these samples
+        if newest_ns is None:  # samples may wait in the ring buffer, and the first sample is the oldest
             return self._driver.first_t_ns
         return newest_ns + now_ns - self._taken_ns
 
     # --- events
 
     def add_event(self, event: Event) -> None:
-        """Queue an event whose time is known."""
+        """Queue an event that has a time."""
         self._events.append(event)
 
     def add_event_now(self, kind: str, text: str) -> None:
-        """Queue an event of the present moment. The event gets a time as soon as the timeline is known.
+        """Queue an event with the present time. The event waits until the present time is known.
 
         Parameters
         ----------
@@ -108,7 +106,7 @@ class DeviceTimeline:
             self._events.append(Event(kind, now_ns, text))
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call, except events that wait for the timeline."""
+        """Return the events since the last call, except events that still wait for a time."""
         now_ns = self._now_ns() if self._untimed else None
         if now_ns is not None:
             self._events += [Event(kind, now_ns, text) for kind, text in self._untimed]
@@ -118,8 +116,8 @@ class DeviceTimeline:
 
     # --- host clock
 
-    def slew_to_host(self) -> None:
-        """Slew the Unix times towards the host clock, and queue an event if the host clock was set."""
+    def slew_to_host_clock(self) -> None:
+        """Slew the Unix times of the samples towards the host clock, and queue an event if the host clock was set."""
         now_ns = time.monotonic_ns()
         step_s = self._clock.slew_and_return_host_step(now_ns, time.time_ns()) / 1e9
         if abs(step_s) < MIN_CLOCK_STEP_S or self._driver.times_are_unix:
@@ -131,8 +129,8 @@ class DeviceTimeline:
         self._events.append(Event("clock_jumped", now_ns, text))
 
     def host_clock_offset_text(self) -> str:
-        """Return a message about the offset of the sample times from the host clock; empty if the offset is small."""
-        behind_s = 0.0 if self._driver.times_are_unix else self._clock.behind_ns / 1e9
+        """Return a message about the offset of the sample times from the host clock, or "" if the offset is small."""
+        behind_s = 0.0 if self._driver.times_are_unix else self._clock.lag_behind_host_ns / 1e9
         if abs(behind_s) < MIN_CLOCK_STEP_S:
             return ""
         where = "behind" if behind_s > 0.0 else "ahead of"

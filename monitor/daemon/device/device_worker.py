@@ -1,8 +1,7 @@
 """Worker of one device: reader thread, ring buffer, processing pipeline and publication of the results.
 
-In each round, the main loop calls ``DeviceWorker.process_new_samples``. This method takes the new samples, advances the
-pipeline (``DevicePipeline``) and publishes the results that are due (``ResultPublisher``). ``DeviceTimeline`` converts
-the times of the samples, ``DeviceStatus`` reports the status, and ``WindowRestore`` fills the window after a restart.
+In each round of the main loop, ``DeviceWorker.process_new_samples`` takes the new samples, advances the pipeline
+(``DevicePipeline``) and publishes the results that are due (``ResultPublisher``).
 """
 
 import threading
@@ -32,19 +31,19 @@ if TYPE_CHECKING:
     from monitor.simulator import SimulatedDevice
 
 RING_S: Final = 10.0
-"""Capacity of the ring buffer, in seconds of samples, within the bounds of RING_SAMPLES_RANGE."""
+"""Capacity of the ring buffer in seconds, limited to RING_SAMPLES_RANGE."""
 RING_SAMPLES_RANGE: Final = (65_536, 1_000_000)
-"""Smallest and largest capacity of the ring buffer."""
+"""Minimum and maximum capacity of the ring buffer in samples."""
 UNKNOWN_RATE_HZ: Final = 1000.0
-"""Sample rate for which the ring buffer is sized if no rate is configured."""
+"""Assumed sample rate for the capacity of the ring buffer if no rate is configured."""
 REPLAY_PAUSE_S: Final = 0.002
-"""Interval at which the reader of a replayed recording checks a full queue for space."""
+"""Interval at which the reader of a replayed recording checks a full queue."""
 MODEL_SELECTION_S: Final = 0.001
-"""Processor time per round for the selection of a thermal model, for a live sensor."""
+"""Processor time per round for the selection of a thermal model of a live sensor."""
 MODEL_SELECTION_REPLAY_S: Final = 0.02
-"""Processor time per round for the selection of a thermal model, for a replayed recording, which can wait."""
+"""Processor time per round for the selection of a thermal model of a replayed recording."""
 MODEL_SELECTION_CPU_SHARE: Final = 0.02
-"""Share of one processor that the selection of a thermal model may use for a device."""
+"""Maximum fraction of one processor for the selection of a thermal model."""
 
 
 class DeviceWorker:
@@ -61,16 +60,16 @@ class DeviceWorker:
     wake : threading.Event
         Event that is set when samples have arrived.
     ready : KernelReadiness
-        Flags of the compiled kernels. The samples wait until the kernels that the device needs are compiled.
+        Flags of the compiled kernels. Samples wait until the required kernels are compiled.
     recorder : Recorder, optional
-        Records samples and raw bytes, and provides the samples from before a restart.
+        Recorder of samples and raw bytes.
     simulated : SimulatedDevice, optional
-        Simulated sensor that sends to the link. It is started and stopped with the reader thread.
+        Simulated sensor that sends samples to the link.
 
     Raises
     ------
     ConfigError
-        If the model in force cannot be read.
+        If the noise model of the device cannot be read.
     """
 
     def __init__(
@@ -94,7 +93,7 @@ class DeviceWorker:
         self.driver = Driver(
             device.name, link, device.decoder, self.clock, self._push, device.axes, device.silence_s, keep
         )
-        # a short recording may end before the kernels of the change detection are compiled
+        # otherwise, a short recording could end before the kernels of change detection are compiled
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         live = device.refit_s != 0.0 and timed and not isinstance(link, ReplayLink)
         self._replayed = link.epoch == "unix"
@@ -108,49 +107,49 @@ class DeviceWorker:
         self._recorder = recorder
         self._wake = wake
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
-        self._rate_doubts = (False, False)  # True if the configured rate is contradicted; True if it is not checked yet
+        self._rate_doubts = (False, False)  # configured rate is contradicted; configured rate is not checked yet
 
     # --- start and stop
 
     def start(self) -> None:
-        """Start the reader thread. A recording that ended less than one window ago is continued."""
+        """Start the reader thread, and continue a recording that ended less than one window ago."""
         if self.simulated is not None:
             self.simulated.start()
         if self._recorder is not None and not self._replayed:
             self.restore.resume_from(self._recorder.find_recording_tail(self.name))
-            if self.restore.active:  # the program may restart before a new estimate exists
+            if self.restore.active:  # the program may restart before a new estimate is available
                 self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
         self._thread.start()
 
     def rebuild_window(self) -> None:
-        """Fill the window from the recording while new samples wait in the ring buffer. Called in a thread."""
+        """Fill the window from the recording, while new samples wait in the ring buffer."""
         self.restore.rebuild_window()
         self._wake.set()
 
     def stop(self) -> None:
-        """Stop the reader thread. The samples in the ring buffer stay there until the next ``process_new_samples``."""
+        """Stop the reader thread. Samples in the ring buffer are kept."""
         self.driver.stop()
         if self.simulated is not None:
             self.simulated.stop()
 
-    def join(self, timeout_s: float) -> bool:
-        """Wait for the end of the reader thread; return False if the thread still runs after ``timeout_s`` seconds."""
+    def join_reader_thread(self, timeout_s: float) -> bool:
+        """Wait for the end of the reader thread, and return False after a timeout."""
         if self._thread.is_alive():
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     @property
     def replay_finished(self) -> bool:
-        """True if a replay has ended and all its samples have been processed."""
+        """True if a replay has ended and all samples have been processed."""
         if self.driver.state != "ended" or self._thread.is_alive() or not self.pipeline.ready.all.is_set():
             return False
         return not self.pipeline.awaits_thermal_model and (self.ring.empty or self.clock.rate_hz is None)
 
     @property
     def read_attempts(self) -> int | None:
-        """Number of read attempts of the reader thread, see ``Driver.iterations``.
+        """Number of read attempts of the reader thread, or None if the thread may block.
 
-        None for a reader that has ended, and for a replayed recording, which blocks while the ring buffer is full.
+        A reader that has ended makes no attempts, and a replayed recording blocks while the ring buffer is full.
         """
         return None if self._replayed or self.driver.state == "ended" else self.driver.iterations
 
@@ -164,21 +163,20 @@ class DeviceWorker:
         now_s : float
             Present time on the monotonic clock, in seconds.
         drain : bool, optional
-            True to process all samples and publish all results now, because the device stops.
+            True to process all samples and publish all results, because the device stops.
         """
         self.publisher.schedule.begin_round(now_s, drain)
         with self.pipeline.kernel_context(self.clock.rate_hz):
             self._process_new_samples(drain)
 
     def _process_new_samples(self, drain: bool) -> None:
-        """Process the new samples. The numerical kernels must be callable."""
         events = self.driver.take_events()
-        if self.restore.active:  # the thread that rebuilds the window owns the pipeline
+        if self.restore.active:  # another thread uses the pipeline
             self.publisher.publish_events(self.timeline.take_events() + events)
             return
         blocks = self._take() if drain or self._can_take() else []
         events = self.timeline.take_events() + events  # the time of the first sample is known now
-        self.pipeline.advance(blocks, self.clock.rate_hz, drain)
+        self.pipeline.process_blocks(blocks, self.clock.rate_hz, drain)
         if drain:
             self.pipeline.process_held_samples()
         if self.pipeline.thermal is not None and any(event.kind == "link_back" for event in events):
@@ -194,26 +192,24 @@ class DeviceWorker:
             self.status.latency.note_publication()
 
     def _can_take(self) -> bool:
-        """Return True if samples may be taken from the ring buffer, which needs the sample rate and the kernels."""
+        """Return True if the sample rate and the kernels are available to process samples."""
         pipeline = self.pipeline
         if pipeline.awaits_thermal_model or self.restore.active:
             return False
         if pipeline.estimator is not None or pipeline.refusal_reason:
             return True
-        if self.clock.rate_hz is None:  # samples are published even if the sample rate stays unknown
-            return self.ring.room < self.ring.capacity // 2
+        if self.clock.rate_hz is None:  # samples are also published if the sample rate stays unknown
+            return self.ring.free_capacity < self.ring.capacity // 2
         return pipeline.required_kernels_ready(self.clock.rate_hz)
 
     def _take(self) -> list[SampleBlock]:
-        """Return all samples from the ring buffer."""
         self.status.latency.note_samples_taken()
-        blocks = self.ring.take()
+        blocks = self.ring.take_samples()
         if blocks:
             self.timeline.set_newest_sample_time(int(blocks[-1].t_ns[-1]))
         return blocks
 
     def _select_thermal_model(self) -> None:
-        """Continue the selection of a thermal model for a short time."""
         thermal, schedule = self.pipeline.thermal, self.publisher.schedule
         if thermal is None or not thermal.is_selecting_model or not schedule.is_due("thermal"):
             return
@@ -222,12 +218,12 @@ class DeviceWorker:
         while thermal.run_selection_step() and time.perf_counter() < until_s:
             pass
         if self._replayed:
-            self._wake.set()  # waiting samples of the recording can be processed
+            self._wake.set()  # samples of the recording may wait
         else:
             schedule.postpone("thermal", (time.perf_counter() - begun_s) / MODEL_SELECTION_CPU_SHARE)
 
     def _check_rate(self, drain: bool) -> None:
-        """Withhold the coefficients while the data contradict the configured rate, or have not confirmed it yet."""
+        """Withhold the coefficients while the configured rate is contradicted or not yet confirmed."""
         if drain:
             self.clock.compare_rates_at_end()
         doubts = (self.clock.contradicting_rate_hz is not None, self.clock.rate_check_pending)
@@ -235,10 +231,9 @@ class DeviceWorker:
             self._rate_doubts = doubts
             self.publisher.withholds_coefficients = any(doubts)
             self._update_rate()
-            self.pipeline.advanced = True  # the newest estimate must be computed again
+            self.pipeline.advanced = True  # the estimate must be computed again
 
     def _update_rate(self) -> None:
-        """Pass the best known sample rate to the pipeline."""
         rate_hz = self.clock.rate_hz
         if rate_hz is not None and not self.restore.active:
             self.pipeline.refine_rate(rate_hz)
@@ -246,28 +241,28 @@ class DeviceWorker:
     # --- commands and status
 
     def empty_window(self) -> None:
-        """Empty the window, unless the window is being rebuilt."""
+        """Discard all samples of the window, unless the window is being rebuilt."""
         if not self.restore.active:
             self.pipeline.empty_window()
 
     def copy_window_and_temperature(self) -> tuple[WindowSnapshot, Floats] | None:
-        """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
+        """Return a copy of the window and the temperatures [n] in °C, or None if the window is empty."""
         return None if self.restore.active else self.pipeline.copy_window_and_temperature()
 
-    def set_limits(self, device: Device) -> None:
-        """Replace the limits by the limits of new settings. Unchanged limits keep their state.
+    def replace_limits(self, device: Device) -> None:
+        """Replace the user limits of the device. The states of unchanged limits are kept.
 
         Raises
         ------
         ConfigError
-            If a limit is relative to a coefficient that the model in force does not have.
+            If a limit is relative to a coefficient that the noise model does not contain.
         """
         limits = LimitMonitor(device.limits, self.model)
         limits.copy_states_from(self.publisher.limits)
         self.device, self.publisher.limits = device, limits
 
     def publish_event(self, kind: str, text: str) -> None:
-        """Publish an event of the present moment, as soon as the timeline of the device is known.
+        """Publish an event with the present time, as soon as the present time is known.
 
         Parameters
         ----------
@@ -285,16 +280,16 @@ class DeviceWorker:
         Parameters
         ----------
         states : dict of str to str
-            State of each output of the service, by its name.
+            State of each output of the service, by name.
         memory_bytes : int
             Resident memory of the process.
 
         Returns
         -------
         Health
-            The published status.
+            Published status.
         """
-        self.timeline.slew_to_host()
+        self.timeline.slew_to_host_clock()
         self.publisher.publish_events(self.timeline.take_events())
         self._update_rate()
         if self._recorder is not None:
@@ -307,30 +302,26 @@ class DeviceWorker:
     # --- called by the reader thread
 
     def _record_chunks(self, chunks: Sequence[Chunk]) -> None:
-        """Record raw bytes."""
         if self._recorder is not None and chunks:
-            self._recorder.queue_chunks(self.name, chunks, self.timeline.offset_ns(chunks[0].t_ns))
+            self._recorder.queue_chunks(self.name, chunks, self.timeline.unix_offset_ns(chunks[0].t_ns))
 
     def _push(self, samples: SampleBlock) -> None:
-        """Record decoded samples, and put the samples into the ring buffer.
-
-        For a live sensor, a full ring buffer overwrites the oldest samples. A replayed recording waits for space.
-        """
+        """Record decoded samples, and put them into the ring buffer; a replayed recording waits for space."""
         if self._recorder is not None:
             if self.pipeline.estimator is None:  # the program may crash before the first status is published
                 self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
-            self._recorder.queue_samples(self.name, samples, self.timeline.offsets_ns(samples))
+            self._recorder.queue_samples(self.name, samples, self.timeline.unix_offsets_ns(samples))
             while self._replayed and self._recorder.is_queue_filling(self.name):
                 time.sleep(REPLAY_PAUSE_S)
-        while self._replayed and self.ring.room < len(samples) < self.ring.capacity:
+        while self._replayed and self.ring.free_capacity < len(samples) < self.ring.capacity:
             time.sleep(REPLAY_PAUSE_S)
-        self.ring.push(samples)
+        self.ring.push_samples(samples)
         self.status.latency.note_samples_arrived()
         self._wake.set()
 
 
 def _arrivals_are_timed(device: Device, link: Link) -> bool:
-    """Return True if arrival times show the sample rate: not for a file or an accelerated simulation."""
+    """Return True if the arrival times of samples show the sample rate."""
     simulated = isinstance(device.link, VirtualTable) and device.link.speed != 1.0
     captured = isinstance(link, ReplayLink) and link.epoch == "monotonic"
     return not simulated and not captured

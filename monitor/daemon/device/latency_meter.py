@@ -1,4 +1,4 @@
-"""Latency from the reception of samples to the publication of the results."""
+"""Latency from the arrival of samples to the publication of results."""
 
 import time
 
@@ -6,9 +6,9 @@ import numpy as np
 
 
 class LatencyMeter:
-    """Latency of the published results of one device.
+    """Meter of the latency from the arrival of samples to the publication of results.
 
-    The reader thread calls ``note_samples_arrived``. The main loop calls all other methods.
+    The reader thread calls ``note_samples_arrived``, and the main loop calls the other methods.
     """
 
     def __init__(self) -> None:
@@ -17,22 +17,22 @@ class LatencyMeter:
         self._latencies_s: list[float] = []
 
     def note_samples_arrived(self) -> None:
-        """Note that samples have been put into the ring buffer."""
+        """Record the time at which samples arrive in the ring buffer."""
         self._arrived_ns = self._arrived_ns or time.monotonic_ns()
 
     def note_samples_taken(self) -> None:
-        """Note that all samples have been taken from the ring buffer."""
+        """Record that all samples have been taken from the ring buffer."""
         arrived_ns, self._arrived_ns = self._arrived_ns, 0
         self._taken_ns = self._taken_ns or arrived_ns
 
     def note_publication(self) -> None:
-        """Note that results with all taken samples have been published."""
+        """Record the latency of the results that have just been published."""
         if self._taken_ns:
             self._latencies_s.append((time.monotonic_ns() - self._taken_ns) / 1e9)
             self._taken_ns = 0
 
-    def take_quantiles(self) -> tuple[float | None, float | None]:
-        """Return median and 99 % quantile of the latency since the last call, in seconds; None without results."""
+    def take_latency_quantiles(self) -> tuple[float | None, float | None]:
+        """Return the median and the 99 % quantile of the latency since the last call, in seconds or None."""
         latencies_s, self._latencies_s = self._latencies_s, []
         if not latencies_s:
             return None, None

@@ -1,10 +1,8 @@
 """Processing pipeline of one device: motion detection, noise estimation, thermal model and drift compensation.
 
-``DevicePipeline.advance`` processes blocks of samples in order of time. The newest results are in ``estimator``,
-``thermal``, ``compensation`` and ``signal_monitor``. ``take_events`` returns the detections.
-
-The pipeline publishes nothing and reads no clock. The device worker decides when to call the pipeline and what to
-publish. After a restart of the program, ``replay_samples`` processes the end of the recording without events.
+``DevicePipeline.process_blocks`` processes blocks of samples in order of time. The newest results are in ``estimator``,
+``thermal``, ``compensation`` and ``signal_monitor``, and ``take_events`` returns the detected events. The pipeline
+publishes no results and reads no clock.
 """
 
 from collections import deque
@@ -29,7 +27,7 @@ from monitor.noise.model import NoiseModel
 from monitor.settings.loading import Device
 
 MAX_PIECE_SAMPLES: Final = 512
-"""Largest number of samples between two tests for changed noise. A fast replay passes thousands at a time."""
+"""Maximum number of samples between two tests for changed noise."""
 
 
 class DevicePipeline:
@@ -40,15 +38,15 @@ class DevicePipeline:
     device : Device
         Settings of the device.
     model : NoiseModel or None
-        Noise model in force, with which the samples are compared.
+        Noise model with which the samples are compared.
     ready : KernelReadiness
-        Flags of the compiled kernels. ``advance`` compiles no kernel, because compilation would delay all devices.
+        Flags of the compiled kernels.
     replayed : bool
-        True for the samples of a recording. They can wait while a thermal model is being selected.
+        True for a replayed recording, whose samples can wait while a thermal model is being selected.
     needs_all : bool
-        True if processing must wait until all kernels can be called.
+        True if samples wait until all kernels are compiled.
     live : bool
-        True if samples arrive at the device's sample rate, so that kernels can be interpreted at a low rate.
+        True if samples arrive in real time, so that kernels can be interpreted at a low rate.
     """
 
     def __init__(
@@ -66,13 +64,13 @@ class DevicePipeline:
         self.compensation: LiveCompensation | None = None
         self.model_in_force: PreparedModel | None = None
         self.refusal_reason = ""
-        """Reason why an estimate is not possible; empty if it is possible."""
+        """Reason why an estimate is not possible, or ""."""
         self.advanced = False
-        """True if samples were processed since the publisher last set this attribute to False."""
+        """True if samples have been processed since the last refit."""
         self.since_ns: list[int | None] = [None] * len(AXES)
-        """Time of the first sample after the restart of each axis, in nanoseconds; None without a restart."""
+        """Time of the first sample after the last restart of each axis in nanoseconds, or None."""
         self.newest_ns = 0
-        """Time of the newest sample that entered the pipeline, in nanoseconds; 0 before the first."""
+        """Time of the newest processed sample in nanoseconds, or 0."""
         self.arma_worker = ArmaWorker(f"drift of {device.name}", synchronous=replayed)
         self._device = device
         self._model = model
@@ -88,28 +86,28 @@ class DevicePipeline:
         self._replaying = False
 
     def required_kernels_ready(self, rate_hz: float) -> bool:
-        """Return True if the kernels that the first samples need are compiled or can be interpreted."""
+        """Return True if the required kernels are compiled or can be interpreted."""
         if not self._interprets and not self._needs.is_set():
-            self._interprets = self._live and self.ready.reserve_interpreter(rate_hz)
+            self._interprets = self._live and self.ready.reserve_interpreted_rate(rate_hz)
         return self._interprets or self._needs.is_set()
 
     @property
     def fit_kernels_ready(self) -> bool:
-        """True if the kernels that fit the noise coefficients can be called."""
+        """True if the kernels of the fit are compiled or can be interpreted."""
         return self._interprets or self.ready.fit.is_set()
 
     @property
     def fit_is_interpreted(self) -> bool:
-        """True if Python interprets the kernels of the fit. A fit then takes about 0.1 s."""
+        """True if Python interprets the kernels of the fit, which then takes about 0.1 s."""
         return self._interprets and not self.ready.fit.is_set()
 
     @property
     def detection_kernels_ready(self) -> bool:
-        """True if the kernels of motion and change detection can be called."""
+        """True if the kernels of motion and change detection are compiled or can be interpreted."""
         return self._interprets or self.ready.all.is_set()
 
     def kernel_context(self, rate_hz: float | None) -> AbstractContextManager[None]:
-        """Return the context manager for calls of the kernels, which interprets kernels if necessary."""
+        """Return a context manager in which kernels that are not compiled are interpreted."""
         if rate_hz is not None and self.estimator is None:
             self.required_kernels_ready(rate_hz)
         return interpret_uncompiled_kernels() if self._interprets and not self.ready.all.is_set() else nullcontext()
@@ -119,7 +117,7 @@ class DevicePipeline:
         """True while samples of a recording wait for the selection of a thermal model."""
         return bool(self._pieces)
 
-    def advance(self, blocks: Sequence[SampleBlock], rate_hz: float | None, drain: bool) -> None:
+    def process_blocks(self, blocks: Sequence[SampleBlock], rate_hz: float | None, drain: bool) -> None:
         """Process blocks of samples. While the sample rate is unknown, the samples are discarded.
 
         Parameters
@@ -127,9 +125,9 @@ class DevicePipeline:
         blocks : sequence of SampleBlock
             New samples, in order of time.
         rate_hz : float or None
-            Sample rate; None if it is unknown.
+            Sample rate in Hz, or None if the sample rate is unknown.
         drain : bool
-            True if all samples are to be processed now, without a wait for the thermal model.
+            True to process all samples without waiting for a thermal model.
         """
         if blocks:
             self.newest_ns = int(blocks[-1].t_ns[-1])
@@ -153,34 +151,33 @@ class DevicePipeline:
             self._update_thermal()
 
     def process_held_samples(self) -> None:
-        """Process the samples that the motion detector holds back. Called after the last sample."""
+        """Process the samples that the motion detector holds back, after the last sample."""
         self._update_estimator(self.signal_monitor.flush_delayed_samples() if self.signal_monitor is not None else [])
         self._restart_changed_axes()
         self._update_thermal()
 
     def update_drift_models(self) -> None:
-        """At the end of an interval, adopt new drift models, and start to identify the models that are due."""
+        """Adopt identified drift models at the end of an interval, and start identifications that are due."""
         live = self.compensation
-        if live is None or not self.ready.all.is_set():  # the thread that identifies models would compile kernels
+        if live is None or not self.ready.all.is_set():  # otherwise, the identification would compile kernels
             return
         if live.compensator.samples_to_interval_end == live.compensator.interval_samples:
             self.arma_worker.adopt_and_start_models(live)
 
     def replay_samples(self, samples: SampleBlock, rate_hz: float) -> None:
-        """Process a recorded block after a restart of the program, to rebuild the window.
+        """Process recorded samples without events, to rebuild the window after a restart of the program.
 
-        The events of these samples were published before the restart, so they are discarded. Changes of the noise
-        restart no axis, because the recording states the start of each axis.
+        A change of the noise restarts no axis, because the start of each axis is read from the recording.
 
         Parameters
         ----------
         samples : SampleBlock
             Recorded samples, in order of time.
         rate_hz : float
-            Sample rate.
+            Sample rate in Hz.
         """
         self._replaying = True
-        self.advance([samples], rate_hz, drain=True)
+        self.process_blocks([samples], rate_hz, drain=True)
         self._replaying = False
         live = self.compensation
         if live is not None and np.isfinite(samples.values[:, :3]).any():
@@ -192,7 +189,7 @@ class DevicePipeline:
         self.take_thermal_intervals()
 
     def empty_window(self) -> None:
-        """Empty the window."""
+        """Discard all samples of the window."""
         if self.estimator is not None:
             self.estimator.empty_window()
             self.since_ns = [self.newest_ns + 1] * len(AXES)
@@ -207,7 +204,7 @@ class DevicePipeline:
                 one.set_rate(rate_hz)
 
     def copy_window_and_temperature(self) -> tuple[WindowSnapshot, Floats] | None:
-        """Return a copy of the window, and the temperature float64 [n] in °C; None if the window is empty."""
+        """Return a copy of the window and the temperatures [n] in °C, or None if the window is empty."""
         if self.estimator is None or self._temperatures is None or not self.estimator.samples_in_window:
             return None
         return self.estimator.copy_window(), self._temperatures.newest_temperatures(self.estimator.samples_in_window)
@@ -229,7 +226,7 @@ class DevicePipeline:
     # --- private methods
 
     def _create_estimator(self, rate_hz: float) -> bool:
-        """Create the estimator for a sample rate; return False if this is not possible now."""
+        """Create the estimator for a sample rate; return False if this is not possible."""
         if self.refusal_reason or not self.required_kernels_ready(rate_hz):
             return False
         device = self._device
@@ -238,15 +235,12 @@ class DevicePipeline:
             self._temperatures = TemperatureRing(self.estimator.window_length_samples)
             if self._model is not None:
                 self.model_in_force = PreparedModel(self._model, self.estimator.window_length_samples)
-        except (
-            ConfigError
-        ) as error:  # the configured averaging times do not suit the measured rate; samples are still published
+        except ConfigError as error:  # the averaging times do not fit the measured rate
             self.refusal_reason = f"no estimate: {error}"
             return False
         return True
 
     def _create_detectors(self) -> None:
-        """Create the configured parts: motion and change detection, thermal model and drift compensation."""
         if self.estimator is None:
             return
         device, rate_hz = self._device, self.estimator.rate_hz
@@ -258,7 +252,6 @@ class DevicePipeline:
         self.compensation = LiveCompensation(rate_hz) if device.compensate else None
 
     def _update_estimator(self, blocks: Sequence[SampleBlock]) -> None:
-        """Update the estimator with blocks of samples."""
         if self.estimator is None or self._temperatures is None:
             return
         for samples in blocks:
@@ -267,7 +260,6 @@ class DevicePipeline:
             self.advanced = True
 
     def _restart_changed_axes(self) -> None:
-        """Restart the axes in which a change of the noise was detected."""
         restarts = self.signal_monitor.take_restart_requests() if self.signal_monitor is not None else []
         if self.estimator is None or not self._device.restart or self._replaying:
             return
@@ -277,7 +269,6 @@ class DevicePipeline:
             self.since_ns[restart.axis] = self.newest_ns - back_ns
 
     def _update_thermal(self) -> None:
-        """Pass the samples at rest to the thermal model."""
         if self.signal_monitor is None or self.thermal is None:
             return
         if self.signal_monitor.orientation_changes != self._handled:

@@ -1,8 +1,7 @@
 """Ring buffer for samples between the reader thread and the worker of a device.
 
-There is one writer and one reader. The writer never waits, and a full buffer overwrites its oldest samples.
-``RingBuffer.overflowed`` counts the overwritten samples. They are also added to ``lost`` of the next block, so the gap
-keeps its length in time. The lock is held only while samples are copied.
+The writer never waits, and a full buffer overwrites the oldest samples. ``RingBuffer.overflowed`` counts the
+overwritten samples. The overwritten samples are also counted as missing before the next block.
 """
 
 import threading
@@ -15,12 +14,12 @@ from drivers.data_types import SampleBlock, make_block
 
 
 class RingBuffer:
-    """Ring buffer for samples, with 80 bytes per sample.
+    """Ring buffer for samples, with one writer and one reader.
 
     Parameters
     ----------
     capacity : int
-        Largest number of samples in the buffer.
+        Maximum number of samples in the buffer.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -36,22 +35,22 @@ class RingBuffer:
 
     @property
     def empty(self) -> bool:
-        """True if the buffer holds no sample."""
+        """True if the buffer contains no samples."""
         return self._read == self._written
 
     @property
-    def room(self) -> int:
-        """Number of samples that fit into the buffer without overwriting older samples."""
+    def free_capacity(self) -> int:
+        """Number of samples that can be added without overwriting older samples."""
         return self.capacity - (self._written - self._read)
 
-    def push(self, samples: SampleBlock) -> None:
-        """Add samples. A full buffer overwrites its oldest samples."""
+    def push_samples(self, samples: SampleBlock) -> None:
+        """Add samples, and overwrite the oldest samples if the buffer is full."""
         with self._lock:
             for start in range(0, len(samples), self.capacity):
                 self._write(samples[start : start + self.capacity])
 
-    def take(self) -> list[SampleBlock]:
-        """Return all samples since the last call, split into blocks where samples are missing."""
+    def take_samples(self) -> list[SampleBlock]:
+        """Remove and return all samples, split into blocks at missing samples."""
         with self._lock:
             n = self._written - self._read
             if n == 0:
@@ -64,7 +63,6 @@ class RingBuffer:
         return [replace(taken[a:b], lost=int(lost[a])) for a, b in pairwise(edges)]
 
     def _write(self, samples: SampleBlock) -> None:
-        """Copy a block of at most ``capacity`` samples into the buffer."""
         n = len(samples)
         overwritten = max(0, self._written + n - self._read - self.capacity)
         if overwritten:

@@ -1,7 +1,7 @@
 """Restore of the estimation window after a restart of the program, from the end of the recording.
 
 The pipeline processes the recorded samples of the last window again, without events. The start of each axis and the
-values of the iterated fit are read from the state that was recorded with the samples (``segment.DaemonState``).
+fitted values are read from the recorded state (``segment.DaemonState``).
 """
 
 import time
@@ -20,22 +20,22 @@ from monitor.daemon.storage.recording_tail import RecordingTail
 from monitor.settings.loading import Device
 
 MIN_REPLAY_S: Final = 600.0
-"""Minimum length of the replayed recording, because change detection needs a history of this length."""
+"""Minimum duration of the replayed recording, which change detection needs."""
 
 
 class WindowRestore:
-    """Restore of the window of one device, and the state for the next restart.
+    """Restore of the estimation window of one device after a restart of the program.
 
     Parameters
     ----------
     device : Device
         Settings of the device.
     pipeline : DevicePipeline
-        Pipeline to fill. While ``active`` is True, only ``rebuild_window`` may use the pipeline.
+        Pipeline of the device. While ``active`` is True, only ``rebuild_window`` may use the pipeline.
     clock : SampleClock
-        Sample clock of the device. The clock counts the samples since the end of the recording as missing.
+        Sample clock of the device.
     timeline : DeviceTimeline
-        Timeline of the device, which receives the event ``window_rebuilt``.
+        Timeline that receives the event ``window_rebuilt``.
     """
 
     def __init__(self, device: Device, pipeline: DevicePipeline, clock: SampleClock, timeline: DeviceTimeline) -> None:
@@ -48,15 +48,15 @@ class WindowRestore:
 
     @property
     def active(self) -> bool:
-        """True while the window waits for ``rebuild_window`` or is being rebuilt."""
+        """True until the window has been rebuilt from the recording."""
         return self._tail is not None
 
     def resume_from(self, tail: RecordingTail | None) -> None:
-        """Continue a recording that ended less than one window ago; without such a recording, do nothing."""
+        """Prepare to rebuild the window from a recording that ended less than one window ago."""
         if tail is None:
             return
         newest, state = tail.newest.samples, tail.newest.state
-        t_ns = int(newest.t_ns[-1]) - self._timeline.offset_ns(time.monotonic_ns())
+        t_ns = int(newest.t_ns[-1]) - self._timeline.unix_offset_ns(time.monotonic_ns())
         ago_s = (time.time_ns() - int(newest.t_ns[-1])) / 1e9
         rate_hz = self._device.rate_hz or state.rate
         if rate_hz is None or not 0.0 <= ago_s <= self._device.window_s:
@@ -69,11 +69,11 @@ class WindowRestore:
         self._tail, self._state_before = tail, state
 
     def rebuild_window(self) -> None:
-        """Fill the window from the recording while new samples wait in the ring buffer. Called in a thread."""
+        """Fill the window from the recording, while new samples wait in the ring buffer."""
         tail = self._tail
         if tail is None:
             return
-        offset_ns = self._timeline.offset_ns(time.monotonic_ns())
+        offset_ns = self._timeline.unix_offset_ns(time.monotonic_ns())
         try:
             text = self._replay(tail, offset_ns)
         except (ImuError, OSError) as error:
@@ -85,25 +85,24 @@ class WindowRestore:
             self._tail = None
 
     def state_to_record(self) -> DaemonState:
-        """Return the present state of the estimate, which is recorded with the samples."""
+        """Return the current state of the estimate, which is recorded with the samples."""
         before, estimator = self._state_before, self._pipeline.estimator
         if self.active:
             return before
         tick_step = self._clock.ticks_per_sample or before.tick_step
         if estimator is None:
             return msgspec.structs.replace(before, rate=self._clock.rate_hz or before.rate, tick_step=tick_step)
-        offset_ns = self._timeline.offset_ns(self._pipeline.newest_ns)
+        offset_ns = self._timeline.unix_offset_ns(self._pipeline.newest_ns)
         entered, theta = estimator.fit_state()
         since = tuple(None if t_ns is None else (t_ns + offset_ns) / 1e9 for t_ns in self._pipeline.since_ns)
         parameters = tuple(None if np.isnan(value) else float(value) for value in theta.ravel())
         return DaemonState(estimator.rate_hz, since, tick_step, parameters, tuple(entered.ravel().tolist()))
 
     def _replay(self, tail: RecordingTail, offset_ns: int) -> str:
-        """Fill the window with the end of a recording; return a message about the result."""
         pipeline, state = self._pipeline, tail.newest.state
         rate_hz = self._clock.rate_hz or state.rate or 0.0
         counted = np.zeros(len(AXES), np.int64)
-        for piece in tail.pieces(max(self._device.window_s, MIN_REPLAY_S)):
+        for piece in tail.read_pieces(max(self._device.window_s, MIN_REPLAY_S)):
             samples = piece.samples
             counted += _count_since_restart(samples, state)
             t_ns = samples.t_ns - offset_ns
@@ -111,7 +110,7 @@ class WindowRestore:
         if pipeline.estimator is None:
             return pipeline.refusal_reason or "the recording holds no samples for the window"
         for axis, unix_s in enumerate(state.since):
-            # these times replace the times of the changes that were detected in the replay
+            # the recorded start of each axis replaces the start that was detected in the replay
             pipeline.since_ns[axis] = None if unix_s is None else round(unix_s * 1e9) - offset_ns
             if unix_s is not None:
                 pipeline.estimator.restart_axis(axis, int(counted[axis]))
@@ -124,7 +123,7 @@ class WindowRestore:
 
 
 def _count_since_restart(samples: SampleBlock, state: DaemonState) -> Ints:
-    """Return the number of samples since the start of each axis in a block, int64 [6], with missing samples."""
+    """Return the number of samples [6] in a block since the restart of each axis, including missing samples."""
     counting = np.zeros(len(AXES), np.int64)
     for axis, unix_s in enumerate(state.since):
         if unix_s is not None:

@@ -1,11 +1,10 @@
 """Parallel compilation of the numerical kernels in child processes.
 
-Numba compiles a kernel at the first call and keeps the machine code in a cache folder on disk. After an installation or
-an upgrade, this folder is empty, and compilation takes tens of seconds of processor time. Child processes therefore
-compile parts of the kernels in parallel. The main process then loads each compiled part from disk. In this way, the
-compilation does not delay the main loop, and the main process never allocates the memory of the compiler.
+Numba compiles a kernel at the first call and stores the machine code in a cache folder. After an installation, the
+folder is empty, and compilation takes tens of seconds of processor time. Child processes therefore compile the kernels
+in parallel, and the main process loads the machine code from disk.
 
-A stamp file in the cache folder shows that all parts are compiled for the present program, Numba and processor.
+A stamp file in the cache folder shows that all kernels are compiled for the current program, Numba and processor.
 """
 
 import os
@@ -29,22 +28,22 @@ from monitor.common.program import PROGRAM
 from monitor.daemon.kernels.kernel_parts import GROUPS, KernelGroup, KernelPart
 
 MAX_PROCESSES: Final = 2
-"""Largest number of compiling processes. Each process needs about 200 MB, which a small board must have too."""
+"""Maximum number of compiling processes. Each process needs about 200 MB of memory."""
 COMPILER: Final = (*PROGRAM, "warm-up", "--from-stdin")
 """Command line of a child process."""
 NICENESS: Final = 5
-"""Niceness of the child processes, so that the processing of samples has priority."""
+"""Niceness of the child processes."""
 BAR_LENGTH: Final = 12
 """Length of the progress bar in characters."""
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class CompilationProgress:
     """Progress of the compilation.
 
     Examples
     --------
-    >>> print(Progress(2, 8, ("change detection",)), Progress(2, 8).bar)
+    >>> print(CompilationProgress(2, 8, ("change detection",)), CompilationProgress(2, 8).progress_bar_text)
     compiling 3 of 8: change detection ███░░░░░░░░░
     """
 
@@ -57,36 +56,36 @@ class Progress:
         return f"compiling {min(self.done + 1, self.of)} of {self.of}: {' and '.join(self.running)}"
 
     @property
-    def share(self) -> float:
-        """Share of the parts that are compiled, 0 to 1."""
+    def compiled_share(self) -> float:
+        """Fraction of the parts that are compiled, from 0 to 1."""
         return self.done / self.of
 
     @property
-    def bar(self) -> str:
-        """Text bar that shows ``share``."""
-        filled = round(BAR_LENGTH * self.share)
+    def progress_bar_text(self) -> str:
+        """Text of the progress bar."""
+        filled = round(BAR_LENGTH * self.compiled_share)
         return "█" * filled + "░" * (BAR_LENGTH - filled)
 
 
 def prepare_kernels(
-    group: KernelGroup, tell: Callable[[Progress], None], processes: int | None = None
+    group: KernelGroup, report_progress: Callable[[CompilationProgress], None], processes: int | None = None
 ) -> Iterator[str]:
-    """Prepare the kernels of a group for calls, and yield the name of each part that is ready.
+    """Compile the kernels of a group or load them from the cache, and yield the name of each finished part.
 
     Parameters
     ----------
     group : KernelGroup
         Parts to prepare.
-    tell : callable
-        Called with a ``Progress`` when the compilation of a part begins or ends, unless all parts are cached on disk.
+    report_progress : callable
+        Function that is called when the compilation of a part begins or ends.
     processes : int, optional
-        Number of child processes. The default is the number of processors, at most ``MAX_PROCESSES``. If the number is
-        0 or no cache folder can be written, the calling process compiles the kernels.
+        Number of child processes, by default at most ``MAX_PROCESSES``. If the number is 0, the calling process
+        compiles the kernels.
 
     Yields
     ------
     str
-        Name of the part that is ready.
+        Name of a finished part.
 
     Raises
     ------
@@ -105,8 +104,8 @@ def prepare_kernels(
         processes = min(_count_processors(), MAX_PROCESSES)
     with closing(_ChildProcesses(group.parts, processes)) as children:
         for done, part in enumerate(group.parts):
-            if not children.wait_for(part, tell):
-                tell(Progress(done, len(group.parts), (part.name,)))
+            if not children.wait_for_part(part, report_progress):
+                report_progress(CompilationProgress(done, len(group.parts), (part.name,)))
             part.prepare()
             yield part.name
     if folder is not None:
@@ -114,23 +113,22 @@ def prepare_kernels(
 
 
 def is_warm(group: KernelGroup) -> bool:
-    """Return True if all kernels of a group are cached on disk for the present program, Numba and processor."""
+    """Return True if all kernels of a group are cached for the current program, Numba and processor."""
     folder = kernel_cache_folder()
     return folder is not None and _stamp_file(folder, group).is_file()
 
 
 def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
-    """Compile parts in a child process of ``prepare_kernels``.
+    """Compile parts of the kernels in a child process, and exit when the standard input closes.
 
-    The function reads one part name per line, compiles the part, and writes the name. When the standard input closes,
-    the parent process has ended, and the child process ends at once.
+    The function reads one part name per line, compiles the part, and writes the name.
 
     Parameters
     ----------
     stdin : text file
-        Source of the part names.
+        Standard input, with part names.
     stdout : text file
-        Receives the name of each compiled part.
+        Standard output, for the names of compiled parts.
     """
     parts = {part.name: part for group in GROUPS for part in group.parts}
     names: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -148,18 +146,18 @@ def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
 
 
 class _ChildProcesses:
-    """Child processes that compile parts. Each child has a thread that sends the names of the parts.
+    """Child processes that compile parts of the kernels, each controlled by a thread.
 
-    If a child cannot be started or fails, its thread ends. The calling process compiles the remaining parts.
+    If a child process fails, the calling process compiles the remaining parts.
     """
 
     def __init__(self, parts: Sequence[KernelPart], processes: int) -> None:
         self._number_of_parts = len(parts)
         self._waiting = deque(part.name for part in parts)
         self._running: list[str] = []
-        # True if a child has compiled the part, False if the calling process must compile it
+        # True if a child process has compiled the part, False if the calling process must compile the part
         self._compiled: dict[str, bool] = {}
-        self._changes: queue.SimpleQueue[Progress] = queue.SimpleQueue()
+        self._changes: queue.SimpleQueue[CompilationProgress] = queue.SimpleQueue()
         self._children: list[subprocess.Popen[str]] = []
         self._active_threads = processes
         self._lock = threading.Lock()
@@ -175,16 +173,16 @@ class _ChildProcesses:
             for child in self._children:
                 child.kill()
 
-    def wait_for(self, part: KernelPart, tell: Callable[[Progress], None]) -> bool:
-        """Wait for a part, and report the progress; return False if the calling process must compile the part."""
+    def wait_for_part(self, part: KernelPart, report_progress: Callable[[CompilationProgress], None]) -> bool:
+        """Wait for a part, and return False if the calling process must compile the part."""
         while part.name not in self._compiled or not self._changes.empty():
             progress = self._changes.get()
             if progress.running:
-                tell(progress)
+                report_progress(progress)
         return self._compiled[part.name]
 
     def _run_child(self) -> None:
-        """Send part names to a child process until no part is left or the child fails."""
+        """Send part names to a child process until no part is left or the child process fails."""
         pipe = subprocess.PIPE
         try:
             with (
@@ -207,12 +205,10 @@ class _ChildProcesses:
                     self._leave_waiting_parts()
 
     def _leave_waiting_parts(self) -> None:
-        """Mark the waiting parts for compilation by the calling process."""
         self._compiled |= dict.fromkeys(self._waiting, False)
         self._put_progress()
 
     def _begin_next(self) -> str | None:
-        """Return the name of the next part to compile; None if no part is left."""
         with self._lock:
             if not self._waiting:
                 return None
@@ -222,20 +218,18 @@ class _ChildProcesses:
             return name
 
     def _finish(self, name: str, compiled: bool) -> None:
-        """Report the end of the compilation of a part."""
         with self._lock:
             self._running.remove(name)
             self._compiled[name] = compiled
             self._put_progress()
 
     def _put_progress(self) -> None:
-        """Put the progress into the queue of the waiting thread."""
         done = sum(self._compiled.values())
-        self._changes.put(Progress(done, self._number_of_parts, tuple(self._running)))
+        self._changes.put(CompilationProgress(done, self._number_of_parts, tuple(self._running)))
 
 
 def _compile_in_child(child: "subprocess.Popen[str]", name: str) -> bool:
-    """Let a child process compile a part; return True on success."""
+    """Compile a part in a child process; return True on success."""
     assert child.stdin is not None
     assert child.stdout is not None
     try:
@@ -246,13 +240,12 @@ def _compile_in_child(child: "subprocess.Popen[str]", name: str) -> bool:
 
 
 def _count_processors() -> int:
-    """Return the number of processors that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)  # missing on macOS
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _stamp_file(folder: Path, group: KernelGroup) -> Path:
-    """Return the path of the stamp file of a group. The name depends on all that affects the machine code."""
+    """Return the path of the stamp file of a group, whose name depends on everything that affects the machine code."""
     machine = [binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()]
     parts = [part.name for part in group.parts]
     everything = [*parts, hash_module_with_imports(Path(__file__)), numba.__version__, sys.version, *machine]

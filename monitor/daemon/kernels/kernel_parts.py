@@ -1,7 +1,4 @@
-"""Parts of the numerical kernels, each with a function that calls the kernels of the part.
-
-When a kernel is called with the argument types of the program, Numba compiles the kernel or loads it from the cache.
-"""
+"""Parts of the numerical kernels, each with a function that calls all kernels of the part."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,19 +21,18 @@ class KernelPart:
     """Kernels that are compiled together."""
 
     name: str  # name of the computation, as shown to the user
-    prepare: Callable[[], None]  # calls each kernel with every signature that the program uses
+    prepare: Callable[[], None]  # calls each kernel with all argument types of the program
 
 
 @dataclass(frozen=True, slots=True)
 class KernelGroup:
-    """Parts that are needed together. A part follows the parts whose kernels it uses."""
+    """Parts of the kernels that are needed together, in order of dependency."""
 
     name: str
     parts: tuple[KernelPart, ...]
 
 
 def _samples(n: int) -> SampleBlock:
-    """Return a block of ``n`` samples with value zero."""
     return make_block(np.arange(n, dtype=np.int64), np.zeros((n, 6)))
 
 
@@ -86,7 +82,7 @@ def _call_temperature_lag() -> None:
 
 
 def _call_analysis() -> None:
-    from monitor.estimation.analysis import analyze  # imported here because the service does not need it
+    from monitor.estimation.analysis import analyze  # the service does not need this import
 
     analyze([_samples(100)], 100.0)
 
@@ -95,7 +91,7 @@ def _call_reconciliation() -> None:
     from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
     from monitor.noise.model import NoiseModel
     from monitor.reconcile.preparation.reconcile_input import Recording
-    from monitor.reconcile.reconcile import reconcile  # imported here because the service does not need it
+    from monitor.reconcile.reconcile import reconcile  # the service does not need this import
 
     model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4), BiasInstability(B=3e-5), RateRandomWalk(K=1e-6))})
     series, rng = model.simulate(4200, 10.0, 1)[:, 2], np.random.default_rng(1)
@@ -106,7 +102,7 @@ def _call_reconciliation() -> None:
 
 
 WINDOW: Final = "Allan deviation"
-"""Name of the part with the kernels of the window."""
+"""Name of the part with the kernels of the sliding window."""
 FIT: Final = "noise coefficients"
 """Name of the part with the kernels of the fit."""
 SERVICE: Final = KernelGroup(
@@ -122,12 +118,12 @@ SERVICE: Final = KernelGroup(
         KernelPart("temperature lag", _call_temperature_lag),
     ),
 )
-"""Parts that the running service needs, in the order in which it needs them."""
+"""Parts that the service needs, in order of use."""
 _ANALYSIS: Final = KernelPart("analysis of recordings", _call_analysis)
 _RECONCILIATION: Final = KernelPart("reconciliation", _call_reconciliation)
 COMMANDS: Final = KernelGroup(
     "commands", (_ANALYSIS,) if find_missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION)
 )
-"""Parts that only the commands on recordings need. A few rarely used kernels are compiled at their first call."""
+"""Parts that only the commands for recordings need."""
 GROUPS: Final = (SERVICE, COMMANDS)
-"""All groups."""
+"""All groups of kernels."""

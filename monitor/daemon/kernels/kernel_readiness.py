@@ -10,14 +10,14 @@ import structlog
 from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
 MAX_INTERPRETED_HZ: Final = 250.0
-"""Maximum total sample rate of the devices with interpreted kernels. A sample takes up to 0.8 ms."""
+"""Maximum total sample rate of devices with interpreted kernels, which need up to 0.8 ms per sample."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 @dataclass(slots=True)
 class KernelReadiness:
-    """Flags of the compiled kernels. Until the kernels are compiled, Python interprets them for low sample rates."""
+    """Flags that show which kernels are compiled."""
 
     window: threading.Event = field(default_factory=threading.Event)
     """Set if the kernels of the Allan deviation are compiled."""
@@ -26,33 +26,32 @@ class KernelReadiness:
     all: threading.Event = field(default_factory=threading.Event)
     """Set if all kernels of the service are compiled."""
     progress: str = ""
-    """Progress of the compilation as one line of text; empty if nothing is being compiled."""
+    """Progress of the compilation as one line of text, or "" after the compilation."""
     interpretable_hz: float = MAX_INTERPRETED_HZ
-    """Total sample rate that is still available for devices with interpreted kernels."""
+    """Total sample rate that is still available for interpreted kernels."""
 
-    def reserve_interpreter(self, rate_hz: float) -> bool:
-        """Return True if Python can also interpret the kernels for a device with this sample rate."""
+    def reserve_interpreted_rate(self, rate_hz: float) -> bool:
+        """Reserve interpreted kernels for a device, and return False if the total sample rate would be too high."""
         if rate_hz > self.interpretable_hz:
             return False
         self.interpretable_hz -= rate_hz
         return True
 
-    def compile(self, wake: threading.Event) -> None:
-        """Compile the kernels, and set a flag and ``wake`` for each compiled part. Called in a thread.
+    def compile_kernels(self, wake: threading.Event) -> None:
+        """Compile the kernels, and set a flag and ``wake`` for each compiled part.
 
-        All flags are set even if the compilation fails, because the main loop would otherwise wait forever. The main
-        loop then compiles the missing kernels or ends with the error.
+        All flags are set even if the compilation fails, because the main loop would otherwise wait forever.
         """
         begin_s = time.monotonic()
 
-        def show(progress: kernel_compilation.Progress) -> None:
+        def show_progress(progress: kernel_compilation.CompilationProgress) -> None:
             if not self.progress:
                 _log.info("compiling kernels, because this version has not run on this machine before")
-            self.progress = f"{progress} {progress.bar}"
+            self.progress = f"{progress} {progress.progress_bar_text}"
             wake.set()
 
         try:
-            for part in kernel_compilation.prepare_kernels(kernel_parts.SERVICE, show):
+            for part in kernel_compilation.prepare_kernels(kernel_parts.SERVICE, show_progress):
                 flag = {kernel_parts.WINDOW: self.window, kernel_parts.FIT: self.fit}.get(part)
                 if flag is not None:
                     flag.set()

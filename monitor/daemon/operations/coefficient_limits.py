@@ -1,15 +1,11 @@
-"""User limits on noise coefficients: detects when a coefficient crosses a limit and when it returns.
+"""User limits on noise coefficients, and detection of crossed limits.
 
-A single value may cross a limit by chance, so the confidence interval decides. An upper limit is crossed if the lower
-end ``lo`` of the interval is above the limit. A lower limit is crossed if the upper end ``hi`` is below the limit. If
-every estimate during ``hold_s`` seconds of samples is beyond the limit, the event ``limit_crossed`` is raised.
+An upper limit is crossed if the lower end of the confidence interval is above the limit. A lower limit is crossed if
+the upper end of the confidence interval is below the limit. If every estimate during ``hold_s`` seconds of samples
+crosses the limit, the event ``limit_crossed`` is raised. If the value stays within the limit for ``hold_s`` seconds of
+samples, the event ``limit_back`` is raised. An estimate without value and upper bound restarts the hold time.
 
-If the value has been within the limit for ``hold_s`` seconds of samples, the event ``limit_back`` is raised. For an
-upper bound without a value, ``hi`` is compared with the limit. An estimate without value and bound, for example after
-the restart of an axis, restarts the hold time.
-
-The hold time is counted in samples. Missing samples are therefore no evidence, and a replayed recording gives the same
-events as the live sensor. The module uses no clock and no thread.
+The hold time is counted in samples, so a replayed recording and the live sensor give the same events.
 """
 
 from collections.abc import Sequence
@@ -29,13 +25,13 @@ from monitor.publishing.exporters.exported_coefficients import from_model
 from monitor.settings.loading import Device, Limit
 
 LIMIT_CROSSED: Final = "limit_crossed"
-"""Kind of the event for a crossed limit."""
+"""Kind of the event when a limit is crossed."""
 LIMIT_BACK: Final = "limit_back"
-"""Kind of the event for the return from a crossed limit."""
+"""Kind of the event when a coefficient returns within a crossed limit."""
 
 
 @dataclass(frozen=True, slots=True)
-class Bound:
+class AxisLimit:
     """Limit of one coefficient on one axis."""
 
     axis: str
@@ -46,24 +42,24 @@ class Bound:
     times_model: float | None = None  # limit as a multiple of the coefficient of the noise model
 
     @property
-    def place(self) -> str:
-        """Axis and letter, for example ``gz N``."""
+    def axis_and_letter(self) -> str:
+        """Axis and letter of the coefficient, for example ``gz N``."""
         return f"{self.axis} {self.letter}"
 
 
 @dataclass(frozen=True, slots=True)
 class _Measured:
-    """Coefficient of one estimate with its interval; NaN if the estimate has no value."""
+    """Coefficient of one estimate with the confidence interval; NaN if the coefficient is unknown."""
 
     value: float
     lo: float
     hi: float
 
-    def is_beyond(self, bound: Bound) -> bool:
-        """Return True if the interval is beyond the limit."""
+    def is_beyond_limit(self, bound: AxisLimit) -> bool:
+        """Return True if the confidence interval is beyond the limit."""
         return self.lo > bound.limit if bound.upper else self.hi < bound.limit
 
-    def is_back(self, bound: Bound) -> bool:
+    def is_within_limit(self, bound: AxisLimit) -> bool:
         """Return True if the value is within the limit."""
         if not bound.upper:
             return self.value >= bound.limit
@@ -72,38 +68,36 @@ class _Measured:
 
 @dataclass(slots=True)
 class _State:
-    """State of one limit."""
-
     crossed: bool = False
     since: tuple[int, int] | None = None  # samples and t_ns of the first estimate that contradicts ``crossed``
 
 
 class LimitMonitor:
-    """Monitor of all limits of one device.
+    """Monitor of all user limits of one device.
 
     Parameters
     ----------
     limits : sequence of Limit
-        Limits from the settings of the device.
+        User limits in the settings of the device.
     model : NoiseModel or None
         Noise model of the device, for limits that are relative to the model.
 
     Raises
     ------
     ConfigError
-        If a limit is relative to a coefficient that the model does not have on that axis.
+        If a limit is relative to a coefficient that the noise model does not contain.
     """
 
     def __init__(self, limits: Sequence[Limit], model: NoiseModel | None) -> None:
-        self.states = {bound: _State() for bound in make_bounds(limits, model)}
+        self.states = {bound: _State() for bound in make_axis_limits(limits, model)}
 
     @property
     def limits_crossed_now(self) -> tuple[str, ...]:
-        """Axis and letter of each crossed limit, for example ``gz N``."""
-        return tuple(bound.place for bound, state in self.states.items() if state.crossed)
+        """Axis and letter of each coefficient that has crossed a limit, for example ``gz N``."""
+        return tuple(bound.axis_and_letter for bound, state in self.states.items() if state.crossed)
 
     def copy_states_from(self, other: "LimitMonitor") -> None:
-        """Copy the states of all limits that both monitors have."""
+        """Copy the states of the limits that both monitors contain."""
         for bound in self.states:
             self.states[bound] = other.states.get(bound, self.states[bound])
 
@@ -112,10 +106,9 @@ class LimitMonitor:
         events = (self._test_bound(bound, state, estimate) for bound, state in self.states.items())
         return [event for event in events if event is not None]
 
-    def _test_bound(self, bound: Bound, state: _State, estimate: Estimate) -> Event | None:
-        """Compare an estimate with one limit; return an event if the state of the limit changes."""
+    def _test_bound(self, bound: AxisLimit, state: _State, estimate: Estimate) -> Event | None:
         seen = _measured(bound, estimate)
-        if not (seen.is_back(bound) if state.crossed else seen.is_beyond(bound)):
+        if not (seen.is_within_limit(bound) if state.crossed else seen.is_beyond_limit(bound)):
             state.since = None
             return None
         if state.since is None:
@@ -128,35 +121,35 @@ class LimitMonitor:
 
 
 def read_model_in_force(device: Device) -> NoiseModel | None:
-    """Read the noise model with which a device is compared; return None if none is configured.
+    """Read the noise model of a device, or return None if no model is configured.
 
     Raises
     ------
     ConfigError
-        If the model cannot be read, or if a limit is relative to a coefficient that the model does not have.
+        If the model cannot be read, or if a limit is relative to a coefficient that the model does not contain.
     """
     model = None if device.model is None else read_model(device.model)
     try:
-        make_bounds(device.limits, model)
+        make_axis_limits(device.limits, model)
     except ConfigError as error:
         raise ConfigError(*(f"device {device.name}: {line}" for line in error.lines)) from None
     return model
 
 
-def make_bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
-    """Return one bound for each axis of each limit.
+def make_axis_limits(limits: Sequence[Limit], model: NoiseModel | None) -> list[AxisLimit]:
+    """Return the limits of single coefficients and axes from the user limits of a device.
 
     Parameters
     ----------
     limits : sequence of Limit
-        Limits from the settings of a device.
+        User limits in the settings of a device.
     model : NoiseModel or None
         Noise model of the device.
 
     Raises
     ------
     ConfigError
-        If a limit is relative to a coefficient that the model does not have on that axis.
+        If a limit is relative to a coefficient that the noise model does not contain.
     """
     known = {} if model is None else from_model(model).axes
     found, wrong = [], []
@@ -171,26 +164,24 @@ def make_bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound
                     )
                     continue
                 upper = limit.times_model * term.value
-                found.append(Bound(axis, limit.letter, upper, True, limit.hold_s, limit.times_model))
+                found.append(AxisLimit(axis, limit.letter, upper, True, limit.hold_s, limit.times_model))
             if limit.above is not None:
-                found.append(Bound(axis, limit.letter, limit.above, True, limit.hold_s))
+                found.append(AxisLimit(axis, limit.letter, limit.above, True, limit.hold_s))
             if limit.below is not None:
-                found.append(Bound(axis, limit.letter, limit.below, False, limit.hold_s))
+                found.append(AxisLimit(axis, limit.letter, limit.below, False, limit.hold_s))
     if wrong:
         raise ConfigError(*wrong)
     return found
 
 
-def _measured(bound: Bound, estimate: Estimate) -> _Measured:
-    """Return the coefficient of an estimate to which a limit applies."""
+def _measured(bound: AxisLimit, estimate: Estimate) -> _Measured:
     table, at = estimate.coefficients, (SYMBOLS.index(bound.letter), AXES.index(bound.axis))
     if Status(int(table.status[at])) == Status.UNESTIMATED:
         return _Measured(float("nan"), float("nan"), float("nan"))
     return _Measured(float(table.value[at]), float(table.lo[at]), float(table.hi[at]))
 
 
-def _event(bound: Bound, seen: _Measured, crossed: bool, t_ns: int, since_ns: int) -> Event:
-    """Return the event ``limit_crossed`` or ``limit_back``."""
+def _event(bound: AxisLimit, seen: _Measured, crossed: bool, t_ns: int, since_ns: int) -> Event:
     what = {"value": seen.value, "lo": seen.lo, "hi": seen.hi, "limit": bound.limit}
     kind = LIMIT_CROSSED if crossed else LIMIT_BACK
     return Event(
@@ -198,16 +189,15 @@ def _event(bound: Bound, seen: _Measured, crossed: bool, t_ns: int, since_ns: in
     )
 
 
-def _sigma(bound: Bound, seen: _Measured) -> float | None:
-    """Return the distance between value and limit in standard errors; None for an upper bound."""
+def _sigma(bound: AxisLimit, seen: _Measured) -> float | None:
+    """Return the distance between value and limit in standard errors, or None for an upper bound."""
     if not isfinite(seen.value):
         return None
     error = (seen.value - seen.lo if seen.value > bound.limit else seen.hi - seen.value) / Z95
     return abs(seen.value - bound.limit) / error if error > 0.0 else None
 
 
-def _text(bound: Bound, seen: _Measured, crossed: bool) -> str:
-    """Return the message of the event."""
+def _text(bound: AxisLimit, seen: _Measured, crossed: bool) -> str:
     unit, name = coefficient_unit(bound.letter, bound.axis), COEFFICIENT_NAMES[sensor_kind(bound.axis)][bound.letter]
     measured = unit.format_si_value(seen.value) if isfinite(seen.value) else f"at most {unit.format_si_value(seen.hi)}"
     limit = f"{unit.format_si_value(bound.limit)}, its {'upper' if bound.upper else 'lower'} limit"

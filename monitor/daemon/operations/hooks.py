@@ -1,15 +1,11 @@
 """Hooks: user commands and zenoh messages that are triggered by events.
 
-An event that matches a hook is encoded as JSON. If the hook names a zenoh key, the JSON is published immediately. If
-the hook names a command, the JSON enters a bounded queue. A few threads run the commands of this queue. A command runs
-without a shell and receives the JSON on the standard input.
-
-A command that exceeds its time limit is killed together with its child processes. Only the end of its output is kept. A
-failure is logged, and the status shows it under ``hook`` until a hook succeeds. The main loop never waits.
+An event that matches a hook is encoded as JSON. The JSON is published on the zenoh key of the hook, or passed to the
+standard input of a command. Commands wait in a bounded queue and run in a few threads, without a shell. A command that
+exceeds the time limit is killed together with all child processes. The status shows the error of the newest run.
 
 For each kind of event and each device, a hook runs at most BURST times in a row and then once in RUN_INTERVAL_S. A
-faulty cable that reports losses every second therefore starts only a few programs, and other events still run their
-hooks. The status shows the number of suppressed runs.
+faulty cable that reports losses every second therefore starts only a few programs.
 """
 
 import os
@@ -32,21 +28,21 @@ from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Hook
 
 THREADS: Final = 4
-"""Number of threads, each of which runs one command at a time."""
+"""Number of threads that run commands."""
 MAX_QUEUED: Final = 100
-"""Largest number of queued commands."""
+"""Maximum number of queued commands."""
 BURST: Final = 10
-"""Largest number of runs in a row."""
+"""Maximum number of runs in a row."""
 RUN_INTERVAL_S: Final = 6.0
-"""Minimum mean interval between two runs after a burst."""
+"""Mean interval between two runs after a burst."""
 OUTPUT_BYTES: Final = 4096
-"""Number of bytes that are kept from the end of a command's output."""
+"""Maximum number of bytes that are kept from the output of a command."""
 MAX_LINE_CHARS: Final = 200
-"""Largest length of the last output line in a message, in characters."""
+"""Maximum length of an output line in a message, in characters."""
 POLL_S: Final = 0.05
-"""Interval between two checks whether a command has ended."""
+"""Interval at which the end of a command is checked."""
 CLOSE_TIMEOUT_S: Final = 2.0
-"""Time for running commands to end when the service stops."""
+"""Longest wait for running commands when the service stops."""
 PRIVATE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 """Environment variables that are not passed to commands."""
 
@@ -55,8 +51,6 @@ _log = structlog.get_logger("imu-monitor")
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """Queued command of a hook."""
-
     hook: Hook
     payload: bytes
     named: Mapping[str, str]  # additional environment variables
@@ -70,7 +64,7 @@ class Hooks(Output):
     hooks : sequence of Hook
         Configured hooks.
     put : callable
-        Publishes a message on a zenoh key; returns "", or the reason why the message was not published.
+        Function that publishes a message on a zenoh key, and returns "" or a description of the error.
     now : callable, optional
         Monotonic clock in seconds.
     """
@@ -82,9 +76,7 @@ class Hooks(Output):
         self._put = put
         self._now = now
         self._jobs: queue.Queue[_Job | None] = queue.Queue(MAX_QUEUED)
-        self._allowed: dict[
-            tuple[Hook, str, str], tuple[float, float]
-        ] = {}  # number of allowed runs, and the time of this number
+        self._allowed: dict[tuple[Hook, str, str], tuple[float, float]] = {}  # number of allowed runs at a time
         self._threads: list[threading.Thread] = []
         self._closing = threading.Event()
         self._last_error = ""  # error of the newest run; empty if it succeeded
@@ -118,11 +110,11 @@ class Hooks(Output):
                 self._start(_Job(hook, payload + b"\n", named))
 
     def close(self) -> None:
-        """Wait up to CLOSE_TIMEOUT_S for queued and running commands, then kill them."""
+        """Wait up to CLOSE_TIMEOUT_S for the commands, and kill the commands that still run."""
         for _ in self._threads:
             try:
                 self._jobs.put_nowait(None)
-            except queue.Full:  # the queue has more commands than can still run
+            except queue.Full:  # the queue is full of commands
                 break
         until_s = time.monotonic() + CLOSE_TIMEOUT_S
         for thread in self._threads:
@@ -135,7 +127,6 @@ class Hooks(Output):
     # --- private methods
 
     def _may_run(self, hook: Hook, kind: str, device: str) -> bool:
-        """Return True if the rate limit of a hook allows a run now, and count the run."""
         now_s = self._now()
         left, at_s = self._allowed.get((hook, kind, device), (float(BURST), now_s))
         left = min(float(BURST), left + (now_s - at_s) / RUN_INTERVAL_S)
@@ -144,7 +135,6 @@ class Hooks(Output):
         return may
 
     def _start(self, job: _Job) -> None:
-        """Queue a command. The first command starts the threads."""
         try:
             while len(self._threads) < THREADS:
                 thread = threading.Thread(target=self._run_queued, name=f"hooks {len(self._threads)}", daemon=True)
@@ -158,12 +148,10 @@ class Hooks(Output):
             self._held_back += 1
 
     def _run_queued(self) -> None:
-        """Run queued commands one after the other, in a thread."""
         while not self._closing.is_set() and (job := self._jobs.get()) is not None:
             self._log_result(job.hook.command[0], _run_command(job.hook, job.payload, job.named, self._closing.is_set))
 
     def _log_result(self, what: str, wrong: str) -> None:
-        """Log the result of a run, and keep the error for the status."""
         if wrong:
             self._failed += 1
             _log.warning("hook", hook=what, error=wrong)
@@ -173,12 +161,11 @@ class Hooks(Output):
 
 
 def _matches(hook: Hook, device: str, kind: str) -> bool:
-    """Return True if a hook matches the device and the kind of an event."""
     return ("*" in hook.on or kind in hook.on) and (not hook.devices or device in hook.devices)
 
 
 def _run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[], bool]) -> str:
-    """Run the command of a hook, or kill it when ``ending`` returns True; return "" or a description of the error."""
+    """Run the command of a hook, and return "" or a description of the error."""
     environment = {name: value for name, value in os.environ.items() if name not in PRIVATE_VARIABLES}
     try:
         process = subprocess.Popen(
@@ -187,7 +174,7 @@ def _run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: C
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env={**environment, **named},
-            start_new_session=True,  # a separate process group can be killed as a whole
+            start_new_session=True,  # so that all child processes can be killed
         )
     except (OSError, ValueError) as error:
         return f"cannot be started: {getattr(error, 'strerror', None) or error}"
@@ -198,14 +185,14 @@ def _run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: C
         return f"killed: {error.strerror or error}"
     finally:
         if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)  # not yet reaped, so no other process has this id
+            os.killpg(process.pid, signal.SIGKILL)  # the process id is still valid, because the process is not reaped
             process.wait()
 
 
 def _wait_for_end(
     process: "subprocess.Popen[bytes]", pipes: "_Pipes", timeout_s: float, ending: Callable[[], bool]
 ) -> str:
-    """Wait for the end of a command, or kill it; return "" or a description of the error."""
+    """Wait for the end of a command or kill the command; return "" or a description of the error."""
     until_s = time.monotonic() + timeout_s
     while process.poll() is None:
         pipes.transfer_pipe_data()
@@ -215,13 +202,13 @@ def _wait_for_end(
             return f"killed after {timeout_s:g} s"
     if process.returncode == 0:
         return ""
-    pipes.read_rest_of_pipe()
+    pipes.read_remaining_output()
     how = f"signal {-process.returncode}" if process.returncode < 0 else f"exit status {process.returncode}"
-    return f"{how}{pipes.last_line()}"
+    return f"{how}{pipes.last_output_line_text()}"
 
 
 class _Pipes:
-    """Non-blocking pipes to a command, so that a command that does not read or write delays nothing."""
+    """Non-blocking pipes to the standard input and output of a command."""
 
     def __init__(self, process: "subprocess.Popen[bytes]", payload: bytes) -> None:
         assert process.stdin is not None
@@ -243,28 +230,27 @@ class _Pipes:
             pipe.close()
 
     def transfer_pipe_data(self) -> None:
-        """Transfer the data that can be transferred within POLL_S."""
+        """Write to the standard input and read from the standard output for up to POLL_S."""
         for key, _ in self._selector.select(POLL_S):
             if key.fileobj is self._in:
                 self._write()
             else:
                 self._read()
 
-    def read_rest_of_pipe(self) -> None:
-        """Read the rest of the output of a finished command, within limits, because its children may still write."""
+    def read_remaining_output(self) -> None:
+        """Read the remaining output of a finished command."""
         for _ in range(16):
             if self._out.closed or not self._read():
                 return
 
-    def last_line(self) -> str:
-        """Return ``: `` and the last output line with unprintable characters replaced; "" without output."""
+    def last_output_line_text(self) -> str:
+        """Return ``: `` and the last output line in printable characters, or "" without output."""
         lines = self._tail.decode("utf-8", "replace").strip().splitlines()
         if not lines:
             return ""
         return f": {''.join(letter if letter.isprintable() else '�' for letter in lines[-1])[-MAX_LINE_CHARS:]}"
 
     def _write(self) -> None:
-        """Write as much of the payload as the pipe accepts."""
         try:
             self._left = self._left[os.write(self._in.fileno(), self._left) :]
         except BlockingIOError:
@@ -276,7 +262,6 @@ class _Pipes:
             self._in.close()
 
     def _read(self) -> bool:
-        """Read once from the pipe; return True if more data may follow."""
         try:
             data = os.read(self._out.fileno(), OUTPUT_BYTES)
         except BlockingIOError:

@@ -1,4 +1,4 @@
-"""Log level of the process. A reload can change the level of existing loggers."""
+"""Log level of the process, which also applies to existing loggers."""
 
 import logging
 

@@ -1,11 +1,10 @@
 """Prometheus metrics over HTTP: the newest values of each device, if ``[metrics] listen`` is set.
 
-The main loop stores the newest health and estimate of each device. For each scrape, a server thread answers with the
-stored values, so a scrape does not delay the main loop. A scrape that hangs is ended after TIMEOUT_S. While MAX_SCRAPES
-scrapes are active, further scrapes are rejected. If the port is in use, the status says so, and the server tries again.
+The main loop stores the newest status and estimate of each device. A server thread answers each scrape with the stored
+values, so a scrape does not delay the main loop. If the port is in use, the server tries again.
 
-All values are in SI units. A coefficient with only an upper bound has ``hi`` and no value. A coefficient that could not
-be estimated has no entry.
+All values are in SI units. A coefficient with only an upper bound has ``hi`` and no value. A coefficient that is not
+estimated has no entry.
 """
 
 import socket
@@ -34,25 +33,25 @@ if TYPE_CHECKING:
 RETRY_S: Final = 5.0
 """Interval between two attempts to listen."""
 TIMEOUT_S: Final = 10.0
-"""Time after which a scrape is ended."""
+"""Maximum duration of a scrape."""
 MAX_SCRAPES: Final = 8
-"""Largest number of concurrent scrapes."""
+"""Maximum number of concurrent scrapes."""
 PAUSE_S: Final = 0.1
-"""Pause after a connection that could not be accepted."""
+"""Pause after a failed connection."""
 PATH: Final = "/metrics"
 """Path of the metrics in the URL."""
 MISSING_LIBRARY_TEXT: Final = 'prometheus-client is not installed: pip install "imu-monitor[metrics]"'
 """Status message if the library is not installed."""
 STATES: Final = ("running", "waiting", "lost", "ended")
-"""States of a device."""
+"""Possible states of a device."""
 _GYRO_UNITS: Final = ", ".join(
     f"{symbol} {gyro_and_accel_units(term)[symbol][0]}" for symbol, term in STANDARD_TERMS.items()
 )
 UNITS: Final = f"gyroscopes {_GYRO_UNITS}; accelerometers with m/s for rad"
-"""Units of the coefficients, for the descriptions."""
+"""Units of the coefficients in the descriptions."""
 
 Rows = Mapping[tuple[str, ...], float | None]
-"""Values of one metric by label values; None if unknown."""
+"""Values of one metric by label values, or None if unknown."""
 Numbers = Callable[[Health], float | None]
 """Function that reads one value from the health of a device."""
 
@@ -64,18 +63,18 @@ COUNTERS: Final[dict[str, tuple[str, Numbers]]] = {
     "repeated": ("Repeated samples, which were discarded", lambda one: one.repeated),
     "late": ("Samples that arrived too late and were discarded", lambda one: one.late),
 }
-"""Counters ``imu_monitor_samples_<name>_total`` for each device: description and value."""
+"""Descriptions and values of the counters ``imu_monitor_samples_<name>_total``."""
 GAUGES: Final[dict[str, tuple[str, Numbers]]] = {
     "sample_rate_hertz": ("Measured sample rate", lambda one: one.rate_hz),
     "uptime_seconds": ("Time since the device was started", lambda one: one.uptime_s),
     "moving": ("1 while the device is moved", lambda one: float(one.moving)),
     "limits_crossed": ("Number of crossed user limits", lambda one: float(len(one.crossed))),
 }
-"""Gauges ``imu_monitor_<name>`` for each device: description and value."""
+"""Descriptions and values of the gauges ``imu_monitor_<name>``."""
 
 
 class MetricsOutput(Output):
-    """Output that stores the newest values and serves them to Prometheus.
+    """Output that serves the newest values of each device to Prometheus.
 
     Parameters
     ----------
@@ -87,7 +86,7 @@ class MetricsOutput(Output):
         self._settings = settings
         self.state = "starting"
         self.port = 0
-        """Port of the server; 0 while the server does not listen."""
+        """Port of the server, or 0 while the server does not listen."""
         self._healths: dict[str, Health] = {}
         self._estimates: dict[str, Estimate] = {}
         self._events: Counter[tuple[str, str]] = Counter()
@@ -98,31 +97,31 @@ class MetricsOutput(Output):
     # --- called by the main loop
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Keep the newest estimate of a device."""
+        """Store the newest estimate of a device."""
         if isinstance(result, Estimate):
             self._estimates[device] = result
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Count an event."""
+        """Count an event of a device."""
         self._events[device, event.kind] += 1
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Keep the newest health of a device."""
+        """Store the newest status of a device."""
         self._healths[device] = health
 
     def remove_device(self, device: str) -> None:
-        """Remove the values of a device."""
+        """Remove the stored values of a device."""
         self._healths.pop(device, None)
         self._estimates.pop(device, None)
         for key in [key for key in self._events if key[0] == device]:
             del self._events[key]
 
     def start(self) -> None:
-        """Start the server in a thread. ``state`` shows errors, after which the server tries again."""
+        """Start the server in a thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the server."""
+        """Stop the server thread."""
         self._closing.set()
         server = self._server
         if server is not None:
@@ -133,7 +132,7 @@ class MetricsOutput(Output):
     # --- called by the registry of the client library
 
     def collect(self) -> "Iterator[Metric]":
-        """Yield all metrics of the present moment."""
+        """Yield all current metrics."""
         healths, estimates = dict(self._healths), dict(self._estimates)
         yield from _device_metrics(healths)
         yield from _process_metrics(healths)
@@ -144,7 +143,6 @@ class MetricsOutput(Output):
     # --- server thread
 
     def _run(self) -> None:
-        """Serve scrapes until the output is closed, and retry while the port cannot be used."""
         try:
             from prometheus_client import CollectorRegistry
         except ImportError:
@@ -170,7 +168,7 @@ class MetricsOutput(Output):
 class _Server(socketserver.ThreadingTCPServer):
     """Server with one thread per scrape.
 
-    The server class of http.server is not used, because it asks the network for the name of this machine.
+    The server class of http.server is not used, because it queries the network for the name of the host.
     """
 
     allow_reuse_address = True
@@ -184,7 +182,7 @@ class _Server(socketserver.ThreadingTCPServer):
         super().__init__(address, _make_handler(registry))
 
     def get_request(self) -> Any:
-        """Accept the next connection. After an error, such as too few file descriptors, pause before the next one."""
+        """Accept the next connection, and pause after an error."""
         try:
             return super().get_request()
         except OSError:
@@ -192,7 +190,7 @@ class _Server(socketserver.ThreadingTCPServer):
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Start a thread for a scrape, or reject the scrape if too many are active."""
+        """Start a thread for a scrape, or reject the scrape if too many scrapes are active."""
         if not self._free.acquire(blocking=False):
             self.shutdown_request(request)
             return
@@ -203,18 +201,18 @@ class _Server(socketserver.ThreadingTCPServer):
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a scrape in its thread."""
+        """Answer a scrape in a thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error of a connection that the client has closed."""
+        """Ignore errors of connections that the client has closed."""
 
 
 def _make_handler(registry: "CollectorRegistry") -> "type[MetricsHandler]":
-    """Return a handler that serves the metrics of a registry at PATH, with the time limit TIMEOUT_S."""
+    """Return a handler class that serves the metrics of a registry at PATH."""
     from prometheus_client import MetricsHandler
 
     class Handler(MetricsHandler):
@@ -231,7 +229,6 @@ def _make_handler(registry: "CollectorRegistry") -> "type[MetricsHandler]":
 
 
 def _device_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
-    """Yield the metrics of all devices."""
     for name, (words, number) in COUNTERS.items():
         rows: Rows = {(device,): number(one) for device, one in healths.items()}
         yield _metric(f"samples_{name}", words, ("device",), rows, counter=True)
@@ -247,7 +244,6 @@ def _device_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
 
 
 def _process_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
-    """Yield the metrics of the process, which are the same in the health of every device."""
     if not healths:
         return
     newest = list(healths.values())[-1]
@@ -261,7 +257,6 @@ def _process_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
 
 
 def _coefficient_metrics(estimates: Mapping[str, Estimate]) -> "Iterator[Metric]":
-    """Yield the metrics of the noise coefficients."""
     for name, words in (
         ("value", "of the window"),
         ("lo", "lower end of the 95 % interval"),
@@ -286,7 +281,6 @@ def _metric(
     rows: Rows,
     counter: bool = False,
 ) -> "Metric":
-    """Return one metric. Unknown values are left out."""
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
     kind = CounterMetricFamily if counter else GaugeMetricFamily

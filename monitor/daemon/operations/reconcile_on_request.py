@@ -1,14 +1,12 @@
 """Reconciliation of the live window on request: answers the zenoh query ``command/reconcile``.
 
-For each query, a thread writes a copy of the window as a recording into a temporary folder. A child process then runs
-``imu-monitor reconcile`` on this recording. The thread answers the query with the JSON result of the child process, and
-the device publishes an event. The child process has a low priority and is killed after TIMEOUT_S. It is a separate
-process, because a fit takes seconds to minutes and would delay every sample. Each device has at most one reconciliation
-at a time.
+For each query, a thread saves a copy of the window as a recording and runs ``imu-monitor reconcile`` in a child
+process. A separate process is used because a fit takes seconds to minutes. The thread answers the query with the JSON
+result, and the device publishes an event. Each device has at most one reconciliation at a time.
 
 The query cannot choose the folder of the report, because anyone on the network may send a query. The report is kept in
-a new folder inside the device's ``reconcile_folder``, if this folder is configured. The answer is a result with
-``exit`` 0, a result with ``exit`` 3 and a reason if the data do not support an answer, or an error in one line.
+a new folder inside ``reconcile_folder``. If the data do not support an answer, the result contains ``exit`` 3 and a
+reason.
 """
 
 import contextlib
@@ -36,12 +34,12 @@ from monitor.publishing.zenoh.publisher import Command
 COMMAND: Final = (*PROGRAM, "reconcile")
 """Command of the child process."""
 TIMEOUT_S: Final = 900.0
-"""Time after which the child process is killed."""
+"""Time in seconds after which the child process is killed."""
 NICENESS_INCREASE: Final = 10
-"""Difference between the niceness of the child process and the niceness of the daemon."""
+"""Niceness of the child process relative to the daemon."""
 LARGEST_NICENESS: Final = 19
 SEED: Final = 1
-"""Seed of the simulated recordings."""
+"""Seed of the random numbers."""
 DONE: Final = 0
 """Exit status of a successful reconciliation."""
 NO_ANSWER: Final = 3
@@ -51,35 +49,35 @@ JOIN_TIMEOUT_S: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """Copy of a window to reconcile."""
+class ReconcileJob:
+    """Copy of the window of a device, for a reconciliation."""
 
     device: str
     unix_s: float  # time of the newest sample
     samples: int  # number of received samples up to the newest one
     window: WindowSnapshot
-    temperature_c: Floats  # [n] of the samples in the window
+    temperature_c: Floats  # [n] temperatures of the samples in the window
     model: Path | None  # model under test
-    folder: Path | None  # folder for reports; None if they are not kept
+    folder: Path | None  # folder for reports; None if reports are not kept
 
 
 @dataclass(frozen=True, slots=True)
-class Finished:
-    """Result of a reconciliation in one sentence."""
+class FinishedReconciliation:
+    """Result of a finished reconciliation in one sentence."""
 
     device: str
     text: str
 
 
 class Reconciler:
-    """Runs the reconciliations of all devices.
+    """Runner of the reconciliations of all devices.
 
     Parameters
     ----------
     program : sequence of str, optional
-        Beginning of the command line. The path of the recording and the options are appended.
+        Command line, without the path of the recording and the options.
     limit_s : float, optional
-        Time in seconds after which the command is killed.
+        Time in seconds after which the child process is killed.
     """
 
     def __init__(self, program: Sequence[str] = COMMAND, limit_s: float = TIMEOUT_S) -> None:
@@ -87,15 +85,15 @@ class Reconciler:
         self._limit_s = limit_s
         self._running: dict[str, threading.Thread] = {}
         self._children: dict[str, subprocess.Popen[bytes]] = {}
-        self._finished: queue.SimpleQueue[Finished] = queue.SimpleQueue()
+        self._finished: queue.SimpleQueue[FinishedReconciliation] = queue.SimpleQueue()
         self._closing = threading.Event()
 
-    def start(self, job: Job, command: Command) -> None:
-        """Start a reconciliation and return at once. A second query for the same device is refused.
+    def start_reconciliation(self, job: ReconcileJob, command: Command) -> None:
+        """Start a reconciliation in a thread, or refuse a second query for the same device.
 
         Parameters
         ----------
-        job : Job
+        job : ReconcileJob
             Window to reconcile.
         command : Command
             Query that receives the answer.
@@ -109,16 +107,16 @@ class Reconciler:
         self._running[job.device] = thread
         thread.start()
 
-    def take_finished(self) -> list[Finished]:
-        """Return the results since the last call."""
+    def take_finished_reconciliations(self) -> list[FinishedReconciliation]:
+        """Return the reconciliations that have finished since the last call."""
         found = []
         with contextlib.suppress(queue.Empty):
             while True:
                 found.append(self._finished.get_nowait())
         return found
 
-    def close(self) -> None:
-        """Kill the running reconciliations, and refuse their queries."""
+    def abort_reconciliations(self) -> None:
+        """Kill the running reconciliations, and refuse the pending queries."""
         self._closing.set()
         for child in list(self._children.values()):
             _kill(child)
@@ -127,20 +125,19 @@ class Reconciler:
 
     # --- thread of one query
 
-    def _run(self, job: Job, command: Command) -> None:
-        """Reconcile a window and answer its query."""
+    def _run(self, job: ReconcileJob, command: Command) -> None:
         try:
             result, status, folder = self._reconcile(job)
         except (OSError, RuntimeError) as error:
             command.reply_refusal(str(error))
-            self._finished.put(Finished(job.device, f"reconcile failed: {error}"))
+            self._finished.put(FinishedReconciliation(job.device, f"reconcile failed: {error}"))
             return
         head = ReconcileReply(device=job.device, t=job.unix_s, samples=job.samples)
         command.reply_result(head.encode_report(result, status, folder))
-        self._finished.put(Finished(job.device, format_result(result, status)))
+        self._finished.put(FinishedReconciliation(job.device, format_reconcile_result(result, status)))
 
-    def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:
-        """Return the JSON result, the exit status, and the folder of the report; None if the report is not kept."""
+    def _reconcile(self, job: ReconcileJob) -> tuple[dict[str, Any], int, str | None]:
+        """Return the JSON result, the exit status, and the folder of the report or None."""
         with tempfile.TemporaryDirectory(prefix="imu-monitor-") as temporary:
             path, folder = Path(temporary) / f"{job.device}.npz", Path(temporary) / "report"
             if job.folder is not None:
@@ -162,7 +159,7 @@ class Reconciler:
         return result, status, None if job.folder is None else str(folder)
 
     def _run_child(self, device: str, arguments: list[str]) -> tuple[int, bytes, bytes]:
-        """Run the program; return its exit status, standard output and standard error."""
+        """Run the program; return the exit status, the standard output and the standard error."""
         pipe = subprocess.PIPE
         child = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, start_new_session=True)
         self._children[device] = child
@@ -183,8 +180,7 @@ class Reconciler:
         return child.returncode, output, errors
 
 
-def _write_window(path: Path, job: Job) -> None:
-    """Write the measured axes, the temperature and the sample rate of a window as a recording."""
+def _write_window(path: Path, job: ReconcileJob) -> None:
     values = job.window.restore_samples()
     columns = {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
     if not np.isnan(job.temperature_c).all():
@@ -192,8 +188,8 @@ def _write_window(path: Path, job: Job) -> None:
     np.savez(path, fs=np.float64(job.window.rate_hz), **columns)  # type: ignore[arg-type]
 
 
-def format_result(result: dict[str, Any], status: int = DONE) -> str:
-    """Return the verdict and the changes of the model in one sentence.
+def format_reconcile_result(result: dict[str, Any], status: int = DONE) -> str:
+    """Return the verdict of a reconciliation and the changes of the model in one sentence.
 
     Parameters
     ----------
@@ -204,7 +200,7 @@ def format_result(result: dict[str, Any], status: int = DONE) -> str:
 
     Examples
     --------
-    >>> format_result({"verdict": "explained", "axes": {"gz": {"steps": [
+    >>> format_reconcile_result({"verdict": "explained", "axes": {"gz": {"steps": [
     ...     {"kind": "added", "effect": "sinusoidal", "confidence": 0.998}]}}})
     'reconcile: explained: gz sinusoidal added (0.998)'
     """
@@ -218,13 +214,12 @@ def format_result(result: dict[str, Any], status: int = DONE) -> str:
 
 
 def _step_text(axis: str, step: dict[str, Any]) -> str:
-    """Return one change of the model as text."""
     confidence = step.get("confidence")
     sure = f" ({confidence:.3f})" if isinstance(confidence, float) else ""
     return f"{axis} {step.get('effect')} {step.get('kind')}{sure}"
 
 
 def _kill(child: "subprocess.Popen[bytes]") -> None:
-    """Kill a child process and all processes that it started."""
+    """Kill a child process and all processes that it has started."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)

@@ -1,12 +1,11 @@
 """Notification of systemd by datagrams on NOTIFY_SOCKET: ready, status, watchdog, reloading and stopping.
 
-Without the variable NOTIFY_SOCKET, no message is sent. A datagram that cannot be sent is dropped. The watchdog of
-systemd acts if too many messages are missing.
+Without the variable NOTIFY_SOCKET, no message is sent. The protocol is described in sd_notify(3) and
+sd_watchdog_enabled(3).
 
-The main loop calls ``send_watchdog``, which sends WATCHDOG=1 while every reader makes progress. A reader makes progress
-if it reads, times out or tries to open the link. If the main loop hangs or a reader is stuck in a driver, the watchdog
-messages stop, and systemd restarts the service. The reader of a missing device also makes progress, because it tries to
-open the link. The protocol is described in sd_notify(3) and sd_watchdog_enabled(3).
+``send_watchdog`` sends WATCHDOG=1 while every reader makes progress, which includes timeouts and attempts to open a
+missing device. If the main loop hangs or a reader is stuck, no watchdog message is sent, and systemd restarts the
+service.
 """
 
 import contextlib
@@ -17,25 +16,24 @@ from collections.abc import Mapping, MutableMapping
 from typing import Final
 
 MIN_STUCK_S: Final = 20.0
-"""Minimum time without progress after which a reader counts as stuck. An attempt may wait for a network host."""
+"""Minimum time without progress after which a reader counts as stuck."""
 BEATS_PER_TIMEOUT: Final = 3.0
 """Number of watchdog messages per watchdog timeout of systemd."""
 VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""Environment variables of the protocol."""
+"""Environment variables that systemd sets."""
 
 
 class SystemdNotifier:
-    """Connection of this process to systemd.
+    """Notifier that sends messages of this process to systemd.
 
     Parameters
     ----------
     address : str, optional
-        Address of the socket, a path or "@name". If it is "", no message is sent.
+        Address of the socket, which is a path or "@name". If the address is "", no message is sent.
     watchdog_s : float, optional
-        Watchdog timeout of systemd in seconds. None if the watchdog is off.
+        Watchdog timeout of systemd in seconds, or None if the watchdog is off.
     stuck_s : float, optional
-        Time in seconds without progress after which a reader counts as stuck. The default is the larger of MIN_STUCK_S
-        and half of ``watchdog_s``.
+        Time in seconds without progress after which a reader counts as stuck. The default depends on ``watchdog_s``.
     """
 
     def __init__(self, address: str = "", watchdog_s: float | None = None, stuck_s: float | None = None) -> None:
@@ -49,7 +47,7 @@ class SystemdNotifier:
 
     @classmethod
     def from_environment(cls, environment: MutableMapping[str, str]) -> "SystemdNotifier":
-        """Create a notifier from the environment, and remove the variables, which child processes must not see.
+        """Create a notifier from the environment variables of systemd, and remove these variables.
 
         Examples
         --------
@@ -62,32 +60,32 @@ class SystemdNotifier:
         known = address.startswith(("/", "@"))
         return cls(address if known else "", int(usec) / 1e6 if known and watched else None)
 
-    def ready(self) -> None:
+    def send_ready(self) -> None:
         """Send the message that the service has started or has finished a reload."""
         self.ready_sent = True
         self._send("READY=1")
 
-    def status(self, sentence: str) -> None:
-        """Send the status in one sentence, if it has changed."""
+    def send_status(self, sentence: str) -> None:
+        """Send the status in one sentence if the status has changed."""
         line = " ".join(sentence.split())
         if line != self._said:
             self._said = line
             self._send(f"STATUS={line}")
 
-    def reloading(self) -> None:
-        """Send the message that a reload has begun. ``ready`` reports the end of the reload."""
+    def send_reloading(self) -> None:
+        """Send the message that a reload has begun; ``send_ready`` reports the end."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
-    def stopping(self) -> None:
+    def send_stopping(self) -> None:
         """Send the message that the service is stopping."""
         self._send("STOPPING=1")
 
-    def send_watchdog(self, turns: Mapping[str, int], now_s: float) -> list[str]:
-        """Send a watchdog message if it is due and no reader is stuck.
+    def send_watchdog(self, read_attempts: Mapping[str, int], now_s: float) -> list[str]:
+        """Send a watchdog message if a message is due and no reader is stuck.
 
         Parameters
         ----------
-        turns : mapping of str to int
+        read_attempts : mapping of str to int
             Number of read attempts of each reader.
         now_s : float
             Present time on the monotonic clock, in seconds.
@@ -99,7 +97,7 @@ class SystemdNotifier:
         """
         self._turns = {
             name: self._turns[name] if self._turns.get(name, (-1, 0.0))[0] == count else (count, now_s)
-            for name, count in turns.items()
+            for name, count in read_attempts.items()
         }
         stuck = [name for name, (_, since_s) in self._turns.items() if now_s - since_s > self._stuck_s]
         if self.watchdog_s is not None and not stuck and now_s >= self._next_beat_s:
@@ -108,7 +106,6 @@ class SystemdNotifier:
         return stuck
 
     def _send(self, text: str) -> None:
-        """Send a datagram if systemd provides a socket."""
         if not self._address:
             return
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:

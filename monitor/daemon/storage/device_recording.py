@@ -1,7 +1,7 @@
 """Recording of one device: a bounded queue, and the segment file to which the queue is written.
 
-The reader thread of the device fills the queue. The recorder thread calls all other methods. If a write fails, the rows
-stay in the queue while the queue has space. Rows that do not fit are counted and leave a gap in the recording.
+The reader thread of the device fills the queue, and the recorder thread calls the other methods. After a failed write,
+samples stay in the queue. Samples that do not fit into the queue are counted as missing in the recording.
 """
 
 import contextlib
@@ -26,17 +26,17 @@ from monitor.settings.loading import Storage
 RETRY_S: Final = 5.0
 """Interval between two attempts to record after an error."""
 MAX_QUEUE_BYTES: Final = 16_000_000
-"""Capacity of the queue of one device, three minutes of samples at 1 kHz."""
+"""Capacity of the queue of one device in bytes, which is three minutes of samples at 1 kHz."""
 TIME_RESOLUTION_NS: Final = 1000
-"""Upper bound of the resolution of Unix times in a recording."""
+"""Resolution of the Unix times in a recording, in nanoseconds."""
 MAX_SAME_SAMPLE_NS: Final = 500_000_000
-"""Largest time difference of two rows with the same counter value that count as the same sample."""
+"""Maximum time difference of two rows of the same sample, in nanoseconds."""
 SAMPLE_BYTES: Final = 80
-"""Memory that one sample occupies in a queue."""
+"""Memory of one sample in the queue, in bytes."""
 CHUNK_OVERHEAD_BYTES: Final = 100
-"""Memory that a chunk occupies in a queue, in addition to its bytes."""
+"""Memory of a chunk in the queue in addition to the data, in bytes."""
 RAW_FOLDER: Final = "raw"
-"""Name of the folder for raw bytes in the folder of a device."""
+"""Name of the subfolder for raw bytes."""
 
 Opening = Callable[[Path, SegmentMetadata], SingleSegmentWriter]
 """Function that opens a new segment."""
@@ -53,8 +53,6 @@ class RecorderEvent:
 
 @dataclass(frozen=True, slots=True)
 class _NewestRow:
-    """Newest row of a recording."""
-
     t_ns: int  # Unix
     tick: int = NO_TICK
     rate_hz: float | None = None
@@ -68,13 +66,13 @@ class RecordingTrack:
     origin : SegmentMetadata
         Device and kind of the recording.
     storage : Storage
-        Folder and segment length.
+        Settings of the storage, with folder and segment length.
     opening : callable
-        Opens a segment.
+        Function that opens a segment.
     events : deque of RecorderEvent
-        Receives the events of the recording.
+        Queue for the events of the recording.
     finished : deque of Path
-        Receives the paths of finished segments.
+        Queue for the paths of finished segments.
     """
 
     def __init__(
@@ -89,23 +87,23 @@ class RecordingTrack:
         device_folder = storage.folder / origin.device
         self.folder = device_folder if origin.kind == "samples" else device_folder / RAW_FOLDER
         self.missed = 0
-        """Number of rows that are not in the recording."""
+        """Number of rows that are missing in the recording."""
         self.trouble = ""
-        """Reason why recording has stopped; empty while it works."""
+        """Reason why the recording has stopped, or ""."""
         self.leaving = False
-        """True if the device was removed. The track is deleted when the queue has been written."""
+        """True if the device was removed, so that the recording ends when the queue is empty."""
         self._segment_s = storage.segment_s
         self._opening = opening
         self._events = events
         self._finished = finished
-        self._lock = threading.Lock()  # protects the queue; held briefly, because the reader thread waits for the lock
+        self._lock = threading.Lock()  # protects the queue
         self._queue: deque[SampleBlock | Chunk] = deque()  # with Unix times
         self._queue_bytes = 0
-        self._dropped = 0  # dropped and missing rows before the oldest row in the queue
+        self._dropped = 0  # rows that are missing before the oldest row in the queue
         self._taken: list[SampleBlock | Chunk] = []  # taken from the queue and being written
         self._writer: SingleSegmentWriter | None = None
         self._begin_s = 0.0  # Unix time of the open segment's first row
-        self._number: int | None = None  # of the newest segment; None until the folder has been searched
+        self._number: int | None = None  # number of the newest segment, or None if it is unknown
         self._rows = 0  # rows or chunks in the open segment
         self._unsynced = False  # True if rows were written since the last flush to disk
         self._stopped_s = 0.0  # monotonic time of the last failure
@@ -117,15 +115,15 @@ class RecordingTrack:
         """True if more than a quarter of the queue is in use."""
         return self._queue_bytes > MAX_QUEUE_BYTES // 4
 
-    def enqueue(self, entries: Sequence[SampleBlock | Chunk], count_dropped: bool) -> None:
-        """Append entries to the queue. If the queue is full, drop the oldest entries.
+    def queue_entries(self, entries: Sequence[SampleBlock | Chunk], count_dropped: bool) -> None:
+        """Append entries to the queue, and drop the oldest entries if the queue is full.
 
         Parameters
         ----------
         entries : sequence of SampleBlock or Chunk
             Entries with Unix times.
         count_dropped : bool
-            True if dropped rows count as missing in the recording. False while another process records these rows.
+            True if dropped rows count as missing in the recording.
         """
         with self._lock:
             self._queue.extend(entries)
@@ -138,8 +136,8 @@ class RecordingTrack:
                     self._dropped += rows + lost
                     self.missed += rows
 
-    def drop_recorded_rows(self) -> None:
-        """Drop queued rows that another process has recorded; rows missing after these rows become a gap."""
+    def drop_rows_recorded_elsewhere(self) -> None:
+        """Drop queued rows that another process has already recorded."""
         newest = self._find_newest_row()
         with self._lock:
             waiting = [*self._taken, *self._queue]
@@ -155,7 +153,7 @@ class RecordingTrack:
             self._queue_bytes = sum(_size(one) for one in waiting)
 
     def _take_queue(self) -> None:
-        """Move the queue to the rows to be written; rows that were dropped become a gap in the recording."""
+        """Move the queued rows to the rows to write, and mark dropped rows as missing."""
         with self._lock:
             self._taken = list(self._queue)
             self._queue.clear()
@@ -165,9 +163,8 @@ class RecordingTrack:
             self._taken[0] = replace(first, lost=first.lost + dropped)
 
     def _find_newest_row(self) -> _NewestRow | None:
-        """Return the newest row in the folder; None if there is none."""
         for path in reversed(segment.list_segments(self.folder)):
-            with contextlib.suppress(RecordingError, ConfigError, OSError):  # files that are no segments are skipped
+            with contextlib.suppress(RecordingError, ConfigError, OSError):  # invalid segments are skipped
                 if self.origin.kind == "raw":
                     last = deque(segment.read_chunks(path), maxlen=1)
                     if last:
@@ -182,14 +179,14 @@ class RecordingTrack:
     # --- segment file
 
     def write_queued_rows(self, state: DaemonState, disk_full: str) -> None:
-        """Append the queued rows to the segment. After an error, the rows stay in memory for the next attempt.
+        """Write the queued rows to the segment, or keep the rows for the next attempt after an error.
 
         Parameters
         ----------
         state : DaemonState
             State of the estimate that is recorded with the rows.
         disk_full : str
-            Message if the disk is too full; else "".
+            Message if the disk is too full, otherwise "".
         """
         if disk_full:
             self._report_failure(disk_full)
@@ -204,7 +201,7 @@ class RecordingTrack:
         except ConfigError as error:  # pyarrow is not installed
             self._report_failure(str(error))
         except OSError as error:
-            self._report_failure(stopped_text(self.folder, error))
+            self._report_failure(recording_stopped_text(self.folder, error))
             self.close_segment()
         else:
             self._taken = []
@@ -212,36 +209,36 @@ class RecordingTrack:
                 self.trouble = ""
                 self.report_continuation()
 
-    def sync(self) -> None:
-        """Flush the open segment to disk."""
+    def sync_segment_to_disk(self) -> None:
+        """Flush the open segment to the disk."""
         if self._writer is None or not self._unsynced:
             return
         self._unsynced = False
         try:
             self._writer.flush_to_disk()
         except OSError as error:
-            self._report_failure(stopped_text(self.folder, error))
+            self._report_failure(recording_stopped_text(self.folder, error))
             self.close_segment()
 
     def close_segment(self, pack: bool = True) -> None:
-        """Close the open segment, and queue it for packing if ``pack`` is True."""
+        """Close the open segment, and request its compression if ``pack`` is True."""
         writer, self._writer = self._writer, None
         if writer is None:
             return
         try:
             writer.close()
         except OSError as error:
-            self._report_failure(stopped_text(writer.path, error))
+            self._report_failure(recording_stopped_text(writer.path, error))
         if pack:
             self._finished.append(writer.path)
 
-    def suspend(self) -> None:
+    def suspend_recording(self) -> None:
         """Close the open segment while another process may create segments in the folder."""
         self.close_segment(pack=False)
         self._number = None
 
     def close_if_file_changed(self) -> str:
-        """Close a file that another program has changed; return a message, or "" if the file is unchanged."""
+        """Close the segment if another program has changed the file; return a message or ""."""
         writer = self._writer
         change = "" if writer is None else writer.describe_external_change()
         if writer is None or not change:
@@ -251,7 +248,7 @@ class RecordingTrack:
             writer.close_changed_file()
         except OSError as error:
             change = f"{change} ({error.strerror or error})"
-        known = segment.list_segments(self.folder)  # not packed, because some may belong to another program
+        known = segment.list_segments(self.folder)  # not compressed, because another program may use them
         self._number = max(self._number or 0, segment.parse_segment_number(known[-1]) if known else 0)
         note = f"{writer.path} {change} during recording, with {self._rows} rows in it; a new file is begun"
         self.queue_event("recording_stopped", note)
@@ -259,7 +256,7 @@ class RecordingTrack:
         return note
 
     def _append(self, state: DaemonState) -> None:
-        """Append rows to the open segment, or to a new segment if the open segment has its full length."""
+        """Append rows to the open segment, or to a new segment if the open segment has reached the full length."""
         begin_s = _time_s(self._taken[0])
         if self._writer is not None and begin_s - self._begin_s >= self._segment_s:
             self.close_segment()
@@ -274,7 +271,6 @@ class RecordingTrack:
         self._unsynced = True
 
     def _begin(self, begin_s: float) -> SingleSegmentWriter:
-        """Open the next segment."""
         check_folder_or_absent(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         if self._number is None:
@@ -304,19 +300,18 @@ class RecordingTrack:
         self._events.append(RecorderEvent(self.origin.device, kind, text))
 
     def report_continuation(self) -> None:
-        """Queue the event that the recording continues."""
+        """Queue an event that the recording continues."""
         self.queue_event("recording_back", f"recording continues; {self.missed} rows are missing in it")
 
     def _report_failure(self, reason: str) -> None:
-        """Store the reason why the recording has stopped. For the first failure, queue an event."""
         if not self.trouble:
             self.queue_event("recording_stopped", reason)
         self.trouble = reason
         self._stopped_s = time.monotonic()
 
 
-def stopped_text(path: Path, error: OSError) -> str:
-    """Return the message that an error of the file system has stopped the recording.
+def recording_stopped_text(path: Path, error: OSError) -> str:
+    """Return a message that the recording has stopped because of a file system error.
 
     Parameters
     ----------
@@ -331,8 +326,7 @@ def stopped_text(path: Path, error: OSError) -> str:
 def _time_of(newest: _NewestRow, waiting: Sequence[SampleBlock | Chunk]) -> int:
     """Return the time of a recorded row on the clock of the queued rows, in Unix nanoseconds.
 
-    The times that two processes give the same sample differ by some milliseconds, so the sample is identified by the
-    counter of the device. If no queued row has the same counter value, the recorded time is returned.
+    Two processes assign different times to the same sample, so the sample is identified by the counter of the device.
     """
     for one in waiting if newest.tick != NO_TICK else ():
         if isinstance(one, SampleBlock):
@@ -343,7 +337,7 @@ def _time_of(newest: _NewestRow, waiting: Sequence[SampleBlock | Chunk]) -> int:
 
 
 def _rows_after(one: SampleBlock | Chunk, t_ns: int) -> list[SampleBlock | Chunk]:
-    """Return the rows later than a time: the whole block, a part of the block, or no block."""
+    """Return the rows that are later than a time, as a list of zero or one blocks."""
     if isinstance(one, Chunk):
         return [one] if one.t_ns > t_ns else []
     later = np.flatnonzero(one.t_ns > t_ns + TIME_RESOLUTION_NS)
@@ -351,12 +345,10 @@ def _rows_after(one: SampleBlock | Chunk, t_ns: int) -> list[SampleBlock | Chunk
 
 
 def _size(one: SampleBlock | Chunk) -> int:
-    """Return the memory of a queued block or chunk in bytes."""
     if isinstance(one, SampleBlock):
         return SAMPLE_BYTES * len(one)
     return CHUNK_OVERHEAD_BYTES + len(one.data) + len(one.attachment)
 
 
 def _time_s(one: SampleBlock | Chunk) -> float:
-    """Return the time of the first row of a block or chunk, in Unix seconds."""
     return float(one.t_ns[0] if isinstance(one, SampleBlock) else one.t_ns) / 1e9

@@ -18,8 +18,8 @@ class RecordingTail:
     paths: tuple[Path, ...]  # oldest first
     newest: SegmentPiece
 
-    def pieces(self, span_s: float) -> Iterator[SegmentPiece]:
-        """Yield the pieces of the last ``span_s`` seconds with the same axis mounting, oldest first."""
+    def read_pieces(self, span_s: float) -> Iterator[SegmentPiece]:
+        """Yield the recorded pieces of the last ``span_s`` seconds with the same axis mounting, oldest first."""
         begin_ns = int(self.newest.samples.t_ns[-1]) - round(span_s * 1e9)
         for path in self._segments_since(begin_ns):
             for piece in segment.read_samples(path):
@@ -44,15 +44,15 @@ class RecordingTail:
         return list(chosen)
 
 
-def find_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail | None:
-    """Return the end of the recording in a folder, or None if there is no recording to continue.
+def read_recording_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail | None:
+    """Read the end of the recording in a folder, or return None if there is no recording to continue.
 
-    Files that are not valid segments are skipped and left in place.
+    Files that are not valid segments are ignored.
 
     Parameters
     ----------
     origin : SegmentMetadata
-        Metadata of the recording. A recording with another axis mounting is not continued.
+        Metadata of the recording, with the axis mounting.
     folder : Path
         Folder of the segments.
     """

@@ -1,27 +1,20 @@
 """Overlapping Allan variance of a whole recording in floating point, the reference for the sliding window.
 
-The module shares no arithmetic with ``window``, which uses integers. Three measures keep the precision for 10⁷ samples
-and more, even for noise of 1e-4 m/s² on a mean of 9.81 m/s².
+The functions in this module share no arithmetic with ``window``, which uses integers. The following measures keep the
+precision for 10⁷ samples and more, even for noise of 1e-4 m/s² on a mean of 9.81 m/s².
 
-- A term never contains a missing sample, so each run of samples without a gap is treated as a separate recording. The
-  mean of the run is subtracted first. The subtraction is exact if the noise is small compared with the mean (Sterbenz),
-  and second differences do not depend on the mean.
-- Phase is the running sum of the rates without the mean. The rounding errors of all steps are summed separately and
-  added back (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005). Each value of
-  phase is therefore correct to the last digit.
-- The squares are added in ``LANES`` separate sums. NumPy adds these sums pairwise.
+- Each run of samples without a missing sample is treated as a separate recording, and the mean of the run is
+  subtracted. The subtraction is exact if the noise is small compared with the mean (Sterbenz).
+- Phase is the running sum of the mean-free rates. The rounding errors of the running sum are summed separately and
+  added back (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005).
+- The squared differences are added in ``LANES`` separate sums, and NumPy adds these sums pairwise.
 
-Compared with exact sums in whole numbers, σ² is correct to 1e-15 for stationary noise and to 1e-12 under a random walk.
-The remaining error comes from the rounding of phase to double precision. The error is largest for a rate with a strong
-ramp. If the ramp rises by 20 000 times the noise, the error is 1e-10.
+Compared with exact integer arithmetic, the relative error of the Allan variance is 1e-15 for stationary noise and 1e-12
+for random walk. For a ramp that rises by 20 000 times the noise, the relative error is 1e-10.
 
-One float64 per sample and axis is allocated in addition to the samples. The kernel releases the GIL and computes one
-axis per call. A thread pool can therefore compute the axes in parallel with ``overlapping_avar(values, factors,
-each=pool.map)``.
-
-A run is processed in blocks, and all τ of a block are computed together. Phase is then read from memory only once for
-all τ shorter than a block. At longer τ, each second difference needs three phase points, and two of them are still in
-the cache from the previous octave. Processing one τ at a time would be limited by the memory bandwidth.
+The kernel releases the GIL and computes one axis per call. The axes can therefore be computed in parallel with
+``overlapping_avar(values, factors, map_axes=pool.map)``. A run is processed in blocks, and all τ of a block are
+computed together, because a loop over one τ at a time would be limited by the memory bandwidth.
 """
 
 from collections.abc import Callable, Iterable
@@ -45,68 +38,76 @@ EachAxis = Callable[[Callable[[Floats], Column], Iterable[Floats]], Iterable[Col
 MIN_PRESENT_SHARE: Final = 0.98
 """Minimum share of samples that must be present for a slope."""
 BLOCK: Final = 16_384
-"""Number of phase points in a block. Three blocks fill a third of a second-level cache of 1 MB."""
+"""Number of phase points in a block. Three blocks need 0.4 MB, which fits a second-level cache."""
 LANES: Final = 512
-"""Number of separate sums of squares per τ.
-
-With this number, the set-up of a vector loop pays off, and the sums fit the first-level cache.
-"""
+"""Number of separate sums of squares per τ. The sums fit the first-level cache."""
 
 
-def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Floats, Ints]:
+def overlapping_avar(values: Floats, factors: Ints, map_axes: EachAxis = map) -> tuple[Floats, Ints]:
     """Return the overlapping Allan variance of rates and the number of terms.
 
-    NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C). Here x is phase and C is the number
-    of terms. The sample interval is the unit of time, so τ0 does not occur. Values that are not finite are missing.
-    Second differences that contain a missing sample are left out.
+    NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C). Here x is phase, and C is the
+    number of second differences (terms). The unit of time is the sample interval. Second differences that contain a
+    missing sample are left out.
 
     Parameters
     ----------
     values : ndarray of float, shape (n, k)
-        Rates of k axes. The array is not changed.
+        Rates of k axes; values that are not finite are missing.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples, at least 1.
-    each : EachAxis
-        Function that maps over the axes. With the ``map`` method of a thread pool, the axes are computed in parallel.
+    map_axes : EachAxis
+        Function that maps over the axes, for example the ``map`` method of a thread pool.
 
     Returns
     -------
     avar : ndarray of float64, shape (m, k)
-        Allan variance in squared units of the axis; NaN where no term is complete.
+        Allan variance in squared units of the axis; NaN if every second difference contains a missing sample.
     terms : ndarray of int64, shape (m, k)
-        Number of terms.
+        Number of second differences.
 
     >>> overlapping_avar(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
     """
-    columns = list(each(lambda column: overlapping_avar_axis(column, factors), values.T))
+    columns = list(map_axes(lambda column: overlapping_avar_axis(column, factors), values.T))
     return np.stack([avar for avar, _ in columns], axis=1), np.stack([terms for _, terms in columns], axis=1)
 
 
 def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
-    """Return the overlapping Allan variance of one axis and the number of terms, as ``overlapping_avar`` does.
+    """Return the overlapping Allan variance of one axis and the number of second differences.
 
-    The rates have the shape (n,), and the results have the shape (m,).
+    Parameters
+    ----------
+    rate : ndarray of float, shape (n,)
+        Rates of the axis; values that are not finite are missing.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+
+    Returns
+    -------
+    avar : ndarray of float64, shape (m,)
+        Allan variance.
+    terms : ndarray of int64, shape (m,)
+        Number of second differences.
     """
     phase = np.empty(len(rate) + 1)
     phase[0] = 0.0
-    phase[1:] = rate  # always a copy in float64, because float32 sums are too inaccurate for an Allan variance
+    phase[1:] = rate  # a copy in float64, because sums in float32 are too inaccurate
     m = np.ascontiguousarray(factors, np.int64)
     lanes, terms = np.zeros((m.size, LANES)), np.zeros(m.size, np.int64)
     _add_runs(phase, m, lanes, terms)
-    with np.errstate(invalid="ignore"):  # 0/0 where no term is complete
+    with np.errstate(invalid="ignore"):  # 0/0 if every second difference contains a missing sample
         return lanes.sum(axis=1) / (2.0 * m * m * terms), terms
 
 
-def slope_of_recording(values: Floats) -> Floats:
-    """Return the slope of the rates of a recording, estimated from the first and the last third.
+def rate_slope_from_thirds(values: Floats) -> Floats:
+    """Return the slope of the rates of a recording, computed from the means of the first and the last third.
 
-    The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the duration T.
-    For white noise, the variance of this slope is 13.5 N²/T³, compared with 12 N²/T³ for a linear regression. For rate
-    random walk, the variances are 5/4 K²/T and 6/5 K²/T. The slope [k] of the rates [n, k] is in units per sample. It
-    is NaN if more than 2 % of the samples are missing.
+    The difference between the two means is divided by two thirds of the duration T. For white noise, the variance of
+    this slope is 13.5 N²/T³, and the variance of a linear regression is 12 N²/T³. The slope [k] of the rates [n, k] is
+    in units per sample. The slope is NaN if more than 2 % of the samples are missing.
 
-    >>> slope_of_recording(0.5 * np.arange(9.0)[:, None]).tolist()
+    >>> rate_slope_from_thirds(0.5 * np.arange(9.0)[:, None]).tolist()
     [0.5]
     """
     third = len(values) // 3
@@ -122,12 +123,10 @@ def slope_of_recording(values: Floats) -> Floats:
 
 
 def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
-    """Return the slope of the rates that contributes to the Allan variance at each τ.
+    """Return the slope of the rates at each averaging time, from the mean second difference of phase.
 
-    The slope is the mean second difference of phase, divided by m².
-
-    The sum of all second differences telescopes to four blocks of phase at the ends, so one pass over the samples is
-    enough for all τ. Missing samples are replaced by the mean.
+    The mean second difference is divided by m². A linear drift with this slope contributes slope² τ²/2 to the Allan
+    variance. Missing samples are replaced by the mean.
 
     Parameters
     ----------
@@ -139,8 +138,7 @@ def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
     Returns
     -------
     ndarray of float64, shape (m, k)
-        Slope in units per sample; NaN where no second difference is complete, and for axes with more than 2 % of the
-        samples missing.
+        Slope in units per sample; NaN if more than 2 % of the samples are missing.
 
     >>> rate_slope_per_tau(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
     [0.5, 0.5]
@@ -163,7 +161,7 @@ def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
 def _mean(values: Floats) -> tuple[Ints, Floats]:
     """Return the number [k] and the mean [k] of the finite values of each column.
 
-    The kernel sums differences from the first value, because this keeps the precision.
+    Differences from the first value are summed, because the sums of the values would lose precision.
     """
     n, k = values.shape
     first, total, count = np.zeros(k), np.zeros(k), np.zeros(k, np.int64)
@@ -179,10 +177,7 @@ def _mean(values: Floats) -> tuple[Ints, Floats]:
 
 @compiled
 def _sums_of_phase(values: Floats, mean: Floats, places: Ints) -> Floats:
-    """Return the running sum of phase before each point of ``places``, which must ascend.
-
-    Phase is the running sum of the mean-free rates [n, k].
-    """
+    """Return the running sum of phase before each point of ``places``, which must be in ascending order."""
     n, k = values.shape
     phase, total, result = np.zeros(k), np.zeros(k), np.zeros((places.size, k))
     at = 0
@@ -199,17 +194,16 @@ def _sums_of_phase(values: Floats, mean: Floats, places: Ints) -> Floats:
     return result
 
 
-def octaves(longest: int) -> Ints:
-    """Return the powers of two 1, 2, 4, … up to ``longest``."""
-    return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
+def octave_cluster_sizes(largest: int) -> Ints:
+    """Return the powers of two 1, 2, 4, … up to ``largest``."""
+    return 2 ** np.arange(max(largest, 1).bit_length(), dtype=np.int64)
 
 
 def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints:
     """Return the cluster sizes m = τ · rate of a grid of averaging times.
 
-    The grid ``octave`` is 1, 2, 4, …, and ``decade10`` has ten sizes per decade. A grid ends at a quarter of the
-    window, where each variance is still a mean of several independent terms. Averaging times requested by the user may
-    reach half the window.
+    The grid ``octave`` contains powers of two, and ``decade10`` contains ten sizes per decade. Both grids end at a
+    quarter of the window. Averaging times in seconds may reach half the window.
 
     Parameters
     ----------
@@ -223,16 +217,16 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
     Returns
     -------
     ndarray of int64, shape (m,)
-        Cluster sizes in samples, ascending.
+        Cluster sizes in samples, in ascending order.
 
     Raises
     ------
     ConfigError
-        If no τ of the tuple lies between one sample and half the window.
+        If no averaging time lies between one sample and half the window.
     """
     longest = samples // 4
     if tau == "octave":
-        return octaves(longest)
+        return octave_cluster_sizes(longest)
     if tau == "decade10":
         exponents = np.arange(0, np.log10(max(longest, 1)) + 1e-9, 0.1)
         return np.unique(np.rint(10.0**exponents).astype(np.int64))
@@ -248,10 +242,7 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
 
 @compiled
 def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
-    """Add the squared second differences of all runs. ``phase[1:]`` holds rates on input and phase on return.
-
-    The phase of each run starts at 0 in the element before the run.
-    """
+    """Add the squared second differences of all runs; on input, ``phase[1:]`` contains rates."""
     before = 0
     while before + 1 < phase.size:
         last = _integrate(phase, before)
@@ -267,10 +258,7 @@ def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
 
 @compiled
 def _integrate(phase: Floats, before: int) -> int:
-    """Replace the run of finite rates after index ``before`` by phase, and return the last index of the run.
-
-    If the run is empty, ``before`` is returned.
-    """
+    """Replace the finite rates after index ``before`` by phase, and return the index of the last finite rate."""
     total, last = 0.0, before
     while last + 1 < phase.size and np.isfinite(phase[last + 1]):
         last += 1
@@ -290,9 +278,9 @@ def _integrate(phase: Floats, before: int) -> int:
 
 @compiled
 def _add_squares(phase: Floats, first: int, end: int, m: int, lanes: Floats) -> None:
-    """Add the squared second differences that end at indices first ≤ i < end, distributed over the lanes in turn.
+    """Add the squared second differences that end at the indices first ≤ i < end.
 
-    An index that could be negative would make the inner loop scalar.
+    The indices are unsigned, because a signed index would prevent vectorization of the inner loop.
     """
     for row in range(first, end, LANES):
         at0, at1, at2 = np.uintp(row), np.uintp(row - m), np.uintp(row - 2 * m)

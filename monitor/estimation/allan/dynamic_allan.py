@@ -1,14 +1,12 @@
-"""Dynamic Allan variance of a whole recording: Allan deviation and coefficients Q N B K R as functions of time.
+"""Dynamic Allan variance of a recording: Allan deviation and noise coefficients as functions of time.
 
-A window slides along the recording in steps. At each step, the overlapping Allan variance of the window is computed and
-fitted, as in the live ``Estimator``. The method, a variance that is updated with every sample and a least-squares fit,
-follows "Dynamic extraction of random drift error coefficients of MEMS gyroscopes". The result shows changes that are
-averaged out in the Allan variance of the whole recording. Each fit receives the terms of the previous fit, because
-terms are added and dropped with hysteresis.
+A window slides along the recording. At each step, the overlapping Allan variance of the window is computed, and the
+coefficients Q N B K R are fitted. The method follows "Dynamic extraction of random drift error coefficients of MEMS
+gyroscopes". Terms are added to the fit and dropped from the fit with hysteresis, so each fit receives the terms of the
+previous fit.
 
-Only full windows are reported, so that all time steps have the same uncertainty. The number of steps is limited to
-``MAX_STEPS``, so the memory does not grow with the length of the recording. A change is fully visible one window length
-after it happened. During this time, the window contains noise from before and after the change.
+Results are computed only for full windows. A change of the noise is therefore fully visible one window length after the
+change.
 """
 
 from collections.abc import Callable
@@ -23,33 +21,34 @@ from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
 
 STEPS_PER_WINDOW: Final = 20
 """Default number of steps per window length."""
 MAX_STEPS: Final = 500
 
 Progress = Callable[[float], None]
-"""Callback that receives the completed share, 0 to 1."""
+"""Function that receives the completed fraction, from 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class DynamicAllan:
-    """Dynamic Allan variance at T times.
+    """Dynamic Allan variance of six axes at T times, in SI units.
 
-    The last index is the axis, gx to az. The coefficients are in the order Q N B K R. All quantities are in SI units.
+    The last index of each array is the axis, from gx to az. The coefficients are in the order Q N B K R.
     """
 
-    t_s: Floats  # [T] END of each window in seconds since the first sample
+    t_s: Floats  # [T] end of each window, in seconds since the first sample
     window_s: float  # length of the window
     rate_hz: float
     tau_s: Floats  # [m]
-    deviation: Floats  # [T, m, 6] Allan deviation, unit of the axis; NaN if no term is complete
+    deviation: Floats  # [T, m, 6] Allan deviation in units of the axis; NaN if too many samples are missing
     lo: Floats  # [T, m, 6] lower end of the 95 % interval of the deviation
-    hi: Floats  # [T, m, 6] upper end
+    hi: Floats  # [T, m, 6] upper end of the 95 % interval of the deviation
+
     value: Floats  # [T, 5, 6] coefficients; NaN unless estimated
-    value_lo: Floats  # [T, 5, 6] lower end of the 95 % interval; 0 for an upper bound
-    value_hi: Floats  # [T, 5, 6] upper end; the one-sided 95 % bound for an upper bound
+    value_lo: Floats  # [T, 5, 6] lower end of the 95 % interval; 0 if only an upper bound is known
+    value_hi: Floats  # [T, 5, 6] upper end of the 95 % interval, or one-sided 95 % upper bound
     status: NDArray[np.int8]  # [T, 5, 6] values of ``Status``
 
 
@@ -72,17 +71,17 @@ def compute_dynamic_allan(
     window_s : float
         Length of the sliding window in seconds.
     tau : TauGrid
-        Grid of averaging times, or a tuple of averaging times in seconds, within the window.
+        Name of a grid, or a tuple of averaging times in seconds.
     step_s : float or None
-        Time between two windows in seconds. None means a twentieth of the window. The step is made longer if there
-        would be more than ``MAX_STEPS`` steps.
+        Time between two windows in seconds. None means a twentieth of the window. If the number of steps
+        would exceed ``MAX_STEPS``, a longer step is used.
     progress : Progress or None
-        Called with the completed share, 0 to 1.
+        Function that is called with the completed fraction, from 0 to 1.
 
     Raises
     ------
     ConfigError
-        If the window is too short or too long, the step is not above 0, or no τ fits the window.
+        If the window length, the step or the averaging times are out of range.
     NotReady
         If the recording is shorter than the window.
 
@@ -96,7 +95,7 @@ def compute_dynamic_allan(
     ends = _ends(len(values), length, rate_hz, step_s)
     factors = cluster_sizes(length, rate_hz, tau)
     window = AllanWindow(length, factors)
-    columns, covariances = make_design(factors, rate_hz), covariance_table(length, factors)
+    columns, covariances = make_design_matrix(factors, rate_hz), covariance_table(length, factors)
     steps, taus, axes = ends.size, factors.size, values.shape[1]
     deviation, lo, hi = np.full((3, steps, taus, axes), np.nan)
     value, value_lo, value_hi = np.full((3, steps, 5, axes), np.nan)
@@ -104,11 +103,11 @@ def compute_dynamic_allan(
     entered = np.zeros((5, axes), np.bool_)
     start = 0
     for row, end in enumerate(ends.tolist()):
-        window.update(values[start:end])
+        window.append_samples(values[start:end])
         start = end
-        avar, (slope, slopes) = window.avar(), window.slopes_of_axes_and_taus()
-        measured = MeasuredCurve(avar, window.terms(), slope * rate_hz, slopes * rate_hz, entered)
-        found = fit(columns, covariances, measured)
+        avar, (slope, slopes) = window.avar(), window.rate_slopes_per_axis_and_tau()
+        measured = MeasuredCurve(avar, window.term_counts(), slope * rate_hz, slopes * rate_hz, entered)
+        found = fit_coefficients(columns, covariances, measured)
         entered = found.entered
         deviation[row] = np.sqrt(avar)
         lo[row], hi[row] = deviation_intervals(avar, found.edf)
@@ -123,7 +122,6 @@ def compute_dynamic_allan(
 
 
 def _length(rate_hz: float, window_s: float) -> int:
-    """Return the window length in samples."""
     length = round(window_s * rate_hz)
     if not MIN_LENGTH <= length <= MAX_LENGTH:
         raise ConfigError(
@@ -134,7 +132,6 @@ def _length(rate_hz: float, window_s: float) -> int:
 
 
 def _ends(n: int, length: int, rate_hz: float, step_s: float | None) -> NDArray[np.int64]:
-    """Return the end index of the window at each step. The first window ends as soon as it is full."""
     if step_s is not None and not 0.0 < step_s < np.inf:
         raise ConfigError(f"step of {step_s:g} s; the step must be above 0")
     if n < length:

@@ -1,10 +1,9 @@
 """Overlapping Hadamard variance: mean square of third phase differences, insensitive to a linear drift of the rate.
 
-The variance of NIST SP 1065 eq. 20, applied to rates, is σ²(m) = mean of (x_{i+3m} − 3 x_{i+2m} + 3 x_{i+m} − x_i)² /
-6m² over all i, with m ≤ n/3. With the divisor 6, white noise has the same Hadamard variance as Allan variance. Except
-at m of a few samples, the Hadamard variance is 10/9 of the Allan variance for quantization noise, 0.811 for flicker
-noise and 0.5 for random walk. The Hadamard deviation is therefore shown beside the Allan deviation and is not
-corrected. The Hadamard deviation shows the noise without the effect of a ramp or of slow heating.
+The overlapping Hadamard variance (NIST SP 1065 eq. 20) of a rate is the mean of (x_{i+3m} − 3 x_{i+2m} + 3 x_{i+m} −
+x_i)² / 6m² over all i, where x is phase and m ≤ n/3. White noise has equal Hadamard and Allan variances. For m of more
+than a few samples, the Hadamard variance of other noise is the Allan variance times 10/9 for quantization noise, 0.811
+for flicker noise, and 0.5 for random walk.
 
 The degrees of freedom are computed for the fitted mixture of noise terms, from the exact covariance of the third
 differences. The formula of Greenhall & Riley (PTTI 2003, d = 3) holds only for a single power law. Third differences
@@ -19,16 +18,16 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.batch import octaves
+from monitor.estimation.allan.batch import octave_cluster_sizes
 from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
-    Moments,
+    EstimatorMoments,
     PhaseRing,
-    correct_bias,
-    mean_squares,
+    correct_bias_and_compute_intervals,
     phase_autocovariance,
     quadrature_nodes,
-    theta_per_sample,
+    theta_in_sample_units,
+    variance_from_squared_differences,
 )
 
 SQUARED_WEIGHTS: Final = 6.0
@@ -47,62 +46,65 @@ class HadamardCurve:
 
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
-    hvar: Floats  # [m, k] squared unit of the axis; NaN where no term is complete
+    hvar: Floats  # [m, k] in squared units of the axis; NaN if too many samples are missing
     terms: Ints  # [m, k] number of third differences averaged
     edf: Floats  # [m, k] equivalent degrees of freedom; NaN if the noise is unknown
     lo: Floats  # [m, k] lower end of the 95 % interval of the deviation
-    hi: Floats  # [m, k] upper end of the same interval
+    hi: Floats  # [m, k] upper end of the 95 % interval of the deviation
 
 
 def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Return the overlapping Hadamard variance of rates and the number of terms.
+    """Return the overlapping Hadamard variance of rates and the number of third differences.
 
-    The parameters and results are those of ``total.total_variance``, with cluster sizes of up to n/3.
+    The parameters and results are described at ``total.total_variance``. Cluster sizes may reach n/3.
 
     >>> ramp = np.arange(90.0)[:, None]
     >>> hadamard_variance(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
     [0.166666666667, 0.0]
     """
-    return mean_squares(values, factors, SQUARED_WEIGHTS, add_hadamard)
+    return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, add_hadamard_squares)
 
 
-def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
-    """Return the Hadamard variance of a record with confidence intervals.
+def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
+    """Compute the Hadamard variance of a recording with confidence intervals.
 
-    The parameters are those of ``total.total_curve``, with cluster sizes of up to n/3.
+    The parameters are described at ``total.compute_total_curve``. Cluster sizes may reach n/3.
     """
     n = len(values)
-    factors = octaves(n // 3) if factors is None else factors
-    raw, terms = hadamard_variance(values, factors)
-    return make_hadamard_curve([hadamard_moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
+    factors = octave_cluster_sizes(n // 3) if factors is None else factors
+    raw_variance, terms = hadamard_variance(values, factors)
+    return hadamard_curve_from_variance(
+        [hadamard_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms
+    )
 
 
-def make_hadamard_curve(
-    moments: Sequence[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints
+def hadamard_curve_from_variance(
+    moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
 ) -> HadamardCurve:
-    """Compute degrees of freedom and confidence intervals of Hadamard variances.
+    """Compute degrees of freedom and confidence intervals for given Hadamard variances.
 
-    The parameters are those of ``total.make_total_curve``.
+    The parameters are described at ``total.correct_total_variance``.
     """
-    _, edf, lo, hi = correct_bias(moments, theta_per_sample(theta, rate_hz), raw, terms)
+    _, edf, lo, hi = correct_bias_and_compute_intervals(
+        moments, theta_in_sample_units(theta, rate_hz), raw_variance, terms
+    )
     factors = np.array([one.factor for one in moments])
-    return HadamardCurve(factors / rate_hz, factors, raw, terms, edf, lo, hi)
+    return HadamardCurve(factors / rate_hz, factors, raw_variance, terms, edf, lo, hi)
 
 
-def hadamard_moments(n: int, factor: int) -> Moments:
-    """Return the mean and the covariance of the Hadamard variance at one cluster size, which takes a millisecond.
+def hadamard_estimator_moments(n: int, factor: int) -> EstimatorMoments:
+    """Return the mean and the covariance of the Hadamard variance at one cluster size.
 
-    The example computes edf for white noise at m = 1 and 35 000 terms. The result is 18/35 of the number of terms,
-    because neighbouring terms overlap.
+    In the example, white noise at m = 1 has 18 000 degrees of freedom for 35 000 third differences.
 
     Parameters
     ----------
     n : int
-        Number of samples in the record.
+        Number of samples in the recording.
     factor : int
         Cluster size in samples, at most n/3.
 
-    >>> one = hadamard_moments(35_002, 1)
+    >>> one = hadamard_estimator_moments(35_002, 1)
     >>> round(2 * one.mean[1] ** 2 / one.covariance[1, 1])
     18000
     """
@@ -116,23 +118,23 @@ def hadamard_moments(n: int, factor: int) -> Moments:
     mean, covariance = np.zeros(NUM_COEFFICIENTS), np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS))
     mean[:4] = scale * shared[:, np.argmin(lags)]
     covariance[:4, :4] = 2.0 * (scale / terms) ** 2 * (shared * pairs @ shared.T)
-    return Moments(n, factor, terms, mean, mean, covariance)
+    return EstimatorMoments(n, factor, terms, mean, mean, covariance)
 
 
 @compiled
-def add_hadamard(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
-    """Add the squares of all terms of the Hadamard variance.
+def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
+    """Add the squared third differences of phase at one cluster size to sums.
 
     Parameters
     ----------
     ring : PhaseRing
-        Phase of the record.
+        Phase of the recording.
     m : int
         Cluster size in samples.
     sums : ndarray of float64, shape (k,)
         Sums of squares, updated in place.
     terms : ndarray of int64, shape (k,)
-        Number of terms, updated in place.
+        Number of third differences, updated in place.
     """
     phase, missing, first, n = ring.phase, ring.missing, ring.first, ring.n
     places = phase.shape[0]

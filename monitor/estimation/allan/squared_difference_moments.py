@@ -1,17 +1,12 @@
 """Mean and covariance of squared phase differences, for the bias and the degrees of freedom of a variance.
 
-A variance of the Allan family is a mean of squared differences d_k². Each difference d_k = Σ_p w_p x(k_p) is a sum of a
-few phase points x(k_p) with the weights w_p. A constant rate has no effect on the differences, because Σ w_p = Σ w_p
-k_p = 0.
+A variance of the Allan family is a mean of squared differences d_k². Each difference d_k = Σ_p w_p x(k_p) is a weighted
+sum of a few phase points. The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q), where G is
+the generalised autocovariance of phase (``phase_autocovariance``). The formula also holds for points that are reflected
+at the ends of a recording. For Gaussian noise, the theorem of Isserlis gives Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
 
-The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q). Here G is the generalised autocovariance
-of phase, see ``phase_autocovariance``. This formula also holds for points reflected at the ends of a record. For
-Gaussian noise, the theorem of Isserlis gives Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
-
-For one cluster size and unit coefficients, ``Moments`` contains the expectation of the variance estimate and the Allan
-variance. ``Moments`` also contains the quadratic form that gives the variance of the estimate. A ramp adds a known
-offset to each second difference. The square of the offset increases the mean, and the product of offset and noise
-increases the variance of the estimate. A ramp without noise adds no variance.
+A ramp adds a known offset to each second difference. The square of the offset increases the mean, and the product of
+offset and noise increases the variance of the estimate.
 
 All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
 """
@@ -32,23 +27,23 @@ NUM_COEFFICIENTS: Final = 5
 """Number of coefficients Q N B K R, in the order of θ."""
 
 _BLOCK_GROWTH: Final = 1.5
-"""Ratio of the lengths of successive blocks, which grow with the distance from a kink."""
+"""Ratio of the lengths of successive blocks."""
 
 
 @dataclass(frozen=True, slots=True)
-class Moments:
-    """Moments of one variance estimate at one cluster size for a record of ``n`` samples without gaps."""
+class EstimatorMoments:
+    """Mean and covariance of a variance estimate at one cluster size, for ``n`` samples without missing samples."""
 
     n: int  # samples in the record
     factor: int  # cluster size in samples
     terms: int  # number of differences averaged
-    mean: Floats  # [5] expectation of the variance for each unit coefficient
-    allan: Floats  # [5] Allan variance for each unit coefficient, which the corrected variance estimates
+    mean: Floats  # [5] expectation of the variance for unit coefficients
+    allan: Floats  # [5] Allan variance for unit coefficients
     covariance: Floats  # [5, 5] C of the quadratic form Var = Σ_ab θ_a θ_b C_ab
 
 
 class PhaseRing(NamedTuple):
-    """Phase of a record of n samples, as a ring of n + 1 or more points."""
+    """Ring buffer of n + 1 or more phase points, for a recording of n samples."""
 
     phase: Floats | Ints  # [places, at least k] phase, or wrapping integer phase
     missing: NDArray[np.int32]  # [places, at least k] running count of missing samples
@@ -57,14 +52,13 @@ class PhaseRing(NamedTuple):
 
 
 def _integrate_to_phase(values: Floats) -> PhaseRing:
-    """Return the phase of the mean-free rates [n, k], in C order."""
     phase = np.zeros((len(values) + 1, values.shape[1]))
     missing = np.zeros(phase.shape, np.int32)
     rate = phase[1:]
     rate[:] = values
     absent = ~np.isfinite(rate)
     rate[absent] = 0.0
-    # the phase of the mean-free rate stays small, which keeps its precision
+    # phase of the mean-free rates stays small, so less precision is lost
     rate -= rate.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
     rate[absent] = 0.0
     np.cumsum(rate, axis=0, out=rate)
@@ -72,10 +66,10 @@ def _integrate_to_phase(values: Floats) -> PhaseRing:
     return PhaseRing(phase, missing, 0, len(values))
 
 
-def mean_squares(
+def variance_from_squared_differences(
     values: Floats, factors: Ints, squared_weights: float, add_squares: Callable[[PhaseRing, int, Floats, Ints], None]
 ) -> tuple[Floats, Ints]:
-    """Return the variances [m, k] of rates [n, k] and the number of terms [m, k].
+    """Return a variance of rates that is a mean of squared phase differences, and the number of differences.
 
     Parameters
     ----------
@@ -84,38 +78,40 @@ def mean_squares(
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
     squared_weights : float
-        Factor of the variance definition, see ``variance_of_sums``.
+        Divisor in the definition of the variance, see ``variance_from_sums_of_squares``.
     add_squares : callable
-        Function that adds the squared differences at one cluster size to the sums [k] and the numbers of terms [k].
+        Function that adds the squared differences at one cluster size to sums [k], and counts the differences [k].
     """
     ring = _integrate_to_phase(values)
     sums = np.zeros((factors.size, values.shape[1]))
     terms = np.zeros(sums.shape, np.int64)
     for i, m in enumerate(factors):
         add_squares(ring, int(m), sums[i], terms[i])
-    return variance_of_sums(sums, terms, factors, squared_weights), terms
+    return variance_from_sums_of_squares(sums, terms, factors, squared_weights), terms
 
 
-def variance_of_sums(sums: Floats, terms: Ints, factors: Ints, squared_weights: float) -> Floats:
-    """Convert sums of squared differences of phase to variances.
+def variance_from_sums_of_squares(sums: Floats, terms: Ints, factors: Ints, squared_weights: float) -> Floats:
+    """Convert sums of squared phase differences to variances.
 
     Parameters
     ----------
     sums : ndarray of float64, shape (m, k)
         Sums of squared differences.
     terms : ndarray of int64, shape (m, k)
-        Number of terms in each sum.
+        Number of differences in each sum.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
     squared_weights : float
-        Factor of the variance definition: 2 for second differences, 6 for third differences.
+        Divisor in the definition of the variance: 2 for second differences, 6 for third differences.
     """
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(terms > 0, sums / (squared_weights * factors[:, None] ** 2 * terms), np.nan))
 
 
-def theta_per_sample(theta: Floats, rate_hz: float) -> Floats:
-    """Convert θ of a fit from SI to units of one sample. A negative Q², which represents a band limit, becomes 0.
+def theta_in_sample_units(theta: Floats, rate_hz: float) -> Floats:
+    """Convert squared coefficients θ from SI to units of one sample.
+
+    A negative Q², which represents a band limit, becomes 0.
 
     Parameters
     ----------
@@ -127,17 +123,17 @@ def theta_per_sample(theta: Floats, rate_hz: float) -> Floats:
     return np.asarray(np.maximum(theta, 0.0) * (rate_hz ** (-2.0 * TO_SI))[:, None])
 
 
-def correct_bias(
-    moments: Sequence[Moments], theta: Floats, variance: Floats, terms: Ints
+def correct_bias_and_compute_intervals(
+    moments: Sequence[EstimatorMoments], theta: Floats, variance: Floats, terms: Ints
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Correct measured variances for bias, and compute their degrees of freedom and intervals.
+    """Correct measured variances for bias, and compute degrees of freedom and confidence intervals.
 
-    A variance with expectation E and variance Var has edf = 2 E²/Var degrees of freedom. Missing terms reduce the
-    degrees of freedom in proportion.
+    An estimate with the expectation E and the variance Var has 2 E²/Var degrees of freedom. Missing samples reduce the
+    degrees of freedom in proportion to the number of omitted differences.
 
     Parameters
     ----------
-    moments : sequence of Moments
+    moments : sequence of EstimatorMoments
         Moments of the m cluster sizes.
     theta : ndarray of float64, shape (5, k)
         Q² N² B² K² R² in units of one sample; NaN means unknown.
@@ -149,9 +145,9 @@ def correct_bias(
     Returns
     -------
     corrected : ndarray of float64, shape (m, k)
-        Estimate of the Allan variance.
+        Variances without bias, which estimate the Allan variance.
     edf : ndarray of float64, shape (m, k)
-        Degrees of freedom; NaN if θ is unknown or there is no noise.
+        Degrees of freedom; NaN if θ is unknown or the variance is zero.
     lo, hi : ndarray of float64, shape (m, k)
         Ends of the 95 % interval of the deviation.
     """
@@ -168,9 +164,9 @@ def correct_bias(
 
 
 def phase_autocovariance(t: Floats) -> Floats:
-    """Return the generalised autocovariance of phase [4, …] for Q, N, B and K of size one, at lags t in samples.
+    """Return the generalised autocovariance of phase [4, …] for unit Q, N, B and K, at lags t in samples.
 
-    The autocovariances of discrete sums of white noise are δ(t), −|t|/2, t² ln|t| / 2π and (|t|³ − |t|)/12.
+    The autocovariances are δ(t), −|t|/2, t² ln|t| / 2π and (|t|³ − |t|)/12.
     """
     t = np.abs(t)
     flicker = t * t * np.log(np.where(t == 0.0, 1.0, t)) / (2.0 * np.pi)
@@ -178,18 +174,17 @@ def phase_autocovariance(t: Floats) -> Floats:
 
 
 def quadrature_nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
-    """Return nodes and weights that sum a function over begin ≤ k < end. The function is smooth except at the kinks.
+    """Return nodes and weights to approximate the sum of a function over the integers begin ≤ k < end.
 
-    The range is divided into blocks, whose length grows with the distance to the nearest kink. The sum over the L
-    points of a block is replaced by a three-point Gauss rule, which is exact for polynomials of degree 5. The second
-    and fourth central moments of L equally spaced points are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
+    The range is divided into blocks, whose length grows with the distance from the nearest kink. The sum over a block
+    is replaced by a three-point Gauss rule, which is exact for polynomials of degree 5.
 
     Parameters
     ----------
     begin, end : int
         Range of the sum.
     kinks : iterable of int
-        Points at which the function is not smooth.
+        Points at which the function or a derivative is not continuous.
 
     Returns
     -------

@@ -1,29 +1,21 @@
-"""Total variance of a rate: the Allan variance of a record that is reflected at both ends.
-
-The total variance is defined for τ up to the record length.
+"""Total variance of a rate: the Allan variance of a recording that is reflected at both ends.
 
 "Applications of total variance method in random error analysis of the fiber optic gyro signal" shows that a rate must
-be reflected as a rate (y*_{-j} = y_{j-1}) and not as a phase. The paper defines σ² as the mean of D²/2, where D_k(m) =
-(1/m) Σ_{i≤m} (y*_{k+i+m} − y*_{k+i}) is a difference of cluster means. This module takes the mean over all k, which
-gives Howe's TOTVAR of the integrated rate (NIST SP 1065 eq. 25). The terms are second differences of phase, d_i =
-x*_{i-m} − 2 x*_i + x*_{i+m}, at every inner point i. The reflected phase before the start is x*_{-j} = 2 x_0 − x_j. The
-phase after the end is reflected in the same way. For m ≤ i ≤ n − m, the terms are the same as in the overlapping Allan
-variance.
+be reflected as a rate and not as a phase. The mean over all phase points gives Howe's TOTVAR of the integrated rate
+(NIST SP 1065 eq. 25). The total variance is the mean of d_i² / (2 m²) over the inner points i, where d_i = x*_{i-m} − 2
+x*_i + x*_{i+m} is a second difference of reflected phase. Before the start, the reflected phase is x*_{-j} = 2 x_0 −
+x_j.
 
-``total_variance`` returns uncorrected variances. ``total_curve`` corrects the bias with respect to the Allan variance
-of the same noise. The expectation of the total variance is computed exactly for any mixture of noise terms. For τ ≤
-T/2, the expectation is the Allan variance times 1 − a τ/T. The factor a is 0 for white noise, 0.481 for flicker noise,
-0.750 for random walk (SP 1065 table 7) and −4/3 for quantization noise. The degrees of freedom are exact as well. For
-mixed noise, formulas for a single power law are inaccurate.
+``total_variance`` returns uncorrected variances, and ``compute_total_curve`` corrects the bias. For τ ≤ T/2, the
+expectation of the total variance is the Allan variance times 1 − a τ/T. The factor a is 0 for white noise, 0.481 for
+flicker noise, 0.750 for random walk (SP 1065 table 7) and −4/3 for quantization noise. The expectation and the degrees
+of freedom are computed exactly for any mixture of noise terms.
 
-The χ² intervals are given for τ up to T/2. The bias correction uses the noise that was fitted to the same record.
-Beyond T/2, nominal 95 % intervals therefore contain the true value in only 67 to 92 of 100 records, so the value is
-given without an interval. A ramp R adds a known offset to every term. The mean includes the exact square of the offset,
-which is R²τ²/2 for terms without reflection and less at the ends. The degrees of freedom include the product of offset
-and noise.
+The χ² confidence intervals are given for τ up to T/2. The bias correction uses coefficients that were fitted to the
+same recording. Beyond T/2, nominal 95 % intervals therefore contain the true value in only 67 to 92 of 100 recordings.
 
-Terms that contain a missing sample are left out. The bias and the degrees of freedom per term are computed as for a
-record without gaps. If fewer than ``MIN_SHARE`` of the terms remain, the corrected variance and the interval are NaN.
+A ramp R adds a known offset to every second difference. The mean includes the square of the offset, and the degrees of
+freedom include the product of offset and noise. Second differences that contain a missing sample are left out.
 """
 
 from collections.abc import Sequence
@@ -34,52 +26,49 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.batch import octaves
+from monitor.estimation.allan.batch import octave_cluster_sizes
 from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
-    Moments,
+    EstimatorMoments,
     PhaseRing,
-    correct_bias,
-    mean_squares,
+    correct_bias_and_compute_intervals,
     phase_autocovariance,
     quadrature_nodes,
-    theta_per_sample,
+    theta_in_sample_units,
+    variance_from_squared_differences,
 )
 
 MIN_SHARE: Final = 0.5
-"""Minimum share of the terms for a bias correction.
+"""Minimum share of the second differences for a bias correction.
 
-With fewer terms, the reflected terms have more weight than the correction assumes. If a gap in the middle leaves half
-of the terms, the variance of random walk is 18 % too low and that of quantization 21 % too high (3000 records).
+If missing samples in the middle of a recording remove half of the second differences, the variance of random walk is
+18 % too low, and the variance of quantization noise is 21 % too high (3000 simulated recordings).
 """
 MAX_EXACT_TERMS: Final = 256
-"""Maximum number of terms whose covariances are summed one by one.
-
-Longer records use a coarser grid of phase points.
-"""
+"""Maximum number of samples for which all covariances are summed. Longer recordings use a coarse grid."""
 MIN_CLUSTER_POINTS: Final = 32
-"""Minimum number of grid points in a cluster if the record is much longer than the cluster."""
+"""Minimum number of grid points in a cluster."""
 SQUARED_WEIGHTS: Final = 2.0
-"""Factor in the definition of the Allan variance, σ² = mean of d² / (2 m²)."""
+"""Divisor in the definition of the Allan variance, σ² = mean of d² / (2 m²)."""
 _RAMP: Final = NUM_COEFFICIENTS - 1
 """Row of the ramp R in θ."""
 
 
 @dataclass(frozen=True, slots=True)
 class TotalCurve:
-    """Total variance of k axes at m averaging times, corrected for bias so that it estimates the Allan variance."""
+    """Total variance of k axes at m averaging times, corrected for bias."""
 
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
-    tvar: Floats  # [m, k] squared unit of the axis; NaN if the noise is unknown or too few terms remain
+    tvar: Floats  # [m, k] in squared units of the axis; NaN if the noise is unknown or too many samples are missing
     terms: Ints  # [m, k] number of differences averaged
     edf: Floats  # [m, k] equivalent degrees of freedom; NaN where ``tvar`` is NaN
-    lo: Floats  # [m, k] lower end of the 95 % interval of the deviation; NaN beyond half the record
-    hi: Floats  # [m, k] upper end of the same interval
+    lo: Floats  # [m, k] lower end of the 95 % interval of the deviation; NaN beyond half the recording
+    hi: Floats  # [m, k] upper end of the 95 % interval of the deviation
 
 
 def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Return the uncorrected total variance of rates and the number of terms.
+    """Return the uncorrected total variance of rates and the number of second differences.
 
     Parameters
     ----------
@@ -91,18 +80,18 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     Returns
     -------
     tvar : ndarray of float64, shape (m, k)
-        Biased total variance in squared units of the axis.
+        Uncorrected total variance in squared units of the axis.
     terms : ndarray of int64, shape (m, k)
         Number of terms.
 
     >>> total_variance(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
     """
-    return mean_squares(values, factors, SQUARED_WEIGHTS, _add_all_terms)
+    return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, _add_all_terms)
 
 
-def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> TotalCurve:
-    """Return the bias-corrected total variance of a record with confidence intervals.
+def compute_total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> TotalCurve:
+    """Compute the bias-corrected total variance of a recording with confidence intervals.
 
     Parameters
     ----------
@@ -111,51 +100,57 @@ def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | N
     rate_hz : float
         Sample rate in Hz.
     theta : ndarray of float64, shape (5, k)
-        Fitted Q² N² B² K² R² in SI, see ``coefficient_fit.Fit.theta``; NaN means unknown.
+        Fitted Q² N² B² K² R² in SI; NaN means unknown.
     factors : ndarray of int64, shape (m,), or None
-        Cluster sizes in samples, below n. None means octaves.
+        Cluster sizes in samples, below n. None means powers of two.
     """
     n = len(values)
-    factors = octaves(n - 1) if factors is None else factors
-    raw, terms = total_variance(values, factors)
-    return make_total_curve([total_moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
+    factors = octave_cluster_sizes(n - 1) if factors is None else factors
+    raw_variance, terms = total_variance(values, factors)
+    return correct_total_variance(
+        [total_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms
+    )
 
 
-def make_total_curve(moments: Sequence[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> TotalCurve:
-    """Correct total variances for bias, and compute degrees of freedom and confidence intervals.
+def correct_total_variance(
+    moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
+) -> TotalCurve:
+    """Correct given total variances for bias, and compute degrees of freedom and confidence intervals.
 
     Parameters
     ----------
-    moments : sequence of Moments
+    moments : sequence of EstimatorMoments
         Moments of the m cluster sizes.
     rate_hz : float
         Sample rate in Hz.
     theta : ndarray of float64, shape (5, k)
         Fitted Q² N² B² K² R² in SI; NaN means unknown.
-    raw : ndarray of float64, shape (m, k)
+    raw_variance : ndarray of float64, shape (m, k)
         Uncorrected total variances.
     terms : ndarray of int64, shape (m, k)
         Number of terms.
     """
     enough = terms >= MIN_SHARE * np.array([one.terms for one in moments])[:, None]
-    tvar, edf, lo, hi = correct_bias(moments, theta_per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
+    tvar, edf, lo, hi = correct_bias_and_compute_intervals(
+        moments, theta_in_sample_units(theta, rate_hz), np.where(enough, raw_variance, np.nan), terms
+    )
     factors = np.array([one.factor for one in moments])
     unsure = 2 * factors > np.array([one.n for one in moments])
     lo[unsure] = hi[unsure] = np.nan
     return TotalCurve(factors / rate_hz, factors, tvar, terms, edf, lo, hi)
 
 
-def total_moments(n: int, factor: int) -> Moments:
-    """Return the mean and the covariance of the total variance at one cluster size, which takes a few milliseconds.
+def total_estimator_moments(n: int, factor: int) -> EstimatorMoments:
+    """Return the mean and the covariance of the total variance at one cluster size.
 
     Parameters
     ----------
     n : int
-        Number of samples in the record.
+        Number of samples in the recording.
     factor : int
         Cluster size in samples, from 1 to n − 1.
 
-    >>> one = total_moments(100_000, 50_000)               # random walk at T/2: 1 − 0.750/2
+    >>> one = total_estimator_moments(100_000, 50_000)               # random walk at T/2: 1 − 0.750/2
     >>> print(f"{one.mean[3] / one.allan[3]:.3f}")
     0.625
     """
@@ -164,11 +159,11 @@ def total_moments(n: int, factor: int) -> Moments:
     half = 0.5 / factor**2
     mean = half / (n - 1) * (_squares(points, signs) @ weights)
     inner = _squares(factor * np.array([[-1.0, 0.0, 1.0]]), np.array([[1.0, -2.0, 1.0]]))
-    return Moments(n, factor, n - 1, mean, half * inner[:, 0], _covariance(n, factor))
+    return EstimatorMoments(n, factor, n - 1, mean, half * inner[:, 0], _covariance(n, factor))
 
 
 def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
-    """Return the phase points [i, 5] of the terms at ``places`` and the ends of the record, with weights."""
+    """Return the phase points [i, 5] of the second differences at ``places``, and the weights of the points."""
     front, behind = places < m, places > n - m
     points = [0.0 * places, np.abs(places - m), places, np.minimum(places + m, 2 * n - m - places), n + 0.0 * places]
     signs = [2.0 * front, 1.0 - 2.0 * front, -2.0 + 0.0 * places, 1.0 - 2.0 * behind, 2.0 * behind]
@@ -176,7 +171,7 @@ def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
 
 
 def _squares(points: Floats, signs: Floats) -> Floats:
-    """Return the mean squares [5, i] of weighted sums of phase points, for each coefficient of size one."""
+    """Return the mean squares [5, i] of weighted sums of phase points, for unit coefficients."""
     lags = points[:, :, None] - points[:, None, :]
     random = np.einsum("ip,iq,aipq->ai", signs, signs, phase_autocovariance(lags))
     ramp = (signs * 0.5 * points**2).sum(axis=1) ** 2
@@ -186,9 +181,8 @@ def _squares(points: Floats, signs: Floats) -> Floats:
 def _covariance(n: int, m: int) -> Floats:
     """Return the quadratic form [5, 5] that gives the variance of the total variance.
 
-    Up to ``MAX_EXACT_TERMS`` samples, all pairs of terms are summed. Longer records use pairs on a coarse grid, because
-    the autocovariances are smooth. In a record of more than ``MAX_EXACT_TERMS`` / ``MIN_CLUSTER_POINTS`` clusters, the
-    ends contribute as in a shorter record, and each additional term adds the same amount.
+    Longer recordings use a coarse grid, because the autocovariances are smooth. If a recording contains many clusters,
+    each additional second difference adds the same amount to the sums.
     """
     scale = 2.0 * (0.5 / (m * m * (n - 1.0))) ** 2
     if n <= MAX_EXACT_TERMS:
@@ -204,11 +198,11 @@ def _covariance(n: int, m: int) -> Floats:
 
 
 def _pair_sums(n: int, m: int, step: float) -> Floats:
-    """Return the sums [5, 5] of the products of covariances r^a_jk r^b_jk over all pairs j, k of terms.
+    """Return the sums [5, 5] of the products of covariances over all pairs of second differences.
 
-    The record is sampled every ``step`` samples, so each pair represents step² pairs of terms. The covariance of
-    quantization noise is nonzero only where phase points coincide, and each such pair represents ``step`` pairs. The
-    two ends of the record are an exception, because all reflected terms contain them.
+    The phase is sampled every ``step`` samples, so each pair represents step² pairs. The covariance of quantization
+    noise is nonzero only if phase points coincide, so each such pair represents ``step`` pairs. The two ends of the
+    recording are exceptions, because all reflected second differences contain an end point.
     """
     at = np.arange(n + 1)
     lags = phase_autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
@@ -232,7 +226,7 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
 
 
 def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
-    """Combine the rows of phase points [4, points, …] to weighted sums [4, terms, …]."""
+    """Combine phase points [4, points, …] to second differences [4, terms, …]."""
     terms = signs[:, 0, None] * of_points[:, rows[:, 0]]
     for p in range(1, rows.shape[1]):
         terms += signs[:, p, None] * of_points[:, rows[:, p]]
@@ -240,27 +234,26 @@ def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
 
 
 def _add_all_terms(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
-    """Add the squares of all terms of the total variance. There are none if the cluster is as long as the record."""
     if m < ring.n:
-        add_total(ring, m, 1, ring.n, sums, terms)
+        add_total_variance_squares(ring, m, 1, ring.n, sums, terms)
 
 
 @compiled
-def add_total(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
-    """Add the squares of a range of terms of the total variance.
+def add_total_variance_squares(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
+    """Add the squares of a range of second differences of reflected phase to sums.
 
     Parameters
     ----------
     ring : PhaseRing
-        Phase of the record.
+        Phase of the recording.
     m : int
         Cluster size in samples.
     begin, end : int
-        Range begin ≤ i < end of the terms.
+        Range begin ≤ i < end of the phase points.
     sums : ndarray of float64, shape (k,)
         Sums of squares, updated in place.
     terms : ndarray of int64, shape (k,)
-        Number of terms, updated in place.
+        Number of second differences, updated in place.
     """
     i = begin
     while i < end:
@@ -273,11 +266,9 @@ def add_total(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms
 
 @compiled
 def _add_run(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
-    """Add the squares of a run of terms that are all reflected in the same way, except incomplete terms.
+    """Add the squares of consecutive second differences that are all reflected in the same way.
 
-    The first phase point of a term that is reflected at the front is the start of the record, and correspondingly at
-    the back. The reflected point has the opposite sign, and twice the phase at the end of the record is added. A term
-    is incomplete if a sample between the first and the last point is missing.
+    A reflected phase point is twice the phase at the end of the recording minus the phase at the mirror point.
     """
     phase, missing, first, n = ring.phase, ring.missing, ring.first, ring.n
     places = phase.shape[0]

@@ -5,14 +5,12 @@ because Cov(d², e²) = 2 Cov(d, e)² (Isserlis):
 
     Cov(σ²_i, σ²_j) = Σ_ab θ_a θ_b C^ab_ij,   C^ab_ij = 1/(2 M_i M_j) Σ_c w(c) r^a_ij(c) r^b_ij(c).
 
-Here r denotes the second differences of the generalised autocovariance of phase, over clusters of m_i and m_j samples.
-Phase is a discrete sum of white noise. The autocovariances of Q, N, B and K are δ(t), −|t|/2, t² ln|t| / 2π and (|t|³ −
-|t|)/12. The factor w(c) is the number of pairs of terms that are c samples apart, and M is the number of terms.
-``covariance_table`` computes C once for a window length and a list of cluster sizes, so that a fit needs only products.
+Here r is a second difference of the generalised autocovariance of phase, over clusters of m_i and m_j samples. The
+autocovariances of Q, N, B and K are δ(t), −|t|/2, t² ln|t| / 2π and (|t|³ − |t|)/12. The factor w(c) is the number of
+pairs of second differences at lag c, and M is the number of second differences.
 
-The variance Cov_ii of the Allan variance σ² at one τ gives the exact degrees of freedom of mixed noise, edf = 2 σ⁴ /
-Cov_ii. The usual formulas of Greenhall & Riley (PTTI 2003) hold for a single power law and have an error of 15–25 %
-near m = 1. The exact sum takes only milliseconds.
+For a mixture of noise terms, the exact number of degrees of freedom is 2 σ⁴ / Var(σ²). The formulas of Greenhall &
+Riley (PTTI 2003) hold for a single power law and have an error of 15–25 % near m = 1.
 
 All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
 """
@@ -32,46 +30,40 @@ from monitor.noise.effects.ieee952.bias_instability import FLICKER_AVAR, BiasIns
 Q, N, B, K, R = range(5)
 
 NOISES: Final = 4
-"""Number of random terms in the table, Q N B K. The ramp R is deterministic and adds no variance."""
+"""Number of random noise terms, Q N B K. The ramp R is deterministic and adds no variance."""
 
 PAIRS: Final = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 """Pairs a ≤ b of noise terms, in the order of the last index of the table."""
 
 LAG_STEP: Final = 0.5
-"""Ratio of the length of a block of lags to the distance from the nearest kink of r."""
+"""Ratio of the length of a block of lags to the distance from the nearest kink."""
 
 TAIL: Final = 8.0
-"""Lag in units of (m_i + m_j) beyond which the differences of t² ln t are computed from their series."""
+"""Lag in units of (m_i + m_j) beyond which differences of t² ln t are computed from a series."""
 
 UNLIMITED_SAMPLES: Final = 1 << 62
-"""Number of samples that means "without limit"."""
+"""Number of samples that represents an unlimited number."""
 
 TABLE_STEP: Final = 1.1
-"""Ratio of window lengths at which the table of a growing window is recomputed.
-
-Between two tables, the covariances are scaled by the number of terms.
-"""
+"""Growth of the window after which the covariance table is recomputed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CovarianceTable:
-    """Covariances of the Allan variances for one window length and coefficients of size one.
-
-    The arrays are read-only.
-    """
+    """Covariances of Allan variances for one window length and unit coefficients. The arrays are read-only."""
 
     n: int  # samples in the window
     factors: Ints  # [m] cluster sizes in samples
-    terms: Ints  # [m] number of second differences in a window without gaps; ≤ 0 if the window is too short
+    terms: Ints  # [m] number of second differences without missing samples; ≤ 0 if the window is too short
     covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN if the window is too short
-    slope: Floats  # [4] variance of ``batch.slope_of_recording``, for unit θ
-    bend: Floats  # [m, 4] covariance of this slope with ``batch.rate_slope_per_tau``
+    slope: Floats  # [4] variance of ``batch.rate_slope_from_thirds`` for unit coefficients
+    bend: Floats  # [m, 4] covariance of ``slope`` with ``batch.rate_slope_per_tau``
 
 
 class AxisCovarianceTables:
-    """Covariance tables of six axes of a growing window.
+    """Covariance tables of six axes for a growing window.
 
-    Axes that use the whole window share a table. A restarted axis has a separate table.
+    Axes that use the whole window share a covariance table.
 
     Parameters
     ----------
@@ -86,8 +78,8 @@ class AxisCovarianceTables:
         self._capacity = capacity
         self._tables: dict[int | None, CovarianceTable] = {}  # by restarted axis, or None for the whole window
 
-    def at(self, axis: int, n: int, window_samples: int) -> CovarianceTable:
-        """Return the table of an axis. While the window grows, a table for up to 10 % fewer samples is used.
+    def table_of_axis(self, axis: int, n: int, window_samples: int) -> CovarianceTable:
+        """Return the covariance table of an axis, for n or up to 10 % fewer samples.
 
         Parameters
         ----------
@@ -104,17 +96,17 @@ class AxisCovarianceTables:
             known = self._tables[key] = covariance_table(n, self._factors)
         return known
 
-    def remaining_valid_samples(self, table: CovarianceTable, n: int) -> int:
-        """Return for how many samples a table stays valid, including sample n.
+    def samples_until_table_expires(self, table: CovarianceTable, n: int) -> int:
+        """Return the number of further samples for which a covariance table stays valid.
 
-        The table of a full window stays valid without limit, so the result is ``UNLIMITED_SAMPLES``.
+        For a full window, the result is ``UNLIMITED_SAMPLES``.
 
-        Parameters
-        ----------
-        table : CovarianceTable
-            Table that ``at`` has returned for n samples.
-        n : int
-            Number of newest samples that the axis uses.
+            Parameters
+            ----------
+            table : CovarianceTable
+                Result of ``table_of_axis`` for n samples.
+            n : int
+                Number of newest samples that the axis uses.
         """
         if n >= self._capacity:
             return UNLIMITED_SAMPLES
@@ -122,10 +114,9 @@ class AxisCovarianceTables:
 
 
 def covariance_table(n: int, factors: Ints) -> CovarianceTable:
-    """Return the covariances of overlapping Allan variances of n samples.
+    """Compute the covariances of overlapping Allan variances for a window of n samples.
 
-    The example computes edf for white noise at m = 1 and 30 000 terms. The result is 2/3 of the number of terms,
-    because neighbouring terms share one sample.
+    In the example, white noise at m = 1 has 20 000 degrees of freedom for 30 000 second differences.
 
     Parameters
     ----------
@@ -141,7 +132,7 @@ def covariance_table(n: int, factors: Ints) -> CovarianceTable:
     factors = np.ascontiguousarray(factors, np.int64)
     covariance = np.full((factors.size, factors.size, len(PAIRS)), np.nan)
     _fill(n, factors, covariance)
-    # t² ln t describes continuous 1/f noise. Sampled noise ends at half the rate and is weaker at the shortest τ.
+    # t² ln t describes continuous 1/f noise, and sampled 1/f noise is weaker at the shortest τ.
     share = np.array([_sampled_flicker(m) for m in factors.tolist()])
     for pair, (a, b) in enumerate(PAIRS):
         covariance[:, :, pair] *= np.outer(share, share) ** ((a == B) + (b == B))
@@ -154,18 +145,15 @@ def covariance_table(n: int, factors: Ints) -> CovarianceTable:
 
 @cache
 def _sampled_flicker(m: int) -> float:
-    """Return the ratio of the Allan deviations of sampled and continuous 1/f noise.
-
-    It differs from 1 only at short τ.
-    """
+    """Return the ratio of the Allan deviations of sampled and continuous 1/f noise at one cluster size."""
     return float(np.sqrt(BiasInstability(B=1.0).avar(np.array([float(m)]), 1.0)[0] / FLICKER_AVAR))
 
 
 def _slope_variance(n: int) -> Floats:
-    """Return the variance [4] of ``batch.slope_of_recording`` for Q, N, B and K of size one at τ0 = 1.
+    """Return the variance [4] of ``batch.rate_slope_from_thirds`` for unit Q, N, B and K at τ0 = 1.
 
-    The slope is a weighted sum of four phase points with the spacing τ = n/3. The autocovariances of phase give the
-    variances 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3 of this sum. They are divided by (2τ²)².
+    The slope is a weighted sum of four phase points with the spacing τ = n/3, divided by 2τ². The variances of the
+    weighted sum are 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3.
     """
     if n < 3:
         return np.full(NOISES, np.nan)
@@ -175,11 +163,9 @@ def _slope_variance(n: int) -> Floats:
 
 
 def _bend_covariance(n: int, m: int) -> Floats:
-    """Return the covariance [4] of ``batch.slope_of_recording`` and ``batch.rate_slope_per_tau`` at one cluster size.
+    """Return the covariance [4] of the two slopes in ``batch`` at one cluster size, for unit Q, N, B and K.
 
-    The coefficients Q, N, B and K have the size one, and τ0 = 1. Each of the two slopes is a weighted sum of phase
-    points, so the covariance is a sum of autocovariances of phase. About sixty phase points represent each block of m
-    points of the mean second difference.
+    Each slope is a weighted sum of phase points. At most 128 points represent each block of m points.
     """
     if n < 3 or n + 1 <= 2 * m:
         return np.full(NOISES, np.nan)
@@ -196,7 +182,7 @@ def _bend_covariance(n: int, m: int) -> Floats:
 
 
 class PerTauSpanDegreesOfFreedom:
-    """Degrees of freedom of an Allan curve in which each τ uses a different number of newest samples.
+    """Degrees of freedom of Allan variances that use a different number of newest samples at each τ.
 
     Parameters
     ----------
@@ -205,7 +191,7 @@ class PerTauSpanDegreesOfFreedom:
     spans : ndarray of int64, shape (m,)
         Number of samples that each τ uses.
     columns : ndarray of float64, shape (m, 4 or more)
-        Allan variance of Q, N, B and K of size one at τ0 = 1.
+        Allan variance of unit Q, N, B and K at τ0 = 1.
     """
 
     def __init__(self, factors: Ints, spans: Ints, columns: Floats) -> None:
@@ -215,9 +201,9 @@ class PerTauSpanDegreesOfFreedom:
         self._terms = np.array([one.terms[0] for one in tables])
 
     def edf(self, theta: Floats, rate_hz: float, terms: Ints) -> Floats:
-        """Return the degrees of freedom [m, k] for noise with the relative shares of ``theta``.
+        """Return the degrees of freedom [m, k] of the Allan variances of k axes.
 
-        White noise is assumed for axes that have not been fitted.
+        White noise is assumed for axes without fitted coefficients.
 
         Parameters
         ----------
@@ -252,7 +238,7 @@ def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) ->
     Returns
     -------
     lo, hi : ndarray of float64
-        Ends of the interval of the deviation, in the shape of ``avar``.
+        Lower and upper end of the interval, in the shape of ``avar``.
 
     >>> lo, hi = deviation_intervals(np.array([1.0]), np.array([10.0]))
     >>> print(f"{lo[0]:.3f} {hi[0]:.3f}")
@@ -261,7 +247,7 @@ def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) ->
     tail = (1.0 - probability) / 2.0
     safe = np.where(edf > 0.0, edf, np.nan)
     low, high = chi2_quantile(safe, tail), chi2_quantile(safe, 1.0 - tail)
-    # With less than one degree of freedom there may be no upper bound, even if the variance is zero.
+    # With less than one degree of freedom, the upper end may be infinite.
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         lo, hi = np.sqrt(avar * safe / high), np.sqrt(avar * safe / low)
     return lo, np.where((low == 0.0) & (avar >= 0.0), np.inf, hi)
@@ -269,7 +255,6 @@ def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) ->
 
 @compiled
 def _fill(n: int, factors: Ints, covariance: Floats) -> None:
-    """Fill the covariance table [m, m, 10] for a window of n samples."""
     sums = np.empty(10)
     for i in range(factors.size):
         for j in range(i, factors.size):
@@ -285,9 +270,9 @@ def _fill(n: int, factors: Ints, covariance: Floats) -> None:
 
 @compiled
 def _sum_lags(n: int, small: int, large: int, sums: Floats) -> None:
-    """Sum w(c) r^a(c) r^b(c) over the lags c between two terms.
+    """Sum the products of covariances over the lags between two second differences.
 
-    The functions r have kinks at a few lags. The kinks are added one by one, and the smooth ranges between them in
+    The covariances have kinks at a few lags. The sum over each smooth range between two kinks is approximated in
     blocks.
     """
     for pair in range(10):
@@ -312,10 +297,9 @@ def _sum_lags(n: int, small: int, large: int, sums: Floats) -> None:
 
 @compiled
 def _add_blocks(kink: int, count: int, side: float, n: int, small: int, large: int, sums: Floats) -> None:
-    """Add ``count`` lags that follow a kink, in blocks that grow with the distance from the kink.
+    """Add ``count`` lags that follow a kink, in blocks whose length grows with the distance from the kink.
 
-    The sum over the L points of a block is replaced by the three-point Gauss rule of
-    ``difference_moments.quadrature_nodes``.
+    The sum over a block is approximated by the Gauss rule of ``squared_difference_moments.quadrature_nodes``.
     """
     done = 0
     while done < count:
@@ -335,7 +319,7 @@ def _add_blocks(kink: int, count: int, side: float, n: int, small: int, large: i
 
 @compiled
 def _add(lag: float, weight: float, n: int, small: int, large: int, sums: Floats) -> None:
-    """Add one lag to the sums of all pairs of noise terms, weighted with the number of pairs of terms at this lag."""
+    """Add the products of covariances at one lag, weighted with the number of pairs of second differences."""
     weight *= min(n + 1.0 - 2 * large, n + 1.0 - small - large - lag)
     if lag > TAIL * (small + large):
         r = small * large / (np.pi * lag * lag) * (1.0 + 0.5 * (small * small + large * large) / (lag * lag))

@@ -1,29 +1,22 @@
 """Sliding window with the overlapping Allan variance of the last L samples, updated with every sample.
 
-For every cluster size m and axis, the window stores the sum S_m and the number C_m of the squared second differences of
-phase. The Allan variance of the rate is σ²(m) = S_m / (2 m² C_m), see "Dynamic extraction of random drift error
-coefficients of MEMS gyroscopes", equations 12 to 15. Missing samples are NaN in the input and keep their positions in
-time. For each τ and axis, a new sample adds one second difference and removes the oldest one. The cost therefore does
-not depend on the window length.
+For every cluster size m and axis, the window stores the sum S and the number C of the squared second differences of
+phase. The Allan variance of the rate is S / (2 m² C), see "Dynamic extraction of random drift error coefficients of
+MEMS gyroscopes", equations 12 to 15. A new sample adds one second difference and removes the oldest second difference,
+so the cost does not depend on the window length. Missing samples are NaN in the input.
 
-Three measures keep the sums exact for years.
+Three measures keep the sums exact.
 
-- Phase is an integer, the running sum of the samples times 2^s, modulo 2⁶⁴. The rounding error of each sample is added
-  to the next sample. A second difference x_k - 2x_{k-m} + x_{k-2m} is therefore exact to one unit of 2^-s, even if
-  phase has wrapped around. A constant such as 9.81 m/s² has no effect. The exponent s is chosen so that full-scale
+- Phase is an integer: the running sum of the samples times 2^s, modulo 2⁶⁴. The rounding error of each sample is added
+  to the next sample, so a second difference is exact to one unit of 2^-s. The exponent s is chosen so that full-scale
   input cannot overflow at the longest τ.
-- The same integers give the same squares when a term is added and when the term is removed. S_m is stored as a double,
-  and the rounding errors of all additions are summed in a second double (Knuth's TwoSum). After a transient has left
-  the window, the remaining error is 2⁻¹⁰⁶ of the largest value of S_m.
-- For each axis, a running count of missing samples shows whether all 2m samples of a term are present. Incomplete terms
-  are neither added nor removed.
+- A second difference has the same square when it is added and when it is removed. The rounding errors of the sums are
+  stored in a second double (Knuth's TwoSum).
+- A running count of missing samples shows whether a second difference contains a missing sample. Incomplete second
+  differences are neither added nor removed.
 
-Each τ can use a smaller number of newest samples than the window contains (``spans``). All τ use the same ring buffer
-of phase.
-
-The rounding adds white phase noise of variance 2^-2s/12. With noise of standard deviation σ per sample, the relative
-change of σ²(m) is about 2·2^-s/(σ √L) at every m. For an hour at 100 Hz and σ = 1e-4 rad/s or m/s², the relative change
-is 1e-10. The exponents s are then 38 for rates and 36 for accelerations.
+Rounding adds white phase noise of variance 2^-2s/12. For an hour at 100 Hz and noise of 1e-4 rad/s or m/s² per sample,
+the relative change of the Allan variance is 1e-10.
 """
 
 from typing import Any, Final
@@ -44,43 +37,34 @@ from monitor.estimation.allan.window_kernel import (
     TOTAL,
     WIDTH,
     WindowBuffers,
-    advance,
+    append_staged_samples,
     keep_newest,
-    slopes_of_axes_and_taus,
-    view_arrays,
+    rate_slopes_per_axis_and_tau,
+    view_window_arrays,
 )
 
 MIN_LENGTH: Final = 100
-"""Minimum window length in samples. A shorter window gives no useful Allan deviation."""
+"""Minimum window length in samples."""
 MAX_LENGTH: Final = 10_000_000
-"""Maximum window length in samples. Each sample takes 64 bytes, or 96 bytes once a sample has been missing."""
+"""Maximum window length in samples. Each sample needs up to 96 bytes of memory."""
 SKIP_BLOCK_ROWS: Final = 4096
 """Largest number of missing samples processed in one call."""
 FULL_SCALE: Final = (70.0,) * 3 + (400.0,) * 3 + (1.0,) * 2
-"""Full scale in rad/s and m/s² (4000 °/s, 40 g).
-
-At the longest τ, the mean over τ may reach these values. At shorter τ, it may exceed them.
-"""
+"""Largest mean over the longest τ in rad/s and m/s² (4000 °/s, 40 g)."""
 QUICK_S: Final = 10.0
-"""Shortest span of a displayed deviation in seconds.
+"""Minimum duration of the samples for a displayed Allan deviation, in seconds.
 
-With a shorter span, the displayed deviation at m = 1 fluctuates visibly. With 1000 samples at 100 Hz, the fluctuation
-is 3 %.
+For 1000 samples at 100 Hz, the displayed Allan deviation at m = 1 fluctuates by 3 %.
 """
 QUICK_CLUSTERS: Final = 16
-"""Minimum number of clusters of length τ in a span.
-
-16 clusters give 15 independent differences and an error of 20 %.
-"""
+"""Minimum number of clusters for a displayed Allan deviation, for an error of 20 %."""
 
 
-def display_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
-    """Return the number of newest samples that each displayed deviation uses.
+def samples_per_displayed_tau(factors: Ints, rate_hz: float, window_samples: int) -> Ints:
+    """Return the number of newest samples from which each displayed Allan deviation is computed.
 
-    The span of each τ is 16 τ, at least 10 s and at most the whole window. A change of N is then fully visible within a
-    minute at τ up to 3 s, even with a window of an hour. Long τ keep the best possible confidence. The deviations are
-    only for display. The spans differ, so a fit to these deviations finds spurious terms while the noise changes
-    (``docs/windows.md``).
+    The duration is 16 τ, at least 10 s and at most the whole window. A change of N is therefore visible within a minute
+    for τ up to 3 s. A fit to the displayed Allan deviations would find spurious terms (``docs/windows.md``).
 
     Parameters
     ----------
@@ -88,26 +72,26 @@ def display_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
         Cluster sizes in samples.
     rate_hz : float
         Sample rate in Hz.
-    length : int
+    window_samples : int
         Window length in samples.
 
     Returns
     -------
     ndarray of int64, shape (m,)
-        Span of each cluster size in samples.
+        Number of newest samples for each cluster size.
 
-    >>> display_spans(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
+    >>> samples_per_displayed_tau(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
     [1000, 1600, 100000]
     """
-    return np.minimum(np.maximum(QUICK_CLUSTERS * factors, round(QUICK_S * rate_hz)), length)
+    return np.minimum(np.maximum(QUICK_CLUSTERS * factors, round(QUICK_S * rate_hz)), window_samples)
 
 
-def phase_scale(longest: int) -> Floats:
-    """Return the scale 2^s [LANES] from samples to integer phase, for clusters of up to ``longest`` samples.
+def integer_phase_scale(largest_cluster: int) -> Floats:
+    """Return the scale 2^s [LANES] that converts samples to integer phase.
 
-    A second difference is at most 2 m times full scale. The scaled value must stay below 2⁶³.
+    A scaled second difference at the largest cluster size stays below 2⁶³.
     """
-    bits = 62 - np.ceil(np.log2(2.0 * longest * np.array(FULL_SCALE)))
+    bits = 62 - np.ceil(np.log2(2.0 * largest_cluster * np.array(FULL_SCALE)))
     return np.asarray(np.exp2(np.minimum(bits, 48.0)))
 
 
@@ -121,16 +105,16 @@ class AllanWindow:
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples, ascending, from 1 to length/2.
     spans : ndarray of int64, shape (m,), or None
-        Number of samples that each row uses, from two clusters to ``length``. None means the whole window. If spans are
-        given, the rows may have any order, and a cluster size may occur several times with different spans.
+        Number of newest samples for each cluster size, from two clusters to ``length``. None means the whole window. If
+        spans are given, a cluster size may occur several times.
 
     Raises
     ------
     ConfigError
-        If the length, a cluster size or a span is out of range.
+        If the window length, a cluster size or a span is out of range.
 
     >>> window = AllanWindow(100, np.array([1, 2]))
-    >>> window.update(np.tile([[1.0], [2.0]], (50, 6)))   # 1, 2, 1, 2, … : σ²(1) = 1/2, σ²(2) = 0
+    >>> window.append_samples(np.tile([[1.0], [2.0]], (50, 6)))   # 1, 2, 1, 2, … : σ²(1) = 1/2, σ²(2) = 0
     >>> window.avar()[:, 0].tolist()
     [0.5, 0.0]
     """
@@ -150,20 +134,20 @@ class AllanWindow:
         self.factors = factors.astype(np.int64)
         self.spans = spans.astype(np.int64)
         self._taus = int(factors.size)
-        self._scale = phase_scale(int(factors.max()))
-        # Three arrays hold everything, because each array passed to the kernel costs 50 ns. See view_arrays.
+        self._scale = integer_phase_scale(int(factors.max()))
+        # Three arrays, because each array that is passed to a kernel costs 50 ns. See view_window_arrays.
         taus, places = self._taus, length + 1 + RUN_SAMPLES
         self._ints = _aligned(LANES + -(-2 * taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
         self._floats = _aligned((2 + 2 * RUN_SAMPLES + 2 * taus + STAGE_SAMPLES) * LANES, np.float64)
         self._missing = np.zeros(places * LANES, np.int32)
-        arrays = view_arrays(self._ints, self._floats, self._missing, taus)
+        arrays = view_window_arrays(self._ints, self._floats, self._missing, taus)
         self._state, self._phase, self._scaling = arrays.state, arrays.phase, arrays.scaling
         arrays.factors[:], arrays.spans[:] = self.factors, self.spans
         self._terms = arrays.terms.reshape(taus, LANES)
         self._sums, self._rest = arrays.sums.reshape(taus, LANES), arrays.rest.reshape(taus, LANES)
         self._stage = arrays.stage[: STAGE_SAMPLES * AXES].reshape(STAGE_SAMPLES, AXES)
-        self.resets = -1  # number of times the window has been emptied; the call below sets it to 0
-        self.reset()
+        self.resets = -1  # number of times the window has been emptied
+        self.discard_samples()
 
     @property
     def samples_in_window(self) -> int:
@@ -175,25 +159,21 @@ class AllanWindow:
         """Number of samples since the last reset, including missing ones."""
         return int(self._state[TOTAL])
 
-    def reset(self) -> None:
-        """Discard all samples.
-
-        Phase and the running count of missing samples are kept, because only differences of them are used.
-        """
+    def discard_samples(self) -> None:
+        """Discard all samples."""
         self.resets += 1
         self._terms[:] = 0
         self._floats[:] = 0
         self._scaling[:LANES] = self._scale
         self._state[[TOTAL, LAST_MISSING, WIDTH]] = (0, -(1 << 62), LANES)
 
-    def update(self, values: Floats) -> None:
-        """Advance the window by samples.
+    def append_samples(self, values: Floats) -> None:
+        """Append samples to the window, and remove the oldest samples.
 
         Parameters
         ----------
         values : ndarray of float, shape (n, 6)
-            Samples in rad/s and m/s². NaN and values of 1e7 and more, which are too large for integer phase, count as
-            missing.
+            Samples in rad/s and m/s². NaN and values of 1e7 and more count as missing.
 
         Raises
         ------
@@ -207,34 +187,33 @@ class AllanWindow:
         n = shape[0]
         if n > STAGE_SAMPLES:
             for start in range(0, n, STAGE_SAMPLES):
-                self.update(rows[start : start + STAGE_SAMPLES])
+                self.append_samples(rows[start : start + STAGE_SAMPLES])
             return
-        self._stage[:n] = rows  # A call of ``stage`` would slow down a single sample by 3 %.
-        advance(self._ints, self._floats, self._missing, self._taus, 0, n)
+        self._stage[:n] = rows
+        append_staged_samples(self._ints, self._floats, self._missing, self._taus, 0, n)
 
-    def stage(self, values: Floats) -> None:
-        """Copy up to ``STAGE_SAMPLES`` samples [n, 6] to the input buffer of compiled code (``buffers``)."""
-        # A copy, because each new memory layout or access flag of an array triggers a compilation of seconds.
+    def copy_to_input_buffer(self, values: Floats) -> None:
+        """Copy up to ``STAGE_SAMPLES`` samples [n, 6] to the input buffer of the compiled kernels."""
+        # A copy, because each new memory layout of an array triggers a compilation of several seconds.
         self._stage[: len(values)] = values
 
-    def buffers(self) -> WindowBuffers:
-        """Return the arrays of the window for compiled code."""
+    def kernel_buffers(self) -> WindowBuffers:
+        """Return the arrays of the window for the compiled kernels."""
         return WindowBuffers(self._ints, self._floats, self._missing, self._taus, self.length)
 
-    def skip(self, n: int) -> None:
-        """Advance by n missing samples. If n exceeds the window length, the window is emptied."""
+    def append_missing_samples(self, n: int) -> None:
+        """Append n missing samples. If n exceeds the window length, the window is emptied."""
         if n > self.length:
-            self.reset()
+            self.discard_samples()
             return
-        # In blocks, so that a long outage does not need a long array.
+        # Blocks limit the memory for a long outage.
+
         hole = np.full((min(n, SKIP_BLOCK_ROWS), AXES), np.nan)
         for start in range(0, n, SKIP_BLOCK_ROWS):
-            self.update(hole[: n - start])
+            self.append_samples(hole[: n - start])
 
     def keep_newest(self, axis: int, n: int) -> None:
-        """Discard all but the newest samples of one axis, and count the older ones as missing.
-
-        The cost is one pass over the window and the cost of n new samples.
+        """Mark all but the newest n samples of one axis as missing.
 
         Parameters
         ----------
@@ -247,19 +226,19 @@ class AllanWindow:
             keep_newest(self._ints, self._floats, self._missing, self._taus, axis, n)
 
     def avar(self) -> Floats:
-        """Return the Allan variance [m, 6] in squared units of the axis; NaN where no term is complete."""
+        """Return the Allan variance [m, 6] in squared units of the axis; NaN if too many samples are missing."""
         sums = (self._sums + self._rest)[:, :AXES]
         m = self.factors[:, None] * self._scale[:AXES]
         terms = self._terms[:, :AXES]
-        # Rounding alone makes second differences of up to one unit on a constant axis. This is not noise.
+        # Rounding causes second differences of up to one unit on a constant axis.
         sums = np.where(sums <= terms, 0.0, sums)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
 
-    def slopes_of_axes_and_taus(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
-        """Return the slope of the rate of each axis, and the slope that contributes to the Allan variance at each τ.
+    def rate_slopes_per_axis_and_tau(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
+        """Return the slope of the rate of each axis, and the slope at each averaging time.
 
-        The definitions are those of ``batch.slope_of_recording`` and ``batch.rate_slope_per_tau``.
+        The definitions are given at ``batch.rate_slope_from_thirds`` and ``batch.rate_slope_per_tau``.
 
         Parameters
         ----------
@@ -271,19 +250,19 @@ class AllanWindow:
         slope : ndarray of float64, shape (6,)
             Slope in units of the axis per sample; NaN if too many samples are missing.
         slopes : ndarray of float64, shape (m, 6)
-            Slope at each τ, in the same unit.
+            Slope at each τ in units of the axis per sample.
         """
         slope, slopes = np.empty(AXES), np.empty((self._taus, AXES))
         lengths = np.full(AXES, self.samples_in_window) if lengths is None else lengths
-        slopes_of_axes_and_taus(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
+        rate_slopes_per_axis_and_tau(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
         return slope / self._scale[:AXES], slopes / self._scale[:AXES]
 
-    def terms(self) -> Ints:
-        """Return the number of second differences averaged, shape (m, 6)."""
+    def term_counts(self) -> Ints:
+        """Return the number of second differences [m, 6] in each Allan variance."""
         return self._terms[:, :AXES].copy()
 
     def newest_samples(self, axis: int, n: int) -> Floats:
-        """Return up to n of the newest samples of one axis, computed from the phase; NaN means missing.
+        """Return up to n newest samples of one axis, computed from the phase; NaN means missing.
 
         Parameters
         ----------
@@ -297,8 +276,8 @@ class AllanWindow:
         phase, missing = self._phase[at * LANES + axis], self._missing[at * LANES + axis]
         return np.where(np.diff(missing) > 0, np.nan, np.diff(phase) / self._scale[axis])
 
-    def view_ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
-        """Return a view of the ring buffer of phase. The view is valid until the next update.
+    def view_phase_ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
+        """Return a view of the ring buffer of phase, which is valid until samples are appended.
 
         Returns
         -------
@@ -307,7 +286,7 @@ class AllanWindow:
         missing : ndarray of int32, shape (rows, LANES)
             Running count of missing samples before each point.
         first : int
-            Row of the oldest of the n + 1 phase points of the window. The points continue at row 0 after the last row.
+            Row of the oldest phase point of the window.
         unit : ndarray of float64, shape (6,)
             Size of one unit of phase in rad/s and m/s².
         """
@@ -318,7 +297,6 @@ class AllanWindow:
 
 
 def _aligned(size: int, dtype: type[np.generic]) -> NDArray[Any]:
-    """Return an array of zeros that begins at a cache line."""
     space = np.zeros(size + LINE, dtype)
     start = -(space.ctypes.data // space.itemsize) % LINE
     return space[start : start + size]

@@ -1,7 +1,7 @@
 """Compiled kernels of ``AllanWindow``, which append phase to the ring buffer and update the sums of all cluster sizes.
 
-The arithmetic is described in ``window``. All data of a window are stored in three arrays (``WindowBuffers``), because
-each array that Python passes to compiled code costs 50 ns.
+The arithmetic is described in ``window``. Three arrays contain all data of a window (``WindowBuffers``), because each
+array that Python passes to compiled code costs 50 ns.
 """
 
 from typing import Final, NamedTuple
@@ -14,48 +14,42 @@ from monitor.common.compiled import compiled, inlined
 
 AXES: Final = 6
 LANES: Final = 8
-"""Number of columns per sample: six axes, padded to a vector register."""
+"""Number of columns per sample, which are six axes and two columns of padding."""
 TOTAL, NEWEST, LAST_MISSING, WIDTH = 0, 1, 2, 3
 """Indices of the state array.
 
-The elements are the number of samples since the last reset, the row of the newest phase point, the newest sample that
-was missing on any axis, and ``LANES``. The kernel reads ``LANES`` from the array, because the compiler would turn a
-loop of known length 8 into scalar statements.
+The elements are the number of samples since the last reset, the row of the newest phase point, the number of the newest
+missing sample, and ``LANES``. The kernel reads ``LANES`` from the array, because a loop of constant length would not be
+vectorized.
 """
 RUN_SAMPLES: Final = 64
 """Maximum number of samples whose phase is written before the sums are updated."""
 STAGE_SAMPLES: Final = 512
 """Maximum number of samples passed to the kernel at a time."""
 LINE: Final = 8
-"""Number of 8-byte numbers in a cache line. A row of phase fills exactly one line."""
+"""Number of 8-byte numbers in a cache line."""
 MIN_PRESENT_SHARE: Final = 0.98
-"""Minimum share of samples that must be present for a slope.
-
-Gaps shift the centre of the remaining samples by less than this share.
-"""
+"""Minimum share of samples that must be present for a slope."""
 LEVEL: Final = 64
-"""Number of samples averaged for the reference level. At full scale and the finest unit, the sum fits into 64 bits."""
+"""Number of newest samples whose mean is the reference level of an axis."""
 NEVER: Final = 1 << 62
 """Marker for a missing reference level."""
 BEND_POINTS: Final = 64
-"""Number of points that represent a block of phase.
-
-The error of the sum is 1 % of the standard deviation of the sum.
-"""
+"""Number of phase points that represent a block. The error is 1 % of the standard deviation of the sum."""
 
 
 class WindowBuffers(NamedTuple):
-    """Memory of a window in the three arrays that Python passes to compiled code."""
+    """Memory of a window, in three arrays that are passed to compiled code."""
 
-    ints: Ints  # see ``view_arrays``
-    floats: Floats  # see ``view_arrays``
+    ints: Ints  # see ``view_window_arrays``
+    floats: Floats  # see ``view_window_arrays``
     missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
     taus: int  # number of cluster sizes
     length: int  # samples in the full window
 
 
 class WindowArrays(NamedTuple):
-    """Views of the memory of a window with m cluster sizes."""
+    """Views of the arrays of a window with m cluster sizes."""
 
     state: Ints  # [LANES] see ``TOTAL``
     factors: Ints  # [m] cluster sizes in samples
@@ -63,15 +57,15 @@ class WindowArrays(NamedTuple):
     terms: Ints  # [m · LANES] number of second differences in each sum
     phase: Ints  # [places · LANES] ring of integer phase
     scaling: Floats  # [2 · LANES] units of phase per unit of the axis, and rounding errors to add to the next sample
-    scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares that are added to and removed from the sums
+    scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares that are added to the sums, and squares that are subtracted
     sums: Floats  # [m · LANES] sums of squared second differences
     rest: Floats  # [m · LANES] rounding errors of the sums
     stage: Floats  # [at least STAGE_SAMPLES · AXES] input buffer
     missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
 
 
-def view_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int) -> WindowArrays:
-    """Return views of the memory of a window.
+def view_window_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int) -> WindowArrays:
+    """Return views of the parts of the arrays of a window.
 
     Parameters
     ----------
@@ -88,17 +82,18 @@ def view_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: in
     )  # fmt: skip
 
 
-cut_arrays = compiled(view_arrays)
-"""Compiled version of ``view_arrays`` for kernels."""
+compiled_view_window_arrays = compiled(view_window_arrays)
+"""Compiled version of ``view_window_arrays`` for kernels."""
 
 
 @compiled
-def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int) -> None:
-    """Advance the window by n samples of the input buffer, starting at row ``start``.
+def append_staged_samples(
+    ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int
+) -> None:
+    """Append n samples of the input buffer to the window, and update the sums of all cluster sizes.
 
-    The kernel first appends the phase of up to ``RUN_SAMPLES`` samples. It then updates the sums of one τ after another
-    for all these samples. The processor can prefetch the few memory ranges that one τ reads. A loop over all τ for each
-    sample would read from a hundred memory ranges at the same time.
+    The kernel appends the phase of up to ``RUN_SAMPLES`` samples before the sums of each τ are updated. The processor
+    can prefetch the few memory ranges of one τ.
 
     Parameters
     ----------
@@ -110,7 +105,7 @@ def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, s
         Number of rows.
     """
     # One statement, because each access to a field changes a reference count.
-    state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = cut_arrays(
+    state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = compiled_view_window_arrays(
         ints, floats, missing, taus
     )
     places = phase.size // LANES
@@ -148,16 +143,14 @@ def _add_run(
     rest: Floats,
     lanes: int,
 ) -> None:
-    """Update the sums of each τ for ``run`` new samples, whose phase is stored from row ``first`` on.
-
-    ``count`` is the number of earlier samples.
-    """
+    """Update the sums of each τ for ``run`` new samples, whose phase begins at row ``first``."""
     places = phase.size // LANES
     for i in range(factors.size):
         row = max(0, 2 * factors[i] - 1 - count)  # first row with a complete term
         own = slice(i * LANES, (i + 1) * LANES)
         while row < run:
-            # up to the row at which one of the ranges reaches the end of the ring, or the span becomes full
+            # up to the row at which the span becomes full
+
             now = first + row if first + row < places else first + row - places
             leaving = count + row >= spans[i]
             end = run if leaving else min(run, spans[i] - count)
@@ -169,7 +162,6 @@ def _add_run(
 
 @compiled
 def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints) -> None:
-    """Append one phase point and the running count of missing samples to the ring."""
     before = LANES * state[NEWEST]
     now = before + LANES if before + LANES < phase.size else 0
     state[TOTAL] += 1
@@ -185,7 +177,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
             phase[now + lane] = phase[before + lane]
             count = missing[before + lane] + 1
             state[LAST_MISSING] = state[TOTAL]
-        if missing[now + lane] != count:  # Zeros are not written, so that the system does not allocate the memory.
+        if missing[now + lane] != count:  # The memory of zeros is not allocated until it is written.
             missing[now + lane] = count
 
 
@@ -205,15 +197,14 @@ def _slide(
     rest: Floats,
     lanes: int,
 ) -> int:
-    """Update the sums of one τ for up to ``rows`` new phase points from row ``now`` on, and return how many were used.
+    """Update the sums of one τ for up to ``rows`` new phase points, and return the number of processed points.
 
-    The number is smaller than ``rows`` if one of the ranges reaches the end of the ring. If ``leaving`` is true, the
-    oldest terms are removed from the sums.
+    The number is smaller than ``rows`` if a range reaches the end of the ring buffer.
     """
     places = phase.size // LANES
     old = now - span - 1
-    new1, new2 = place(now - m, places), place(now - 2 * m, places)
-    old0, old1, old2 = place(old + 2 * m, places), place(old + m, places), place(old, places)
+    new1, new2 = ring_row(now - m, places), ring_row(now - 2 * m, places)
+    old0, old1, old2 = ring_row(old + 2 * m, places), ring_row(old + m, places), ring_row(old, places)
     run = min(rows, places - max(now, new1, new2, old0, old1, old2))
     n = run * LANES
     added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
@@ -233,22 +224,21 @@ def _slide(
 
 
 @compiled
-def place(index: int, places: int) -> int:
-    """Return the row of a phase point in the ring buffer.
+def ring_row(index: int, rows: int) -> int:
+    """Return the row of a phase point in the ring buffer, for an index that may be negative.
 
     Parameters
     ----------
     index : int
-        Row of the point, or a negative number of rows before the start of the ring.
-    places : int
-        Number of rows in the ring.
+        Row of the phase point; negative before the start of the ring buffer.
+    rows : int
+        Number of rows in the ring buffer.
     """
-    return index if index >= 0 else index + places
+    return index if index >= 0 else index + rows
 
 
 @compiled
 def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> None:
-    """Compute the squared second differences of n numbers in one flat loop, which the compiler vectorizes."""
     i0, i1, i2 = np.uintp(at0 * LANES), np.uintp(at1 * LANES), np.uintp(at2 * LANES)
     for i in range(np.uintp(n)):
         d = float(phase[i0 + i] - 2 * phase[i1 + i] + phase[i2 + i])
@@ -269,11 +259,10 @@ def _remove_incomplete(
 
 @compiled
 def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats, lanes: int) -> None:
-    """Add the squares ``added`` to the sums, and subtract the squares ``evicted``, row by row.
+    """Add the squares ``added`` to the sums, and subtract the squares ``evicted``.
 
-    The rounding errors are added to ``rest`` (TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B). If an index could be
-    negative, or if ``lanes`` were a constant, the inner loop would not be vectorized and would take three times as
-    long.
+    The rounding errors are added to ``rest`` (TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B). The indices are unsigned
+    and ``lanes`` is an argument, because the inner loop would otherwise not be vectorized.
     """
     for row in range(np.uintp(0), np.uintp(n), np.uintp(lanes)):
         for lane in range(np.uintp(lanes)):
@@ -291,19 +280,18 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 def _replace_terms(
     now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, sums: Floats, rest: Floats
 ) -> None:
-    """Update the sums of all τ for a single sample of a full window without gaps.
+    """Update the sums of all τ for a single sample of a full window without missing samples.
 
-    The set-up of a vector loop for each τ would cost more than the loop. The differences are therefore computed one by
-    one, and a single loop updates all sums.
+    A vector loop for each τ would be slower, so a single loop updates all sums.
     """
     places = phase.size // LANES
     added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
     at0 = np.uintp(now * LANES)
     for i in range(factors.size):
         m, old = factors[i], now - spans[i] - 1
-        at1, at2 = np.uintp(place(now - m, places) * LANES), np.uintp(place(now - 2 * m, places) * LANES)
-        old0, old1 = np.uintp(place(old + 2 * m, places) * LANES), np.uintp(place(old + m, places) * LANES)
-        old2 = np.uintp(place(old, places) * LANES)
+        at1, at2 = np.uintp(ring_row(now - m, places) * LANES), np.uintp(ring_row(now - 2 * m, places) * LANES)
+        old0, old1 = np.uintp(ring_row(old + 2 * m, places) * LANES), np.uintp(ring_row(old + m, places) * LANES)
+        old2 = np.uintp(ring_row(old, places) * LANES)
         out = np.uintp(i * LANES)
         for lane in range(np.uintp(AXES)):
             d = float(phase[at0 + lane] - 2 * phase[at1 + lane] + phase[at2 + lane])
@@ -327,12 +315,12 @@ def keep_newest(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: in
     n : int
         Number of newest samples to keep.
     """
-    w = cut_arrays(ints, floats, missing, taus)
+    w = compiled_view_window_arrays(ints, floats, missing, taus)
     state, places = w.state, w.phase.size // LANES
-    # The count of missing samples changes at every older point, so every term that contains one is incomplete.
-    oldest = place(state[NEWEST] - n, places) * LANES + axis
+    # The count of missing samples changes at every older point, so every older second difference is incomplete.
+    oldest = ring_row(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
-        missing[place(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
+        missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
     state[LAST_MISSING] = max(state[LAST_MISSING], state[TOTAL] - n)
     for i in range(taus):
         _recompute_sum(w, i, axis, n)
@@ -340,13 +328,12 @@ def keep_newest(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: in
 
 @compiled
 def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
-    """Recompute the sum of row i for one axis from the newest n samples."""
     phase, missing, m, own, places = w.phase, w.missing, w.factors[i], i * LANES + axis, w.phase.size // LANES
     total, left, count = 0.0, 0.0, 0
     for back in range(min(n, w.spans[i]) - 2 * m, -1, -1):
         at = w.state[NEWEST] - back
-        at0, at1 = place(at, places) * LANES + axis, place(at - m, places) * LANES + axis
-        at2 = place(at - 2 * m, places) * LANES + axis
+        at0, at1 = ring_row(at, places) * LANES + axis, ring_row(at - m, places) * LANES + axis
+        at2 = ring_row(at - 2 * m, places) * LANES + axis
         if missing[at0] == missing[at2]:
             d = float(phase[at0] - 2 * phase[at1] + phase[at2])
             s = total + d * d
@@ -359,19 +346,16 @@ def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
 
 @inlined
 def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
-    """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all of them are missing.
-
-    The sum of the differences from this mean fits into 64 bits.
-    """
+    """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all are missing."""
     places = phase.size // LANES
-    last, first = newest * LANES + axis, place(newest - min(n, LEVEL), places) * LANES + axis
+    last, first = newest * LANES + axis, ring_row(newest - min(n, LEVEL), places) * LANES + axis
     present = min(n, LEVEL) - (missing[last] - missing[first])
     return (phase[last] - phase[first]) // present if present > 0 else NEVER
 
 
 @inlined
-def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
-    """Return the slope of the rate over the last n samples, from the means of the first and the last third.
+def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
+    """Return the slope of the rate of one axis, from the means of the first and the last third of n samples.
 
     Parameters
     ----------
@@ -382,7 +366,7 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
     newest : int
         Row of the newest phase point.
     n : int
-        Number of samples in use.
+        Number of newest samples.
     axis : int
         Index of the axis.
 
@@ -395,25 +379,25 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
     middle = _reference_level(phase, missing, newest, n, axis)
     if third == 0 or middle == NEVER:
         return np.nan
-    at0, at1 = newest * LANES + axis, place(newest - third, places) * LANES + axis
-    at2, at3 = place(newest - 2 * third, places) * LANES + axis, place(newest - 3 * third, places) * LANES + axis
+    at0, at1 = newest * LANES + axis, ring_row(newest - third, places) * LANES + axis
+    at2, at3 = ring_row(newest - 2 * third, places) * LANES + axis, ring_row(newest - 3 * third, places) * LANES + axis
     late, early = third - (missing[at0] - missing[at1]), third - (missing[at2] - missing[at3])
     if (
         min(late, early) < MIN_PRESENT_SHARE * third
         or 3 * third - (missing[at0] - missing[at3]) < MIN_PRESENT_SHARE * 3 * third
     ):
         return np.nan
-    # Phase and middle · count wrap modulo 2⁶⁴. The difference is small and is computed before the conversion.
+    # Phase wraps modulo 2⁶⁴, so the small difference is computed before the conversion to floating point.
     rise = float(phase[at0] - phase[at1] - middle * late) / late
     rise -= float(phase[at2] - phase[at3] - middle * early) / early
     return float(rise / (2.0 * third))
 
 
 @compiled
-def slopes_of_axes_and_taus(
+def rate_slopes_per_axis_and_tau(
     ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, lengths: Ints, slope: Floats, slopes: Floats
 ) -> None:
-    """Compute the slope of the rate of each axis, and the slope that contributes to the Allan variance at each τ.
+    """Compute the slope of the rate of each axis, and the slope at each averaging time.
 
     Parameters
     ----------
@@ -422,14 +406,14 @@ def slopes_of_axes_and_taus(
     lengths : ndarray of int64, shape (6,)
         Number of newest samples of each axis.
     slope : ndarray of float64, shape (6,)
-        Result of ``slope_of_thirds`` for each axis.
+        Result of ``integer_slope_from_thirds`` for each axis, overwritten.
     slopes : ndarray of float64, shape (m, 6)
-        Result of ``mean_second_difference`` for each τ and axis.
+        Result of ``mean_second_difference`` for each τ and axis, overwritten.
     """
-    w = cut_arrays(ints, floats, missing, taus)
+    w = compiled_view_window_arrays(ints, floats, missing, taus)
     for axis in range(AXES):
         n, newest = lengths[axis], w.state[NEWEST]
-        slope[axis] = slope_of_thirds(w.phase, w.missing, newest, n, axis)
+        slope[axis] = integer_slope_from_thirds(w.phase, w.missing, newest, n, axis)
         for i in range(w.factors.size):
             slopes[i, axis] = mean_second_difference(w.phase, w.missing, newest, n, w.factors[i], axis)
 
@@ -438,24 +422,22 @@ def slopes_of_axes_and_taus(
 def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
     """Return the mean second difference of phase over clusters of m samples, divided by m².
 
-    The sum of all second differences telescopes to four blocks of m points at the ends. Only ``BEND_POINTS`` points of
-    a long block are used, because phase is smooth enough for them to represent the block. A missing sample is replaced
-    by the mean of the newest samples.
-
-    The result is the slope of the rate in integer units per sample, or NaN if too many samples are missing. The
-    parameters are those of ``slope_of_thirds``, with the cluster size m in samples.
+    The sum of all second differences is a sum over four blocks of m phase points at the ends. About ``BEND_POINTS``
+    points represent each block. A missing sample is replaced by the mean of the newest samples. The result is in
+    integer units per sample, or NaN if too many samples are missing. The other parameters are described at
+    ``integer_slope_from_thirds``.
     """
     places = phase.size // LANES
-    last, first = newest * LANES + axis, place(newest - n, places) * LANES + axis
+    last, first = newest * LANES + axis, ring_row(newest - n, places) * LANES + axis
     middle = _reference_level(phase, missing, newest, n, axis)
     if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < MIN_PRESENT_SHARE * n:
         return np.nan
     stride = max(1, m // BEND_POINTS)
     total = 0.0
     for k in range(0, m, stride):
-        at0, at1 = place(newest - k, places) * LANES + axis, place(newest - m - k, places) * LANES + axis
-        at2 = place(newest - n + 2 * m - 1 - k, places) * LANES + axis
-        at3 = place(newest - n + m - 1 - k, places) * LANES + axis
+        at0, at1 = ring_row(newest - k, places) * LANES + axis, ring_row(newest - m - k, places) * LANES + axis
+        at2 = ring_row(newest - n + 2 * m - 1 - k, places) * LANES + axis
+        at3 = ring_row(newest - n + m - 1 - k, places) * LANES + axis
         absent = missing[at0] - missing[at1] - missing[at2] + missing[at3]
         total += float(phase[at0] - phase[at1] - phase[at2] + phase[at3] + middle * absent)
     points = (m + stride - 1) // stride

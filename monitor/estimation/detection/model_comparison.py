@@ -110,7 +110,7 @@ class PreparedModel:
             n = count_axis_samples_in_window(curve, i)
             if n < MIN_SAMPLES:
                 continue
-            edf = expected.degrees_of_freedom(tables.at(i, n, curve.n), terms)
+            edf = expected.degrees_of_freedom(tables.table_of_axis(i, n, curve.n), terms)
             one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, edf, n, len(self._expected))
             if one is not None:
                 found[axis] = one

@@ -1,30 +1,26 @@
-"""Weighted non-negative least-squares fit of the coefficients Q N B K R to an Allan curve of several axes.
+"""Weighted non-negative least-squares fit of the coefficients Q N B K R to the Allan variances of several axes.
 
 The Allan variance is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares. The weight
 matrix is the inverse covariance of the Allan variances at all τ under the fitted model. A fast fit uses only the
-variances. The weights are recomputed a few times. The errors of the coefficients are then within a few percent of the
-Cramér–Rao limit.
+variances. The errors of the coefficients are within a few percent of the Cramér–Rao limit.
 
 The status of each coefficient is determined from the solution û without the constraint θ ≥ 0. If the true squared
-coefficient is t, the variance of û is a polynomial v(t) = c0 + c1 t + c2 t², which follows from the covariances of
-``uncertainty``. A term is included if û exceeds a multiple of √c0, the standard deviation for an absent term. The
-confidence interval of the term contains all t for which û is a plausible estimate. A term that is not included has a
-one-sided bound, which is never tighter than the bound from an estimate of zero.
+coefficient is t, the variance of û is a polynomial v(t) = c0 + c1 t + c2 t². A term is included in the fit if û exceeds
+a multiple of √c0, the standard deviation for an absent term. The confidence interval contains all t for which û is a
+plausible estimate. For a term that is not included, only an upper bound is given.
 
 The Allan variance alone cannot distinguish a ramp from a random walk. If the slope of the rate in the window is known,
-the fit uses the Allan variance without the contribution of this slope, so that K is unbiased with and without a ramp. R
-is included if the slope is significantly larger than the slope that noise would cause. For this test, K is set to the
-upper end of the confidence interval. Otherwise K or R may cause the slope, and both coefficients are bounded. If the
-slope is unknown, R is only bounded, and a ramp is estimated as K.
+the contribution of the slope is subtracted from the Allan variance before the fit, so K is unbiased. R is included if
+the slope is significantly larger than the slope that noise would cause. If the slope is unknown, a ramp is estimated as
+K, and R is only bounded.
 
 The bandwidth of real sensors ends below half the sample rate. White noise after a low-pass filter has the Allan
-variance N²/τ − c/τ² at τ beyond the memory of the filter. The term c/τ² has the shape of quantization noise with a
-negative sign. If the fit is inconsistent with the shortest τ, Q² may therefore become negative. A negative Q²
-represents the band limit, and Q is only bounded by the Allan variance at the shortest τ. If the fit is still
-inconsistent, the shortest τ are left out one after another. If no filter explains the Allan variance, for example
-because of a spectral line or motion, no τ is left out, and the misfit is reported.
+variance N²/τ − c/τ² at long τ. The term c/τ² has the shape of quantization noise with a negative sign. If the fit is
+inconsistent with the shortest τ, Q² may therefore become negative, and Q is only bounded. If the fit is still
+inconsistent, the shortest τ are left out one after another. If no low-pass filter explains the Allan variance, all τ
+are used, and the misfit is reported.
 
-The fit accepts any curve. All coefficients of an axis with too few τ or without noise are UNESTIMATED.
+All coefficients of an axis with too few τ or without noise are UNESTIMATED.
 """
 
 from collections.abc import Callable, Sequence
@@ -52,16 +48,16 @@ TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 """Powers of the sample rate that convert Q N B K R from τ0 = 1 to SI."""
 
 PER_AXIS_FIELDS: Final = ("theta", "fitted", "edf", "entered", "left_out", "scatter", "misfit", "k_or_r")
-"""Fields of ``Fit`` that have one column per axis, besides the coefficients."""
+"""Fields of ``Fit`` with one column per axis, except the coefficients."""
 THRESHOLDS_ONCE: Final = (2.33, 2.33)
-"""Thresholds in σ to add and to drop a term in a single fit. They add 1 % of absent terms."""
+"""Thresholds in σ to add and to drop a term in a single fit, with a false-alarm probability of 1 %."""
 THRESHOLDS_WATCHED: Final = (3.0, 1.5)
-"""Thresholds in σ to add and to drop a term in repeated fits. The difference is a hysteresis."""
+"""Thresholds in σ to add and to drop a term in repeated fits, with hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
-class Design:
-    """Columns of the fit for one list of cluster sizes."""
+class DesignMatrix:
+    """Design matrix of the fit for one list of cluster sizes."""
 
     factors: Ints  # [m] cluster sizes in samples
     rate_hz: float
@@ -73,18 +69,18 @@ class Fit:
     """Result of one fit of six axes."""
 
     coefficients: Coefficients
-    theta: Floats  # [5, 6] Q² N² B² K² R² of the fitted curve, SI; a negative Q² represents a band limit
-    fitted: Floats  # [m, 6] Allan variance of the fitted model, squared unit; NaN without a model or if left out
-    edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN where the curve is NaN
+    theta: Floats  # [5, 6] fitted Q² N² B² K² R² in SI; a negative Q² represents a band limit
+    fitted: Floats  # [m, 6] Allan variance of the fitted model; NaN without a fit or if τ is left out
+    edf: Floats  # [m, 6] equivalent degrees of freedom of the measured Allan variance
     entered: NDArray[np.bool_]  # [5, 6] True for the terms in the fit
-    left_out: Ints  # [6] number of shortest τ left out, because they contradict every fit
-    scatter: Floats  # [6] variance of the curve about the fit, relative to noise of the five terms
-    misfit: Floats  # [6] ``scatter`` if chance does not explain this value, otherwise 1
-    k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
+    left_out: Ints  # [6] number of shortest τ that are left out of the fit
+    scatter: Floats  # [6] mean squared residual relative to the variance expected from the five terms
+    misfit: Floats  # [6] ``scatter`` if the residuals are significantly too large, otherwise 1
+    k_or_r: NDArray[np.bool_]  # [6] True if the rate drifts, but random walk and ramp cannot be distinguished
 
 
-def make_design(factors: Ints, rate_hz: float) -> Design:
-    """Return the columns of the fit from the Allan variances of the noise terms.
+def make_design_matrix(factors: Ints, rate_hz: float) -> DesignMatrix:
+    """Return the design matrix of the fit, whose columns are the Allan variances of the noise terms.
 
     Parameters
     ----------
@@ -95,46 +91,52 @@ def make_design(factors: Ints, rate_hz: float) -> Design:
     """
     m = np.asarray(factors, np.float64)
     columns = np.ascontiguousarray(unit_coefficient_allan_variances(m, 1.0))
-    return Design(factors, rate_hz, columns)
+    return DesignMatrix(factors, rate_hz, columns)
 
 
-def shared_inputs(
-    design: Design, table: CovarianceTable, blind: Floats | None = None, ask: bool = True
+def make_shared_inputs(
+    design: DesignMatrix,
+    table: CovarianceTable,
+    ignored_direction: Floats | None = None,
+    may_drop_short_taus: bool = True,
 ) -> SharedInputs:
-    """Return the inputs of a fit that depend only on the window length.
+    """Return the inputs of a fit that are the same for all axes.
 
     Parameters
     ----------
-    design : Design
-        Columns for the cluster sizes of the curve.
-    table : Table
+    design : DesignMatrix
+        Design matrix for the cluster sizes.
+    table : CovarianceTable
         Covariances for the window length.
-    blind : ndarray of float64, shape (m,), or None
-        Direction of the curve that the fit ignores, in units of one sample. None means no such direction.
-    ask : bool
-        True to leave out the shortest τ that contradict the fit.
+    ignored_direction : ndarray of float64, shape (m,), or None
+        Change of the Allan variances that has no effect on the fit, in units of one sample.
+    may_drop_short_taus : bool
+        True to leave out the shortest τ if they contradict the fit.
     """
     flat = design.columns.copy()
-    # The slope includes noise, so the subtraction of the slope reduces the expected contribution of each noise term.
+    # The measured slope includes noise, so its subtraction reduces the expected contribution of each noise term.
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
     flat[:, ~design.columns.any(axis=0)] = 0.0  # terms that are not fitted
-    blind = np.zeros(design.factors.size) if blind is None else blind
+
+    ignored_direction = np.zeros(design.factors.size) if ignored_direction is None else ignored_direction
     whole = table.terms.astype(np.float64)
-    return SharedInputs(design.columns, flat, table.covariance, whole, table.slope, blind, ask)
+    return SharedInputs(
+        design.columns, flat, table.covariance, whole, table.slope, ignored_direction, may_drop_short_taus
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredCurve:
-    """Measured Allan curve of k axes, and the slopes of the rate in the same window."""
+    """Measured Allan variances of k axes, and slopes of the rate in the same window."""
 
-    avar: Floats  # [m, k] Allan variance, squared unit of the axis; NaN if the window is too short
+    avar: Floats  # [m, k] Allan variance in squared units of the axis; NaN if the window is too short
     terms: Ints  # [m, k] number of second differences averaged
-    slope: Floats | None = None  # [k] unit/s, ``batch.slope_of_recording``; None or NaN: a ramp is only bounded
-    slopes: Floats | None = None  # [m, k] unit/s, ``batch.rate_slope_per_tau``; None: a strong ramp biases K
+    slope: Floats | None = None  # [k] ``batch.rate_slope_from_thirds`` in unit/s; if None or NaN, R is only bounded
+    slopes: Floats | None = None  # [m, k] ``batch.rate_slope_per_tau`` in unit/s; if None, a strong ramp biases K
     entered_before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the previous fit; None for a single fit
 
-    def axis(self, column: int) -> "MeasuredCurve":
-        """Return the data of one axis."""
+    def select_axis(self, column: int) -> "MeasuredCurve":
+        """Return the measured Allan variances and slopes of one axis."""
         one = slice(column, column + 1)
         slope = None if self.slope is None else self.slope[one]
         slopes = None if self.slopes is None else self.slopes[:, one]
@@ -142,37 +144,35 @@ class MeasuredCurve:
         return MeasuredCurve(self.avar[:, one], self.terms[:, one], slope, slopes, before)
 
 
-def fit(
-    design: Design,
+def fit_coefficients(
+    design: DesignMatrix,
     table: CovarianceTable,
     measured: MeasuredCurve,
-    full: bool = True,
-    start: Floats | None = None,
-    blind: Floats | None = None,
-    ask: bool = True,
+    full_covariance: bool = True,
+    start_theta: Floats | None = None,
+    ignored_direction: Floats | None = None,
+    may_drop_short_taus: bool = True,
 ) -> Fit:
-    """Fit the coefficients of k axes to overlapping Allan variances.
+    """Fit the coefficients Q N B K R of k axes to overlapping Allan variances.
 
-    If the measured curve contains the terms of a previous fit, terms are added at 3 σ and dropped at 1.5 σ. In a single
-    fit, both thresholds are 2.33 σ.
+    In repeated fits, terms are added at 3 σ and dropped at 1.5 σ. In a single fit, both thresholds are 2.33 σ.
 
     Parameters
     ----------
-    design : Design
-        Columns for the cluster sizes of the curve.
+    design : DesignMatrix
+        Design matrix for the cluster sizes.
     table : CovarianceTable
         Covariances for the window length.
     measured : MeasuredCurve
-        Measured curve and slopes.
-    full : bool
+        Measured Allan variances and slopes.
+    full_covariance : bool
         True to weight by the covariances of all τ, False to weight by the variances alone.
-    start : ndarray of float64, shape (5, k), or None
-        ``theta`` of a recent fit, from which the first weights are computed. A fit from a start takes a third of the
-        time.
-    blind : ndarray of float64, shape (m,), or None
-        Direction of the curve that the fit ignores.
-    ask : bool
-        True to leave out short τ that contradict the fit.
+    start_theta : ndarray of float64, shape (5, k), or None
+        ``theta`` of a recent fit, from which the first weights are computed. The fit is then three times as fast.
+    ignored_direction : ndarray of float64, shape (m,), or None
+        Change of the Allan variances that has no effect on the fit, in units of one sample.
+    may_drop_short_taus : bool
+        True to leave out the shortest τ if they contradict the fit.
     """
     avar, terms, before = measured.avar, measured.terms, measured.entered_before
     m, axes = avar.shape
@@ -180,13 +180,15 @@ def fit(
         axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C")
     )
     maps = empty_solution_maps(axes, m)
-    if start is not None:
-        found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
+    if start_theta is not None:
+        found.theta[:] = start_theta.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
     slope = np.full(axes, np.nan) if measured.slope is None else measured.slope / design.rate_hz
     slopes = np.tile(slope, (m, 1)).T if measured.slopes is None else measured.slopes.T / design.rate_hz
-    options = FitOptions(*(THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED), full, start is not None)
-    shared = shared_inputs(design, table, blind, ask)
+    options = FitOptions(
+        *(THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED), full_covariance, start_theta is not None
+    )
+    shared = make_shared_inputs(design, table, ignored_direction, may_drop_short_taus)
     fit_axes(0, axes, shared, CurvesOfAxes(curves, counts, slope, np.ascontiguousarray(slopes)), options, found, maps)
     to_si = design.rate_hz**TO_SI
     value = np.where(found.status == Status.ESTIMATED, np.sqrt(np.maximum(found.theta, 0.0)), np.nan)
@@ -201,43 +203,42 @@ def fit(
     )  # fmt: skip
 
 
-def replace_axis(whole: Fit, axis: int, one: Fit) -> Fit:
-    """Return a fit in which the results of one axis are replaced.
+def replace_axis_results(all_axes: Fit, axis: int, axis_fit: Fit) -> Fit:
+    """Return a copy of a fit in which the results of one axis are replaced.
 
     Parameters
     ----------
-    whole : Fit
+    all_axes : Fit
         Fit of all axes.
     axis : int
         Index of the axis to replace.
-    one : Fit
+    axis_fit : Fit
         Fit of this axis alone.
     """
 
-    def put(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def replace_column(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         result = parts[0].copy()
         result[..., axis] = parts[1][..., 0]
         return result
 
-    return _combine((whole, one), put)
+    return _combine((all_axes, axis_fit), replace_column)
 
 
 def concatenate_fits(fits: Sequence[Fit], axes: Ints) -> Fit:
-    """Join fits of different axes to one fit in the order of the axes.
+    """Concatenate fits of different axes in the order of the axes.
 
     Parameters
     ----------
     fits : sequence of Fit
         Fits of one or more axes.
     axes : ndarray of int64, shape (k,)
-        Axis of each column of the fits, in the order of the fits.
+        Index of the axis of each column of the fits.
     """
     order = np.argsort(axes)
     return _combine(fits, lambda parts: np.concatenate(parts, axis=-1)[..., order])
 
 
 def _combine(fits: Sequence[Fit], join: Callable[[Sequence[NDArray[Any]]], NDArray[Any]]) -> Fit:
-    """Return a fit in which a function has joined each array of several fits."""
     names = ("value", "lo", "hi", "status")
     coefficients = (join([getattr(one.coefficients, name) for one in fits]) for name in names)
     fields = {name: join([getattr(one, name) for one in fits]) for name in PER_AXIS_FIELDS}
@@ -245,7 +246,7 @@ def _combine(fits: Sequence[Fit], join: Callable[[Sequence[NDArray[Any]]], NDArr
 
 
 def empty_fit(avar: Floats) -> Fit:
-    """Return the result for a curve [m, 6] that has not been fitted, in which all coefficients are unestimated."""
+    """Return a fit for Allan variances [m, 6] in which all coefficients are unestimated."""
     nothing = np.full((5, avar.shape[1]), np.nan)
     status = np.full((5, avar.shape[1]), Status.UNESTIMATED, np.int8)
     return Fit(
@@ -261,11 +262,8 @@ def empty_fit(avar: Floats) -> Fit:
     )
 
 
-def _white_edf(design: Design, table: CovarianceTable, terms: Ints) -> Floats:
-    """Return the degrees of freedom for white noise, used until there is a fit.
-
-    In the first seconds, the noise of a sensor is mostly white.
-    """
+def _white_edf(design: DesignMatrix, table: CovarianceTable, terms: Ints) -> Floats:
+    """Return the degrees of freedom for white noise, which are used for axes without a fit."""
     whole = table.terms[:, None]
     ratio = np.where((whole > 0) & (terms > 0), whole / np.maximum(terms, 1), np.nan)  # of all terms to present terms
     own = table.covariance[:, :, WHITE].diagonal()[:, None] * ratio

@@ -10,28 +10,25 @@ from numpy.typing import NDArray
 from drivers.data_types import Floats
 
 SYMBOLS: Final = ("Q", "N", "B", "K", "R")
-"""Symbols of the coefficients in the order of their rows.
-
-The symbols denote quantization noise, angle random walk, bias instability, rate random walk and rate ramp.
-"""
+"""Symbols of quantization noise, angle random walk, bias instability, rate random walk and rate ramp."""
 
 
 class Status(IntEnum):
-    """Status of a coefficient, which is always published with the coefficient."""
+    """Status of a noise coefficient."""
 
-    UNESTIMATED = 0  # too little data, or withheld: value, lo and hi are NaN
-    UPPER_BOUND = 1  # only bounded by the data: value is NaN, lo is 0, hi is the one-sided 95 % bound
+    UNESTIMATED = 0  # too few data, or withheld; value, lo and hi are NaN
+    UPPER_BOUND = 1  # value is NaN, lo is 0, hi is the one-sided 95 % upper bound
     ESTIMATED = 2  # value with a two-sided 95 % interval
 
 
 @dataclass(frozen=True, slots=True)
 class Coefficients:
-    """Values and 95 % intervals of the coefficients in SI units (rad, m, s).
+    """Values and 95 % intervals of the coefficients of six axes in SI units (rad, m, s).
 
-    The rows are Q N B K R, the columns gx to az.
+    The rows are Q N B K R, and the columns are gx to az.
     """
 
     value: Floats  # [5, 6] NaN unless the status is ESTIMATED
-    lo: Floats  # [5, 6] lower end of the interval
-    hi: Floats  # [5, 6] upper end of the interval
+    lo: Floats  # [5, 6] lower end of the 95 % interval
+    hi: Floats  # [5, 6] upper end of the 95 % interval
     status: NDArray[np.int8]  # [5, 6] values of ``Status``

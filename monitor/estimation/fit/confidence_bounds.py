@@ -11,25 +11,25 @@ from monitor.estimation.fit.fit_kernel_types import TermResults
 from monitor.estimation.fit.least_squares import N, Q
 
 UPPER_BOUND_Z: Final = Z95
-"""Quantile of an upper bound.
+"""Normal quantile of an upper bound.
 
-With this quantile, a bound has a probability of 97.5 % in a single fit. Large terms are estimated instead of bounded,
-so the probability among the reported bounds is lower, but at least 95 %.
+Large terms are estimated instead of bounded, so the probability of the reported bounds is below 97.5 %, but at least
+95 %.
 """
 EXCLUSION_SIGMA: Final = 3.3
-"""Distance in σ below the contribution of a term, beyond which a measured variance excludes the term.
+"""Deviation in σ at which a measured Allan variance excludes the contribution of a term.
 
-With 20 τ, the probability that any variance deviates by this distance by chance is 1 %.
+The probability that any of 20 Allan variances deviates by 3.3 σ is 1 %.
 """
 MIN_CUBE_ROOT_FACTOR: Final = 0.05
-"""Minimum factor of the cube root of χ². Below this factor, that is below two degrees of freedom, there is no bound."""
+"""Minimum factor of the cube root of χ² for a finite upper limit."""
 
 
 @compiled
 def pearson_quantile(z: float, skewness: float) -> float:
     """Return the quantile of probability Φ(z) of the standardized Pearson III distribution.
 
-    The distribution is a χ² with 8/skewness² degrees of freedom, in the approximation of Wilson & Hilferty (1931).
+    The χ² approximation of Wilson & Hilferty (1931) is used.
 
     Parameters
     ----------
@@ -43,12 +43,12 @@ def pearson_quantile(z: float, skewness: float) -> float:
 
 
 @compiled
-def interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> float:
+def confidence_interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> float:
     """Return one end of the confidence interval of a coefficient.
 
-    The end is √t, where t is the true squared coefficient for which the estimate û lies k standard deviations √v(t)
-    above t. The number k is the quantile of probability Φ(z) of a distribution with the skewness 2 √c2. The value t
-    solves the equation (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0. A negative t is replaced by zero.
+    The end is √t, where the estimate û exceeds the true squared coefficient t by k standard deviations √v(t). The
+    factor k is a quantile of the Pearson III distribution with skewness 2 √c2. The squared coefficient t solves the
+    equation (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0. A negative solution is replaced by zero.
 
     Parameters
     ----------
@@ -70,21 +70,23 @@ def interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> 
 
 
 @compiled
-def limit_by_curve(curve: Floats, edf: Floats, rows: Ints, columns: Floats, memory: int, terms: TermResults) -> None:
-    """Limit the coefficients of a curve that the five terms do not explain.
+def limit_terms_by_measured_avar(
+    avar: Floats, edf: Floats, rows: Ints, unit_avar: Floats, filter_memory: int, terms: TermResults
+) -> None:
+    """Limit each coefficient so that no term exceeds a measured Allan variance.
 
-    The contribution of a single term must not exceed the measured Allan variance at any τ. N is only limited at τ of
-    more than ``memory`` samples, because a filter of the sensor may have removed white noise at shorter τ.
+    N is only limited at τ of more than ``filter_memory`` samples, because a filter in the sensor may have removed white
+    noise at shorter τ.
 
     Parameters
     ----------
-    curve, edf : ndarray of float64, shape (m,)
+    avar, edf : ndarray of float64, shape (m,)
         Allan variance and its degrees of freedom.
     rows : ndarray of int64
         Indices of the τ in use.
-    columns : ndarray of float64, shape (m, 5)
+    unit_avar : ndarray of float64, shape (m, 5)
         Allan variance of unit coefficients.
-    memory : int
+    filter_memory : int
         Memory of the filter in samples.
     terms : TermResults
         Results of the fit, updated in place.
@@ -92,8 +94,8 @@ def limit_by_curve(curve: Floats, edf: Floats, rows: Ints, columns: Floats, memo
     for a in range(5):
         most = np.inf
         for i in rows:
-            if columns[i, a] > 0.0 and (a != N or columns[i, N] * memory < 1.0):
-                most = min(most, upper_limit(curve[i], edf[i], EXCLUSION_SIGMA) / columns[i, a])
+            if unit_avar[i, a] > 0.0 and (a != N or unit_avar[i, N] * filter_memory < 1.0):
+                most = min(most, avar_upper_limit(avar[i], edf[i], EXCLUSION_SIGMA) / unit_avar[i, a])
         most = np.sqrt(most)
         if terms.status[a] == 0 or terms.hi[a] <= most:
             continue
@@ -103,15 +105,15 @@ def limit_by_curve(curve: Floats, edf: Floats, rows: Ints, columns: Floats, memo
 
 
 @compiled
-def upper_limit(avar: float, edf: float, z: float) -> float:
-    """Return the upper limit of the true variance at z σ (Wilson & Hilferty).
+def avar_upper_limit(avar: float, edf: float, z: float) -> float:
+    """Return the upper limit of the true Allan variance at z σ (Wilson & Hilferty 1931).
 
-    The limit is infinite with too few degrees of freedom.
+    The limit is infinite if there are too few degrees of freedom.
 
     Parameters
     ----------
     avar : float
-        Measured variance.
+        Measured Allan variance.
     edf : float
         Degrees of freedom.
     z : float
@@ -123,17 +125,17 @@ def upper_limit(avar: float, edf: float, z: float) -> float:
 
 
 @compiled
-def bound_by_first_point(avar: float, edf: float, column: float, terms: TermResults) -> None:
-    """Bound Q by the first measured Allan variance, because the band limit of the sensor hides Q.
+def bound_q_by_first_point(avar: float, edf: float, unit_avar: float, terms: TermResults) -> None:
+    """Bound Q by the Allan variance at the shortest τ, because Q cannot be estimated for a band-limited sensor.
 
     Parameters
     ----------
     avar, edf : float
-        First measured Allan variance, and the degrees of freedom.
-    column : float
+        Allan variance at the shortest τ, and the degrees of freedom.
+    unit_avar : float
         Allan variance of Q = 1 at the same τ.
     terms : TermResults
         Results of the fit, updated in place.
     """
     terms.entered[Q], terms.status[Q] = False, 1
-    terms.lo[Q], terms.hi[Q] = 0.0, np.sqrt(upper_limit(avar, edf, UPPER_BOUND_Z) / column)
+    terms.lo[Q], terms.hi[Q] = 0.0, np.sqrt(avar_upper_limit(avar, edf, UPPER_BOUND_Z) / unit_avar)

@@ -1,24 +1,21 @@
 """Update of the coefficients with every sample, in compiled code.
 
-For fixed weights, the normal equations of the fit are linear in the Allan variance. ``SolutionMaps`` contains the
-matrices of this linear map, whose evaluation takes about eighty products per axis. If the set of positive terms
-changes, the four normal equations are solved again with the same weights.
+For fixed weights, the solution of the fit is a linear function of the Allan variances. ``SolutionMaps`` contains the
+matrices of this linear map. If the set of positive terms changes, the normal equations are solved again with the same
+weights.
 
 The weights and the selection of terms are recomputed in each of the following cases.
 
-- A term would be added or dropped.
+- A term or a ramp would be added or dropped.
 - A coefficient has changed by a fifth and by more than the standard deviation.
-- The slope would add or drop a ramp.
-- The window has grown by a tenth, or half of it has been replaced.
+- The window has grown by a tenth, or half of the window has been replaced.
 
-Between two computations, the weights are outdated. The error of a coefficient depends on the weights only in second
-order, so outdated weights increase the error by at most 2 %.
+Outdated weights increase the error of a coefficient by at most 2 %. To recompute the weights of an axis, the kernel
+returns, and Python calls ``fit_axes``. A call of ``fit_axes`` from the kernel would compile that function a second
+time.
 
-When an axis needs a new map, the kernel returns, and Python calls ``fit_axes``. Such calls are rare. If the kernel
-itself called ``fit_axes``, the compiler would have to compile this function a second time.
-
-The result contains Q N B K R for every sample, with NaN where a coefficient is not estimated. Only
-``Estimator.get_estimate`` computes confidence intervals.
+The result contains Q N B K R for every sample, with NaN for coefficients that are not estimated. Confidence intervals
+are only computed by ``Estimator.get_estimate``.
 """
 
 from typing import Final, NamedTuple
@@ -38,12 +35,12 @@ from monitor.estimation.allan.window_kernel import (
     TOTAL,
     WindowArrays,
     WindowBuffers,
-    advance,
-    cut_arrays,
+    append_staged_samples,
+    compiled_view_window_arrays,
+    integer_slope_from_thirds,
     mean_second_difference,
-    slope_of_thirds,
 )
-from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, Design, shared_inputs
+from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, DesignMatrix, make_shared_inputs
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.estimation.fit.fit_kernel import fit_axes
 from monitor.estimation.fit.fit_kernel_types import (
@@ -61,20 +58,17 @@ from monitor.estimation.fit.least_squares import Q, R, invert_on_subset, nonzero
 REFRESH: Final = 2
 """Minimum number of fits of an axis within one window length."""
 PATIENCE: Final = 64
-"""Minimum number of fits within one window length for an axis without a solution or with a misfit.
-
-The linear map cannot show that a band limit, a spectral line or a transient has disappeared.
-"""
-OPTIONS: Final = FitOptions(*THRESHOLDS_WATCHED, full=False, warm=True)
+"""Minimum number of fits within one window length for an axis without a solution or with a misfit."""
+OPTIONS: Final = FitOptions(*THRESHOLDS_WATCHED, full_covariance=False, warm=True)
 """Options of the fits that recompute the linear maps."""
 
 U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 
 
 class RefitState(NamedTuple):
-    """State of the fit of all axes."""
+    """State of the continuous fit of all axes."""
 
-    curves: CurvesOfAxes  # curves and slopes at the last fit of each axis; only ``slope`` is that of the newest window
+    curves: CurvesOfAxes  # Allan variances at the last fit of each axis; ``slope`` is updated with every sample
     output: FitOutput
     maps: SolutionMaps
     ages: Ints  # [6] number of samples since the last fit of each axis
@@ -88,16 +82,16 @@ class SumsToVariances(NamedTuple):
 
 
 class ContinuousRefit:
-    """Coefficients of a window, updated with every sample.
+    """Noise coefficients of a window, updated with every sample.
 
     Parameters
     ----------
     window : AllanWindow
-        Window that is advanced only by this object.
+        Window to which only this object appends samples.
     rows : int
-        Number of rows of the window that are fitted, from the first.
+        Number of cluster sizes of the window that are fitted.
     tables : AxisCovarianceTables
-        Covariances of these rows, for the length of each axis.
+        Covariances for the fitted cluster sizes.
     """
 
     def __init__(self, window: AllanWindow, rows: int, tables: AxisCovarianceTables) -> None:
@@ -105,37 +99,37 @@ class ContinuousRefit:
         avar, terms, slopes = np.zeros((3, AXES, rows))
         self._curves = CurvesOfAxes(avar, terms, np.zeros(AXES), slopes)
         self._ages = np.zeros(AXES, np.int64)
-        self.reset()
+        self.restart_all_fits()
 
-    def reset(self) -> None:
-        """Restart the fits of all axes. No term is in the new fits."""
+    def restart_all_fits(self) -> None:
+        """Restart the fits of all axes without any term."""
         output = empty_fit_output(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
         self._state = RefitState(self._curves, output, empty_solution_maps(AXES, self._rows), self._ages)
-        self._used: list[CovarianceTable | None] = [None] * AXES  # tables from which ``_known`` was computed
+        self._used: list[CovarianceTable | None] = [None] * AXES  # covariance tables from which ``_known`` was computed
         self._known: list[SharedInputs] = []
 
-    def restart(self, axis: int) -> None:
-        """Restart the fit of one axis. The axis is fitted at the next sample."""
+    def restart_fit_of_axis(self, axis: int) -> None:
+        """Restart the fit of one axis at the next sample."""
         output = self._state.output
         output.entered[axis], output.status[axis], output.theta[axis] = False, 0, np.nan
         self._request_fit(axis)
 
     @property
-    def entered(self) -> NDArray[np.bool_]:
+    def terms_in_fit(self) -> NDArray[np.bool_]:
         """Boolean array of shape (5, 6), True for the terms in the fit."""
         return self._state.output.entered.T
 
-    def advance_and_refit(self, design: Design, samples: Floats, lengths: Ints) -> Floats:
-        """Advance the window by samples, and return the coefficients after each sample.
+    def advance_and_refit(self, design: DesignMatrix, samples: Floats, lengths: Ints) -> Floats:
+        """Append samples to the window, and return the coefficients after each sample.
 
         Parameters
         ----------
-        design : Design
-            Columns of the fit.
+        design : DesignMatrix
+            Design matrix of the fit.
         samples : ndarray of float64, shape (n, 6)
             Samples in rad/s and m/s²; NaN means missing.
         lengths : ndarray of int64, shape (6,)
-            Number of samples of each axis in the window, updated in place.
+            Number of newest samples of each axis, updated in place.
 
         Returns
         -------
@@ -148,42 +142,41 @@ class ContinuousRefit:
             self._advance(design, samples[part], lengths, coefficients[part])
         return coefficients
 
-    def _advance(self, design: Design, values: Floats, lengths: Ints, coefficients: Floats) -> None:
-        """Advance by up to ``STAGE_SAMPLES`` samples and write the coefficients [n, 5, 6]."""
-        self._window.stage(values)
+    def _advance(self, design: DesignMatrix, values: Floats, lengths: Ints, coefficients: Floats) -> None:
+        self._window.copy_to_input_buffer(values)
         to_si = design.rate_hz**TO_SI
         done = 0
         while done < len(values):
             until = done + min(len(values) - done, self._find_tables(design, lengths))
             while done < until:
-                done, due = _follow(self._window.buffers(), self._state, lengths, to_si, done, until, coefficients)
+                done, due = _follow(
+                    self._window.kernel_buffers(), self._state, lengths, to_si, done, until, coefficients
+                )
                 if due:
                     self._fit([axis for axis in range(AXES) if due >> axis & 1], to_si, coefficients[done - 1])
 
     def _fit(self, axes: list[int], to_si: Floats, coefficients: Floats) -> None:
-        """Fit some axes, and write the estimated coefficients into ``coefficients`` [5, 6]."""
         output = self._state.output
         for axis in axes:
             fit_axes(axis, axis + 1, self._known[axis], self._curves, OPTIONS, output, self._state.maps)
         size = np.sqrt(np.maximum(output.theta[axes], 0.0)) * to_si
         coefficients[:, axes] = np.where(output.status[axes] == Status.ESTIMATED, size, np.nan).T
 
-    def _find_tables(self, design: Design, lengths: Ints) -> int:
-        """Find the covariance table of every axis, and return for how many samples all tables stay valid."""
+    def _find_tables(self, design: DesignMatrix, lengths: Ints) -> int:
+        """Find the covariance table of every axis; return the number of samples for which all tables stay valid."""
         filled = min(self._window.samples_in_window + 1, self._window.length)
         lasts = UNLIMITED_SAMPLES
         for axis in range(AXES):
             n = min(int(lengths[axis]) + 1, filled)
-            table = self._tables.at(axis, n, filled)
+            table = self._tables.table_of_axis(axis, n, filled)
             if table is not self._used[axis]:
                 self._used[axis] = table
                 self._request_fit(axis)
-                self._known[axis : axis + 1] = [shared_inputs(design, table)]
-            lasts = min(lasts, self._tables.remaining_valid_samples(table, n))
+                self._known[axis : axis + 1] = [make_shared_inputs(design, table)]
+            lasts = min(lasts, self._tables.samples_until_table_expires(table, n))
         return lasts
 
     def _request_fit(self, axis: int) -> None:
-        """Request a fit of one axis at the next sample."""
         self._state.maps.used[axis] = 0
         self._ages[axis] = self._window.length
 
@@ -192,12 +185,12 @@ class ContinuousRefit:
 def _follow(
     buffers: WindowBuffers, state: RefitState, lengths: Ints, to_si: Floats, start: int, end: int, coefficients: Floats
 ) -> tuple[int, int]:
-    """Advance by the samples in the input buffer of the window, and write the coefficients after each sample.
+    """Process rows of the input buffer of the window, and write the coefficients after each row.
 
-    Rows ``start`` to ``end`` of the buffer are processed. If axes must be fitted after a row, the function stops and
-    copies the curves of these axes to ``state.curves``. It returns the next row and the bit set of the axes to fit.
+    If an axis must be fitted again after a row, the function stops and copies the Allan variances of the axis to
+    ``state.curves``. The function returns the next row and the bit set of the axes to fit.
     """
-    w = cut_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
+    w = compiled_view_window_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
     curves, output, maps, ages = state
     ints, floats, missing, taus, window = buffers
     # Local names, because each access to a field in a loop changes a reference count.
@@ -212,11 +205,13 @@ def _follow(
     scale = SumsToVariances(unit, inverse)
     for row in range(start, end):
         due = 0
-        advance(ints, floats, missing, taus, row, 1)
+        append_staged_samples(ints, floats, missing, taus, row, 1)
         filled = min(counters[TOTAL], window)
         for axis in range(AXES):
             lengths[axis] = min(lengths[axis] + 1, filled)
-            slope[axis] = slope_of_thirds(phase, missing, counters[NEWEST], lengths[axis], axis) / scaling[axis]
+            slope[axis] = (
+                integer_slope_from_thirds(phase, missing, counters[NEWEST], lengths[axis], axis) / scaling[axis]
+            )
         _project(w, scale, curves, maps, right)
         _apply_maps(right, slope, maps, output, valid)
         for axis in range(AXES):
@@ -237,13 +232,12 @@ def _follow(
 
 @compiled
 def _copy_curve(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, axis: int, length: int) -> None:
-    """Copy the Allan variances and the slopes of one axis from the window."""
     for i in range(curves.avar.shape[1]):
         at = i * LANES + axis
         total, count = w.sums[at] + w.rest[at], w.terms[at]
         curves.terms[axis, i] = count
         scale.inverse[axis, i] = 1.0 / (scale.unit[axis, i] * count)
-        # As in AllanWindow.avar, a constant axis has no noise.
+        # Rounding alone causes sums up to this limit, as in AllanWindow.avar.
         curves.avar[axis, i] = total * scale.inverse[axis, i] if total > count else 0.0
         bend = mean_second_difference(w.phase, w.missing, w.state[NEWEST], length, w.factors[i], axis)
         curves.slopes[axis, i] = bend / w.scaling[axis]
@@ -251,8 +245,7 @@ def _copy_curve(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, a
 
 @inlined
 def _project(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, maps: SolutionMaps, right: Floats) -> None:
-    """Compute r = Xᵀ V⁻¹ y [axes, NOISES] of the current curve."""
-    lanes = np.uintp(LANES)  # unsigned, because checks for negative indices would cost as much as the arithmetic
+    lanes = np.uintp(LANES)  # unsigned, because checks for negative indices would be slow
     # Local names, because each access to a field in a loop changes a reference count.
     sums, rest, counts, terms, slope = w.sums, w.rest, w.terms, curves.terms, curves.slope
     unit, inverse, used = scale.unit, scale.inverse, maps.used
@@ -276,10 +269,9 @@ def _project(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, maps
 
 @inlined
 def _apply_maps(right: Floats, slope: Floats, maps: SolutionMaps, output: FitOutput, valid: NDArray[np.bool_]) -> None:
-    """Compute θ [axes, 5] from the linear maps, and store in ``valid`` [axes] whether the maps are still valid.
+    """Compute θ [axes, 5] from the linear maps, and set ``valid`` [axes] to True for maps that are still valid.
 
-    If the set of positive terms has changed, the normal equations are solved again with the same weights. For an axis
-    without a map, θ is not changed.
+    For an axis without a map, θ is not changed.
     """
     normal, inverse, whole, low, high = maps.normal, maps.inverse, maps.whole, maps.low, maps.high
     used, free, straight, theta, entered = maps.used, maps.free, maps.straight, output.theta, output.entered
@@ -303,7 +295,7 @@ def _apply_maps(right: Floats, slope: Floats, maps: SolutionMaps, output: FitOut
                 allowed = x > 0.0 or (free[axis] and a == Q)
                 same = same and allowed
                 theta[axis, a] = x if allowed else 0.0  # a new fit starts with the weights of this θ
-            # The comparison is False for NaN. Only a term that is not zero can be added.
+            # The comparison is False for NaN.
             limit = high[axis, NOISES + a] if there else np.inf
             holds = holds and low[axis, NOISES + a] <= u <= limit
         for a in range(np.uintp(NOISES)):

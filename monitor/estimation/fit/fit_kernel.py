@@ -1,10 +1,7 @@
 """Compiled kernel of the fit, which computes the weights and the non-negative solution of each axis.
 
-All quantities are in units of one sample, as described in ``fit_arrays``. The caller allocates the arrays for the
-results, with one row per axis.
-
-For given weights, the coefficients are a linear function of the Allan variances. This linear map is stored with the
-limits within which it is as good as a new fit. ``continuous_refit`` applies the map after every sample.
+The units are described in ``fit_kernel_types``. For given weights, the coefficients are a linear function of the Allan
+variances. The kernel stores this linear map for ``continuous_refit``, with the limits within which the map is valid.
 """
 
 from typing import Final
@@ -14,7 +11,7 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES, PAIRS
-from monitor.estimation.fit.confidence_bounds import bound_by_first_point, limit_by_curve
+from monitor.estimation.fit.confidence_bounds import bound_q_by_first_point, limit_terms_by_measured_avar
 from monitor.estimation.fit.fit_kernel_types import (
     CurvesOfAxes,
     FitOptions,
@@ -42,56 +39,56 @@ from monitor.estimation.fit.term_selection import (
 )
 
 MIN_ROWS: Final = NOISES + 1
-"""Minimum number of τ. With fewer τ, a fit of four terms has no degree of freedom left for a test."""
+"""Minimum number of τ for a fit of four terms."""
 COLD_PASSES: Final = 3
-"""Number of passes with new weights, without a previous fit. More passes change no coefficient by a tenth of σ."""
+"""Number of times the weights are recomputed in a fit without a start."""
 WARM_PASSES: Final = 1
-"""Number of passes with new weights, starting from the coefficients of a recent fit."""
+"""Number of times the weights are recomputed in a fit that starts from a recent fit."""
 MISFIT_SIGMA: Final = 4.0
-"""Residual in σ above which a short τ contradicts the fit."""
+"""Residual in σ above which the Allan variance at a short τ contradicts the fit."""
 REPEATED_MISFIT_SIGMA: Final = 2.5
-"""Residual in σ above which a short τ contradicts a fit with a negative Q².
+"""Residual in σ above which the Allan variance at a short τ contradicts a fit with a negative Q².
 
-The limit is lower, so that the remaining effect of a band limit does not bias N.
+A lower limit prevents a bias of N.
 """
 TOTAL_MISFIT_SIGMA: Final = 6.0
-"""Number of standard deviations of χ² beyond which the five terms do not explain the curve."""
+"""Number of standard deviations of χ² above which the five terms do not explain the Allan variances."""
 SHORT_ROWS: Final = 4
-"""Number of shortest τ in use that are tested for a contradiction."""
+"""Number of shortest τ at which the residuals are tested."""
 FILTER_MEMORY: Final = 16
-"""Largest cluster size in samples that can be left out. A filter with a longer memory is not noise of the sensor."""
+"""Largest cluster size in samples that can be left out."""
 WHITE: Final = PAIRS.index((N, N))
-"""Index of the pair (N, N) in the table."""
+"""Index of the pair (N, N) in ``CovarianceTable.covariance``."""
 
 
 @compiled
 def fit_axes(
-    first: int,
-    end: int,
+    first_axis: int,
+    end_axis: int,
     shared: SharedInputs,
     curves: CurvesOfAxes,
     options: FitOptions,
     output: FitOutput,
     maps: SolutionMaps,
 ) -> None:
-    """Fit the axes first ≤ axis < end.
+    """Fit the coefficients of the axes first_axis ≤ axis < end_axis.
 
     Parameters
     ----------
-    first, end : int
+    first_axis, end_axis : int
         Range of axes.
     shared : SharedInputs
         Inputs that are the same for all axes.
     curves : CurvesOfAxes
-        Measured curves and slopes.
+        Measured Allan variances and slopes.
     options : FitOptions
         Thresholds and weights.
     output : FitOutput
         Results, updated in place.
     maps : SolutionMaps
-        Linear map of the solution, updated in place.
+        Linear maps of the solutions, updated in place.
     """
-    for axis in range(first, end):
+    for axis in range(first_axis, end_axis):
         _fit_axis(axis, shared, curves, options, output, maps)
 
 
@@ -99,13 +96,12 @@ def fit_axes(
 def _fit_axis(
     axis: int, shared: SharedInputs, curves: CurvesOfAxes, options: FitOptions, output: FitOutput, maps: SolutionMaps
 ) -> None:
-    """Fit one axis. With too few τ, all coefficients are unestimated."""
     curve, slope, m = curves.avar[axis], curves.slope[axis], curves.avar.shape[1]
     straight = slope == slope
     terms = TermResults(output.entered[axis], output.theta[axis], output.lo[axis], output.hi[axis], output.status[axis])
     problem = LeastSquares(
-        np.empty(m), np.empty(m), shared.flat if straight else shared.columns, shared.covariance, shared.blind,
-        np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
+        np.empty(m), np.empty(m), shared.flat if straight else shared.columns, shared.covariance,
+        shared.ignored_direction, np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
     rows = _prepare_rows(axis, shared, curves, problem)
     maps.used[axis, 0] = maps.used[axis, 1] = 0
@@ -115,14 +111,14 @@ def _fit_axis(
         for a in range(5):
             terms.entered[a], terms.status[a] = False, 0
         return
-    first, free = _fit_or_fall_back(axis, rows, problem, curve, shared.ask, options, output)
+    first, free = _fit_or_fall_back(axis, rows, problem, curve, shared.may_drop_short_taus, options, output)
     used, misfit = rows[first:], output.misfit[axis]
     for a in range(5):
         terms.lo[a], terms.hi[a], terms.status[a] = np.nan, np.nan, 0
     tests = select_terms(problem, used, options, straight, misfit, terms)
     tighten_bounds(problem, used, misfit, tests, terms)
     for a in range(5):
-        if terms.status[a] == 1 and not terms.hi[a] < np.inf:  # the curve is too short for a bound
+        if terms.status[a] == 1 and not terms.hi[a] < np.inf:  # there are too few τ for a bound
             terms.status[a], terms.lo[a], terms.hi[a] = 0, np.nan, np.nan
     noise, most, maps.either[axis] = select_ramp(slope, shared.slope_variance, options, terms)
     compute_observation_variances(problem, rows, terms.theta)
@@ -131,10 +127,10 @@ def _fit_axis(
     if store_linear_map(axis, used, problem, curves, output, maps):
         compute_map_validity_limits(maps.low[axis], maps.high[axis], options, tests, most, terms)
     if misfit > 1.0:
-        limit_by_curve(curve, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms)
+        limit_terms_by_measured_avar(curve, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms)
     if free:
         i = rows[0]
-        bound_by_first_point(curve[i], output.edf[axis, i], shared.columns[i, Q], terms)
+        bound_q_by_first_point(curve[i], output.edf[axis, i], shared.columns[i, Q], terms)
 
 
 @compiled
@@ -154,19 +150,25 @@ def _prepare_rows(axis: int, shared: SharedInputs, curves: CurvesOfAxes, problem
 
 @compiled
 def _fit_or_fall_back(
-    axis: int, rows: Ints, problem: LeastSquares, curve: Floats, ask: bool, options: FitOptions, output: FitOutput
+    axis: int,
+    rows: Ints,
+    problem: LeastSquares,
+    curve: Floats,
+    may_drop_short_taus: bool,
+    options: FitOptions,
+    output: FitOutput,
 ) -> tuple[int, bool]:
-    """Fit with the requested weights, or with the variances alone if the misfit is too large.
+    """Fit with the full covariance, or with the variances alone if the misfit is too large.
 
-    Return how many of the shortest τ were left out, and whether Q² was allowed to be negative.
+    Return the number of shortest τ that are left out, and True if Q² may be negative.
     """
-    full, theta = options.full, output.theta[axis]
+    full_covariance, theta = options.full_covariance, output.theta[axis]
     while True:
-        first, free = _fit_terms(curve, rows, problem, ask, full, options.warm, theta)
+        first, free = _fit_terms(curve, rows, problem, may_drop_short_taus, full_covariance, options.warm, theta)
         scatter, limit = _misfit(problem, rows[first:], theta)
-        if not full or scatter <= limit:
+        if not full_covariance or scatter <= limit:
             break
-        full = False  # with the wrong covariances, a fit to other noise than the five terms may miss all points
+        full_covariance = False  # for noise other than the five terms, the covariances are wrong
     output.left_out[axis], output.scatter[axis] = first, scatter
     output.misfit[axis] = scatter if scatter > limit else 1.0
     return first, free
@@ -174,7 +176,6 @@ def _fit_or_fall_back(
 
 @compiled
 def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats, output: FitOutput) -> None:
-    """Compute the Allan variance of the fitted model, and the degrees of freedom of the curve under this model."""
     theta = output.theta[axis]
     for k in range(rows.size):
         i = rows[k]
@@ -190,36 +191,42 @@ def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats
 
 @compiled
 def _fit_terms(
-    curve: Floats, rows: Ints, problem: LeastSquares, ask: bool, full: bool, warm: bool, theta: Floats
+    curve: Floats,
+    rows: Ints,
+    problem: LeastSquares,
+    may_drop_short_taus: bool,
+    full_covariance: bool,
+    warm: bool,
+    theta: Floats,
 ) -> tuple[int, bool]:
-    """Fit Q N B K with re-weighting.
+    """Fit Q N B K with recomputed weights.
 
-    Return how many of the shortest τ were left out, and whether Q² was allowed to be negative.
+    Return the number of shortest τ that are left out, and True if Q² may be negative.
     """
     first, free = 0, False
     warm = warm and theta[N] > 0.0
     while True:
         used = rows[first:]
         if warm:
-            compute_weights(problem, used, theta, full)
+            compute_weights(problem, used, theta, full_covariance)
         else:
-            for i in used:  # start with white noise of the level of the curve
+            for i in used:  # the first weights assume white noise
                 variance = curve[i] * curve[i] * problem.covariance[i, i, WHITE] / problem.columns[i, N] ** 2
                 for a in range(5):
                     problem.weighted[i, a] = problem.columns[i, a] / variance
         for _ in range(WARM_PASSES if warm else COLD_PASSES):
             compute_normal_equations(problem, used)
             solve_nonnegative(problem.normal, problem.right, free, theta)
-            compute_weights(problem, used, theta, full)
+            compute_weights(problem, used, theta, full_covariance)
         limit = REPEATED_MISFIT_SIGMA if free else MISFIT_SIGMA
-        if not ask or not _is_contradicted(problem, used[:SHORT_ROWS], theta, limit):
+        if not may_drop_short_taus or not _is_contradicted(problem, used[:SHORT_ROWS], theta, limit):
             break
         if not free:
             free = True
         elif used.size > MIN_ROWS and problem.columns[used[0], N] * FILTER_MEMORY >= 1.0:
             first += 1
-        else:  # The cause is not a filter but a spectral line, motion, or another effect outside the five terms.
-            first, free, ask = 0, False, False
+        else:  # The cause is not a low-pass filter.
+            first, free, may_drop_short_taus = 0, False, False
     compute_normal_equations(problem, used)
     solve_nonnegative(problem.normal, problem.right, free, theta)
     return first, free
@@ -227,9 +234,9 @@ def _fit_terms(
 
 @compiled
 def _misfit(problem: LeastSquares, rows: Ints, theta: Floats) -> tuple[float, float]:
-    """Return the mean square of the residuals in σ, and the limit of the mean square for noise of the five terms.
+    """Return the mean squared residual in σ², and the limit of the mean squared residual for the five terms.
 
-    Above the limit, the confidence intervals are widened accordingly (Birge 1932).
+    Above the limit, the confidence intervals are widened (Birge 1932).
     """
     level, columns, variance = problem.level, problem.columns, problem.variance
     total, freedom = 0.0, rows.size
@@ -251,7 +258,7 @@ def _misfit(problem: LeastSquares, rows: Ints, theta: Floats) -> tuple[float, fl
 def _is_contradicted(problem: LeastSquares, rows: Ints, theta: Floats, limit: float) -> bool:
     """Return True if any residual exceeds ``limit`` σ.
 
-    The residuals are computed from the cube root of χ², which is approximately normal (Wilson & Hilferty 1931).
+    The residual is computed from the cube root of χ², which is approximately normal (Wilson & Hilferty 1931).
     """
     columns = problem.columns
     for i in rows:

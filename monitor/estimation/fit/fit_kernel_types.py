@@ -1,7 +1,7 @@
-"""Named tuples of arrays that the compiled functions of the fit pass to each other.
+"""Named tuples of arrays that the compiled functions of the fit exchange.
 
-All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²). Results that could not
-be computed are NaN.
+All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²). NaN means that a result
+is unknown.
 """
 
 from typing import Final, NamedTuple
@@ -13,28 +13,28 @@ from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.uncertainty import NOISES
 
 LIMIT_COUNT: Final = 2 * NOISES
-"""Number of quantities with limits in ``SolutionMaps``, which are θ and the unconstrained solution û of Q N B K."""
+"""Number of limits in ``SolutionMaps``, for θ and for the unconstrained solution û of Q N B K."""
 
 
 class SharedInputs(NamedTuple):
     """Inputs of a fit that are the same for all axes at one window length."""
 
     columns: Floats  # [m, 5] Allan variance of unit coefficients
-    flat: Floats  # [m, 5] ``columns`` for a curve from which the measured slope has been subtracted
+    flat: Floats  # [m, 5] ``columns`` after subtraction of the measured slope
     covariance: Floats  # [m, m, 10] ``CovarianceTable.covariance``
-    whole: Floats  # [m] number of terms in a window without gaps
-    slope_variance: Floats  # [4] variance of the slope of the rate, for unit θ
-    blind: Floats  # [m] direction of the curve that the fit ignores, larger than any noise; zero means none
-    ask: bool  # True to leave out short τ that contradict the fit
+    whole: Floats  # [m] number of second differences in a window without missing samples
+    slope_variance: Floats  # [4] variance of the slope of the rate for unit coefficients
+    ignored_direction: Floats  # [m] change of the Allan variances that has no effect on the fit; 0 for none
+    may_drop_short_taus: bool  # True to leave out the shortest τ if they contradict the fit
 
 
 class CurvesOfAxes(NamedTuple):
-    """Measured curves and slopes, with one row per axis."""
+    """Measured Allan variances and slopes, with one row per axis."""
 
     avar: Floats  # [axes, m] Allan variance
     terms: Floats  # [axes, m] number of second differences averaged
     slope: Floats  # [axes] slope of the rate; NaN means not measured
-    slopes: Floats  # [axes, m] slope that contributes to the Allan variance at each τ
+    slopes: Floats  # [axes, m] slope of the rate at each τ
 
 
 class FitOptions(NamedTuple):
@@ -42,29 +42,30 @@ class FitOptions(NamedTuple):
 
     enter: float  # threshold in σ to add a term
     leave: float  # threshold in σ to drop a term
-    full: bool  # True to weight by the covariances of all τ, False to weight by their variances alone
+    full_covariance: bool  # True to weight by the covariances of all τ, False to weight by their variances alone
     warm: bool  # True to start with the weights of ``FitOutput.theta``
 
 
 class FitOutput(NamedTuple):
     """Results of a fit, with one row per axis."""
 
-    entered: NDArray[np.bool_]  # [axes, 5] terms in the fit; on input, the terms of the previous fit
+    entered: NDArray[np.bool_]  # [axes, 5] True for terms in the fit; on input, of the previous fit
     theta: Floats  # [axes, 5] squared coefficients; on input, the start of a warm fit
     lo: Floats  # [axes, 5] lower end of the interval
     hi: Floats  # [axes, 5] upper end of the interval
     status: NDArray[np.int8]  # [axes, 5] values of ``Status``
-    edf: Floats  # [axes, m] degrees of freedom of the curve
-    fitted: Floats  # [axes, m] fitted model
+    edf: Floats  # [axes, m] degrees of freedom of the Allan variance
+    fitted: Floats  # [axes, m] Allan variance of the fitted model
     left_out: Ints  # [axes] number of shortest τ left out
-    misfit: Floats  # [axes] ``scatter``, or 1 if chance explains the scatter
-    scatter: Floats  # [axes] variance about the fit, relative to noise of the five terms
+    misfit: Floats  # [axes] ``scatter`` if the residuals are significantly too large, otherwise 1
+    scatter: Floats  # [axes] mean squared residual relative to the variance expected from the five terms
 
 
 class TermResults(NamedTuple):
-    """Results of a fit for the five terms of one axis, which are rows of ``FitOutput``."""
+    """Results of the fit of one axis, which are rows of ``FitOutput``."""
 
-    entered: NDArray[np.bool_]  # [5] terms in the fit
+    entered: NDArray[np.bool_]  # [5] True for terms in the fit
+
     theta: Floats  # [5] squared coefficients
     lo: Floats  # [5] lower end of the interval
     hi: Floats  # [5] upper end of the interval
@@ -72,13 +73,13 @@ class TermResults(NamedTuple):
 
 
 class LeastSquares(NamedTuple):
-    """Weighted least-squares problem of one axis, with the memory for its weights and normal equations."""
+    """Weighted least-squares problem of one axis, with memory for weights and normal equations."""
 
-    level: Floats  # [m] observations y, which are the Allan variances without the contribution of the slope
-    stretch: Floats  # [m] square root of the ratio of the terms without gaps to the present terms
+    level: Floats  # [m] observations y: Allan variances without the contribution of the slope
+    stretch: Floats  # [m] square root of the ratio of possible to present second differences
     columns: Floats  # [m, 5] columns X
     covariance: Floats  # [m, m, 10] ``CovarianceTable.covariance``
-    blind: Floats  # [m] direction that the fit ignores; ``blind`` blindᵀ is added to the covariance V
+    ignored_direction: Floats  # [m] change without effect on the fit; the outer product is added to V
     variance: Floats  # [m] variances of the observations under the model
     weighted: Floats  # [m, 5] V⁻¹ X
     normal: Floats  # [5, 5] Xᵀ V⁻¹ X
@@ -94,28 +95,28 @@ class TermTests(NamedTuple):
 
 
 class SolutionMaps(NamedTuple):
-    """Solution of each axis as a linear map from the Allan variances to the coefficients, with limits of validity.
+    """Linear maps from the Allan variances of each axis to the coefficients, with limits of validity.
 
     The right-hand side of the normal equations is r = Xᵀ V⁻¹ y. The constrained solution is θ = ``inverse`` r, and the
     unconstrained solution is û = ``whole`` r.
     """
 
     rows: Floats  # [axes, m, NOISES] V⁻¹ X
-    ramp: Floats  # [axes, NOISES] part of r that is subtracted per slope²
-    twist: Floats  # [axes, NOISES] part of r per slope, because the slope differs between the τ
+    ramp: Floats  # [axes, NOISES] factor of slope² that is subtracted from r
+    twist: Floats  # [axes, NOISES] factor of the slope that is subtracted from r
     normal: Floats  # [axes, 5, 5] Xᵀ V⁻¹ X
     inverse: Floats  # [axes, NOISES, NOISES]
     whole: Floats  # [axes, NOISES, NOISES]
     low: Floats  # [axes, LIMIT_COUNT + 1] lower limits of θ, of û and of the absolute slope
-    high: Floats  # [axes, LIMIT_COUNT + 1] upper limits
-    used: Ints  # [axes, 2] first τ in use and the one after the last; equal if there is no solution
+    high: Floats  # [axes, LIMIT_COUNT + 1] upper limits of θ, of û and of the absolute slope
+    used: Ints  # [axes, 2] range of the τ in use; empty if there is no solution
     free: NDArray[np.bool_]  # [axes] True if Q² may be negative
-    straight: NDArray[np.bool_]  # [axes] True if slope² τ²/2 is subtracted from the curve
-    either: NDArray[np.bool_]  # [axes] True if the slope is due to K or R, which cannot be distinguished
+    straight: NDArray[np.bool_]  # [axes] True if slope² τ²/2 is subtracted from the Allan variance
+    either: NDArray[np.bool_]  # [axes] True if K and R cannot be distinguished
 
 
 def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput:
-    """Allocate the results of a fit.
+    """Allocate the arrays for the results of a fit.
 
     Parameters
     ----------
@@ -124,7 +125,7 @@ def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput
     m : int
         Number of τ.
     entered : ndarray of bool, shape (axes, 5)
-        Terms of the previous fit. The result contains this array.
+        Terms of the previous fit, which become part of the result.
     """
     theta, lo, hi = np.full((3, axes, 5), np.nan)
     edf, fitted = np.full((2, axes, m), np.nan)
@@ -133,7 +134,7 @@ def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput
 
 
 def empty_solution_maps(axes: int, m: int) -> SolutionMaps:
-    """Allocate linear maps, which are not valid before a fit.
+    """Allocate the arrays for linear maps, which are invalid before a fit.
 
     Parameters
     ----------

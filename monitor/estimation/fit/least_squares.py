@@ -1,7 +1,7 @@
 """Compiled solver for small weighted least-squares problems with correlated observations and non-negative solutions.
 
-``fit_arrays.LeastSquares`` contains the problem for all τ, and ``rows`` lists the indices of the τ in use. The code
-uses loops, because loops compile several times faster than array expressions.
+``fit_kernel_types.LeastSquares`` contains the problem for all τ, and ``rows`` contains the indices of the τ in use.
+Loops are used because they compile several times faster than array expressions.
 """
 
 from typing import Final
@@ -14,9 +14,9 @@ from monitor.estimation.allan.uncertainty import NOISES
 from monitor.estimation.fit.fit_kernel_types import LeastSquares
 
 SINGULAR_COVARIANCE: Final = 1e-9
-"""Pivots of the correlation matrix of the observations below this value are rounding errors."""
+"""Smallest pivot of a regular correlation matrix of the observations."""
 SINGULAR_NORMAL: Final = 1e-12
-"""Pivots of the correlation matrix of the coefficients below this value are rounding errors."""
+"""Smallest pivot of a regular correlation matrix of the coefficients."""
 
 Q, N, B, K, R = range(5)
 """Rows of the coefficients in θ."""
@@ -24,7 +24,7 @@ Q, N, B, K, R = range(5)
 
 @compiled
 def _allan_covariance(theta: Floats, c: Floats) -> float:
-    """Return the covariance Σ_ab θ_a θ_b C^ab of two Allan variances. A negative Q², a band limit, counts as zero."""
+    """Return the covariance Σ_ab θ_a θ_b C^ab of two Allan variances; a negative Q² counts as zero."""
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
     return float(
         q * (q * c[0] + 2.0 * (n * c[1] + b * c[2] + k * c[3]))
@@ -41,7 +41,7 @@ def compute_observation_variances(problem: LeastSquares, rows: Ints, theta: Floa
     Parameters
     ----------
     problem : LeastSquares
-        Problem. Its ``variance`` is overwritten.
+        Problem, in which ``variance`` is overwritten.
     rows : ndarray of int64
         Indices of the τ in use.
     theta : ndarray of float64, shape (5,)
@@ -53,22 +53,22 @@ def compute_observation_variances(problem: LeastSquares, rows: Ints, theta: Floa
 
 
 @compiled
-def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool) -> None:
-    """Compute V⁻¹ X with the covariance V of the observations under a model, or with its diagonal.
+def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full_covariance: bool) -> None:
+    """Compute the weights V⁻¹ X from the covariance V of the observations under a model.
 
     Parameters
     ----------
     problem : LeastSquares
-        Problem. Its ``variance`` and ``weighted`` are overwritten.
+        Problem, in which ``variance`` and ``weighted`` are overwritten.
     rows : ndarray of int64
         Indices of the τ in use.
     theta : ndarray of float64, shape (5,)
         Squared coefficients of the model.
-    full : bool
+    full_covariance : bool
         True to use the covariances, False to use the variances alone.
     """
     compute_observation_variances(problem, rows, theta)
-    if full and _whiten(problem, rows, theta):
+    if full_covariance and _whiten(problem, rows, theta):
         return
     weighted, columns, variance = problem.weighted, problem.columns, problem.variance
     for i in rows:
@@ -78,15 +78,18 @@ def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool
 
 @compiled
 def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
-    """Compute V⁻¹ X by Cholesky decomposition. Return False if the correlation matrix is not positive definite."""
+    """Compute V⁻¹ X by Cholesky decomposition; return False if the correlation matrix is not positive definite."""
     # Local names, because each access to a field in a loop changes a reference count.
-    m, variance, stretch, blind = rows.size, problem.variance, problem.stretch, problem.blind
+    m, variance, stretch, ignored_direction = rows.size, problem.variance, problem.stretch, problem.ignored_direction
     covariance, columns, weighted = problem.covariance, problem.columns, problem.weighted
     factor, column = np.empty((m, m)), np.empty(m)
     for k in range(m):
         for j in range(k + 1):
             i, h = rows[k], rows[j]
-            x = _allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
+            x = (
+                _allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h]
+                + ignored_direction[i] * ignored_direction[h]
+            )
             factor[k, j] = x / np.sqrt(variance[i] * variance[h])
     if not _factorize(factor, m, SINGULAR_COVARIANCE):
         return False
@@ -101,14 +104,14 @@ def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
 
 @compiled
 def compute_normal_equations(problem: LeastSquares, rows: Ints) -> None:
-    """Compute Xᵀ V⁻¹ X and Xᵀ V⁻¹ y.
+    """Compute the matrices Xᵀ V⁻¹ X and Xᵀ V⁻¹ y of the normal equations.
 
-    A column of zeros represents a term that is not fitted. The solution for this term is zero.
+    A column of zeros represents a term that is not fitted.
 
     Parameters
     ----------
     problem : LeastSquares
-        Problem with its weights. Its ``normal`` and ``right`` are overwritten.
+        Problem with weights, in which ``normal`` and ``right`` are overwritten.
     rows : ndarray of int64
         Indices of the τ in use.
     """
@@ -131,55 +134,55 @@ def compute_normal_equations(problem: LeastSquares, rows: Ints) -> None:
 
 
 @compiled
-def solve_nonnegative(normal: Floats, right: Floats, free: bool, theta: Floats) -> None:
-    """Solve least squares with non-negative Q N B K by finding the subset that meets the Kuhn–Tucker conditions.
+def solve_nonnegative(normal: Floats, right_side: Floats, q_may_be_negative: bool, theta: Floats) -> None:
+    """Solve the least-squares problem with non-negative Q N B K.
 
-    The terms in the subset are positive, and the error would not decrease if another term grew.
+    The solution is positive on the subset of terms that meets the Kuhn–Tucker conditions.
 
     Parameters
     ----------
     normal : ndarray of float64, shape (5, 5)
         Normal matrix.
-    right : ndarray of float64, shape (5,)
+    right_side : ndarray of float64, shape (5,)
         Right-hand side.
-    free : bool
+    q_may_be_negative : bool
         True if Q² may be negative.
     theta : ndarray of float64, shape (5,)
-        Solution.
+        Solution, overwritten.
     """
     for subset in range(2**NOISES - 1, 0, -1):
-        if not solve_on_subset(normal, right, subset, theta):
+        if not solve_on_subset(normal, right_side, subset, theta):
             continue
         allowed = True
         for a in range(NOISES):
             if subset >> a & 1:
-                allowed = allowed and (theta[a] >= 0.0 or (free and a == Q))
+                allowed = allowed and (theta[a] >= 0.0 or (q_may_be_negative and a == Q))
             else:
-                pull = right[a]
+                pull = right_side[a]
                 for b in range(NOISES):
                     pull -= normal[a, b] * theta[b]
-                allowed = allowed and pull <= 1e-9 * abs(right[a])
+                allowed = allowed and pull <= 1e-9 * abs(right_side[a])
         if allowed:
             return
     for a in range(5):
         theta[a] = 0.0
-    theta[N] = right[N] / normal[N, N]
+    theta[N] = right_side[N] / normal[N, N]
 
 
 @compiled
-def solve_on_subset(normal: Floats, right: Floats, subset: int, solution: Floats) -> bool:
-    """Solve the normal equations on a subset of the columns by Cholesky decomposition, each column scaled to one.
+def solve_on_subset(normal: Floats, right_side: Floats, subset: int, solution: Floats) -> bool:
+    """Solve the normal equations on a subset of the columns by Cholesky decomposition.
 
     Parameters
     ----------
     normal : ndarray of float64, shape (5, 5)
         Normal matrix.
-    right : ndarray of float64, shape (5,)
+    right_side : ndarray of float64, shape (5,)
         Right-hand side.
     subset : int
         Bit set of the columns.
     solution : ndarray of float64, shape (5,)
-        Solution, zero outside the subset.
+        Solution, which is zero outside the subset.
 
     Returns
     -------
@@ -194,7 +197,7 @@ def solve_on_subset(normal: Floats, right: Floats, subset: int, solution: Floats
             n += 1
     for k in range(n):
         a = terms[k]
-        scaled[k] = right[a] / np.sqrt(normal[a, a])
+        scaled[k] = right_side[a] / np.sqrt(normal[a, a])
         for j in range(k + 1):
             b = terms[j]
             factor[k, j] = normal[a, b] / np.sqrt(normal[a, a] * normal[b, b])
@@ -208,10 +211,7 @@ def solve_on_subset(normal: Floats, right: Floats, subset: int, solution: Floats
 
 @compiled
 def _factorize(matrix: Floats, n: int, singular: float) -> bool:
-    """Replace the lower triangle of a correlation matrix [n, n] by the Cholesky factor.
-
-    Return False if it is singular.
-    """
+    """Replace a correlation matrix [n, n] by the Cholesky factor; return False if the matrix is singular."""
     for k in range(n):
         for j in range(k + 1):
             x = matrix[k, j]
@@ -228,7 +228,7 @@ def _factorize(matrix: Floats, n: int, singular: float) -> bool:
 
 @compiled
 def _substitute(factor: Floats, n: int, x: Floats) -> None:
-    """Replace the right-hand side x [n] by the solution of the equations, given the Cholesky factor of the matrix."""
+    """Replace the right-hand side x [n] by the solution, for the Cholesky factor of a matrix."""
     for k in range(n):
         y = x[k]
         for c in range(k):
@@ -243,7 +243,7 @@ def _substitute(factor: Floats, n: int, x: Floats) -> None:
 
 @compiled
 def nonzero_term_bits(theta: Floats) -> int:
-    """Return the bit set of the terms that are not zero."""
+    """Return the nonzero terms as a bit set."""
     subset = 0
     for a in range(NOISES):
         if theta[a] != 0.0:
@@ -262,7 +262,7 @@ def invert_on_subset(normal: Floats, subset: int, inverse: Floats) -> bool:
     subset : int
         Bit set of the terms.
     inverse : ndarray of float64, shape (4, 4)
-        Result, zero outside the subset.
+        Inverse, which is zero outside the subset.
 
     Returns
     -------

@@ -1,15 +1,14 @@
 """Search for the low-pass filter of a sensor, and fit of the coefficients with this filter.
 
-If the bandwidth of a sensor is below half the sample rate, the Allan variance at the shortest τ is smaller than N²/τ. A
-recording of a day determines this Allan variance to 0.04 %, so a model error of 1 % biases N. In this module, the
-column of N is the Allan variance of white noise after a Butterworth low-pass filter of order 1 to 4. The filter is
-either a digital filter at the sample rate or an analogue filter before sampling. The cutoff and the order with the
-smallest misfit are used. The fit allows for the uncertainty of the cutoff, so that no interval becomes too narrow. If
-no low-pass filter explains the Allan variance, the result of ``fit`` without the shortest τ is kept.
+If the bandwidth of a sensor is below half the sample rate, the Allan variance at the shortest τ is smaller than N²/τ,
+which biases N. In this module, the design matrix contains the Allan variance of white noise after a Butterworth
+low-pass filter. The filter is either a digital filter at the sample rate or an analogue filter before sampling. The
+order from 1 to 4 and the cutoff with the smallest misfit are used, and the fit allows for the uncertainty of the
+cutoff. If no low-pass filter explains the Allan variances, the result of ``fit_coefficients`` without the shortest τ is
+kept.
 
-The filters have a flat passband, so N is the level of the white noise in the passband. Q is only bounded, because
-almost any filter together with Q explains almost any Allan variance. A filter must also be visible in the spectrum. If
-the spectrum does not decrease above the cutoff, the deviation from N²/τ has another cause.
+N is the level of the white noise in the passband. Q is only bounded, because Q and the filter cannot be distinguished.
+A filter is only accepted if the spectrum decreases above the cutoff.
 """
 
 from collections.abc import Generator, Sequence
@@ -23,49 +22,55 @@ from drivers.data_types import Floats, Ints
 from monitor.common.minimization import minimize_by_golden_section
 from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
 from monitor.estimation.allan.uncertainty import CovarianceTable
-from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit, replace_axis
+from monitor.estimation.fit.coefficient_fit import (
+    DesignMatrix,
+    Fit,
+    MeasuredCurve,
+    fit_coefficients,
+    replace_axis_results,
+)
 from monitor.estimation.fit.coefficient_values import Status
-from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, upper_limit
+from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, avar_upper_limit
 from monitor.estimation.fit.least_squares import N, Q
 
 Kind = Literal["digital", "sampled"]
-"""Digital filter at the sample rate, or analogue filter before sampling."""
+"""Kind of a low-pass filter: digital at the sample rate, or analogue before sampling."""
 FAMILIES: Final[tuple[tuple[Kind, int], ...]] = tuple(
     (kind, order) for order in (1, 2, 3, 4) for kind in ("digital", "sampled")
 )
-"""Kinds and orders of low-pass filters that are tried."""
+"""Kinds and orders of the low-pass filters in the search."""
 CUTOFFS: Final = np.geomspace(0.005, 0.49, 56)
-"""Grid of cutoff frequencies, as shares of the sample rate."""
+"""Grid of cutoff frequencies, as fractions of the sample rate."""
 SPECTRUM_BINS: Final = 1 << 13
-"""Number of bins of the squared response from zero to half the sample rate, which limits the memory of a filter."""
+"""Number of bins of the squared frequency response from zero to half the sample rate."""
 REFINED_FAMILIES: Final = 3
-"""Number of families with the smallest misfit on the grid, for which the cutoff is refined."""
+"""Number of filter kinds and orders for which the cutoff is refined."""
 CUTOFFS_PER_STEP: Final = 8
-"""Number of grid cutoffs tried in one step of a search."""
+"""Number of grid cutoffs in one step of the search."""
 REFINED_CUTOFFS_PER_STEP: Final = 10
-"""Number of refined cutoffs tried in one step of a search. They take longer, because their spectra are not cached."""
+"""Number of refined cutoffs in one step of the search."""
 CUTOFF_TOLERANCE: Final = 1e-4
-"""Tolerance of the logarithm of the cutoff at the end of a search."""
+"""Tolerance of the logarithm of the refined cutoff."""
 ALIASES: Final = 8
-"""Number of aliases on each side that are added to the response of a sampled analogue filter."""
+"""Number of aliases on each side in the frequency response of a sampled analogue filter."""
 MAX_SCATTER: Final = 2.0
-"""Largest variance about the fit, relative to the variance from noise, with which a filter explains a curve."""
+"""Largest mean squared residual, relative to the expected variance, of an accepted filter."""
 POWER_BINS: Final = 1024
-"""Number of bins of the measured spectrum from zero to half the sample rate."""
+"""Number of bins of the measured power spectrum from zero to half the sample rate."""
 MAX_STRETCHES: Final = 64
-"""Maximum number of stretches averaged in a spectrum."""
+"""Maximum number of segments that are averaged in a power spectrum."""
 MIN_STRETCHES: Final = 4
-"""Minimum number of stretches for a spectrum."""
+"""Minimum number of segments for a power spectrum."""
 STOPBAND_START: Final = 1.2
 """Start of the stopband, as a multiple of the cutoff."""
 MAX_STOPBAND_RATIO: Final = 2.0
 """Largest ratio of the measured to the expected stopband level."""
 MAX_STOPBAND_SHARE: Final = 0.05
-"""Share of the passband level that is added to the limit of the stopband level."""
+"""Fraction of the passband level that is added to the limit of the stopband level."""
 CUTOFF_STEP: Final = 1.01
 """Relative step of the cutoff for the numerical derivative."""
 LOG_CUTOFF_SIGMA: Final = 3.0
-"""Prior standard deviation of the logarithm of the cutoff, which is large enough to allow any cutoff."""
+"""Prior standard deviation of the logarithm of the cutoff, which allows any cutoff."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +79,12 @@ class LowPass:
 
     kind: Kind
     order: int
-    cutoff: float  # as a share of the sample rate
+    cutoff: float  # as a fraction of the sample rate
 
     def avar(self, factors: Ints) -> Floats:
         """Return the Allan variance [m] of filtered white noise with N = 1 in the passband, at τ0 = 1.
 
-        If V(m) is the variance of a sum of m samples, the Allan variance is (4 V(m) − V(2m)) / 2m².
+        The Allan variance is (4 V(m) − V(2m)) / 2m², where V(m) is the variance of a sum of m samples.
 
         >>> LowPass("digital", 2, 0.1).avar(np.array([1, 1000])).round(6).tolist()
         [0.024355, 0.000998]
@@ -88,14 +93,12 @@ class LowPass:
         return (4.0 * self._sums(m) - self._sums(2 * m)) / (2.0 * m.astype(np.float64) ** 2)
 
     def _sums(self, m: Ints) -> Floats:
-        """Return the variance of sums of m samples."""
         level, first = _autocovariance_sums(self.kind, self.order, self.cutoff)
         k = np.minimum(m, level.size) - 1
         return np.asarray(m * level[k] - first[k])
 
 
 def _squared_response(kind: Kind, order: int, cutoff: float, bins: int = SPECTRUM_BINS) -> Floats:
-    """Return the squared response [bins + 1] from zero to half the sample rate."""
     f = np.arange(bins + 1) / (2.0 * bins)
     if kind == "digital":
         with np.errstate(over="ignore"):
@@ -106,7 +109,7 @@ def _squared_response(kind: Kind, order: int, cutoff: float, bins: int = SPECTRU
 
 @lru_cache(1024)
 def _column(low_pass: LowPass, factors: bytes) -> Floats:
-    """Return the Allan variance of a low-pass filter from a cache; ``factors`` contains the bytes of an int64 array."""
+    """Return the Allan variance of a low-pass filter from a cache, for the bytes of an int64 array."""
     return low_pass.avar(np.frombuffer(factors, np.int64))
 
 
@@ -122,9 +125,9 @@ def _autocovariance_sums(kind: Kind, order: int, cutoff: float) -> tuple[Floats,
 
 
 def power_spectrum(rates: Floats) -> Floats:
-    """Return the spectrum [POWER_BINS + 1] of one axis [n] in arbitrary units, or an empty array if n is too small.
+    """Return the power spectrum [POWER_BINS + 1] of the rates [n] of one axis in arbitrary units.
 
-    The spectrum is the mean over stretches with few missing samples, spread over the axis.
+    The result is the mean over segments with few missing samples, or an empty array if there are too few samples.
     """
     rows = 2 * POWER_BINS
     begins = np.unique(np.linspace(0, len(rates) - rows, MAX_STRETCHES).astype(np.int64))
@@ -139,17 +142,17 @@ def power_spectrum(rates: Floats) -> Floats:
     return np.asarray((turned.real**2 + turned.imag**2).mean(axis=0))
 
 
-def is_seen_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
-    """Return True if a measured spectrum decreases above the cutoff as expected for the filter.
+def is_visible_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
+    """Return True if a measured power spectrum decreases above the cutoff of a low-pass filter.
 
-    Medians of the passband and the stopband are compared, so that spectral lines have no effect.
+    The medians of the passband and the stopband are compared, because a median is insensitive to spectral lines.
 
     Parameters
     ----------
     low_pass : LowPass
         Filter to test.
     power : ndarray of float64, shape (POWER_BINS + 1,)
-        Spectrum of the axis, from ``power_spectrum``.
+        Power spectrum of the axis, from ``power_spectrum``.
     """
     f = np.arange(power.size) / (2.0 * max(power.size - 1, 1))
     below = (f >= low_pass.cutoff / 4.0) & (f <= low_pass.cutoff / 2.0) & (f >= 3.0 / (2.0 * POWER_BINS))
@@ -163,23 +166,23 @@ def is_seen_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
     )
 
 
-def apply_low_passes(
-    design: Design, table: CovarianceTable, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
+def refit_with_low_passes(
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
 ) -> tuple[Fit, list[LowPass | None]]:
-    """Replace the fit of each axis that the five terms do not explain by a fit with a low-pass filter.
+    """Fit axes whose Allan variances contradict the five terms again, with low-pass filters.
 
     Parameters
     ----------
-    design : Design
-        Columns that were passed to ``fit``.
+    design : DesignMatrix
+        Design matrix of the first fit.
     table : CovarianceTable
-        Covariances that were passed to ``fit``.
+        Covariances of the first fit.
     measured : MeasuredCurve
-        Measured curve that was passed to ``fit``.
+        Measured Allan variances of the first fit.
     found : Fit
-        Result of ``fit``.
+        First fit, without low-pass filters.
     filters : sequence of LowPass or None
-        Filter of each axis from ``find_low_pass``, or None. A filter is accepted if the fit explains the curve.
+        Low-pass filter of each axis from ``find_low_pass``, or None.
 
     Returns
     -------
@@ -190,51 +193,53 @@ def apply_low_passes(
     """
     used: list[LowPass | None] = [None] * len(filters)
     for axis, low_pass in enumerate(filters):
-        if low_pass is not None and is_contradicted(found, axis):
-            better = _fit_low_pass(design, table, measured.axis(axis), low_pass)
+        if low_pass is not None and is_contradicted_by_curve(found, axis):
+            better = _fit_low_pass(design, table, measured.select_axis(axis), low_pass)
             if better.scatter[0] < MAX_SCATTER:
-                _bound_q(design, better, measured.axis(axis))
-                found = replace_axis(found, axis, better)
+                _bound_q(design, better, measured.select_axis(axis))
+                found = replace_axis_results(found, axis, better)
                 used[axis] = low_pass
     return found, used
 
 
-def _bound_q(design: Design, found: Fit, measured: MeasuredCurve) -> None:
-    """Bound Q by the first measured Allan variance, because a fit with a filter cannot determine Q."""
+def _bound_q(design: DesignMatrix, found: Fit, measured: MeasuredCurve) -> None:
+    """Bound Q by the Allan variance at the shortest τ."""
     c, first = found.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
-    most = upper_limit(measured.avar[first, 0], found.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
+    most = avar_upper_limit(measured.avar[first, 0], found.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
     if np.isfinite(most):
         c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 
 
-def is_contradicted(found: Fit, axis: int) -> bool:
-    """Return True if the five terms do not explain the curve of an axis.
+def is_contradicted_by_curve(found: Fit, axis: int) -> bool:
+    """Return True if the Allan variances of an axis contradict the five terms.
 
     Parameters
     ----------
     found : Fit
-        Fit of the curve.
+        Fit of the Allan variances.
     axis : int
         Column of the fit.
     """
     return bool(found.left_out[axis] > 0 or found.theta[0, axis] < 0.0 or found.misfit[axis] > 1.0)
 
 
-def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurve, power: Floats) -> LowPass | None:
-    """Return the low-pass filter with the smallest misfit for one axis, or None if no filter explains the curve.
+def find_low_pass(
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, power: Floats
+) -> LowPass | None:
+    """Return the low-pass filter with the smallest misfit for one axis, or None if no filter is accepted.
 
     Parameters
     ----------
-    design : Design
-        Columns for the cluster sizes of the curve.
+    design : DesignMatrix
+        Design matrix for the cluster sizes.
     table : CovarianceTable
         Covariances for the window length.
     measured : MeasuredCurve
-        Measured curve of a single axis.
+        Measured Allan variances of a single axis.
     power : ndarray of float64
-        Spectrum of the axis, from ``power_spectrum``.
+        Power spectrum of the axis, from ``power_spectrum``.
     """
-    search = search_low_pass(design, table, measured, power)
+    search = search_low_pass_in_steps(design, table, measured, power)
     while True:
         try:
             next(search)
@@ -243,12 +248,13 @@ def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurv
             return found
 
 
-def search_low_pass(
-    design: Design, table: CovarianceTable, measured: MeasuredCurve, power: Floats
+def search_low_pass_in_steps(
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, power: Floats
 ) -> Generator[None, None, LowPass | None]:
-    """Do the search of ``find_low_pass`` in steps of a few milliseconds, for callers that must not block.
+    """Search for the low-pass filter of one axis in steps of a few milliseconds.
 
-    The parameters are those of ``find_low_pass``. The generator yields after each step and returns the filter or None.
+    The generator yields after each step and returns the filter or None. The parameters are described at
+    ``find_low_pass``.
     """
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     grids: list[list[float]] = []
@@ -265,23 +271,22 @@ def search_low_pass(
         at = int(np.argmin(grids[family]))
         ends = np.log(CUTOFFS[[max(at - 1, 0), min(at + 1, CUTOFFS.size - 1)]])
 
-        def of(log_cutoff: float, kind: Kind = kind, order: int = order) -> float:
+        def scatter_at(log_cutoff: float, kind: Kind = kind, order: int = order) -> float:
             column = LowPass(kind, order, float(np.exp(log_cutoff))).avar(design.factors)
             return float(_fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
 
         least, log_cutoff = yield from _yield_after_several_steps(
-            minimize_by_golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
+            minimize_by_golden_section(scatter_at, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
         )
         found.append((least, LowPass(kind, order, float(np.exp(log_cutoff)))))
         yield
     least, low_pass = min(found, key=lambda one: one[0])
-    return low_pass if least < MAX_SCATTER and is_seen_in_spectrum(low_pass, power) else None
+    return low_pass if least < MAX_SCATTER and is_visible_in_spectrum(low_pass, power) else None
 
 
 def _yield_after_several_steps(
     search: Generator[None, None, tuple[float, float]],
 ) -> Generator[None, None, tuple[float, float]]:
-    """Run a search, and yield after every ``REFINED_CUTOFFS_PER_STEP`` steps."""
     steps = 0
     while True:
         try:
@@ -294,20 +299,18 @@ def _yield_after_several_steps(
             yield
 
 
-def _fit_columns(design: Design, table: CovarianceTable, measured: MeasuredCurve) -> Fit:
-    """Fit quickly with exactly these columns and all τ."""
-    return fit(design, table, measured, full=False, ask=False)
+def _fit_columns(design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve) -> Fit:
+    return fit_coefficients(design, table, measured, full_covariance=False, may_drop_short_taus=False)
 
 
-def _with_noise_column(design: Design, column: Floats) -> Design:
-    """Return the design with the given column for N, and with a column of zeros for Q."""
+def _with_noise_column(design: DesignMatrix, column: Floats) -> DesignMatrix:
     columns = design.columns.copy()
     columns[:, N], columns[:, Q] = column, 0.0
     return replace(design, columns=columns)
 
 
-def _fit_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
-    """Return the fit with a filter. The fit ignores changes of the curve that a change of the cutoff would cause."""
+def _fit_low_pass(design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
+    """Return the fit with a filter whose cutoff is uncertain."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     up, down = (
         _column(replace(low_pass, cutoff=low_pass.cutoff * by), factors) for by in (CUTOFF_STEP, 1.0 / CUTOFF_STEP)
@@ -315,5 +318,5 @@ def _fit_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurv
     own = _with_noise_column(design, _column(low_pass, factors))
     rough = _fit_columns(own, table, measured)
     level = max(float(rough.theta[N, 0]) * design.rate_hz, 0.0)
-    blind = level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
-    return fit(own, table, measured, blind=blind, ask=False)
+    ignored_direction = level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
+    return fit_coefficients(own, table, measured, ignored_direction=ignored_direction, may_drop_short_taus=False)

@@ -1,7 +1,7 @@
 """Selection of significant terms, their confidence intervals, and the limits within which a solution stays valid.
 
-All decisions in this compiled module use the unconstrained solution û. If the true squared coefficient is t, the
-variance of û is v(t) = c0 + c1 t + c2 t². The docstring of ``coefficient_fit`` describes the method.
+All decisions use the unconstrained solution û. If the true squared coefficient is t, the variance of û is v(t) = c0 +
+c1 t + c2 t². The method is described in ``coefficient_fit``.
 """
 
 from typing import Final
@@ -12,7 +12,7 @@ from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.uncertainty import NOISES
-from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, interval_end, pearson_quantile
+from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, confidence_interval_end, pearson_quantile
 from monitor.estimation.fit.fit_kernel_types import (
     LIMIT_COUNT,
     CurvesOfAxes,
@@ -35,22 +35,18 @@ from monitor.estimation.fit.least_squares import (
 )
 
 MAX_THETA_CHANGE: Final = 0.4
-"""Relative change of θ above which the linear map is recomputed, if the change also exceeds ``MAX_THETA_SIGMA``.
-
-A change of 0.4 is a change of the coefficient by a fifth.
-"""
+"""Relative change of θ above which the linear map is recomputed, if the change also exceeds ``MAX_THETA_SIGMA``."""
 MAX_THETA_SIGMA: Final = 1.0
-"""Change of θ in standard deviations up to which the linear map is not recomputed.
-"""
+"""Change of θ in standard deviations up to which the linear map is not recomputed."""
 DETECTABLE_SIGMA: Final = 3.0
-"""Size in σ at which an absent term would be detected."""
+"""Size in σ at which a term is detected."""
 
 
 @compiled
 def select_terms(
     problem: LeastSquares, rows: Ints, options: FitOptions, straight: bool, misfit: float, terms: TermResults
 ) -> TermTests:
-    """Select the significant terms, and compute confidence intervals and bounds (see ``coefficient_fit``).
+    """Select the significant terms, and compute confidence intervals and upper bounds.
 
     Parameters
     ----------
@@ -63,7 +59,7 @@ def select_terms(
     straight : bool
         True if the contribution of the slope has been subtracted.
     misfit : float
-        Factor by which variances are widened.
+        Factor by which variances are multiplied.
     terms : TermResults
         Results of the axis, updated in place.
     """
@@ -91,15 +87,14 @@ def select_terms(
 def _select_term(
     a: int, estimate: float, c0: float, c1: float, c2: float, options: FitOptions, terms: TermResults
 ) -> None:
-    """Decide whether one term is in the fit, and compute its interval or its bound."""
     threshold = options.leave if terms.entered[a] else options.enter
-    low = interval_end(estimate, c0, c1, c2, Z95)
-    high = interval_end(estimate, c0, c1, c2, -Z95)
+    low = confidence_interval_end(estimate, c0, c1, c2, Z95)
+    high = confidence_interval_end(estimate, c0, c1, c2, -Z95)
     if terms.theta[a] > 0.0 and not low < np.sqrt(terms.theta[a]) < high:
-        # Other terms are fixed at zero, so θ differs from û. The interval must also cover the interval of θ.
-        low = min(low, interval_end(terms.theta[a], c0, c1, c2, Z95))
-        high = max(high, interval_end(terms.theta[a], c0, c1, c2, -Z95))
-    # A term that is not in the fit is not added while the interval includes zero.
+        # θ differs from û if other terms are fixed at zero, so the interval must cover both.
+        low = min(low, confidence_interval_end(terms.theta[a], c0, c1, c2, Z95))
+        high = max(high, confidence_interval_end(terms.theta[a], c0, c1, c2, -Z95))
+    # A term is not added while the interval includes zero.
     seen = terms.entered[a] or low > 0.0
     terms.entered[a] = seen and a != R and terms.theta[a] > 0.0 and estimate > threshold * np.sqrt(c0)
     if terms.entered[a]:
@@ -107,16 +102,15 @@ def _select_term(
     else:
         # The bound is never tighter than the bound from an estimate of zero.
         terms.status[a], terms.lo[a] = 1, 0.0
-        terms.hi[a] = interval_end(max(estimate, 0.0), c0, c1, c2, -UPPER_BOUND_Z)
+        terms.hi[a] = confidence_interval_end(max(estimate, 0.0), c0, c1, c2, -UPPER_BOUND_Z)
 
 
 @compiled
 def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: TermTests, terms: TermResults) -> None:
-    """Recompute the bounds of absent terms with better weights.
+    """Recompute the upper bounds of absent terms with better weights.
 
-    The weights of the fit assume that the term is absent. For K, these weights make little use of the few long τ, where
-    K has most effect, and the bound becomes very large or infinite. The bounds are therefore computed with weights for
-    a term that is just large enough to be detected.
+    Weights for an absent K make little use of long τ, so the upper bound of K would be very large. The bounds are
+    therefore computed with weights for a term that is just large enough to be detected.
 
     Parameters
     ----------
@@ -125,15 +119,15 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
     rows : ndarray of int64
         Indices of the τ in use.
     misfit : float
-        Factor by which variances are widened.
+        Factor by which variances are multiplied.
     tests : TermTests
         Result of ``select_terms``.
     terms : TermResults
-        Results of the axis, whose ``hi`` is updated in place.
+        Results of the axis, in which ``hi`` is updated in place.
     """
     m = problem.level.size
     own = LeastSquares(
-        problem.level, problem.stretch, problem.columns, problem.covariance, problem.blind,
+        problem.level, problem.stretch, problem.columns, problem.covariance, problem.ignored_direction,
         np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
     supposed, gain = np.empty(5), np.empty((1, rows.size))
@@ -148,12 +142,11 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
         if _map_to_term(a, own, rows, gain[0]):
             c = _variance_forms(a, a + 1, gain, rows, terms.theta, own.covariance)[0]
             estimate = max(_estimate(gain[0], own, rows), 0.0)
-            terms.hi[a] = interval_end(estimate, misfit * c[0], misfit * c[1], c[2], -UPPER_BOUND_Z)
+            terms.hi[a] = confidence_interval_end(estimate, misfit * c[0], misfit * c[1], c[2], -UPPER_BOUND_Z)
 
 
 @compiled
 def _estimate(gain: Floats, problem: LeastSquares, rows: Ints) -> float:
-    """Return the unconstrained estimate of one term from the row of the linear map for this term."""
     estimate, stretch, level = 0.0, problem.stretch, problem.level
     for k in range(rows.size):
         estimate += gain[k] / stretch[rows[k]] * level[rows[k]]
@@ -162,9 +155,9 @@ def _estimate(gain: Floats, problem: LeastSquares, rows: Ints) -> float:
 
 @compiled
 def _map_to_term(a: int, problem: LeastSquares, rows: Ints, gain: Floats) -> bool:
-    """Compute the row of the linear map from the Allan variances to the unconstrained estimate of term a.
+    """Compute the linear map from the Allan variances to the unconstrained estimate of term a.
 
-    The row is for a window without gaps. Return False if the terms cannot be distinguished.
+    Return False if the terms cannot be distinguished.
     """
     unit, solution, weighted = np.zeros(5), np.empty(5), problem.weighted
     unit[a] = 1.0
@@ -180,11 +173,7 @@ def _map_to_term(a: int, problem: LeastSquares, rows: Ints, gain: Floats) -> boo
 
 @compiled
 def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Floats, covariance: Floats) -> Floats:
-    """Return the coefficients c0, c1, c2 of the variance of û, for the terms first ≤ a < end.
-
-    One loop over the pairs of τ computes the coefficients of all terms. For the ramp, which adds no noise, c1 and c2
-    are zero.
-    """
+    """Return the coefficients c0, c1, c2 of the variance of û for the terms first ≤ a < end."""
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
     forms, bent, own = np.zeros((end - first, 3)), np.zeros(5), np.zeros(5)
     for i in range(rows.size):
@@ -219,16 +208,14 @@ def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Float
 def select_ramp(
     slope: float, slope_variance: Floats, options: FitOptions, terms: TermResults
 ) -> tuple[float, float, bool]:
-    """Include R if the slope is too large to be caused by noise.
-
-    The noise is computed with K at the upper end of the confidence interval.
+    """Include R in the fit if the slope of the rate is significantly larger than expected from noise.
 
     Parameters
     ----------
     slope : float
         Slope of the rate in units of one sample; NaN means not measured.
     slope_variance : ndarray of float64, shape (4,)
-        Variance of the slope for unit θ.
+        Variance of the slope for unit coefficients.
     options : FitOptions
         Thresholds to add and to drop a term.
     terms : TermResults
@@ -237,11 +224,11 @@ def select_ramp(
     Returns
     -------
     noise : float
-        Variance of the slope under the fitted noise; 0 without a slope.
+        Variance of the slope under the fitted noise; 0 if the slope is not measured.
     most : float
-        Variance of the slope with K at the upper end of its interval; NaN without a slope.
+        Variance of the slope with K at the upper end of the confidence interval; NaN if the slope is not measured.
     either : bool
-        True if the axis drifts, but K and R cannot be distinguished.
+        True if the rate drifts, but K and R cannot be distinguished.
     """
     theta, status = terms.theta, terms.status
     if slope != slope:
@@ -256,7 +243,7 @@ def select_ramp(
     status[R] = 2 if terms.entered[R] else 1
     terms.lo[R] = max(abs(slope) - Z95 * np.sqrt(most), 0.0) if terms.entered[R] else 0.0
     terms.hi[R] = abs(slope) + (Z95 if terms.entered[R] else UPPER_BOUND_Z) * np.sqrt(most)
-    # True if K is only bounded and the other terms do not explain the slope.
+    # K is only bounded, and the other terms do not explain the slope.
     others = noise - max(theta[K], 0.0) * slope_variance[K]
     either = status[K] == 1 and status[R] == 1 and slope * slope > options.enter**2 * others
     return noise, most, bool(either)
@@ -266,22 +253,22 @@ def select_ramp(
 def store_linear_map(
     axis: int, rows: Ints, problem: LeastSquares, curves: CurvesOfAxes, output: FitOutput, maps: SolutionMaps
 ) -> bool:
-    """Store the solution of one axis as a linear map.
+    """Store the solution of one axis as a linear map from the Allan variances to the coefficients.
 
     Parameters
     ----------
     axis : int
-        Row of the arrays.
+        Index of the axis.
     rows : ndarray of int64
         Indices of the τ in use.
     problem : LeastSquares
         Problem with its weights and normal equations.
     curves : CurvesOfAxes
-        Measured curves and slopes.
+        Measured Allan variances and slopes.
     output : FitOutput
         Results of the fit.
     maps : SolutionMaps
-        Linear map, updated in place.
+        Linear maps, updated in place.
 
     Returns
     -------
@@ -289,7 +276,7 @@ def store_linear_map(
         False if the solution cannot be stored as a linear map.
     """
     if rows[-1] - rows[0] != rows.size - 1:
-        return False  # A τ between others has no terms. Only a gap nearly as long as the window can cause this.
+        return False  # the indices of the τ in use are not consecutive
     for a in range(5):
         for b in range(5):
             maps.normal[axis, a, b] = problem.normal[a, b]
@@ -315,7 +302,7 @@ def store_linear_map(
 def compute_map_validity_limits(
     low: Floats, high: Floats, options: FitOptions, tests: TermTests, most: float, terms: TermResults
 ) -> None:
-    """Compute the limits within which the linear map of one axis is as good as a new fit.
+    """Compute the limits within which the linear map of one axis stays valid.
 
     Parameters
     ----------
@@ -326,7 +313,7 @@ def compute_map_validity_limits(
     tests : TermTests
         Result of ``select_terms``.
     most : float
-        Variance of the slope from ``select_ramp``; NaN without a slope.
+        Variance of the slope from ``select_ramp``; NaN if the slope is not measured.
     terms : TermResults
         Results of the axis.
     """
@@ -334,7 +321,7 @@ def compute_map_validity_limits(
         sigma = np.sqrt(tests.absent_variance[a])
         reach = max(MAX_THETA_CHANGE * abs(terms.theta[a]), MAX_THETA_SIGMA * sigma)
         low[a], high[a] = terms.theta[a] - reach, terms.theta[a] + reach
-        # The limits of û are the values at which the term would be added or dropped.
+        # A term is added or dropped at the limits of û.
         low[NOISES + a], high[NOISES + a] = -np.inf, np.inf
         if terms.entered[a]:
             low[NOISES + a] = options.leave * sigma

@@ -18,7 +18,12 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats, Ints
 from drivers.recordings import Recording, iter_blocks
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, overlapping_avar_axis, slope_of_recording
+from monitor.estimation.allan.batch import (
+    cluster_sizes,
+    overlapping_avar,
+    overlapping_avar_axis,
+    rate_slope_from_thirds,
+)
 from monitor.estimation.analysis import analyze
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
 
@@ -72,7 +77,7 @@ def one_thread(values: Floats, rounds: int) -> None:
         "one axis": lambda: overlapping_avar_axis(column, octave),
         "of six": lambda: overlapping_avar_axis(values[:, 5], octave),
         "six": lambda: overlapping_avar(values, octave),
-        "slope": lambda: slope_of_recording(values),
+        "slope": lambda: rate_slope_from_thirds(values),
         "analyze": lambda: analyze(blocks, RATE_HZ),
         "allantools, decade10": lambda: peer(column, decade),
         "decade10": lambda: overlapping_avar_axis(column, decade),
@@ -111,7 +116,7 @@ def threads(values: Floats, rounds: int) -> None:
     with ThreadPoolExecutor(THREADS) as pool:
         works = {
             "one thread": lambda: overlapping_avar(values, factors),
-            f"{THREADS} threads": lambda: overlapping_avar(values, factors, each=pool.map),
+            f"{THREADS} threads": lambda: overlapping_avar(values, factors, map_axes=pool.map),
         }
         for name, work in works.items():
             wall, processor = on_the_wall(work, rounds)

@@ -66,7 +66,7 @@ def filled(length: int) -> AllanWindow:
     """A window that evicts with each sample."""
     window = AllanWindow(length, cluster_sizes(length))
     for _ in range(-(-(length + BLOCK) // 100_000)):
-        window.update(made(min(100_000, length + BLOCK)))
+        window.append_samples(made(min(100_000, length + BLOCK)))
     return window
 
 
@@ -76,7 +76,7 @@ def in_blocks(window: AllanWindow, values: Floats, size: int) -> Callable[[], No
 
     def work() -> None:
         for one in blocks:
-            window.update(one)
+            window.append_samples(one)
 
     return work
 

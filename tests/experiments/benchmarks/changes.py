@@ -231,9 +231,9 @@ def cost() -> None:
 
         return work
 
-    run(detector.process_samples)(), run(window.update)()
+    run(detector.process_samples)(), run(window.append_samples)()
     load = Load()
-    took = alternate({"change": run(detector.process_samples), "window": run(window.update)}, 7)
+    took = alternate({"change": run(detector.process_samples), "window": run(window.append_samples)}, 7)
     shown = table("cost, six axes, blocks of 100", "what", "ns a sample and axis: median (best)")
     for name, (median, best) in took.items():
         shown.add_row(name, f"{median / 6e5 * 1e9:.1f} ({best / 6e5 * 1e9:.1f})")

@@ -30,9 +30,9 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from drivers.data_types import Floats, Ints
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_per_tau, slope_of_recording
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds, rate_slope_per_tau
 from monitor.estimation.allan.uncertainty import CovarianceTable, covariance_table
-from monitor.estimation.fit.coefficient_fit import Design, MeasuredCurve, fit, make_design
+from monitor.estimation.fit.coefficient_fit import DesignMatrix, MeasuredCurve, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from tests.experiments.benchmarks.records import (
     HOURS_3,
@@ -69,9 +69,9 @@ Estimator = Callable[[Floats, float], Floats]
 
 
 @cache
-def _octaves(n: int, rate_hz: float) -> tuple[Ints, Design, CovarianceTable]:
+def _octaves(n: int, rate_hz: float) -> tuple[Ints, DesignMatrix, CovarianceTable]:
     factors = cluster_sizes(n, rate_hz)
-    return factors, make_design(factors, rate_hz), covariance_table(n, factors)
+    return factors, make_design_matrix(factors, rate_hz), covariance_table(n, factors)
 
 
 def weighed_by_variances(values: Floats, rate_hz: float) -> Floats:
@@ -87,8 +87,8 @@ def weighed_by_covariances(values: Floats, rate_hz: float) -> Floats:
 def _fitted(values: Floats, rate_hz: float, full: bool) -> Floats:
     factors, columns, covariances = _octaves(len(values), rate_hz)
     avar, terms = overlapping_avar(values, factors)
-    straight, each = slope_of_recording(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
-    found = fit(columns, covariances, MeasuredCurve(avar, terms, straight, each), full=full)
+    straight, each = rate_slope_from_thirds(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
+    found = fit_coefficients(columns, covariances, MeasuredCurve(avar, terms, straight, each), full_covariance=full)
     return np.asarray(np.sqrt(np.maximum(found.theta, 0.0)))
 
 

@@ -37,7 +37,7 @@ def block_of(index: int) -> Floats:
 def difference(window: AllanWindow, newest: Floats) -> float:
     """Largest relative difference to the batch computation."""
     avar, terms = overlapping_avar(newest[-LENGTH:], window.factors)
-    if not np.array_equal(terms, window.terms()):
+    if not np.array_equal(terms, window.term_counts()):
         raise SystemExit("the window counts other terms than the batch computation")
     return float(np.nanmax(np.abs(window.avar() / avar - 1.0)))
 
@@ -50,7 +50,7 @@ def run(blocks: int, say: Callable[[str], None]) -> float:
         values = block_of(index)
         if index == blocks // 10:
             values[1000:1050] += TRANSIENT
-        window.update(values)
+        window.append_samples(values)
         done = (index + 1) * BLOCK
         if index == blocks // 10 or index + 1 == blocks or str(done).rstrip("0") == "1":
             worst = max(worst, found := difference(window, values))

@@ -15,12 +15,15 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
-from monitor.estimation.allan.hadamard import hadamard_moments, hadamard_variance
-from monitor.estimation.allan.squared_difference_moments import correct_bias, theta_per_sample
-from monitor.estimation.allan.total import total_moments, total_variance
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds
+from monitor.estimation.allan.hadamard import hadamard_estimator_moments, hadamard_variance
+from monitor.estimation.allan.squared_difference_moments import (
+    correct_bias_and_compute_intervals,
+    theta_in_sample_units,
+)
+from monitor.estimation.allan.total import total_estimator_moments, total_variance
 from monitor.estimation.allan.uncertainty import covariance_table
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
 from monitor.noise.effect import Source
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
@@ -53,8 +56,8 @@ def fitted(values: Floats) -> Floats:
     """θ [5, k] of the records themselves."""
     factors = cluster_sizes(len(values), 1.0)
     avar, terms = overlapping_avar(values, factors)
-    measured = MeasuredCurve(avar, terms, slope_of_recording(values))
-    return fit(make_design(factors, 1.0), covariance_table(len(values), factors), measured).theta
+    measured = MeasuredCurve(avar, terms, rate_slope_from_thirds(values))
+    return fit_coefficients(make_design_matrix(factors, 1.0), covariance_table(len(values), factors), measured).theta
 
 
 Spread = tuple[Floats, Floats, Floats, Floats]
@@ -84,8 +87,8 @@ def main() -> None:
     n, rng = arguments.samples, np.random.default_rng(arguments.seed)
     factors = np.array([min(round(share * n), n - 1) for share in SHARES])
     thirds = np.array([n // 24, n // 12, n // 6, n // 4, n // 3])
-    own = [total_moments(n, int(m)) for m in factors]
-    other = [hadamard_moments(n, int(m)) for m in thirds]
+    own = [total_estimator_moments(n, int(m)) for m in factors]
+    other = [hadamard_estimator_moments(n, int(m)) for m in thirds]
     print(
         f"{arguments.records} records of {n} samples. Cells: mean over truth; edf counted / stated; % of intervals that"
     )
@@ -96,12 +99,18 @@ def main() -> None:
     for name, coefficients in NOISES.items():
         values = records(coefficients, n, arguments.records, rng)
         theta = np.append(np.square(coefficients), 0.0)
-        known, found = np.repeat(theta[:, None], arguments.records, axis=1), theta_per_sample(fitted(values), 1.0)
+        known, found = np.repeat(theta[:, None], arguments.records, axis=1), theta_in_sample_units(fitted(values), 1.0)
         tvar, terms = total_variance(values, factors)
-        totals = correct_bias(own, known, tvar, terms), correct_bias(own, found, tvar, terms)
+        totals = (
+            correct_bias_and_compute_intervals(own, known, tvar, terms),
+            correct_bias_and_compute_intervals(own, found, tvar, terms),
+        )
         line(name, totals, np.stack([one.allan for one in own]) @ theta)
         hvar, terms = hadamard_variance(values, thirds)
-        hadamards = correct_bias(other, known, hvar, terms), correct_bias(other, found, hvar, terms)
+        hadamards = (
+            correct_bias_and_compute_intervals(other, known, hvar, terms),
+            correct_bias_and_compute_intervals(other, found, hvar, terms),
+        )
         rows.append((name, hadamards, np.stack([one.mean for one in other]) @ theta))
     print("\n| Hadamard variance | " + " | ".join(f"{m / n:.3f} T" for m in thirds) + " |")
     print("| --- " * (1 + len(thirds)) + "|")

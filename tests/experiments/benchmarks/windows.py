@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
-from monitor.estimation.allan.window import AllanWindow, display_spans
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
+from monitor.estimation.allan.window import AllanWindow, samples_per_displayed_tau
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.noise.effect import Source
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
@@ -48,7 +48,7 @@ def windows(factors: Ints, length: int, rate_hz: float) -> dict[str, AllanWindow
     """The recursive ones."""
     return {
         "rectangle": AllanWindow(length, factors),
-        "a window per τ": AllanWindow(length, factors, display_spans(factors, rate_hz, length)),
+        "a window per τ": AllanWindow(length, factors, samples_per_displayed_tau(factors, rate_hz, length)),
     }
 
 
@@ -56,7 +56,7 @@ def course(window: AllanWindow, values: Floats, ends: Sequence[int]) -> Floats:
     """σ² [looks, m, 6] after so many samples each."""
     looks = []
     for start, end in zip([0, *ends], ends, strict=False):
-        window.update(values[start:end])
+        window.append_samples(values[start:end])
         looks.append(window.avar())
     return np.array(looks)
 
@@ -175,7 +175,7 @@ def cost_table(rounds: int, seed: int) -> None:
     held = {}
     for name, window in windows(factors, length, 100.0).items():
         for _ in range(-(-(length + 1000) // len(values))):
-            window.update(values)
+            window.append_samples(values)
         held[name] = bytes_of(window)
         works[f"{name} blocks"] = advancing(window, values, 100)
         works[f"{name} singles"] = advancing(window, values[:2000], 1)
@@ -199,7 +199,7 @@ def advancing(window: AllanWindow, values: Floats, size: int) -> Callable[[], No
 
     def work() -> None:
         for one in blocks:
-            window.update(one)
+            window.append_samples(one)
 
     return work
 
@@ -234,9 +234,13 @@ def fit_table(records: int, seed: int) -> None:
 def fitted(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
     """The fit as if the curve were a rectangle's, each row of its own number of terms."""
     whole = covariances(length, factors)
-    spans = display_spans(factors, RATE_HZ, length) if name == "a window per τ" else np.full(factors.size, length)
+    spans = (
+        samples_per_displayed_tau(factors, RATE_HZ, length)
+        if name == "a window per τ"
+        else np.full(factors.size, length)
+    )
     terms = np.repeat(np.maximum(spans + 1 - 2 * factors, 0)[:, None], 6, axis=1)
-    return fit(make_design(factors, RATE_HZ), whole, MeasuredCurve(avar, terms))
+    return fit_coefficients(make_design_matrix(factors, RATE_HZ), whole, MeasuredCurve(avar, terms))
 
 
 def restarted(values: Floats, factors: Ints, before: int, ends: Sequence[int]) -> Iterator[Fit]:
@@ -244,9 +248,9 @@ def restarted(values: Floats, factors: Ints, before: int, ends: Sequence[int]) -
     window = AllanWindow(LENGTH, factors)
     for look, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
         if look == 1:
-            window.reset()
+            window.discard_samples()
             start = before
-        window.update(values[start:end])
+        window.append_samples(values[start:end])
         yield fitted(RESTARTED, factors, window.avar(), window.samples_in_window)
 
 

@@ -336,7 +336,7 @@ def test_through_the_reader_s_thread_to_the_end_of_a_replay():
     rig.station.start()
     wait_for(lambda: rig.work(time.monotonic()) or rig.station.replay_finished, "the end of the replay")
     rig.station.stop()
-    assert rig.station.join(PATIENCE_S)
+    assert rig.station.join_reader_thread(PATIENCE_S)
     rig.work(time.monotonic(), drain=True)
     assert sum(map(len, rig.caught.blocks)) == 400
     assert rig.caught.estimates[-1][1].samples == 400
@@ -594,7 +594,7 @@ def test_bias_is_held_against_temperature():
     follow_temperature(rig, 3.0, 100.0)
     assert len(rig.caught.thermals) >= 31
     unix_s, look = rig.caught.thermals[-1]
-    assert unix_s == rig.station.timeline.unix_s(look.t_ns)
+    assert unix_s == rig.station.timeline.to_unix_s(look.t_ns)
     assert set(look.axes) == {"gx", "gy", "gz", "ax", "ay", "az"}
     last = look.axes["gz"]
     assert last.one_step.bias == pytest.approx(last.bias, abs=5e-4)
@@ -728,7 +728,7 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
     for i in range(60):
         rig.bring(1000)
         if i >= 20:
-            rig.station.ring.take()
+            rig.station.ring.take_samples()
             at = np.arange(rig.sent - 1000, rig.sent)
             values = 1e-3 * np.random.default_rng(i).standard_normal((1000, 6))
             values[:, 1] += 0.02

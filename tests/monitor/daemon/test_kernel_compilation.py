@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 from monitor.cli.warm_up import warm_up
 from monitor.common import compiled
 from monitor.daemon.kernels import kernel_compilation, kernel_parts
-from monitor.daemon.kernels.kernel_compilation import Progress
+from monitor.daemon.kernels.kernel_compilation import CompilationProgress
 from monitor.daemon.kernels.kernel_parts import KernelGroup, KernelPart
 from tests.support.waiting import PATIENCE_S
 
@@ -50,7 +50,7 @@ def test_every_part_is_ready_in_its_order_whatever_becomes_of_the_children(
 ) -> None:
     monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", child))
     calls: list[str] = []
-    told: list[Progress] = []
+    told: list[CompilationProgress] = []
     group = group_of(calls, "abcd")
     assert not kernel_compilation.is_warm(group)
     assert list(kernel_compilation.prepare_kernels(group, told.append, processes)) == list("abcd")
@@ -70,7 +70,7 @@ def test_progress_that_cannot_be_written_ends_the_compilation_with_its_error(
 ) -> None:
     monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", ANSWERS_ALL))
 
-    def tell(_progress: Progress) -> None:
+    def tell(_progress: CompilationProgress) -> None:
         raise BrokenPipeError(32, "Broken pipe")
 
     calls: list[str] = []
@@ -103,7 +103,7 @@ def test_without_a_folder_for_them_kernels_are_compiled_by_this_process_at_every
     monkeypatch.setattr(kernel_compilation, "kernel_cache_folder", lambda: None)
     monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", ANSWERS_ALL))
     calls: list[str] = []
-    told: list[Progress] = []
+    told: list[CompilationProgress] = []
     group = group_of(calls, "ab")
     for _ in range(2):
         assert list(kernel_compilation.prepare_kernels(group, told.append)) == ["a", "b"]

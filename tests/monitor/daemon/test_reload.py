@@ -58,18 +58,18 @@ def test_devices_are_compared_as_they_stand_in_the_file(tmp_path: Path) -> None:
     assert change.removed == ("b", "c")
     assert [one.name for one in change.limited] == ["d"]
     assert change.restart == ()
-    assert change.text() == "added: e; removed: c; restarted: b; new limits: d"
+    assert change.describe_changes() == "added: e; removed: c; restarted: b; new limits: d"
 
 
 def test_a_model_that_reads_otherwise_begins_its_device_anew(tmp_path: Path) -> None:
     text = device("a", 'model = "m.toml"') + QUIET
     model = tmp_path / "m.toml"
     model.write_text("sample_rate = 100.0\n[gz.angle_random_walk]\nN = 1e-4\n")
-    assert changed(tmp_path, text, text).text() == "no device changed"
+    assert changed(tmp_path, text, text).describe_changes() == "no device changed"
     path = tmp_path / "c.toml"
     config, models = loading.load_config(path), {"a": read_model(model)}
     model.write_text("sample_rate = 100.0\n[gz.angle_random_walk]\nN = 2e-4\n")
-    assert reload.compare_with_file(config, models).text() == "restarted: a"
+    assert reload.compare_with_file(config, models).describe_changes() == "restarted: a"
 
 
 def test_what_only_a_restart_makes_hold_is_said_again_and_again(tmp_path: Path) -> None:

@@ -23,32 +23,32 @@ def numbers(blocks):
 
 def test_what_goes_in_comes_out():
     ring = RingBuffer(10)
-    assert ring.take() == []
-    ring.push(made(0, 3))
-    ring.push(made(3, 2))
-    (taken,) = ring.take()
+    assert ring.take_samples() == []
+    ring.push_samples(made(0, 3))
+    ring.push_samples(made(3, 2))
+    (taken,) = ring.take_samples()
     assert taken.t_ns.tolist() == [0, 1, 2, 3, 4]
     assert taken.values[:, 5].tolist() == [0, 1, 2, 3, 4]
     assert taken.temperature_c.tolist() == [0.5, 1.5, 2.5, 3.5, 4.5]
     assert taken.ticks.tolist() == [0, 1, 2, 3, 4]
     assert taken.lost == 0
-    assert ring.take() == []
+    assert ring.take_samples() == []
 
 
 def test_loss_cuts_blocks_where_it_stood():
     ring = RingBuffer(10)
-    ring.push(made(2, 2, lost=2))
-    ring.push(made(4, 1))
-    ring.push(made(8, 2, lost=3))
-    taken = ring.take()
+    ring.push_samples(made(2, 2, lost=2))
+    ring.push_samples(made(4, 1))
+    ring.push_samples(made(8, 2, lost=3))
+    taken = ring.take_samples()
     assert [(one.lost, one.t_ns.tolist()) for one in taken] == [(2, [2, 3, 4]), (3, [8, 9])]
 
 
 def test_what_was_taken_does_not_change_when_the_ring_goes_on():
     ring = RingBuffer(4)
-    ring.push(made(0, 4))
-    (taken,) = ring.take()
-    ring.push(made(4, 4))
+    ring.push_samples(made(0, 4))
+    (taken,) = ring.take_samples()
+    ring.push_samples(made(4, 4))
     assert taken.t_ns.tolist() == [0, 1, 2, 3]
     with pytest.raises(ValueError, match="read-only"):
         taken.values[0] = 1.0
@@ -59,9 +59,9 @@ def test_a_full_ring_overwrites_its_oldest_and_tells(sizes):
     ring = RingBuffer(4)
     total = 0
     for n in sizes:
-        ring.push(made(total, n))
+        ring.push_samples(made(total, n))
         total += n
-    taken = ring.take()
+    taken = ring.take_samples()
     assert numbers(taken) == list(range(total - 4, total))
     assert [one.lost for one in taken] == [total - 4]
     assert ring.overflowed == total - 4
@@ -69,10 +69,10 @@ def test_a_full_ring_overwrites_its_oldest_and_tells(sizes):
 
 def test_loss_of_overwritten_samples_travels_on():
     ring = RingBuffer(4)
-    ring.push(made(5, 2, lost=5))
-    ring.push(made(10, 2, lost=3))
-    ring.push(made(13, 3, lost=1))
-    taken = ring.take()
+    ring.push_samples(made(5, 2, lost=5))
+    ring.push_samples(made(10, 2, lost=3))
+    ring.push_samples(made(13, 3, lost=1))
+    taken = ring.take_samples()
     assert sum(one.lost for one in taken) + len(numbers(taken)) == 16
     assert [(one.lost, one.t_ns.tolist()) for one in taken] == [(11, [11]), (1, [13, 14, 15])]
     assert ring.overflowed == 3
@@ -90,7 +90,7 @@ def test_received_and_lost_are_all_that_was_sent(capacity, steps):
     seen = []
     for step in [*steps, None]:
         if step is None:
-            for one in ring.take():
+            for one in ring.take_samples():
                 told += one.lost
                 came += len(one)
                 seen += one.t_ns.tolist()
@@ -98,7 +98,7 @@ def test_received_and_lost_are_all_that_was_sent(capacity, steps):
                 assert int(one.t_ns[0]) == told + came - len(one)
         else:
             lost, n = step
-            ring.push(made(at + lost, n, lost))
+            ring.push_samples(made(at + lost, n, lost))
             at += lost + n
     assert told + came == at
     assert seen == sorted(set(seen))
@@ -113,16 +113,16 @@ def test_a_writer_and_a_reader_at_once(capacity):
         at = 0
         for i in range(pushes):
             n, lost = 1 + i % 37, i % 5 == 0
-            ring.push(made(at + lost, n, int(lost)))
+            ring.push_samples(made(at + lost, n, int(lost)))
             at += n + lost
         stopped.set()
 
     writer = threading.Thread(target=write)
     writer.start()
     while not stopped.is_set():
-        taken += ring.take()
+        taken += ring.take_samples()
     writer.join()
-    taken += ring.take()
+    taken += ring.take_samples()
     sent = sum(1 + i % 37 + (i % 5 == 0) for i in range(pushes))
     assert sum(len(one) + one.lost for one in taken) == sent
     assert ring.overflowed + len(numbers(taken)) == sum(1 + i % 37 for i in range(pushes))

@@ -123,7 +123,7 @@ def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_ti
     n, compiled, prepare = 2000, threading.Event(), kernel_compilation.prepare_kernels
 
     def held_back(
-        group: kernel_parts.KernelGroup, tell: Callable[[kernel_compilation.Progress], None]
+        group: kernel_parts.KernelGroup, tell: Callable[[kernel_compilation.CompilationProgress], None]
     ) -> Iterator[str]:
         compiled.wait(PATIENCE_S)
         yield from prepare(group, tell)
@@ -280,7 +280,7 @@ def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
 
 def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(
-        _group: kernel_parts.KernelGroup, _tell: Callable[[kernel_compilation.Progress], None]
+        _group: kernel_parts.KernelGroup, _tell: Callable[[kernel_compilation.CompilationProgress], None]
     ) -> Iterator[str]:
         yield kernel_parts.WINDOW
         raise OSError(28, "No space left on device")

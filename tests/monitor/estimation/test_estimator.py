@@ -220,7 +220,7 @@ def test_an_outage_longer_than_the_window_forgets_what_was_seen_before():
     estimator.add_samples(made(0, 3000))
     assert np.isfinite(estimator.get_estimate().history.value[-1, 1]).all()
     estimator.add_samples(made(10_000, 5, lost=7000))
-    assert not estimator._refit.entered.any()
+    assert not estimator._refit.terms_in_fit.any()
 
 
 def test_the_course_is_bounded_until_someone_looks():

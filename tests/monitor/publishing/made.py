@@ -10,8 +10,8 @@ from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
-from monitor.estimation.allan.total import TotalCurve, total_curve
+from monitor.estimation.allan.hadamard import HadamardCurve, compute_hadamard_curve
+from monitor.estimation.allan.total import TotalCurve, compute_total_curve
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.model_comparison import ModelComparison, PreparedModel
 from monitor.estimation.estimate import Estimate
@@ -120,7 +120,7 @@ def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
     values = 1e-3 * np.random.default_rng(3).standard_normal((1000, 6))
     theta = np.zeros((5, 6))
     theta[1] = 1e-8
-    return total_curve(values, 100.0, theta), hadamard_curve(values, 100.0, theta)
+    return compute_total_curve(values, 100.0, theta), compute_hadamard_curve(values, 100.0, theta)
 
 
 def analysis(found: Estimate | None = None, seconds: float = 3600.0, notes: tuple[str, ...] = ()) -> RecordingAnalysis:

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.data_types import AXES, Event
 from drivers.errors import ConfigError
-from monitor.daemon.operations.coefficient_limits import LimitMonitor, make_bounds
+from monitor.daemon.operations.coefficient_limits import LimitMonitor, make_axis_limits
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.noise.model import NoiseModel
@@ -117,7 +117,7 @@ def test_an_upper_bound_is_back_only_when_it_is_under_the_limit_itself() -> None
 def test_a_limit_relative_to_the_model_is_that_many_times_its_size() -> None:
     model = NoiseModel.from_toml('sample_rate = 100.0\n["g*".angle_random_walk]\nN = 1.0e-4')
     relative = Limit(axes=("gx", "gz"), letter="N", times_model=1.5, hold_s=1.0)
-    assert [(b.axis, b.limit, b.upper) for b in make_bounds([relative], model)] == [
+    assert [(b.axis, b.limit, b.upper) for b in make_axis_limits([relative], model)] == [
         ("gx", pytest.approx(1.5e-4), True),
         ("gz", pytest.approx(1.5e-4), True),
     ]

@@ -14,7 +14,13 @@ import pytest
 import imu_monitor
 from drivers.data_types import make_block
 from drivers.recordings import load_samples
-from monitor.daemon.operations.reconcile_on_request import COMMAND, NICENESS_INCREASE, Job, Reconciler, format_result
+from monitor.daemon.operations.reconcile_on_request import (
+    COMMAND,
+    NICENESS_INCREASE,
+    ReconcileJob,
+    Reconciler,
+    format_reconcile_result,
+)
 from monitor.estimation.estimator import Estimator
 from monitor.publishing.zenoh.publisher import Command
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
@@ -55,24 +61,26 @@ class Asked:
         return self
 
 
-def job(device: str = "bench-1", model: Path | None = None, folder: Path | None = None, warm: bool = True) -> Job:
+def job(
+    device: str = "bench-1", model: Path | None = None, folder: Path | None = None, warm: bool = True
+) -> ReconcileJob:
     estimator = Estimator(100.0, N / 100.0)
     estimator.add_samples(make_block(np.arange(N) * 10_000_000, VALUES.copy()))
     temperature_c = WARM if warm else np.full(N, np.nan)
-    return Job(device, 1_763_700_000.0, 360_000, estimator.copy_window(), temperature_c, model, folder)
+    return ReconcileJob(device, 1_763_700_000.0, 360_000, estimator.copy_window(), temperature_c, model, folder)
 
 
 def program(text: str) -> tuple[str, ...]:
     return (sys.executable, "-c", GIVEN + textwrap.dedent(text))
 
 
-def run(text: str, one: Job | None = None, limit_s: float = PATIENCE_S) -> tuple[Asked, list[str]]:
+def run(text: str, one: ReconcileJob | None = None, limit_s: float = PATIENCE_S) -> tuple[Asked, list[str]]:
     """The answer of one query, and what is said of it."""
     reconciler, asked = Reconciler(program(text), limit_s), Asked()
-    reconciler.start(one or job(), asked.command)
+    reconciler.start_reconciliation(one or job(), asked.command)
     asked.wait()
-    reconciler.close()
-    return asked, [finished.text for finished in reconciler.take_finished()]
+    reconciler.abort_reconciliations()
+    return asked, [finished.text for finished in reconciler.take_finished_reconciliations()]
 
 
 def test_the_answer_is_what_the_program_says() -> None:
@@ -149,7 +157,7 @@ def test_a_failure_is_an_error_in_one_line(text: str, error: str) -> None:
 
 def test_a_program_that_is_not_there_is_an_error() -> None:
     reconciler, asked = Reconciler(("/nowhere/imu-monitor",)), Asked()
-    reconciler.start(job(), asked.command)
+    reconciler.start_reconciliation(job(), asked.command)
     assert "No such file" in asked.wait().errors[0]
 
 
@@ -187,25 +195,25 @@ def test_one_at_a_time_for_each_device(tmp_path: Path) -> None:
     """
     reconciler = Reconciler(program(text))
     first, second, other, later = Asked(), Asked(), Asked("bench-2"), Asked()
-    reconciler.start(job(), first.command)
-    reconciler.start(job(), second.command)
-    reconciler.start(job("bench-2"), other.command)
+    reconciler.start_reconciliation(job(), first.command)
+    reconciler.start_reconciliation(job(), second.command)
+    reconciler.start_reconciliation(job("bench-2"), other.command)
     assert second.wait().errors == ["busy: a reconciliation of this device is already running"]
     assert not first.done.is_set()
     go.touch()
     assert first.wait().answers[0]["device"] == "bench-1"
     assert other.wait().answers[0]["device"] == "bench-2"
     reconciler._running["bench-1"].join(PATIENCE_S)  # the thread ends after it has answered
-    reconciler.start(job(), later.command)
+    reconciler.start_reconciliation(job(), later.command)
     assert later.wait().errors == []
-    reconciler.close()
+    reconciler.abort_reconciliations()
 
 
 def test_closing_ends_what_runs_and_says_so() -> None:
     reconciler, asked = Reconciler(program(f"time.sleep({FOREVER_S})")), Asked()
-    reconciler.start(job(), asked.command)
+    reconciler.start_reconciliation(job(), asked.command)
     wait_for(lambda: reconciler._children, "the program to be started")
-    reconciler.close()
+    reconciler.abort_reconciliations()
     assert asked.wait().errors == ["the service is stopping"]
 
 
@@ -233,7 +241,9 @@ def test_the_program_is_this_one() -> None:
 
 def test_a_verdict_without_steps_and_a_step_without_confidence() -> None:
     step = {"kind": "retuned", "effect": "angle_random_walk", "confidence": None}
-    assert format_result({"verdict": "explained", "axes": {"gz": {"steps": [step]}}}) == (
+    assert format_reconcile_result({"verdict": "explained", "axes": {"gz": {"steps": [step]}}}) == (
         "reconcile: explained: gz angle_random_walk retuned"
     )
-    assert format_result({"verdict": "unexplained", "axes": {"gz": {"steps": []}}}) == "reconcile: unexplained"
+    assert (
+        format_reconcile_result({"verdict": "unexplained", "axes": {"gz": {"steps": []}}}) == "reconcile: unexplained"
+    )

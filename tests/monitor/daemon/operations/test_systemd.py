@@ -60,11 +60,11 @@ def test_what_is_said_arrives_by_a_path_and_by_an_abstract_name(address: str) ->
     with Listening(address) as systemd:
         unit = SystemdNotifier(address, 9.0)
         begun_s = time.monotonic() - 1e-6  # the stamp is cut to microseconds
-        unit.status("1 device;\nall well")
-        unit.status("1 device; all well")
-        unit.ready()
-        unit.reloading()
-        unit.stopping()
+        unit.send_status("1 device;\nall well")
+        unit.send_status("1 device; all well")
+        unit.send_ready()
+        unit.send_reloading()
+        unit.send_stopping()
         said = systemd.lines()
     assert [line for line in said if not line.startswith("MONOTONIC_USEC=")] == [
         "STATUS=1 device; all well",
@@ -92,7 +92,7 @@ def test_signs_of_life_come_three_in_the_time_allowed_and_end_with_a_stuck_reade
 def test_nobody_to_tell_is_no_trouble(tmp_path: Path) -> None:
     for address in ("", str(tmp_path / "none"), "vsock:2:9999"):
         unit = SystemdNotifier.from_environment({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000000"})
-        unit.ready()
+        unit.send_ready()
         assert unit.send_watchdog({"a": 1}, 1.0) == []
     assert SystemdNotifier.from_environment({"WATCHDOG_USEC": "1000000"}).watchdog_s is None
     assert not SystemdNotifier.from_environment(
@@ -104,7 +104,7 @@ def test_a_socket_that_nobody_reads_holds_nothing_up(tmp_path: Path) -> None:
     with Listening(str(tmp_path / "notify")):
         unit = SystemdNotifier(str(tmp_path / "notify"))
         for i in range(10_000):
-            unit.status(str(i))
+            unit.send_status(str(i))
 
 
 class Freezing:

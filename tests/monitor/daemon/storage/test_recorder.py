@@ -227,9 +227,9 @@ def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, 
     keeper.close(PATIENCE_S)
     back = written(tmp_path / "bench")
     got = concatenate_blocks([piece.samples for piece in back])
-    assert keeper.missed > 0
-    assert keeper.missed == 20_000 - len(got)
-    assert str(keeper.missed) in keeper.state
+    assert keeper.missed_rows > 0
+    assert keeper.missed_rows == 20_000 - len(got)
+    assert str(keeper.missed_rows) in keeper.state
     # each hole is told where it is
     counted = 0
     for piece in back:
@@ -401,7 +401,7 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
         assert after.pipeline.estimator.samples_in_window == 3000
     finally:
         after.stop()
-        after.join(PATIENCE_S)
+        after.join_reader_thread(PATIENCE_S)
 
 
 @pytest.mark.parametrize(
@@ -422,7 +422,7 @@ def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s:
     after.restore.resume_from(after._recorder.find_recording_tail("bench"))
     after.rebuild_window()
     assert after.pipeline.estimator is None
-    assert after._can_take() is False or after.ring.room == after.ring.capacity
+    assert after._can_take() is False or after.ring.free_capacity == after.ring.capacity
     texts = [event.text for event in after.timeline._events]
     assert texts == [] if reason is None else reason in texts[0]
 
@@ -644,7 +644,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
     tail = again.find_recording_tail("bench")
     assert tail is not None
     assert tail.newest.samples.ticks[-1] == 99
-    assert len(list(tail.pieces(10.0))) == 1
+    assert len(list(tail.read_pieces(10.0))) == 1
     again.start()
     again.queue_samples("bench", rows(100, 100), 0)
     wait_for(lambda: segment.parse_segment_number(segment.list_segments(tmp_path / "bench")[-1]) == 8)
@@ -676,7 +676,7 @@ def test_a_folder_that_cannot_be_used_costs_only_what_has_no_room_in_memory(tmp_
     (tmp_path / "store").unlink()
     wait_for(lambda: keeper.state.startswith("ok"))
     keeper.close()
-    assert keeper.missed == 500
+    assert keeper.missed_rows == 500
     assert keeper.state == "ok, but 500 rows are not in the recording: the disk was too slow or full"
     (piece,) = written(tmp_path / "store" / "bench")
     assert (piece.samples.lost, piece.samples.ticks[0]) == (500, 500)

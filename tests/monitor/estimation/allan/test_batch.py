@@ -15,7 +15,7 @@ from monitor.estimation.allan.batch import (
     cluster_sizes,
     overlapping_avar,
     overlapping_avar_axis,
-    slope_of_recording,
+    rate_slope_from_thirds,
 )
 from tests.support.allan_references import columns, nist_1000
 
@@ -133,14 +133,14 @@ def test_single_precision_is_summed_in_double():
     assert overlapping_avar(y, factors)[0] == pytest.approx(
         overlapping_avar(y.astype(np.float64), factors)[0], rel=1e-15
     )
-    assert slope_of_recording(y) == pytest.approx(slope_of_recording(y.astype(np.float64)), rel=1e-12)
+    assert rate_slope_from_thirds(y) == pytest.approx(rate_slope_from_thirds(y.astype(np.float64)), rel=1e-12)
 
 
 def test_axes_in_threads_are_the_same_axes():
     y = np.random.default_rng(6).standard_normal((5000, 6))
     y[77, 2] = np.nan
     with ThreadPoolExecutor(3) as pool:
-        avar, terms = overlapping_avar(y, np.array([1, 10, 100]), each=pool.map)
+        avar, terms = overlapping_avar(y, np.array([1, 10, 100]), map_axes=pool.map)
     assert avar.tolist() == overlapping_avar(y, np.array([1, 10, 100]))[0].tolist()
     assert terms[0].tolist() == [4999, 4999, 4997, 4999, 4999, 4999]
 
@@ -148,12 +148,12 @@ def test_axes_in_threads_are_the_same_axes():
 def test_slope_is_that_of_what_is_there_in_the_thirds_and_absent_where_too_little_is():
     y = np.random.default_rng(7).standard_normal((1001, 3)) + 0.01 * np.arange(1001.0)[:, None]
     y[500, 1], y[600, 2], y[601, 2] = np.nan, np.inf, -np.inf
-    found = slope_of_recording(y)
+    found = rate_slope_from_thirds(y)
     assert found[0] == pytest.approx((y[668:, 0].mean() - y[2:335, 0].mean()) / 666.0, rel=1e-12)
     assert found[1:] == pytest.approx((y[668:, 1:].mean(axis=0) - y[2:335, 1:].mean(axis=0)) / 666.0, rel=1e-12)
     y[700:720, 1] = np.nan
-    assert np.isnan(slope_of_recording(y)).tolist() == [False, True, False]
-    assert np.isnan(slope_of_recording(y[:2])).all()
+    assert np.isnan(rate_slope_from_thirds(y)).tolist() == [False, True, False]
+    assert np.isnan(rate_slope_from_thirds(y[:2])).all()
 
 
 def test_too_long_clusters_have_no_answer():

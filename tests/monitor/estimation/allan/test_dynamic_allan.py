@@ -7,7 +7,7 @@ from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan import batch
 from monitor.estimation.allan.dynamic_allan import MAX_STEPS, compute_dynamic_allan
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.effects import (
     AngleRandomWalk,
@@ -52,7 +52,7 @@ def test_every_step_is_a_batch_over_its_window() -> None:
     found = compute_dynamic_allan(values, RATE_HZ, 40.0, "octave", 7.0)
     length, step = 4000, 700
     factors = batch.cluster_sizes(length, RATE_HZ)
-    columns, covariances = make_design(factors, RATE_HZ), covariance_table(length, factors)
+    columns, covariances = make_design_matrix(factors, RATE_HZ), covariance_table(length, factors)
     entered = np.zeros((5, 6), np.bool_)
     assert found.t_s.tolist() == [(length + i * step) / RATE_HZ for i in range(found.t_s.size)]
     assert found.t_s.size == 12
@@ -60,8 +60,11 @@ def test_every_step_is_a_batch_over_its_window() -> None:
     for row, end in enumerate(range(length, 12_001, step)):
         window = values[end - length : end]
         avar, terms = batch.overlapping_avar(window, factors)
-        slope, slopes = batch.slope_of_recording(window) * RATE_HZ, batch.rate_slope_per_tau(window, factors) * RATE_HZ
-        expected = fit(columns, covariances, MeasuredCurve(avar, terms, slope, slopes, entered))
+        slope, slopes = (
+            batch.rate_slope_from_thirds(window) * RATE_HZ,
+            batch.rate_slope_per_tau(window, factors) * RATE_HZ,
+        )
+        expected = fit_coefficients(columns, covariances, MeasuredCurve(avar, terms, slope, slopes, entered))
         entered = expected.entered
         lo, hi = deviation_intervals(avar, expected.edf)
         assert found.deviation[row] == pytest.approx(np.sqrt(avar), rel=1e-9)

@@ -7,9 +7,9 @@ from allantools.ci import edf_greenhall
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor.estimation.allan.hadamard import hadamard_curve, hadamard_moments, hadamard_variance
+from monitor.estimation.allan.hadamard import compute_hadamard_curve, hadamard_estimator_moments, hadamard_variance
 from monitor.estimation.allan.squared_difference_moments import phase_autocovariance
-from monitor.estimation.allan.total import total_moments
+from monitor.estimation.allan.total import total_estimator_moments
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
 from tests.support.allan_references import columns, nist_1000
 
@@ -66,11 +66,11 @@ def test_a_linear_drift_of_a_thousand_times_the_noise_is_not_seen():
         hadamard_variance(noise, factors)[0],
         rtol=1e-8,
     )
-    assert hadamard_moments(2000, 64).mean[4] == 0.0
+    assert hadamard_estimator_moments(2000, 64).mean[4] == 0.0
 
 
 def test_white_noise_reads_as_in_allan_s_variance():
-    one, allan = hadamard_moments(10_000, 100), total_moments(10_000, 100).allan
+    one, allan = hadamard_estimator_moments(10_000, 100), total_estimator_moments(10_000, 100).allan
     assert one.mean[:4] / allan[:4] == pytest.approx([10.0 / 9.0, 1.0, 0.8113, 0.5], abs=1e-4)
 
 
@@ -82,7 +82,7 @@ def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
         rows[starts, starts + p * m] = weight
     lags = phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     noise = np.stack([rows @ g @ rows.T for g in lags])
-    one = hadamard_moments(n, m)
+    one = hadamard_estimator_moments(n, m)
     np.testing.assert_allclose(one.mean[:4], noise[:, 0, 0] / (6 * m * m), rtol=1e-9)
     exact = 2.0 * np.einsum("aij,bij->ab", noise, noise) / (6.0 * m * m * starts.size) ** 2
     scale = np.sqrt(np.outer(exact.diagonal(), exact.diagonal()))
@@ -91,7 +91,7 @@ def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
 
 def test_degrees_of_freedom_agree_with_greenhall_and_riley_where_that_is_good():
     for m in (32, 125, 333):
-        one = hadamard_moments(1000, m)
+        one = hadamard_estimator_moments(1000, m)
         edf = 2.0 * one.mean[1:4] ** 2 / one.covariance.diagonal()[1:4]
         formula = [edf_greenhall(alpha, 3, m, 1001, overlapping=True, modified=False) for alpha in (0, -1, -2)]
         assert edf == pytest.approx(formula, rel=2e-3)
@@ -104,7 +104,7 @@ def test_intervals_hold_what_they_promise():
     sources = AngleRandomWalk(N=1.0), BiasInstability(B=0.02**0.5), RateRandomWalk(K=1e-3**0.5)
     values = sum(np.stack([s.start_series(rate_hz, rng).draw_samples(n) for _ in range(runs)], axis=1) for s in sources)
     factors = np.array([4, 16, 64, 128, 170])
-    curve = hadamard_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
+    curve = compute_hadamard_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
     white = 1.0 / curve.tau_s  # of these, white noise is all but a ten-thousandth
     np.testing.assert_allclose(curve.hvar.mean(axis=1), white, rtol=0.1)
     held = (curve.lo**2 <= white[:, None]) & (white[:, None] <= curve.hi**2)
@@ -114,13 +114,13 @@ def test_intervals_hold_what_they_promise():
 
 def test_gaps_cost_degrees_of_freedom_and_unknown_noise_all_intervals():
     values = np.random.default_rng(3).standard_normal((400, 2))
-    whole = hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, np.nan])
+    whole = compute_hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, np.nan])
     assert whole.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128]
     assert np.isfinite(whole.hvar).all()
     assert np.isfinite(whole.hi[:, 0]).all()
     assert np.isnan(whole.hi[:, 1]).all()
     values[100, 0] = np.nan
-    less = hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, 1.0])
+    less = compute_hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, 1.0])
     np.testing.assert_allclose((less.edf / whole.edf)[:7, 0], (less.terms / whole.terms)[:7, 0])
     assert np.isnan(less.hi[7, 0])  # not a term is left
     assert (less.terms[:, 0] == whole.terms[:, 0] - 3 * less.factors)[:5].all()

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from drivers.errors import ConfigError
 from monitor.estimation.allan.batch import cluster_sizes
-from monitor.estimation.allan.hadamard import hadamard_curve
+from monitor.estimation.allan.hadamard import compute_hadamard_curve
 from monitor.estimation.allan.live_total_and_hadamard import MIN_SAMPLES, LiveTotalAndHadamard
-from monitor.estimation.allan.total import total_curve
+from monitor.estimation.allan.total import compute_total_curve
 from monitor.estimation.allan.window import AllanWindow
 
 THETA = np.repeat(np.array([[1e-12], [1e-10], [1e-12], [1e-14], [0.0]]), 6, axis=1)
@@ -23,8 +23,8 @@ def made(n, seed=0):
 
 def one_round(slow):
     for _ in range(100):
-        slow.step()
-        result = slow.get(100.0, THETA)
+        slow.compute_next_tau()
+        result = slow.curves_of_last_round(100.0, THETA)
         if result is not None:
             return result
     raise AssertionError("a round has no end")
@@ -34,8 +34,8 @@ def check(slow, window, values):
     found = one_round(slow)
     last = values[-window.length :]
     for curve, expected, name in (
-        (found[0], total_curve(last, 100.0, THETA, found[0].factors), "tvar"),
-        (found[1], hadamard_curve(last, 100.0, THETA, found[1].factors), "hvar"),
+        (found[0], compute_total_curve(last, 100.0, THETA, found[0].factors), "tvar"),
+        (found[1], compute_hadamard_curve(last, 100.0, THETA, found[1].factors), "hvar"),
     ):
         assert np.array_equal(curve.terms, expected.terms)
         np.testing.assert_allclose(getattr(curve, name), getattr(expected, name), rtol=1e-9)
@@ -49,7 +49,7 @@ def check(slow, window, values):
 def test_equals_the_batch_on_the_window(samples, factors):
     values = made(samples)
     window = AllanWindow(300, factors)
-    window.update(values)
+    window.append_samples(values)
     check(LiveTotalAndHadamard(window), window, values)
 
 
@@ -66,8 +66,8 @@ def test_equals_the_batch_with_gaps_anywhere(samples, holes, skipped, seed):
     for row, axis in holes:
         values[row % samples, axis] = np.nan
     window = AllanWindow(200, cluster_sizes(200, 1.0))
-    window.update(values)
-    window.skip(skipped)
+    window.append_samples(values)
+    window.append_missing_samples(skipped)
     check(LiveTotalAndHadamard(window), window, np.concatenate([values, np.full((skipped, 6), np.nan)]))
 
 
@@ -75,18 +75,18 @@ def test_equals_the_batch_with_gaps_anywhere(samples, holes, skipped, seed):
 def test_a_window_with_a_span_for_each_tau_gives_the_same():
     values = made(900)
     window = AllanWindow(500, np.array([1, 4, 4, 16]), np.array([64, 100, 500, 200]))
-    window.update(values)
+    window.append_samples(values)
     check(LiveTotalAndHadamard(window), window, values)
 
 
 def test_chosen_clusters_wait_until_the_window_holds_them():
     window = AllanWindow(500, cluster_sizes(500, 1.0))
     slow = LiveTotalAndHadamard(window, np.array([100, 300, 499]), np.array([150]))
-    window.update(made(300))
+    window.append_samples(made(300))
     for _ in range(50):
-        slow.step()
-    assert slow.get(100.0, THETA) is None
-    window.update(made(200))
+        slow.compute_next_tau()
+    assert slow.curves_of_last_round(100.0, THETA) is None
+    window.append_samples(made(200))
     totals, hadamards = one_round(slow)
     assert totals.factors.tolist() == [100, 300, 499]
     assert hadamards.factors.tolist() == [150]
@@ -95,34 +95,34 @@ def test_chosen_clusters_wait_until_the_window_holds_them():
 def test_each_step_sees_the_window_of_its_moment_and_a_round_is_handed_over_whole():
     values = made(1200)
     window = AllanWindow(400, cluster_sizes(400, 1.0))
-    window.update(values[:600])
+    window.append_samples(values[:600])
     slow = LiveTotalAndHadamard(window, np.array([2, 300]), np.array([4]))
-    slow.step()
-    window.update(values[600:900])
-    slow.step()
-    assert slow.get(100.0, THETA) is None
-    slow.step()
-    totals, hadamards = slow.get(100.0, THETA)
-    early = total_curve(values[200:600], 100.0, THETA, np.array([2, 300]))
-    late = total_curve(values[500:900], 100.0, THETA, np.array([2, 300]))
+    slow.compute_next_tau()
+    window.append_samples(values[600:900])
+    slow.compute_next_tau()
+    assert slow.curves_of_last_round(100.0, THETA) is None
+    slow.compute_next_tau()
+    totals, hadamards = slow.curves_of_last_round(100.0, THETA)
+    early = compute_total_curve(values[200:600], 100.0, THETA, np.array([2, 300]))
+    late = compute_total_curve(values[500:900], 100.0, THETA, np.array([2, 300]))
     np.testing.assert_allclose(totals.tvar, [early.tvar[0], late.tvar[1]], rtol=1e-9)
-    window.update(values[900:])
-    slow.step()
-    assert np.array_equal(slow.get(100.0, THETA)[0].tvar, totals.tvar)
-    assert np.array_equal(slow.get(100.0, THETA)[1].hvar, hadamards.hvar)
+    window.append_samples(values[900:])
+    slow.compute_next_tau()
+    assert np.array_equal(slow.curves_of_last_round(100.0, THETA)[0].tvar, totals.tvar)
+    assert np.array_equal(slow.curves_of_last_round(100.0, THETA)[1].hvar, hadamards.hvar)
 
 
 def test_an_emptied_window_takes_its_results_along():
     window = AllanWindow(400, cluster_sizes(400, 1.0))
     slow = LiveTotalAndHadamard(window)
-    slow.step()
-    window.update(made(400))
+    slow.compute_next_tau()
+    window.append_samples(made(400))
     one_round(slow)
-    window.reset()
-    window.update(made(MIN_SAMPLES - 1))
-    slow.step()
-    assert slow.get(100.0, THETA) is None
-    window.update(made(100))
+    window.discard_samples()
+    window.append_samples(made(MIN_SAMPLES - 1))
+    slow.compute_next_tau()
+    assert slow.curves_of_last_round(100.0, THETA) is None
+    window.append_samples(made(100))
     check(slow, window, np.concatenate([made(MIN_SAMPLES - 1), made(100)]))
 
 
@@ -133,9 +133,9 @@ def test_a_growing_window_is_followed():
     slow = LiveTotalAndHadamard(window)
     longest = []
     for start in range(0, 400, 4):
-        window.update(values[start : start + 4])
-        slow.step()
-        result = slow.get(100.0, THETA)
+        window.append_samples(values[start : start + 4])
+        slow.compute_next_tau()
+        result = slow.curves_of_last_round(100.0, THETA)
         longest.append(0 if result is None else int(result[0].factors[-1]))
     assert longest == sorted(longest)
     assert longest[-1] >= 128
@@ -145,7 +145,7 @@ def test_a_constant_axis_has_no_variance():
     values = np.zeros((300, 6))
     values[:, 5], values[:, 4] = 9.80665, 1.0 / 3.0
     window = AllanWindow(300, cluster_sizes(300, 1.0))
-    window.update(values)
+    window.append_samples(values)
     slow = LiveTotalAndHadamard(window)
     totals, hadamards = one_round(slow)
     assert (hadamards.hvar == 0.0).all()
@@ -158,9 +158,9 @@ def test_clusters_beyond_what_phase_can_hold_are_left_out():
     short = AllanWindow(length, np.array([1]))
     slow = LiveTotalAndHadamard(short)
     swing = np.where(np.arange(length) < length // 2, 30.0, -30.0)[:, None] * np.ones(6)
-    short.update(swing)
+    short.append_samples(swing)
     totals, _ = one_round(slow)
-    expected = total_curve(swing, 100.0, THETA, totals.factors)
+    expected = compute_total_curve(swing, 100.0, THETA, totals.factors)
     assert totals.factors[-1] < length // 100
     np.testing.assert_allclose(totals.tvar, expected.tvar, rtol=1e-9)
     assert LiveTotalAndHadamard(AllanWindow(length, cluster_sizes(length, 1.0)))._factors[0][-1] == 131_072
@@ -178,13 +178,13 @@ def test_impossible_clusters_are_refused(totals, hadamards):
 
 def test_the_window_is_only_looked_at():
     window = AllanWindow(200, cluster_sizes(200, 1.0))
-    window.update(made(300))
+    window.append_samples(made(300))
     before = window.avar()
-    phase, missing, _, unit = window.view_ring()
+    phase, missing, _, unit = window.view_phase_ring()
     assert not phase.flags.writeable
     assert not missing.flags.writeable
     assert unit.shape == (6,)
     one_round(LiveTotalAndHadamard(window))
     assert np.array_equal(window.avar(), before)
-    window.update(made(5))  # it still advances
+    window.append_samples(made(5))  # it still advances
     assert window.samples_since_reset == 305

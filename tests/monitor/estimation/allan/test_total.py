@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor.estimation.allan import squared_difference_moments as moments_module
-from monitor.estimation.allan.batch import octaves, overlapping_avar
-from monitor.estimation.allan.total import MIN_SHARE, total_curve, total_moments, total_variance
+from monitor.estimation.allan.batch import octave_cluster_sizes, overlapping_avar
+from monitor.estimation.allan.total import MIN_SHARE, compute_total_curve, total_estimator_moments, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from tests.support.allan_references import nist_1000
 
@@ -97,7 +97,7 @@ def test_columns_do_not_mix_and_the_input_is_left_alone():
 
 def test_bias_is_the_published_one_up_to_half_the_record():
     for share, m in ((8, 12_500), (4, 25_000), (2, 50_000)):
-        one = total_moments(100_000, m)
+        one = total_estimator_moments(100_000, m)
         loss = (1.0 - one.mean / one.allan) * share
         assert loss[:4] == pytest.approx([-4.0 / 3.0, 0.0, 0.481, 0.750], abs=1e-3)
 
@@ -109,7 +109,7 @@ def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
     noise = np.stack([rows @ g @ rows.T for g in lags])
     ramp = rows @ (0.5 * np.arange(n + 1.0) ** 2)
     mean = np.append(noise.diagonal(axis1=1, axis2=2).mean(axis=1), np.mean(ramp**2)) / (2 * m * m)
-    one = total_moments(n, m)
+    one = total_estimator_moments(n, m)
     np.testing.assert_allclose(one.mean, mean, rtol=1e-7)
     theta = np.array([3.0, 1.0, 0.3, 1.0 / n**2, 1.0 / n**3])
     together = np.tensordot(theta[:4], noise, 1)
@@ -123,12 +123,12 @@ def test_the_coarse_grid_of_a_long_record_is_good_to_a_few_percent(m):
     rows = differences(n, m)
     lags = moments_module.phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     exact = [2.0 * ((rows @ g @ rows.T) ** 2).sum() / (2 * m * m * (n - 1.0)) ** 2 for g in lags]
-    np.testing.assert_allclose(total_moments(n, m).covariance.diagonal()[:4], exact, rtol=0.05)
+    np.testing.assert_allclose(total_estimator_moments(n, m).covariance.diagonal()[:4], exact, rtol=0.05)
 
 
 @pytest.mark.parametrize(("share", "stated"), [(8, (12.0, 9.14, 7.08)), (4, (6.0, 4.46, 3.36)), (2, (3.0, 2.12, 1.5))])
 def test_degrees_of_freedom_are_howe_s_up_to_half_the_record(share, stated):
-    one = total_moments(64_000, 64_000 // share)
+    one = total_estimator_moments(64_000, 64_000 // share)
     edf = 2.0 * one.mean[1:4] ** 2 / one.covariance.diagonal()[1:4]
     assert edf == pytest.approx(stated, rel=0.02)
 
@@ -136,7 +136,7 @@ def test_degrees_of_freedom_are_howe_s_up_to_half_the_record(share, stated):
 def test_a_ramp_alone_is_corrected_to_its_own_variance():
     n, slope = 600, 0.01
     theta = np.array([[0.0], [0.0], [0.0], [0.0], [slope**2]])
-    curve = total_curve(slope * np.arange(n)[:, None], 1.0, theta)
+    curve = compute_total_curve(slope * np.arange(n)[:, None], 1.0, theta)
     np.testing.assert_allclose(curve.tvar[:, 0], 0.5 * slope**2 * curve.factors**2, rtol=1e-9)
     assert np.isnan(curve.edf).all()  # nothing in it varies
 
@@ -155,7 +155,7 @@ def test_intervals_hold_what_they_promise_up_to_half_the_record(rate_hz):
     )
     values = sum(np.stack([s.start_series(rate_hz, rng).draw_samples(n) for _ in range(runs)], axis=1) for s in sources)
     factors = np.array([64, 128, 256, 384])
-    curve = total_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
+    curve = compute_total_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
     truth = sum(s.avar(factors / rate_hz, 1.0 / rate_hz) for s in sources)
     np.testing.assert_allclose(curve.tvar.mean(axis=1), truth, rtol=0.1)
     held = (curve.lo**2 <= truth[:, None]) & (truth[:, None] <= curve.hi**2)
@@ -167,19 +167,19 @@ def test_intervals_hold_what_they_promise_up_to_half_the_record(rate_hz):
 
 def test_the_shortest_cluster_is_allan_s_and_the_grid_ends_below_the_record():
     values = np.random.default_rng(2).standard_normal((300, 6))
-    curve = total_curve(values, 50.0, np.tile([[0.0], [0.02], [0.0], [0.0], [0.0]], 6))
+    curve = compute_total_curve(values, 50.0, np.tile([[0.0], [0.02], [0.0], [0.0], [0.0]], 6))
     assert curve.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128, 256]
     np.testing.assert_allclose(curve.tau_s, curve.factors / 50.0)
     np.testing.assert_allclose(curve.tvar[0], overlapping_avar(values, np.array([1]))[0][0], rtol=1e-12)
-    assert octaves(256)[-1] == 256
-    assert octaves(255)[-1] == 128
+    assert octave_cluster_sizes(256)[-1] == 256
+    assert octave_cluster_sizes(255)[-1] == 128
 
 
 def test_without_known_noise_or_with_too_little_left_there_is_no_curve():
     values = np.random.default_rng(3).standard_normal((400, 2))
     values[200, 1] = np.nan
     theta = np.array([[0.0, 0.0], [np.nan, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    curve = total_curve(values, 1.0, theta)
+    curve = compute_total_curve(values, 1.0, theta)
     assert np.isnan(curve.tvar[:, 0]).all()
     assert np.isnan(curve.hi[:, 0]).all()
     enough = curve.terms[:, 1] >= MIN_SHARE * 399

@@ -112,10 +112,10 @@ def test_too_short_a_window_is_nan_not_a_number():
 
 def test_tables_are_renewed_as_the_window_grows_and_kept_when_it_is_full():
     tables = AxisCovarianceTables(np.array([1, 2, 4]), capacity=10_000)
-    made = [tables.at(0, n, n) for n in range(8, 10_001)]
+    made = [tables.table_of_axis(0, n, n) for n in range(8, 10_001)]
     lengths = sorted({t.n for t in made})
     assert len(lengths) < np.log(10_000 / 8) / np.log(TABLE_STEP) + 12
     assert all(t.n <= n < TABLE_STEP * t.n + 1 for n, t in zip(range(8, 10_001), made, strict=True))
-    assert tables.at(0, 10_000, 10_000).n == 10_000
-    assert tables.at(0, 10_000, 10_000) is tables.at(0, 10_000, 10_000)
-    assert tables.at(0, 50, 50).n == 50
+    assert tables.table_of_axis(0, 10_000, 10_000).n == 10_000
+    assert tables.table_of_axis(0, 10_000, 10_000) is tables.table_of_axis(0, 10_000, 10_000)
+    assert tables.table_of_axis(0, 50, 50).n == 50

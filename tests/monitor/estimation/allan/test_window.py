@@ -10,9 +10,9 @@ from hypothesis.extra import numpy as hnp
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from drivers.errors import ConfigError
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_per_tau, slope_of_recording
-from monitor.estimation.allan.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, display_spans
-from monitor.estimation.allan.window_kernel import STAGE_SAMPLES, advance
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds, rate_slope_per_tau
+from monitor.estimation.allan.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, samples_per_displayed_tau
+from monitor.estimation.allan.window_kernel import STAGE_SAMPLES, append_staged_samples
 from tests.experiments.benchmarks import long_run
 
 FACTORS = np.array([1, 2, 3, 7, 16, 25, 50])
@@ -44,7 +44,7 @@ def check(window, values, rel=1e-9, largest=0.0):
         avar, terms = expected(values, window.length, window.factors)
     else:
         avar, terms = expected_of_spans(window, values)
-    assert np.array_equal(window.terms(), terms)
+    assert np.array_equal(window.term_counts(), terms)
     found = window.avar()
     assert np.array_equal(np.isnan(found), np.isnan(avar))
     unit = 2.0 / window._scale[:6] / window.factors[:, None]
@@ -55,7 +55,7 @@ def check(window, values, rel=1e-9, largest=0.0):
 def assert_same(one, other):
     """Bit for bit: how the samples were cut must not be seen."""
     assert np.array_equal(one.avar(), other.avar(), equal_nan=True)
-    assert np.array_equal(one.terms(), other.terms())
+    assert np.array_equal(one.term_counts(), other.term_counts())
     assert one.samples_in_window == other.samples_in_window
     assert one.samples_since_reset == other.samples_since_reset
 
@@ -69,7 +69,7 @@ def test_every_position_equals_the_batch():
     values[300:330, 2] = np.nan
     window = AllanWindow(LENGTH, FACTORS)
     for i in range(len(values)):
-        window.update(values[i : i + 1])
+        window.append_samples(values[i : i + 1])
         check(window, values[: i + 1])
 
 
@@ -91,14 +91,14 @@ def rng_rows(n, k):
 def test_blocks_of_any_cut_equal_one_by_one(cuts, values, length):
     factors = cluster_sizes(length, 1.0, "decade10")
     whole, cut, single = (AllanWindow(length, factors) for _ in range(3))
-    whole.update(values)
+    whole.append_samples(values)
     edges = [0, *sorted(cuts), len(values)]
     for a, b in pairwise(edges):
-        cut.update(values[a:b])
+        cut.append_samples(values[a:b])
     for row in values:
-        single.update(row[None])
-    assert np.array_equal(whole.terms(), single.terms())
-    assert np.array_equal(cut.terms(), single.terms())
+        single.append_samples(row[None])
+    assert np.array_equal(whole.term_counts(), single.term_counts())
+    assert np.array_equal(cut.term_counts(), single.term_counts())
     for window in (whole, cut, single):
         check(window, values, largest=70.0)
     atol = (2.0**-50 * 70.0) ** 2
@@ -118,7 +118,7 @@ def test_missing_anywhere_on_one_axis_or_all(holes, length):
     factors = cluster_sizes(length, 1.0)
     window = AllanWindow(length, factors)
     for start in range(0, len(values), 37):
-        window.update(values[start : start + 37])
+        window.append_samples(values[start : start + 37])
         check(window, values[: start + 37])
 
 
@@ -129,25 +129,25 @@ def test_growing_full_and_reset():
     values = made(260)
     window = AllanWindow(LENGTH, FACTORS)
     assert np.isnan(window.avar()).all()
-    assert not window.terms().any()
-    window.update(values[:60])
+    assert not window.term_counts().any()
+    window.append_samples(values[:60])
     assert (window.samples_in_window, window.samples_since_reset) == (60, 60)
     check(window, values[:60])
     assert np.isnan(window.avar()[-2:]).sum() == 6  # m = 50 needs a hundred
-    window.update(values[60:])
+    window.append_samples(values[60:])
     assert (window.samples_in_window, window.samples_since_reset) == (100, 260)
-    window.reset()
+    window.discard_samples()
     assert (window.samples_in_window, window.samples_since_reset) == (0, 0)
     assert np.isnan(window.avar()).all()
-    window.update(values)
+    window.append_samples(values)
     fresh = AllanWindow(LENGTH, FACTORS)
-    fresh.update(values)
+    fresh.append_samples(values)
     assert_same(window, fresh)
 
 
 def test_an_empty_block_changes_nothing():
     window = AllanWindow(LENGTH, FACTORS)
-    window.update(np.empty((0, 6)))
+    window.append_samples(np.empty((0, 6)))
     assert window.samples_since_reset == 0
 
 
@@ -156,22 +156,22 @@ def test_skipping_is_that_many_missing_rows(n):
     values = made(500)
     skipped, missing = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
     for window in (skipped, missing):
-        window.update(values[:250])
-    skipped.skip(n)
-    missing.update(np.full((n, 6), np.nan))
+        window.append_samples(values[:250])
+    skipped.append_missing_samples(n)
+    missing.append_samples(np.full((n, 6), np.nan))
     assert_same(skipped, missing)
     for window in (skipped, missing):
-        window.update(values[250:])
+        window.append_samples(values[250:])
     assert_same(skipped, missing)
     check(skipped, values)
 
 
 def test_a_skip_longer_than_the_window_empties_it():
     window, fresh = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
-    window.update(made(500))
-    window.skip(10**12)
+    window.append_samples(made(500))
+    window.append_missing_samples(10**12)
     for one in (window, fresh):
-        one.update(made(70, seed=3))
+        one.append_samples(made(70, seed=3))
     assert_same(window, fresh)
 
 
@@ -180,9 +180,9 @@ def test_skips_in_pieces_cross_the_piece_length():
     factors = np.array([1, 100, 4500])
     values = made(20_000)
     window = AllanWindow(length, factors)
-    window.update(values)
-    window.skip(8999)
-    window.update(values[:1])
+    window.append_samples(values)
+    window.append_missing_samples(8999)
+    window.append_samples(values[:1])
     check(window, np.concatenate([values, np.full((8999, 6), np.nan), values[:1]]))
 
 
@@ -226,7 +226,7 @@ def test_every_row_equals_the_batch_of_its_own_span_at_every_position():
     values = broken(900)
     window = AllanWindow(300, SPANNED, SPANS)
     for i in range(len(values)):
-        window.update(values[i : i + 1])
+        window.append_samples(values[i : i + 1])
         check(window, values[: i + 1])
 
 
@@ -243,10 +243,10 @@ def test_rows_of_any_span_and_blocks_of_any_cut(cuts, shares, holes):
     spans = 2 * SPANNED + np.floor(np.array(shares) * (200 - 2 * SPANNED)).astype(np.int64)
     cut, single = (AllanWindow(200, SPANNED, spans) for _ in range(2))
     for a, b in pairwise([0, *sorted(cuts), len(values)]):
-        cut.update(values[a:b])
+        cut.append_samples(values[a:b])
     for row in values:
-        single.update(row[None])
-    assert np.array_equal(cut.terms(), single.terms())
+        single.append_samples(row[None])
+    assert np.array_equal(cut.term_counts(), single.term_counts())
     np.testing.assert_allclose(cut.avar(), single.avar(), rtol=1e-13)
     check(cut, values)
 
@@ -255,7 +255,7 @@ def test_full_length_spans_are_the_plain_window():
     values = broken(900)
     plain, spanned = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS, np.full(FACTORS.size, LENGTH))
     for window in (plain, spanned):
-        window.update(values)
+        window.append_samples(values)
     assert_same(plain, spanned)
 
 
@@ -263,16 +263,16 @@ def test_slope_and_length_are_those_of_the_whole_window():
     values = made(900)
     plain, spanned = AllanWindow(300, np.array([1, 2])), AllanWindow(300, np.array([1, 2]), np.array([10, 20]))
     for window in (plain, spanned):
-        window.update(values)
+        window.append_samples(values)
     assert spanned.samples_in_window == 300
-    assert np.array_equal(plain.slopes_of_axes_and_taus()[0], spanned.slopes_of_axes_and_taus()[0])
+    assert np.array_equal(plain.rate_slopes_per_axis_and_tau()[0], spanned.rate_slopes_per_axis_and_tau()[0])
 
 
 def test_a_transient_leaves_each_row_after_its_own_span():
     values = made(900)
     values[600:603] += 1e6 * 1e-4
     window = AllanWindow(300, np.array([1, 1]), np.array([20, 300]))
-    window.update(values[:623])
+    window.append_samples(values[:623])
     check(window, values[:623])
     short, long = window.avar()[:, 0]
     assert short < 1e-7 < 1.0 < long
@@ -290,7 +290,7 @@ def test_impossible_spans_are_refused(factors, spans):
 @pytest.mark.parametrize(("length", "rate_hz"), [(100, 1.0), (100, 100.0), (360_000, 100.0), (3_600_000, 1000.0)])
 def test_quick_spans_fit_any_window(length, rate_hz):
     factors = np.unique([*cluster_sizes(length, rate_hz), length // 2])
-    window = AllanWindow(length, factors, display_spans(factors, rate_hz, length))
+    window = AllanWindow(length, factors, samples_per_displayed_tau(factors, rate_hz, length))
     assert ((window.spans >= 16 * factors) | (window.spans == length)).all()
     assert (window.spans >= min(10 * rate_hz, length)).all()
 
@@ -302,14 +302,14 @@ def test_staged_samples_can_be_taken_one_at_a_time():
     values = broken(STAGE_SAMPLES)
     window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
     for row in values:
-        plain.update(row[None])
+        plain.append_samples(row[None])
     window._stage[:] = values
     for row in range(STAGE_SAMPLES):
-        advance(window._ints, window._floats, window._missing, window._taus, row, 1)
+        append_staged_samples(window._ints, window._floats, window._missing, window._taus, row, 1)
     assert_same(window, plain)
     window._stage[:] = values[::-1]
-    advance(window._ints, window._floats, window._missing, window._taus, 100, 300)
-    plain.update(values[::-1][100:400])
+    append_staged_samples(window._ints, window._floats, window._missing, window._taus, 100, 300)
+    plain.append_samples(values[::-1][100:400])
     assert_same(window, plain)
 
 
@@ -321,7 +321,7 @@ def test_ten_thousand_turns_of_phase_and_ring():
     values = made(50_000, seed=8)
     window = AllanWindow(LENGTH, FACTORS)
     for turn in range(40):
-        window.update(values)
+        window.append_samples(values)
         check(window, values[-(1000 + turn) :])
     assert window.samples_since_reset == 2_000_000
 
@@ -333,7 +333,7 @@ def test_full_scale_square_wave_at_the_longest_tau_does_not_overflow():
     sign = np.where(np.arange(3 * length) // m % 2, 1.0, -1.0)[:, None]
     values = sign * np.array(FULL_SCALE[:6])
     window = AllanWindow(length, factors)
-    window.update(values)
+    window.append_samples(values)
     check(window, values, rel=1e-12)
 
 
@@ -346,9 +346,9 @@ def test_what_a_transient_added_is_taken_out_again(height, held):
     values[2000 : 2000 + held] += height
     factors = cluster_sizes(length, 1.0)
     window = AllanWindow(length, factors)
-    window.update(values[:2500])
+    window.append_samples(values[:2500])
     assert window.avar()[0, 0] > 1e-5 or held > 1000
-    window.update(values[2500:])
+    window.append_samples(values[2500:])
     check(window, values)
 
 
@@ -357,9 +357,9 @@ def test_impossible_values_do_not_stay(wrong):
     values = made(1000)
     values[200:203] = wrong
     window = AllanWindow(LENGTH, FACTORS)
-    window.update(values[:250])
+    window.append_samples(values[:250])
     assert np.isfinite(window.avar()[0]).all()
-    window.update(values[250:])
+    window.append_samples(values[250:])
     check(window, values)
 
 
@@ -368,7 +368,7 @@ def test_what_phase_cannot_hold_counts_as_missing(wrong):
     values, missing = made(150), made(150)
     values[120, 4], missing[120, 4] = wrong, np.nan
     window = AllanWindow(LENGTH, FACTORS)
-    window.update(values)
+    window.append_samples(values)
     check(window, missing)
 
 
@@ -380,9 +380,9 @@ def test_a_swing_beyond_twice_full_scale_recovers():
     values[8000:10_000] = 2000.0
     values[10_000:12_000] = -2000.0
     window = AllanWindow(length, factors)
-    window.update(values[:12_000])
+    window.append_samples(values[:12_000])
     assert np.isfinite(window.avar()).all()
-    window.update(values[12_000:])
+    window.append_samples(values[12_000:])
     check(window, values)
 
 
@@ -392,9 +392,9 @@ def test_a_swing_beyond_twice_full_scale_recovers():
 def test_an_offset_or_a_scale_changes_nothing_else():
     values = made(3000)
     plain, moved, larger = (AllanWindow(LENGTH, FACTORS) for _ in range(3))
-    plain.update(values)
-    moved.update(values + np.array([1.0, -2.0, 3.0, -20.0, 30.0, 100.0]))
-    larger.update(2.0 * values)
+    plain.append_samples(values)
+    moved.append_samples(values + np.array([1.0, -2.0, 3.0, -20.0, 30.0, 100.0]))
+    larger.append_samples(2.0 * values)
     np.testing.assert_allclose(moved.avar(), plain.avar(), rtol=1e-9)
     np.testing.assert_allclose(larger.avar(), 4.0 * plain.avar(), rtol=1e-9)
 
@@ -403,7 +403,7 @@ def test_a_slope_adds_its_own_variance():
     """A ramp alone gives σ² = R² τ²/2 (IEEE Std 952), at every position."""
     slope = np.array([1e-3, -2e-3, 1e-5, 1e-2, 3e-3, -1e-3])
     window = AllanWindow(LENGTH, FACTORS)
-    window.update(np.arange(5000)[:, None] * slope)
+    window.append_samples(np.arange(5000)[:, None] * slope)
     np.testing.assert_allclose(window.avar(), 0.5 * (FACTORS[:, None] * slope) ** 2, rtol=1e-9)
 
 
@@ -411,9 +411,9 @@ def test_an_axis_that_is_never_measured():
     values = made(500)
     values[:, 4] = np.nan
     window = AllanWindow(LENGTH, FACTORS)
-    window.update(values)
+    window.append_samples(values)
     assert np.isnan(window.avar()[:, 4]).all()
-    assert not window.terms()[:, 4].any()
+    assert not window.term_counts()[:, 4].any()
     check(window, values)
 
 
@@ -434,24 +434,24 @@ def test_any_array_is_taken_by_the_one_compiled_version(how):
     if how == "read-only":
         same.flags.writeable = False
     window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
-    plain.update(values)
-    versions = advance.signatures
-    window.update(same)
+    plain.append_samples(values)
+    versions = append_staged_samples.signatures
+    window.append_samples(same)
     assert_same(window, plain)
-    assert advance.signatures == versions
+    assert append_staged_samples.signatures == versions
     assert how == "list" or same is not values
 
 
 def test_updating_leaves_the_caller_s_array_writable():
     values = made(10)
-    AllanWindow(LENGTH, FACTORS).update(values)
+    AllanWindow(LENGTH, FACTORS).append_samples(values)
     assert values.flags.writeable
 
 
 @pytest.mark.parametrize("shape", [(10, 5), (10, 7), (6,), (10, 6, 1)])
 def test_a_wrong_shape_is_refused(shape):
     with pytest.raises(ValueError, match=r"\[n, 6\]"):
-        AllanWindow(LENGTH, FACTORS).update(np.zeros(shape))
+        AllanWindow(LENGTH, FACTORS).append_samples(np.zeros(shape))
 
 
 # --- any order of calls
@@ -476,7 +476,7 @@ class Calls(RuleBasedStateMachine):
         for row, axis in holes:
             if row < n:
                 rows[row, axis] = np.nan
-        self.window.update(rows)
+        self.window.append_samples(rows)
         self.held = np.concatenate([self.held, rows])[-self.window.length :]
 
     @rule(n=st.integers(1, 3))
@@ -486,7 +486,7 @@ class Calls(RuleBasedStateMachine):
 
     @rule(n=st.integers(0, LENGTH + 33))
     def skip(self, n):
-        self.window.skip(n)
+        self.window.append_missing_samples(n)
         empty = n > self.window.length
         self.held = np.concatenate([self.held[:0] if empty else self.held, np.full((0 if empty else n, 6), np.nan)])
         self.held = self.held[-self.window.length :]
@@ -498,7 +498,7 @@ class Calls(RuleBasedStateMachine):
 
     @rule()
     def reset(self):
-        self.window.reset()
+        self.window.discard_samples()
         self.held = self.held[:0]
 
     @invariant()
@@ -507,9 +507,12 @@ class Calls(RuleBasedStateMachine):
         check(self.window, self.held)
         if len(self.held) >= 3:
             np.testing.assert_allclose(
-                self.window.slopes_of_axes_and_taus()[0], slope_of_recording(self.held), rtol=1e-6, atol=1e-12
+                self.window.rate_slopes_per_axis_and_tau()[0], rate_slope_from_thirds(self.held), rtol=1e-6, atol=1e-12
             )
-            seen, true = self.window.slopes_of_axes_and_taus()[1], rate_slope_per_tau(self.held, self.window.factors)
+            seen, true = (
+                self.window.rate_slopes_per_axis_and_tau()[1],
+                rate_slope_per_tau(self.held, self.window.factors),
+            )
             assert np.array_equal(np.isnan(seen), np.isnan(true))
             whole = np.isfinite(self.held).all(axis=0)  # with a gap, each puts another mean in its place
             np.testing.assert_allclose(seen[:, whole], true[:, whole], rtol=1e-5, atol=1e-12)
@@ -528,32 +531,34 @@ def test_forgetting_one_axis_makes_its_older_samples_missing(kept):
     values = made(3 * LENGTH)
     values[LENGTH : LENGTH + 7, 2] = np.nan
     window, expected = AllanWindow(LENGTH, FACTORS), values[: 2 * LENGTH].copy()
-    window.update(expected)
+    window.append_samples(expected)
     window.keep_newest(1, kept)
     expected[: len(expected) - kept, 1] = np.nan
     for n in (0, 3, 40, LENGTH):
-        window.update(values[len(expected) : len(expected) + n])
+        window.append_samples(values[len(expected) : len(expected) + n])
         expected = np.concatenate([expected, values[len(expected) : len(expected) + n]])
         avar, terms = overlapping_avar(expected[-LENGTH:], FACTORS)
-        assert np.array_equal(window.terms(), terms)
+        assert np.array_equal(window.term_counts(), terms)
         assert window.avar()[terms > 0] == pytest.approx(avar[terms > 0], rel=1e-9)
 
 
 def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
     values = made(LENGTH) + 1e-3 * np.arange(LENGTH)[:, None]
     window = AllanWindow(LENGTH, FACTORS)
-    window.update(values)
+    window.append_samples(values)
     window.keep_newest(4, 60)
     lengths = np.full(6, LENGTH)
     lengths[4] = 60
-    assert np.isnan(window.slopes_of_axes_and_taus()[0][4])
-    assert window.slopes_of_axes_and_taus(lengths)[0][4] == pytest.approx(slope_of_recording(values[-60:])[4], rel=1e-6)
-    assert window.slopes_of_axes_and_taus(lengths)[0][[0, 5]] == pytest.approx(
-        slope_of_recording(values)[[0, 5]], rel=1e-6
+    assert np.isnan(window.rate_slopes_per_axis_and_tau()[0][4])
+    assert window.rate_slopes_per_axis_and_tau(lengths)[0][4] == pytest.approx(
+        rate_slope_from_thirds(values[-60:])[4], rel=1e-6
+    )
+    assert window.rate_slopes_per_axis_and_tau(lengths)[0][[0, 5]] == pytest.approx(
+        rate_slope_from_thirds(values)[[0, 5]], rel=1e-6
     )
     expected = rate_slope_per_tau(values[-60:], FACTORS)[:, 4]
     there = np.isfinite(expected)
-    assert window.slopes_of_axes_and_taus(lengths)[1][there, 4] == pytest.approx(expected[there], rel=1e-6)
+    assert window.rate_slopes_per_axis_and_tau(lengths)[1][there, 4] == pytest.approx(expected[there], rel=1e-6)
 
 
 # --- for ever
@@ -571,21 +576,23 @@ def test_a_small_gap_leaves_the_slope(gap):
     factors = np.array([1, 4, 16, 64, 250])
     values = 9.81 + 1e-2 * np.random.default_rng(7).standard_normal((n, 6)) + 1e-3 * np.arange(n)[:, None]
     whole, window = AllanWindow(n, factors), AllanWindow(n, factors)
-    whole.update(values)
+    whole.append_samples(values)
     values[at : at + missing] = np.nan
-    window.update(values)
-    np.testing.assert_allclose(window.slopes_of_axes_and_taus()[0], slope_of_recording(values), rtol=1e-9)
-    np.testing.assert_allclose(window.slopes_of_axes_and_taus()[0], whole.slopes_of_axes_and_taus()[0], rtol=0.01)
+    window.append_samples(values)
+    np.testing.assert_allclose(window.rate_slopes_per_axis_and_tau()[0], rate_slope_from_thirds(values), rtol=1e-9)
+    np.testing.assert_allclose(
+        window.rate_slopes_per_axis_and_tau()[0], whole.rate_slopes_per_axis_and_tau()[0], rtol=0.01
+    )
     # a missing sample stands for the level, here up to the whole ramp away
     np.testing.assert_allclose(
-        window.slopes_of_axes_and_taus()[1][3:], whole.slopes_of_axes_and_taus()[1][3:], rtol=0.05
+        window.rate_slopes_per_axis_and_tau()[1][3:], whole.rate_slopes_per_axis_and_tau()[1][3:], rtol=0.05
     )
     np.testing.assert_allclose(
-        rate_slope_per_tau(values, factors)[3:], whole.slopes_of_axes_and_taus()[1][3:], rtol=0.05
+        rate_slope_per_tau(values, factors)[3:], whole.rate_slopes_per_axis_and_tau()[1][3:], rtol=0.05
     )
     values[:100] = np.nan
-    window.update(values)
-    assert np.isnan(window.slopes_of_axes_and_taus()[0]).all()
-    assert np.isnan(slope_of_recording(values)).all()
-    assert np.isnan(window.slopes_of_axes_and_taus()[1]).all()
+    window.append_samples(values)
+    assert np.isnan(window.rate_slopes_per_axis_and_tau()[0]).all()
+    assert np.isnan(rate_slope_from_thirds(values)).all()
+    assert np.isnan(window.rate_slopes_per_axis_and_tau()[1]).all()
     assert np.isnan(rate_slope_per_tau(values, factors)).all()

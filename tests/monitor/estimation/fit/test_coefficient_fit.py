@@ -9,9 +9,9 @@ from scipy.signal import butter, sosfilt
 from scipy.stats import binom
 
 from drivers.data_types import AXES
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
@@ -34,9 +34,11 @@ RECORDS = 144
 def fit_values(values: np.ndarray, with_slope: bool = True, **more) -> Fit:
     factors = cluster_sizes(len(values), RATE_HZ)
     avar, terms = overlapping_avar(values, factors)
-    slope = slope_of_recording(values) * RATE_HZ if with_slope else None
+    slope = rate_slope_from_thirds(values) * RATE_HZ if with_slope else None
     measured = MeasuredCurve(avar, terms, slope)
-    return fit(make_design(factors, RATE_HZ), covariance_table(len(values), factors), measured, **more)
+    return fit_coefficients(
+        make_design_matrix(factors, RATE_HZ), covariance_table(len(values), factors), measured, **more
+    )
 
 
 @cache
@@ -61,7 +63,9 @@ def exact_curve(theta: np.ndarray, n: int = N) -> Fit:
     avar = sum(t * s.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for t, s in zip(theta, UNIT_SOURCES, strict=True))
     t = covariance_table(n, factors)
     columns = np.repeat(avar[:, None], 6, axis=1)
-    return fit(make_design(factors, RATE_HZ), t, MeasuredCurve(columns, np.repeat(t.terms[:, None], 6, axis=1)))
+    return fit_coefficients(
+        make_design_matrix(factors, RATE_HZ), t, MeasuredCurve(columns, np.repeat(t.terms[:, None], 6, axis=1))
+    )
 
 
 def test_an_exact_curve_gives_its_coefficients_back():
@@ -179,7 +183,7 @@ def test_hysteresis_enters_late_and_leaves_late():
         avar = sum(x * s.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for x, s in zip(theta, UNIT_SOURCES, strict=True))
         measured = MeasuredCurve(np.repeat(avar[:, None], 6, 1), np.repeat(t.terms[:, None], 6, 1))
         both = [replace(measured, entered_before=before) for before in (never, always)]
-        entered.append([fit(make_design(factors, RATE_HZ), t, one).entered[2, 0] for one in both])
+        entered.append([fit_coefficients(make_design_matrix(factors, RATE_HZ), t, one).entered[2, 0] for one in both])
     entered = np.array(entered)
     assert (entered[:, 1] >= entered[:, 0]).all()
     assert not entered[0].any()
@@ -193,7 +197,9 @@ def test_too_few_tau_is_unestimated_but_has_degrees_of_freedom():
     factors = 2 ** np.arange(MIN_ROWS - 1)
     values = np.random.default_rng(0).standard_normal((64, 6))
     avar, terms = overlapping_avar(values, factors)
-    result = fit(make_design(factors, RATE_HZ), covariance_table(64, factors), MeasuredCurve(avar, terms))
+    result = fit_coefficients(
+        make_design_matrix(factors, RATE_HZ), covariance_table(64, factors), MeasuredCurve(avar, terms)
+    )
     assert (result.coefficients.status == Status.UNESTIMATED).all()
     assert np.isnan(result.coefficients.hi).all()
     assert np.isnan(result.fitted).all()
@@ -246,8 +252,8 @@ def test_where_the_terms_are_no_description_none_is_more_than_the_curve():
     values = 1e-3 * np.random.default_rng(5).standard_normal((t.size, 6)) + 0.05 * np.sin(np.pi * t)[:, None]
     factors = cluster_sizes(t.size, 100.0)
     avar, terms = overlapping_avar(values, factors)
-    columns = make_design(factors, 100.0)
-    found = fit(columns, covariance_table(t.size, factors), MeasuredCurve(avar, terms))
+    columns = make_design_matrix(factors, 100.0)
+    found = fit_coefficients(columns, covariance_table(t.size, factors), MeasuredCurve(avar, terms))
     assert (found.misfit > 1.0).all()
     c = found.coefficients
     for axis in range(6):

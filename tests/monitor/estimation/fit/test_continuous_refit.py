@@ -8,7 +8,7 @@ from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import AxisCovarianceTables
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.continuous_refit import ContinuousRefit
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -16,7 +16,7 @@ from monitor.noise.model import NoiseModel
 RATE_HZ = 100.0
 LENGTH = 20_000
 FACTORS = cluster_sizes(LENGTH, RATE_HZ)
-DESIGN = make_design(FACTORS, RATE_HZ)
+DESIGN = make_design_matrix(FACTORS, RATE_HZ)
 MIX = (QuantizationNoise(Q=5e-6), AngleRandomWalk(N=1.5e-4), BiasInstability(B=1e-4), RateRandomWalk(K=3e-5))
 
 
@@ -39,10 +39,12 @@ def follow(values, blocks=(1000,)):
 def fresh(window, before):
     """A fit from nothing to the curve of a window; diagonal weights, as at every sample."""
     n = window.samples_in_window
-    table = AxisCovarianceTables(FACTORS, LENGTH).at(0, n, n)
-    slope, slopes = window.slopes_of_axes_and_taus()
-    avar, terms = window.avar(), window.terms()
-    return fit(DESIGN, table, MeasuredCurve(avar, terms, slope * RATE_HZ, slopes * RATE_HZ, before), full=False)
+    table = AxisCovarianceTables(FACTORS, LENGTH).table_of_axis(0, n, n)
+    slope, slopes = window.rate_slopes_per_axis_and_tau()
+    avar, terms = window.avar(), window.term_counts()
+    return fit_coefficients(
+        DESIGN, table, MeasuredCurve(avar, terms, slope * RATE_HZ, slopes * RATE_HZ, before), full_covariance=False
+    )
 
 
 @pytest.mark.long
@@ -50,7 +52,7 @@ def test_it_is_a_fresh_fit_to_a_small_part_of_the_scatter():
     off = []
     for seconds in (40, 70, 150, 210, 390, 600):
         course, window, refit = follow(simulated(round(seconds * RATE_HZ)))
-        value, coefficients = course[-1], fresh(window, refit.entered).coefficients
+        value, coefficients = course[-1], fresh(window, refit.terms_in_fit).coefficients
         both = np.isfinite(value) & np.isfinite(coefficients.value)
         assert both.sum() >= 12
         scatter = (coefficients.hi - coefficients.lo)[both] / 4.0
@@ -87,7 +89,7 @@ def test_a_transient_leaves_nothing_behind():
     course, window, refit = follow(values)
     other, other_window, other_refit = follow(shaken)
     assert other_window.avar() == pytest.approx(window.avar(), rel=1e-9)
-    at_end, expected = fresh(other_window, other_refit.entered), fresh(window, refit.entered)
+    at_end, expected = fresh(other_window, other_refit.terms_in_fit), fresh(window, refit.terms_in_fit)
     assert at_end.coefficients.value[1] == pytest.approx(expected.coefficients.value[1], rel=1e-6)
     assert other[-1, 1] == pytest.approx(course[-1, 1], rel=2e-3)
 
@@ -115,14 +117,14 @@ def test_a_ramp_comes_and_goes_as_a_slope():
     values = simulated(n, RateRamp(R=1e-4))
     course, window, _ = follow(values)
     assert course[-1, 4] == pytest.approx(np.full(6, 1e-4), rel=0.2)
-    np.testing.assert_allclose(course[-1, 4], np.abs(window.slopes_of_axes_and_taus()[0]) * RATE_HZ, rtol=1e-6)
+    np.testing.assert_allclose(course[-1, 4], np.abs(window.rate_slopes_per_axis_and_tau()[0]) * RATE_HZ, rtol=1e-6)
 
 
 def test_samples_that_are_missing_keep_their_place():
     values = simulated(30_000)
     values[12_000:14_000, 2] = np.nan
     course, window, refit = follow(values)
-    expected = fresh(window, refit.entered).coefficients.value[1]
+    expected = fresh(window, refit.terms_in_fit).coefficients.value[1]
     assert course[-1, 1] == pytest.approx(expected, rel=5e-3)
 
 

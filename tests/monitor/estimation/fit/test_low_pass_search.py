@@ -8,7 +8,7 @@ from drivers.data_types import make_block
 from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.analysis import analyze
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.fit.low_pass_search import LowPass, is_seen_in_spectrum, power_spectrum
+from monitor.estimation.fit.low_pass_search import LowPass, is_visible_in_spectrum, power_spectrum
 
 RATE_HZ = 100.0
 N = 1.5e-4
@@ -102,13 +102,13 @@ def test_what_does_not_fall_beyond_the_cutoff_is_no_filter():
 
 def test_a_spectrum_is_asked_by_medians():
     spectrum = power_spectrum(filtered(2, 20.0, 100_000)[:, 0])
-    assert is_seen_in_spectrum(LowPass("digital", 2, 0.2), spectrum)
-    assert not is_seen_in_spectrum(LowPass("digital", 2, 0.05), spectrum)
-    assert not is_seen_in_spectrum(LowPass("digital", 2, 0.001), spectrum)  # lower than any of its bins
+    assert is_visible_in_spectrum(LowPass("digital", 2, 0.2), spectrum)
+    assert not is_visible_in_spectrum(LowPass("digital", 2, 0.05), spectrum)
+    assert not is_visible_in_spectrum(LowPass("digital", 2, 0.001), spectrum)  # lower than any of its bins
     spectrum[700:703] *= 1e6  # a line beyond the cutoff
-    assert is_seen_in_spectrum(LowPass("digital", 2, 0.2), spectrum)
+    assert is_visible_in_spectrum(LowPass("digital", 2, 0.2), spectrum)
     assert power_spectrum(np.zeros(100)).size == 0
-    assert not is_seen_in_spectrum(LowPass("digital", 2, 0.2), power_spectrum(np.zeros(100)))
+    assert not is_visible_in_spectrum(LowPass("digital", 2, 0.2), power_spectrum(np.zeros(100)))
 
 
 def test_a_spectrum_is_that_of_the_samples_there_are():

@@ -10,8 +10,8 @@ import pytest
 from drivers.data_types import AXES, Event
 from monitor.common import topics
 from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan
-from monitor.estimation.allan.hadamard import hadamard_curve
-from monitor.estimation.allan.total import total_curve
+from monitor.estimation.allan.hadamard import compute_hadamard_curve
+from monitor.estimation.allan.total import compute_total_curve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.coefficient_values import SYMBOLS
@@ -251,8 +251,8 @@ def analyzed(**more: Any) -> dict[str, Any]:
     return parsed(
         AnalysisMessage.from_analysis(
             result,
-            total_curve(values, 100.0, theta, np.array([1, 1000, 2900])),
-            hadamard_curve(values, 100.0, theta, np.array([1, 1000])),
+            compute_total_curve(values, 100.0, theta, np.array([1, 1000, 2900])),
+            compute_hadamard_curve(values, 100.0, theta, np.array([1, 1000])),
             compute_dynamic_allan(values, 100.0, 10.0, (0.01, 0.1, 0.2, 0.4, 1.0), step_s=5.0),
         ).encode()
     )
