@@ -15,7 +15,7 @@ import pytest
 import typer
 
 import drivers.decoders
-from drivers import module_lookup as discovery
+from drivers import module_lookup
 from drivers.data_types import EVENT_KINDS, make_block
 from drivers.recordings import FORMATS
 from drivers.zenoh.sample_message import encode_samples
@@ -164,7 +164,7 @@ def test_the_kinds_of_events_are_those_that_a_hook_may_wait_for() -> None:
 
 
 def test_the_protocols_are_those_that_are_decoded() -> None:
-    assert sorted(first_cells(DECODERS.read_text("utf-8"))) == sorted(discovery.list_modules(drivers.decoders))
+    assert sorted(first_cells(DECODERS.read_text("utf-8"))) == sorted(module_lookup.list_modules(drivers.decoders))
 
 
 def test_every_kind_of_recording_is_named() -> None:

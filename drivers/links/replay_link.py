@@ -37,8 +37,7 @@ from drivers.extras import require_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
-from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples
-from drivers.recordings import segment_file as segment
+from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, segment_file
 from drivers.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
@@ -167,7 +166,7 @@ class ReplayLink(PolledLink):
             self.notes = recording.notes
             return _read_messages(recording, self._message_rows(recording))
         if self._kind == "raw":
-            chunks = (chunk for path in _raw_segments(self._path) for chunk in segment.read_chunks(path))
+            chunks = (chunk for path in _raw_segments(self._path) for chunk in segment_file.read_chunks(path))
             return _relative_times(chunks)
         if self._kind == "log":
             return _relative_times(_read_log(self._path, self._settings.channel))
@@ -201,14 +200,14 @@ def _relative_times(chunks: Iterator[Chunk]) -> Generator[TimedChunk]:
 
 
 def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
-    from drivers.links import can_log_reader as can_log
+    from drivers.links import can_log_reader
 
     suffix = _plain_suffix(path)
     with _open_binary(path) as stream:
         if suffix == ".csv" and not _read_header(path).startswith(PYTHON_CAN_HEADER):
-            yield from can_log.read_hex_csv(stream, channel)
+            yield from can_log_reader.read_hex_csv(stream, channel)
         else:
-            yield from can_log.read_can_log(stream, suffix, channel)
+            yield from can_log_reader.read_can_log(stream, suffix, channel)
 
 
 # --- raw bytes -------------------------------------------------------------------------------------
@@ -216,21 +215,21 @@ def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
 
 def _raw_segments(path: Path) -> list[Path]:
     """Return the segment files of a folder, oldest first. For a file, return only the file."""
-    return segment.list_segments(path) if path.is_dir() else [path]
+    return segment_file.list_segments(path) if path.is_dir() else [path]
 
 
 def _is_raw(path: Path) -> bool:
     found = _raw_segments(path)
-    if not found or not segment.NAME.fullmatch(found[-1].name):
+    if not found or not segment_file.NAME.fullmatch(found[-1].name):
         return False
     try:
-        return segment.read_metadata(found[-1]).kind == "raw"
+        return segment_file.read_metadata(found[-1]).kind == "raw"
     except (OSError, RecordingError):
         return False
 
 
 def _raw_carrier(path: Path) -> Carrier:
-    carrier = segment.read_metadata(_raw_segments(path)[-1]).carrier
+    carrier = segment_file.read_metadata(_raw_segments(path)[-1]).carrier
     known: tuple[Carrier, ...] = ("bytes", "frames", "messages")
     for one in known:
         if one == carrier:

@@ -18,6 +18,7 @@ import typer
 
 from monitor.cli import (
     analyze,
+    check,
     compensate,
     demo,
     doctor,
@@ -25,13 +26,12 @@ from monitor.cli import (
     history,
     reconcile,
     run,
+    simulate,
     thermal,
     view,
     warm_up,
     watch,
 )
-from monitor.cli import check as check_config
-from monitor.cli import simulate as simulate_recording
 from monitor.cli.shared.errors import DEBUG, INTERRUPTED, error_message_and_exit_status
 
 # The limits must be set before NumPy is imported. Threads of the linear algebra libraries do not pay off here,
@@ -75,13 +75,13 @@ def _options_of_all_commands(
 for _command in (
     demo.demo,
     run.run,
-    check_config.check,
+    check.check,
     doctor.doctor,
     warm_up.warm_up,
     watch.watch,
     view.view,
     analyze.analyze,
-    simulate_recording.simulate,
+    simulate.simulate,
     reconcile.reconcile,
     compensate.compensate,
     history.history,

@@ -38,8 +38,8 @@ def reconcile(
     from monitor.commands import reconcile as reconciling
     from monitor.noise.model_loading import load_model
     from monitor.publishing.terminal import reconcile_text as text
-    from monitor.reconcile import json_report as report
-    from monitor.reconcile.several_recordings import comparison_json as comparison_report
+    from monitor.reconcile import json_report
+    from monitor.reconcile.several_recordings import comparison_json
 
     last_s = options.parse_duration("--last", last)
     output.check_output_file("--json", json)
@@ -52,12 +52,12 @@ def reconcile(
             if several:
                 every = reconciling.ComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
                 runs = reconciling.compare_recordings(every, tell)
-                data, show = comparison_report.encode_comparison(runs), partial(text.print_comparison, runs)
+                data, show = comparison_json.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
                 one = reconciling.run_reconciliation(
                     reconciling.ReconciliationRequest(recordings[0], tested, out, seed, rate, last_s=last_s), tell
                 )
-                data, show = report.encode_report(one), partial(text.print_reconciliation, one)
+                data, show = json_report.encode_report(one), partial(text.print_reconciliation, one)
     except NotReady:
         if json is not None:
             output.write_file_or_stdout("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")

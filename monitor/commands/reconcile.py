@@ -28,7 +28,7 @@ from monitor.reconcile.json_report import SCHEMA, encode_report
 from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.result import Reconciliation
-from monitor.reconcile.several_recordings import comparison_json as comparison_report
+from monitor.reconcile.several_recordings import comparison_json
 from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare_results
 
 REPORT: Final = "report.json"
@@ -137,7 +137,7 @@ def compare_recordings(request: ComparisonRequest, report_progress: ProgressCall
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
         why = f"at least two recordings are needed for a comparison, but only {len(runs)} can be evaluated: {why}"
-        _write(request.out / REPORT, _encode_failure(why, 0, comparison_report.SCHEMA))
+        _write(request.out / REPORT, _encode_failure(why, 0, comparison_json.SCHEMA))
         raise NotReady(why)
     report_progress("writing", None)
     comparison = compare_results(runs, fitted_to, silent)
@@ -148,7 +148,7 @@ def compare_recordings(request: ComparisonRequest, report_progress: ProgressCall
 def _write_comparison(result: Comparison, folder: Path) -> None:
     from monitor.publishing.reports.comparison_page import render_page
 
-    _write(folder / REPORT, comparison_report.encode_comparison(result))
+    _write(folder / REPORT, comparison_json.encode_comparison(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
     _write(folder / "report.html", render_page(result).encode())
 

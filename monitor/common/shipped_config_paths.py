@@ -4,8 +4,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from drivers import file_access
-from drivers import module_lookup as discovery
+from drivers import file_access, module_lookup
 from drivers.errors import ConfigError
 
 CONFIG_FOLDER: Final = Path(__file__).resolve().parents[2] / "config"
@@ -33,5 +32,5 @@ def resolve_model_path(name: str, folder: Path) -> Path:
         return path
     names = sorted(file.stem for file in models.glob("*.toml"))
     raise ConfigError(
-        f'no model "{name}", neither a file nor one of those shipped{discovery.format_suggestion(name, names)}'
+        f'no model "{name}", neither a file nor one of those shipped{module_lookup.format_suggestion(name, names)}'
     )

@@ -20,7 +20,7 @@ from drivers.errors import ConfigError
 from drivers.links.replay_link import ReplayLink
 from drivers.recordings.segment_file import SegmentMetadata
 from monitor.common.device_health import Health, format_service_status
-from monitor.daemon import config_changes as reload
+from monitor.daemon import config_changes
 from monitor.daemon.command_handler import CommandHandler
 from monitor.daemon.config_changes import ConfigChange
 from monitor.daemon.device.device_worker import DeviceWorker
@@ -223,7 +223,9 @@ class Service:
         """Read the configuration file again, and apply the changes if the file contains no error."""
         self._unit.send_reloading()
         try:
-            change = reload.compare_with_file(self.config, {worker.name: worker.model for worker in self.workers})
+            change = config_changes.compare_with_file(
+                self.config, {worker.name: worker.model for worker in self.workers}
+            )
             built = [self._build_worker(device) for device in change.added]
         except ConfigError as error:
             _log.error("not reloaded, the running configuration stays in force", error=str(error))

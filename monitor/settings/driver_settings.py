@@ -15,8 +15,7 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 import drivers.decoders
 import drivers.links
-from drivers import module_lookup as discovery
-from drivers import number_ranges
+from drivers import module_lookup, number_ranges
 from drivers.decoders.base import AddressFilteringDecoder, Decoder
 from drivers.errors import ConfigError
 from drivers.links.base import AddressFilteringLink, Link, LinkSettings
@@ -116,21 +115,21 @@ def link_settings_class(name: str) -> type[LinkSettings]:
     if name == VIRTUAL:
         return VirtualTable
     if name not in list_link_names():
-        raise ConfigError(f'"{name}"{discovery.format_choices_by_similarity(name, list_link_names())}')
-    settings: type[LinkSettings] = discovery.import_module(drivers.links, name, "_link").Settings
+        raise ConfigError(f'"{name}"{module_lookup.format_choices_by_similarity(name, list_link_names())}')
+    settings: type[LinkSettings] = module_lookup.import_module(drivers.links, name, "_link").Settings
     return settings
 
 
 def list_link_names() -> tuple[str, ...]:
     """Return the names of all links, including the link of a simulated sensor."""
-    return tuple(sorted({*discovery.list_modules(drivers.links, "_link"), VIRTUAL}))
+    return tuple(sorted({*module_lookup.list_modules(drivers.links, "_link"), VIRTUAL}))
 
 
 def default_decoder(link: str) -> str:
     """Return the default decoder of a link, or an empty string if a configuration must name the decoder."""
     if link == VIRTUAL:
         return VIRTUAL_DECODER
-    return str(discovery.import_module(drivers.links, link, "_link").DEFAULT_DECODER)
+    return str(module_lookup.import_module(drivers.links, link, "_link").DEFAULT_DECODER)
 
 
 def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
@@ -156,10 +155,10 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
     if not isinstance(name, str) or name not in list_link_names():
         said = "missing" if name is None else format_value(name)
         problems.append(
-            Problem("link", f"{said}{discovery.format_choices_by_similarity(str(name or ''), list_link_names())}")
+            Problem("link", f"{said}{module_lookup.format_choices_by_similarity(str(name or ''), list_link_names())}")
         )
     else:
-        module = None if name == VIRTUAL else discovery.import_module(drivers.links, name, "_link")
+        module = None if name == VIRTUAL else module_lookup.import_module(drivers.links, name, "_link")
         checked = check_table(link_settings_class(name), keys, folder)
         link = checked.value if isinstance(checked.value, VirtualTable) else _build(module, checked)
         problems += checked.problems
@@ -180,12 +179,12 @@ def _read_decoder(
     name: object, options: object, folder: Path | None, link: tuple[str, str], problems: list[Problem]
 ) -> Decoder | None:
     """Build the decoder for a link, which is given by name and carrier. Append all problems to ``problems``."""
-    known = discovery.list_modules(drivers.decoders)
+    known = module_lookup.list_modules(drivers.decoders)
     if not isinstance(name, str) or name not in known:
         said = format_value(name) if name else "missing"
-        problems.append(Problem("decoder", f"{said}{discovery.format_choices_by_similarity(str(name), known)}"))
+        problems.append(Problem("decoder", f"{said}{module_lookup.format_choices_by_similarity(str(name), known)}"))
         return None
-    module = discovery.import_module(drivers.decoders, name)
+    module = module_lookup.import_module(drivers.decoders, name)
     if not isinstance(options, dict):
         problems.append(Problem("decoder_options", f"expected a table, got {format_value(options)}"))
         return None
@@ -195,7 +194,7 @@ def _read_decoder(
     link_name, carrier = link
     if carrier and _carrier_of(module) not in ("", carrier):
         fitting = ", ".join(
-            one for one in known if _carrier_of(discovery.import_module(drivers.decoders, one)) == carrier
+            one for one in known if _carrier_of(module_lookup.import_module(drivers.decoders, one)) == carrier
         )
         text = f"{name} reads {_carrier_of(module)}, link {link_name} provides {carrier}: possible are {fitting}"
         problems.append(Problem("decoder", text))

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 import drivers.decoders
-from drivers import module_lookup as discovery
+from drivers import module_lookup
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.number_ranges import NumberRange
@@ -35,7 +35,7 @@ LIST_TABLES: Final = ("device", "hook", "device.limit")
 def format_defaults() -> str:
     """Format a configuration file with the keys of all tables, links and decoders."""
     links = [name for name in driver_settings.list_link_names() if name != FIRST_LINK]
-    decoders = [name for name in discovery.list_modules(drivers.decoders) if name != FIRST_DECODER]
+    decoders = [name for name in module_lookup.list_modules(drivers.decoders) if name != FIRST_DECODER]
     top = {key: find_settings_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
     blocks = [
         INTRODUCTION,
@@ -85,10 +85,10 @@ def format_decoder_defaults(name: str) -> str:
     ConfigError
         If no decoder has this name.
     """
-    known = discovery.list_modules(drivers.decoders)
+    known = module_lookup.list_modules(drivers.decoders)
     if name not in known:
-        raise ConfigError(f'"{name}"{discovery.format_choices_by_similarity(name, known)}')
-    settings = discovery.import_module(drivers.decoders, name).Settings
+        raise ConfigError(f'"{name}"{module_lookup.format_choices_by_similarity(name, known)}')
+    settings = module_lookup.import_module(drivers.decoders, name).Settings
     lacking = "" if fields_by_key(settings) else " has no keys"
     return _table(settings, DECODER_TABLE, f'decoder = "{name}"{lacking}')
 

@@ -12,8 +12,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, Strict, ValidationInfo, model_validator
 
-from drivers import file_access, number_ranges
-from drivers import module_lookup as discovery
+from drivers import file_access, module_lookup, number_ranges
 from drivers.data_types import AXES, EVENT_KINDS
 from drivers.decoders.base import Decoder
 from drivers.driver import AxisMap, parse_axis_map
@@ -57,7 +56,7 @@ def select_axes(pattern: str, _: object = None) -> tuple[str, ...]:
     (('gx', 'gy', 'gz'), ('az',))
     """
     if pattern not in AXIS_PATTERNS:
-        raise ConfigError(f'"{pattern}"{discovery.format_choices_by_similarity(pattern, AXIS_PATTERNS)}')
+        raise ConfigError(f'"{pattern}"{module_lookup.format_choices_by_similarity(pattern, AXIS_PATTERNS)}')
     return tuple(axis for axis in AXES if fnmatch(axis, pattern))
 
 
@@ -392,7 +391,7 @@ class ConfigFile(SettingsModel):
         for i, hook in enumerate(self.hooks):
             for name in sorted(hook.devices - set(names)):
                 yield Conflict(
-                    f"hook[{i}].devices", f'"{name}"{discovery.format_choices_by_similarity(name, names)}', places
+                    f"hook[{i}].devices", f'"{name}"{module_lookup.format_choices_by_similarity(name, names)}', places
                 )
             if hook.key is not None and self.zenoh.mode == "none":
                 text = 'zenoh.mode is "none", so the message cannot be published'

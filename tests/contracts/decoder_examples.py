@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from drivers import decoders
-from drivers import module_lookup as discovery
+from drivers import decoders, module_lookup
 from drivers.decoders.base import Decoder
 from tests.support.settings import read_settings
 
@@ -113,7 +112,7 @@ LISTED = (
     Example("samples", {}, 1e-15, 1e-14, 1e-14),
 )
 
-NAMES = discovery.list_modules(decoders)
+NAMES = module_lookup.list_modules(decoders)
 EXAMPLES = tuple(e for e in LISTED if e.name in NAMES) + tuple(
     Example(name) for name in NAMES if name not in {e.name for e in LISTED}
 )

@@ -15,8 +15,7 @@ from typing import Any
 
 import pytest
 
-from drivers import links
-from drivers import module_lookup as discovery
+from drivers import links, module_lookup
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Link, LinkSettings
@@ -43,7 +42,7 @@ class Rig:
 
 
 def build(name: str, **keys: Any) -> Link:
-    module = discovery.import_module(links, name, "_link")
+    module = module_lookup.import_module(links, name, "_link")
     link: Link = module.build(read_settings(module.Settings, keys))
     return link
 
@@ -154,9 +153,9 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
         yield made
 
 
-@pytest.fixture(params=discovery.list_modules(links, "_link"))
+@pytest.fixture(params=module_lookup.list_modules(links, "_link"))
 def module(request: pytest.FixtureRequest) -> ModuleType:
-    return discovery.import_module(links, request.param, "_link")
+    return module_lookup.import_module(links, request.param, "_link")
 
 
 def receive(rig: Rig) -> list[Chunk]:
@@ -175,7 +174,7 @@ def read_on(link: Link) -> None:
 
 
 def test_every_link_has_a_rig() -> None:
-    assert {name.split("-")[0] for name in RIGS} - {"loopback"} == set(discovery.list_modules(links, "_link"))
+    assert {name.split("-")[0] for name in RIGS} - {"loopback"} == set(module_lookup.list_modules(links, "_link"))
 
 
 def test_module_has_settings_build_and_default_decoder(module: ModuleType) -> None:

@@ -13,8 +13,7 @@ import pytest
 from drivers import file_access
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
-from drivers.recordings import load_samples
-from drivers.recordings import segment_file as segment
+from drivers.recordings import load_samples, segment_file
 from drivers.recordings.writing import atomic_write_path
 from drivers.zenoh.session_config import build_session_config
 from monitor.commands import thermal
@@ -108,11 +107,12 @@ def test_a_recording_in_a_folder_is_left_out_with_a_note(kind: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    "read", [segment.read_metadata, segment.read_last_piece, lambda path: list(segment.read_samples(path))]
+    "read",
+    [segment_file.read_metadata, segment_file.read_last_piece, lambda path: list(segment_file.read_samples(path))],
 )
 def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    path = tmp_path / segment.format_segment_name(1, 1.7e9)
+    path = tmp_path / segment_file.format_segment_name(1, 1.7e9)
     make(kind, path)
     with pytest.raises((RecordingError, OSError), match=KINDS[kind]):
         read(path)
@@ -124,9 +124,9 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
         part.write_text("x")
     assert (tmp_path / "a.csv").read_text() == "x"
     pytest.importorskip("pyarrow")
-    path = tmp_path / segment.format_segment_name(1, 1.7e9)
+    path = tmp_path / segment_file.format_segment_name(1, 1.7e9)
     os.mkfifo(path.with_name(path.name + ".part"))
-    segment.SingleSegmentWriter(path, segment.SegmentMetadata("a", "samples")).close()
+    segment_file.SingleSegmentWriter(path, segment_file.SegmentMetadata("a", "samples")).close()
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_what_is_replayed(kind: str, suffix: str, tmp_path: Path) -> None:
 
 def test_a_segment_of_raw_bytes_that_is_replayed(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    os.mkfifo(tmp_path / segment.format_segment_name(1, 1.7e9))
+    os.mkfifo(tmp_path / segment_file.format_segment_name(1, 1.7e9))
     link = replay_link.build(replay_link.Settings(path=str(tmp_path)))
     with pytest.raises(OSError, match="is a FIFO"):
         link.open()

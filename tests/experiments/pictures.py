@@ -35,7 +35,7 @@ import numpy as np
 from drivers.data_types import Floats
 from drivers.recordings import save_samples
 from monitor.commands.reconcile import ReconciliationRequest, run_reconciliation
-from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.common import shipped_config_paths
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import MinuteAggregator
@@ -56,7 +56,7 @@ from monitor.simulator.demo_config import build_demo_config
 from tests.monitor.publishing.made import estimate, true_coefficients
 
 SIZE = (1600, 1000)
-MODEL = shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml"
+MODEL = shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml"
 T0 = 1_763_705_400.0  # Unix s of the first sample: 2025-11-21 06:10 UTC
 HOUR_S = 3600.0
 SPARE_S = 900.0  # of the recording beyond the hour, so that it still runs when the service is stopped
@@ -181,7 +181,7 @@ def temperature(out: Path, folder: Path) -> Path:
     """Show the tab Temperature of two days in which the bias of gz stepped once."""
     path = out / "viewer-temperature.png"
     source = folder / "warm.npz"
-    model = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
+    model = read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
     n = round(WARM_S * WARM_HZ)
     drawn = model.start_stream(WARM_HZ, 1).draw_samples_with_temperature(n)
     save_samples(source, T0 + np.arange(n) / WARM_HZ, drawn.values, drawn.temperature_c)
@@ -202,7 +202,7 @@ def drift(out: Path, folder: Path) -> Path:
     n = round(TURNED_S * 100.0)
     t_s = np.arange(n) / 100.0
     values = (
-        read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
+        read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
         .start_stream(100.0, 1)
         .draw_samples_with_temperature(n)
         .values.copy()
@@ -227,7 +227,7 @@ def compensation(out: Path, folder: Path) -> Path:
     path, source = out / "compensate.png", folder / "still.npz"
     n = 1_080_000
     values = (
-        read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
+        read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
         .start_stream(100.0, 2)
         .draw_samples_with_temperature(n)
         .values

@@ -18,7 +18,7 @@ import numpy as np
 from drivers.data_types import NO_TICK, Chunk, SampleBlock
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import check_folder_or_absent
-from drivers.recordings import segment_file as segment
+from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
 from drivers.recordings.table import PARTIAL_SUFFIX
 from monitor.settings.loading import Storage
@@ -163,13 +163,13 @@ class RecordingTrack:
             self._taken[0] = replace(first, lost=first.lost + dropped)
 
     def _find_newest_row(self) -> _NewestRow | None:
-        for path in reversed(segment.list_segments(self.folder)):
+        for path in reversed(segment_file.list_segments(self.folder)):
             with contextlib.suppress(RecordingError, ConfigError, OSError):  # invalid segments are skipped
                 if self.origin.kind == "raw":
-                    last = deque(segment.read_chunks(path), maxlen=1)
+                    last = deque(segment_file.read_chunks(path), maxlen=1)
                     if last:
                         return _NewestRow(last[0].t_ns)
-                elif (piece := segment.read_last_piece(path)) is not None:
+                elif (piece := segment_file.read_last_piece(path)) is not None:
                     rows = piece.samples
                     span_s = int(rows.t_ns[-1] - rows.t_ns[0]) / 1e9
                     rate_hz = piece.state.rate or ((len(rows) - 1) / span_s if span_s > 0.0 else None)
@@ -248,8 +248,8 @@ class RecordingTrack:
             writer.close_changed_file()
         except OSError as error:
             change = f"{change} ({error.strerror or error})"
-        known = segment.list_segments(self.folder)  # not compressed, because another program may use them
-        self._number = max(self._number or 0, segment.parse_segment_number(known[-1]) if known else 0)
+        known = segment_file.list_segments(self.folder)  # not compressed, because another program may use them
+        self._number = max(self._number or 0, segment_file.parse_segment_number(known[-1]) if known else 0)
         note = f"{writer.path} {change} during recording, with {self._rows} rows in it; a new file is begun"
         self.queue_event("recording_stopped", note)
         self.queue_event("recording_back", "recording continues in a new file")
@@ -274,12 +274,12 @@ class RecordingTrack:
         check_folder_or_absent(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         if self._number is None:
-            known = segment.list_segments(self.folder)
-            self._number = segment.parse_segment_number(known[-1]) if known else 0
+            known = segment_file.list_segments(self.folder)
+            self._number = segment_file.parse_segment_number(known[-1]) if known else 0
             self._finished.extend(known)
             for part in self.folder.glob(f"*{PARTIAL_SUFFIX}"):
                 part.unlink()
-        path = self.folder / segment.format_segment_name(self._number + 1, begin_s)
+        path = self.folder / segment_file.format_segment_name(self._number + 1, begin_s)
         self._writer = self._opening(path, self.origin)
         self._number += 1
         self._begin_s, self._rows = begin_s, 0

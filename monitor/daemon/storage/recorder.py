@@ -22,7 +22,7 @@ from typing import Final
 from drivers.data_types import AXES, Chunk, Ints, SampleBlock, make_block
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError, RecordingError
-from drivers.recordings import segment_file as segment
+from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
@@ -275,7 +275,7 @@ class Recorder:
         while time.monotonic() < until_s and (self._packing is not None or self._finished):
             try:
                 if self._packing is None:
-                    self._packing = segment.compress_segment(self._finished.popleft())
+                    self._packing = segment_file.compress_segment(self._finished.popleft())
                 next(self._packing)
             except StopIteration:
                 self._packing = None
@@ -295,7 +295,7 @@ class Recorder:
 
 
 def segment_metadata(
-    device: str, axes: AxisMap, kind: segment.Kind = "samples", carrier: str = "", decoder: str = ""
+    device: str, axes: AxisMap, kind: segment_file.Kind = "samples", carrier: str = "", decoder: str = ""
 ) -> SegmentMetadata:
     """Return the metadata of the segments of a device.
 

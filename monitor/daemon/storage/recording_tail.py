@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.recordings import segment_file as segment
+from drivers.recordings import segment_file
 from drivers.recordings.segment_file import SegmentMetadata, SegmentPiece
 
 
@@ -22,7 +22,7 @@ class RecordingTail:
         """Yield the recorded pieces of the last ``span_s`` seconds with the same axis mounting, oldest first."""
         begin_ns = int(self.newest.samples.t_ns[-1]) - round(span_s * 1e9)
         for path in self._segments_since(begin_ns):
-            for piece in segment.read_samples(path):
+            for piece in segment_file.read_samples(path):
                 if piece.samples.t_ns[-1] >= begin_ns:
                     yield piece
 
@@ -31,9 +31,9 @@ class RecordingTail:
         chosen: deque[Path] = deque()
         for path in reversed(self.paths):
             try:
-                if segment.read_metadata(path).axes != self.origin.axes:
+                if segment_file.read_metadata(path).axes != self.origin.axes:
                     break
-                first = next(segment.read_samples(path), None)
+                first = next(segment_file.read_samples(path), None)
             except (RecordingError, OSError):
                 continue
             if first is None:
@@ -56,13 +56,13 @@ def read_recording_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail 
     folder : Path
         Folder of the segments.
     """
-    paths = segment.list_segments(folder)
+    paths = segment_file.list_segments(folder)
     while paths:
         path = paths[-1]
         try:
-            if segment.read_metadata(path).axes != origin.axes:
+            if segment_file.read_metadata(path).axes != origin.axes:
                 return None
-            newest = segment.read_last_piece(path)
+            newest = segment_file.read_last_piece(path)
         except (RecordingError, ConfigError, OSError):
             newest = None
         if newest is not None:

@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from drivers.recordings import segment_file as segment
+from drivers.recordings import segment_file
 
 MIN_KEPT_SEGMENTS: Final = 2
 """Number of newest segments in a folder that are kept to rebuild the window."""
@@ -30,10 +30,10 @@ def delete_old_segments(folders: Sequence[Path], keep_s: float, segment_s: float
         Maximum length of a segment in seconds.
     """
     for folder in folders:
-        known = segment.list_segments(folder)
+        known = segment_file.list_segments(folder)
         for at, (path, after) in enumerate(pairwise(known[: 1 - MIN_KEPT_SEGMENTS])):
-            end_s = segment.parse_segment_start_s(after)  # a segment ends at the start of the next segment
-            by_name_s = segment.parse_segment_start_s(known[-1]) - end_s
+            end_s = segment_file.parse_segment_start_s(after)  # a segment ends at the start of the next segment
+            by_name_s = segment_file.parse_segment_start_s(known[-1]) - end_s
             by_number_s = (len(known) - 1 - at) * segment_s
             if min(by_name_s, by_number_s) > keep_s:
                 _delete(path)
@@ -61,8 +61,8 @@ def delete_until_free(disk_folder: Path, segment_folders: Sequence[Path], max_us
     olds: deque[Path] | None = None
     while (taken := used_disk_share(disk_folder)) > max_used_share:
         if olds is None:
-            every = [path for one in segment_folders for path in segment.list_segments(one)[:-MIN_KEPT_SEGMENTS]]
-            olds = deque(sorted(every, key=segment.parse_segment_start_s))
+            every = [path for one in segment_folders for path in segment_file.list_segments(one)[:-MIN_KEPT_SEGMENTS]]
+            olds = deque(sorted(every, key=segment_file.parse_segment_start_s))
         if not olds:
             return (
                 f"{disk_folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * max_used_share:.4g} %, "

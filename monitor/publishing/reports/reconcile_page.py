@@ -11,8 +11,7 @@ from typing import Final
 from drivers.data_types import AXES
 from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
-from monitor.publishing.plots import reconcile_figures as diagnostic_figure
-from monitor.publishing.plots import style
+from monitor.publishing.plots import reconcile_figures, style
 from monitor.publishing.plots.reconcile_figures import diagnostic_comparison_svg, select_diagnostic_view, zoomed_view
 from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
@@ -54,7 +53,7 @@ def render_page(r: Reconciliation, title: str = "") -> str:
         ),
         words=reconcile_sentences,
         effects=EFFECTS,
-        figures=diagnostic_figure,
+        figures=reconcile_figures,
         colours=style,
         snapshots=lambda result: [result.start, *(step.snapshot_after for step in result.steps)],
         pair_scores=_pair_scores,

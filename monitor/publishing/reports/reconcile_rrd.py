@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from monitor.common.units import format_duration
-from monitor.publishing.plots import axis_colours as colours
+from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.reconcile_figures import MAX_MARKERS, DiagnosticPlot, common_y_limits, to_displayed_units
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH, ChartScale, clip_to_box, decade_range, finite_sections
@@ -30,11 +30,11 @@ from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliat
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
 MAX_PLOTTED_DIAGNOSTICS: Final = 2  # largest number of drawn diagnostics per axis
-BAND_COLOUR: Final = colours.blend_colours(colours.FRAME, 0.55)
+BAND_COLOUR: Final = axis_colours.blend_colours(axis_colours.FRAME, 0.55)
 LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
-RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
+RANGE_COLOUR: Final = axis_colours.TEMPERATURE  # orange, as on the HTML page
 GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
-    *(colours.AXIS_COLOURS[axis] for axis in AXES[:3]), colours.TEMPERATURE, (190, 130, 230), (150, 160, 170),
+    *(axis_colours.AXIS_COLOURS[axis] for axis in AXES[:3]), axis_colours.TEMPERATURE, (190, 130, 230), (150, 160, 170),
 )  # fmt: skip
 
 
@@ -169,7 +169,7 @@ def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
         line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.diagnostic_name(lens)])
         stream.log(f"{path}/{lens}", line, static=True)
         _log_by_step(stream, f"{path}/{lens}", [snapshot.get(lens, np.nan) for snapshot in snapshots])
-    line = rr.SeriesLines(colors=[colours.TEXT], widths=[1.0], names=["threshold"])
+    line = rr.SeriesLines(colors=[axis_colours.TEXT], widths=[1.0], names=["threshold"])
     stream.log(f"{path}/threshold", line, static=True)
     _log_by_step(stream, f"{path}/threshold", [1.0] * len(snapshots))
 
@@ -204,12 +204,12 @@ def _log_curves(
     low, high = (scale.to_chart_positions(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     log = partial(stream.log, static=static)
     log(f"{path}/band", fill_band(low, high, BAND_COLOUR))
-    colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart_positions(plot.x, plot.measured))
+    colour, at = axis_colours.AXIS_COLOURS[axis], _inside(scale.to_chart_positions(plot.x, plot.measured))
     log_lines(log, f"{path}/measured", finite_sections(at), [colour], 0.8, 5.0)
     if len(at) <= MAX_MARKERS:
         log(f"{path}/points", rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
     expected = finite_sections(_inside(scale.to_chart_positions(plot.x, plot.expected)))
-    log_lines(log, f"{path}/expected", expected, [colours.TEXT], 1.0, 10.0)
+    log_lines(log, f"{path}/expected", expected, [axis_colours.TEXT], 1.0, 10.0)
 
 
 def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: ChartScale, result: AxisResult, lens: str) -> None:
@@ -227,7 +227,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: ChartScale, 
 
 def _log_grid(stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str) -> None:
     log = partial(stream.log, static=True)
-    key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND_COLOUR)]
+    key = [("measured", axis_colours.AXIS_COLOURS[axis]), ("model", axis_colours.TEXT), ("95 %", BAND_COLOUR)]
     names = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]
     strokes = [np.array([[x - 1.9, -0.42], [x - 1.2, -0.42]]) for x in LEGEND_X]
     log_lines(log, f"{path}/grid/key", strokes, [tint for _, tint in key], 2.0, 30.0)

@@ -15,7 +15,7 @@ from drivers.data_types import AXES, Floats
 from monitor.common.units import DEVIATION_UNITS, KINDS, Kind, axes_of, sensor_kind
 from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.plots import axis_colours as colours
+from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.rerun.allan_chart import (
     FILL_STEPS,
@@ -86,29 +86,29 @@ class AllanPlot:
         ends = [(axis, WIDTH - 2.0 * (len(axes) - 1 - i) - 0.5) for i, axis in enumerate(axes)]
         strokes = [np.array([[x - 1.15, -0.42], [x - 0.5, -0.42]]) for _, x in ends]
         log_lines(
-            self._log, f"{path}/legend/strokes", strokes, [colours.AXIS_COLOURS[axis] for axis in axes], 2.0, 30.0
+            self._log, f"{path}/legend/strokes", strokes, [axis_colours.AXIS_COLOURS[axis] for axis in axes], 2.0, 30.0
         )
         self._log(f"{path}/legend", label_points([(x, -0.85, axis) for axis, x in ends]))
 
     def _draw_curve(self, scale: ChartScale, curve: "_Curve") -> None:
-        path, colour = f"{self._path}/{curve.axis}", colours.AXIS_COLOURS[curve.axis]
+        path, colour = f"{self._path}/{curve.axis}", axis_colours.AXIS_COLOURS[curve.axis]
         low, high, fitted, model, deviation = (
             scale.to_chart_positions(curve.tau, part)
             for part in (curve.lo, curve.hi, curve.fitted, curve.model, curve.deviation)
         )
-        fill = fill_band(low, high, colours.blend_colours(colour, 0.22))
+        fill = fill_band(low, high, axis_colours.blend_colours(colour, 0.22))
         self._log(f"{path}/band", fill)
         log_lines(
             self._log,
             f"{path}/interval",
             list(interval_strokes(low, high)),
-            [colours.blend_colours(colour, 0.6)],
+            [axis_colours.blend_colours(colour, 0.6)],
             0.75,
             5.0,
         )
         log_lines(self._log, f"{path}/fit", finite_sections(fitted), [colour], 1.25, 10.0)
         dashes = [stroke for section in finite_sections(model) for stroke in dash_line(section)]
-        log_lines(self._log, f"{path}/model", dashes, [colours.TEXT], 0.75, 15.0)
+        log_lines(self._log, f"{path}/model", dashes, [axis_colours.TEXT], 0.75, 15.0)
         points = rr.Points2D(deviation, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0)
         self._log(path, points, rr.AnyValues(drop_untyped_nones=True, **curve.si))
 
@@ -166,9 +166,9 @@ def log_grid(
         Further labels, each given by x, y and text.
     """
     lines = chart_grid(scale)
-    log_lines(log, f"{path}/minor", lines.minor, [colours.MINOR], 0.5, -30.0)
-    log_lines(log, f"{path}/major", lines.major, [colours.MAJOR], 0.5, -29.0)
-    log_lines(log, f"{path}/frame", lines.frame, [colours.FRAME], 0.5, -10.0)
+    log_lines(log, f"{path}/minor", lines.minor, [axis_colours.MINOR], 0.5, -30.0)
+    log_lines(log, f"{path}/major", lines.major, [axis_colours.MAJOR], 0.5, -29.0)
+    log_lines(log, f"{path}/frame", lines.frame, [axis_colours.FRAME], 0.5, -10.0)
     log(labels_path, label_points([*lines.ticks, *labels]))
 
 
@@ -215,7 +215,7 @@ def label_points(labels: Sequence[tuple[float, float, str]]) -> rr.Points2D:
     return rr.Points2D(
         [(x, y) for x, y, _ in labels],
         labels=[text for _, _, text in labels],
-        colors=[colours.TEXT],
+        colors=[axis_colours.TEXT],
         radii=[0.0],
         show_labels=True,
     )

@@ -15,7 +15,7 @@ from PIL import Image  # installed with rerun-sdk
 
 from drivers.data_types import AXES, Floats
 from monitor.common.units import format_utc
-from monitor.publishing.plots import axis_colours as colours
+from monitor.publishing.plots import axis_colours
 from monitor.publishing.rerun.allan_drawing import Log, label_points
 from monitor.publishing.rerun.allan_history_table import COLUMNS, AllanHistory
 
@@ -75,13 +75,17 @@ def encode_heat_map(log_ratio: Floats) -> bytes:
     return data.getvalue()
 
 
-def _palette() -> tuple[colours.Colour, ...]:
+def _palette() -> tuple[axis_colours.Colour, ...]:
     """Return blue below the median, vermilion above the median, and black for missing values."""
     below = [
-        colours.blend_colours(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)
+        axis_colours.blend_colours(axis_colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, axis_colours.MINOR)
+        for i in range(SHADES)
     ]
-    above = [colours.blend_colours(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
-    return (*below, *above, colours.BACKGROUND)
+    above = [
+        axis_colours.blend_colours(axis_colours.AXIS_COLOURS["gx"], i / SHADES, axis_colours.MINOR)
+        for i in range(SHADES + 1)
+    ]
+    return (*below, *above, axis_colours.BACKGROUND)
 
 
 PALETTE: Final = _palette()

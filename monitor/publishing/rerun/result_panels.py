@@ -29,11 +29,10 @@ from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.history.history_table import HistoryTable
-from monitor.publishing.plots import axis_colours as colours
+from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.plots.style import omit_wide_intervals
-from monitor.publishing.rerun import allan_drawing, dynamic_heat_map
-from monitor.publishing.rerun import history_points as past_points
+from monitor.publishing.rerun import allan_drawing, dynamic_heat_map, history_points
 from monitor.publishing.rerun.allan_history_table import AllanHistory
 from monitor.publishing.rerun.decimation import average_buckets, decimate_extremes
 from monitor.publishing.rerun.panel_text import drift_text, health_text, noise_text, overview_text
@@ -112,7 +111,7 @@ class Panel:
 
     def _style_samples(self, name: str, axes: Sequence[str]) -> None:
         for axis in axes:
-            line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", colours.AXIS_COLOURS[axis], 1.0)
+            line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", axis_colours.AXIS_COLOURS[axis], 1.0)
             self._style_lines(f"{name}/{axis}", [line])
 
     def _log_samples(self, name: str, axes: Sequence[str], results: "Sequence[SampleRows | CompensatedRows]") -> Floats:
@@ -135,7 +134,7 @@ class SamplesPanel(Panel):
     def log_styles(self) -> None:
         """Log the names, colours and widths of the lines."""
         self._style_samples("samples", AXES)
-        self._style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
+        self._style_lines("temperature", [("temperature, °C", axis_colours.TEMPERATURE, 1.5)])
 
     def draw(self, unix_s: Floats, results: "Sequence[SampleRows]") -> None:
         """Draw samples."""
@@ -149,7 +148,7 @@ class SamplesPanel(Panel):
         """Draw the stored temperature."""
         temperature = history.select_column("temperature")
         if np.isfinite(temperature.last).any():
-            at, values = past_points.history_points(history, temperature, temperature.last, temperature.last)
+            at, values = history_points.history_points(history, temperature, temperature.last, temperature.last)
             self.scene.log_scalars(self.entity_path("temperature"), at, values[:, 0])
 
 
@@ -172,8 +171,11 @@ class DriftPanel(Panel):
         """Log the names, colours and widths of the lines."""
         unit = DEVIATION_UNITS["gyro"].name
         for axis in axes_of("gyro"):
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
-            lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", colours.TEXT, 1.5)]
+            colour, dim = (
+                axis_colours.AXIS_COLOURS[axis],
+                axis_colours.blend_colours(axis_colours.AXIS_COLOURS[axis], 0.45),
+            )
+            lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", axis_colours.TEXT, 1.5)]
             lines += [(f"{axis} 95 % low", colour, 1.0), (f"{axis} 95 % high", colour, 1.0)]
             self._style_lines(f"drift/{axis}", lines)
             self._style_lines(f"innovation/{axis}", [(f"{axis}, σ", colour, 1.0)])
@@ -201,7 +203,7 @@ class DriftPanel(Panel):
         for axis in axes_of("gyro"):
             title = f"{axis}: measured rate, and rate without drift, {SAMPLE_UNITS['gyro'].name}"
             contents = (f"$origin/samples/{axis}", f"$origin/compensated/{axis}")
-            dimmed = {f"/{name}/samples/{axis}": rr.SeriesLines(colors=[colours.FRAME], widths=[0.75])}
+            dimmed = {f"/{name}/samples/{axis}": rr.SeriesLines(colors=[axis_colours.FRAME], widths=[0.75])}
             rates = time_series_view(f"/{name}", title, contents, RAW_SAMPLES_S, styles=dimmed)
             title = f"{axis}: means at rest, and predicted drift, {DEVIATION_UNITS['gyro'].name}"
             drift = time_series_view(f"/{name}/drift/{axis}", title)
@@ -217,9 +219,12 @@ class ThermalPanel(Panel):
     def log_styles(self) -> None:
         """Log the names, colours and widths of the lines."""
         for axis in AXES:
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
+            colour, dim = (
+                axis_colours.AXIS_COLOURS[axis],
+                axis_colours.blend_colours(axis_colours.AXIS_COLOURS[axis], 0.45),
+            )
             unit = DEVIATION_UNITS[sensor_kind(axis)].name
-            lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", colours.TEXT, 1.0)]
+            lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", axis_colours.TEXT, 1.0)]
             self._style_lines(
                 f"thermal/{axis}", [*lines, (f"{axis} 95 % low", dim, 0.75), (f"{axis} 95 % high", dim, 0.75)]
             )
@@ -261,8 +266,8 @@ class GapPanel(Panel):
     def log_styles(self) -> None:
         """Log the names, colours and widths of the lines."""
         for axis in AXES:
-            self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
-        self._style_lines("gap/threshold", [("threshold", colours.blend_colours(colours.TEXT, 0.6), 1.0)])
+            self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", axis_colours.AXIS_COLOURS[axis], 1.5)])
+        self._style_lines("gap/threshold", [("threshold", axis_colours.blend_colours(axis_colours.TEXT, 0.6), 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[ModelComparison]) -> None:
         """Draw comparisons with the noise model."""
@@ -298,7 +303,10 @@ class CoefficientsPanel(Panel):
     def log_styles(self) -> None:
         """Log the names, colours and widths of the lines."""
         for axis in AXES:
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
+            colour, dim = (
+                axis_colours.AXIS_COLOURS[axis],
+                axis_colours.blend_colours(axis_colours.AXIS_COLOURS[axis], 0.45),
+            )
             for symbol in SYMBOLS:
                 unit = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].name
                 lines = [(f"{axis}, {unit}", colour, 2.0), (f"{axis} 95 % low", dim, 0.75)]
@@ -323,7 +331,7 @@ class CoefficientsPanel(Panel):
             for axis in history.list_axes():
                 value, lo, hi = (history.select_column(f"{axis}.{symbol}{end}") for end in ("", ".lo", ".hi"))
                 if np.isfinite(value.last).any():
-                    at, values = past_points.history_points(history, value, lo.last, hi.last)
+                    at, values = history_points.history_points(history, value, lo.last, hi.last)
                     self.log_coefficient(symbol, axis, at, values)
 
     def log_coefficient(self, symbol: str, axis: str, unix_s: Floats, values: Floats, name: str = "") -> None:

@@ -13,7 +13,7 @@ import rerun as rr
 from drivers.data_types import Floats
 from monitor.common.device_health import Health
 from monitor.history.history_table import HistoryTable
-from monitor.publishing.rerun import result_panels as panels
+from monitor.publishing.rerun import result_panels
 from monitor.publishing.rerun.result_panels import Panel
 from monitor.publishing.rerun.shared_views import TIMELINE
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
@@ -21,7 +21,7 @@ from monitor.publishing.result_kinds import RESULT_KINDS, TimedResult
 
 P = TypeVar("P", bound=Panel)
 PANELS: tuple[type[Panel], ...] = tuple(
-    getattr(panels, drawing.panel) for kind in RESULT_KINDS for drawing in kind.drawings
+    getattr(result_panels, drawing.panel) for kind in RESULT_KINDS for drawing in kind.drawings
 )
 """Classes of all panels."""
 
@@ -79,7 +79,7 @@ class Scene:
         results
             At least one result with Unix time [s], in order of time.
         """
-        kind: type[Panel] = getattr(panels, panel)
+        kind: type[Panel] = getattr(result_panels, panel)
         self.get_or_create_panel(device, kind).draw(
             np.array([unix_s for unix_s, _ in results]), [one for _, one in results]
         )

@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.reconcile.likelihood import poisson_steps_vs_random_walk as poisson_steps
+from monitor.reconcile.likelihood import poisson_steps_vs_random_walk
 from monitor.reconcile.likelihood.state_space_comparison import (
     BackgroundNoise,
     EventProcessComparison,
@@ -64,11 +64,13 @@ def compare_poisson_with_single_steps(
     ValueError
         If the series is too short or the background contains no white noise.
     """
-    means, block_s = compute_block_means(y, tau0_s, poisson_steps.choose_block_length_s(y.size * tau0_s, background, K))
+    means, block_s = compute_block_means(
+        y, tau0_s, poisson_steps_vs_random_walk.choose_block_length_s(y.size * tau0_s, background, K)
+    )
     single = _fit_single_steps(
         means, build_state_space_noise(background, block_s, means.size * block_s), max_single_steps
     )
-    return poisson_steps.fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
+    return poisson_steps_vs_random_walk.fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
         single.score, single.times.size
     )
 

@@ -74,8 +74,7 @@ def deadline(seconds: float) -> Iterator[None]:
 def replace_endless_commands() -> None:
     """Let services, ``reconcile`` and long simulations end where their arguments have been accepted."""
     from monitor.cli.shared import service_in_terminal
-    from monitor.commands import reconcile
-    from monitor.commands import simulate as simulate_recording
+    from monitor.commands import reconcile, simulate
     from monitor.publishing.terminal import watch
 
     places: list[tuple[Any, str]] = [
@@ -86,14 +85,14 @@ def replace_endless_commands() -> None:
     ]
     for place, name in places:
         setattr(place, name, _accepted(name))
-    write: Callable[..., None] = simulate_recording._write
+    write: Callable[..., None] = simulate._write
 
-    def write_short(result: simulate_recording.SimulationResult, *rest: Any) -> None:
+    def write_short(result: simulate.SimulationResult, *rest: Any) -> None:
         if result.samples > LONGEST_SIMULATION:
             raise SystemExit(0)
         write(result, *rest)
 
-    simulate_recording._write = write_short
+    simulate._write = write_short
 
 
 def _accepted(name: str) -> Callable[..., None]:

@@ -20,8 +20,7 @@ import pytest
 
 import drivers.decoders
 import drivers.links
-from drivers import module_lookup as discovery
-from drivers import number_ranges
+from drivers import module_lookup, number_ranges
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError
 from drivers.number_ranges import NumberRange
@@ -29,7 +28,7 @@ from drivers.recordings import load_samples
 from drivers.settings_model import KeywordOrType, SettingsModel, fields_by_key
 from monitor import cli
 from monitor.commands.analyze import AnalysisRequest, run_analysis
-from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.common import shipped_config_paths
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
@@ -89,7 +88,7 @@ def leaves(kind: Any) -> Iterator[Any]:
 def arguments(tmp_path: Path) -> dict[tuple[str, ...], list[str]]:
     """Valid arguments of each command, without the options."""
     rng = np.random.default_rng(1)
-    recording, model = tmp_path / "r.npz", str(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
+    recording, model = tmp_path / "r.npz", str(shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
     warm = 25.0 + 5.0 * np.sin(np.arange(2000) / 200.0)
     np.savez(recording, t=np.arange(2000) / 100.0, temperature=warm, **{a: rng.normal(size=2000) for a in AXES})  # type: ignore[arg-type]
     config = tmp_path / "c.toml"
@@ -219,15 +218,15 @@ def key_cases() -> Iterator[tuple[str, type[SettingsModel], str]]:
     ):
         yield (
             DEVICE.format(keys="", driver=driver),
-            discovery.import_module(drivers.links, name, "_link").Settings,
+            module_lookup.import_module(drivers.links, name, "_link").Settings,
             f"link {name}",
         )
-    for name in discovery.list_modules(drivers.decoders):
+    for name in module_lookup.list_modules(drivers.decoders):
         wanted = {"text": 'columns = ["gz"]\n', "dbc": 'file = "canmod_gps"\nsignals = { gz = "ImuData.GyroZ" }\n'}
         driver = f'link = "virtual"\ndecoder = "{name}"\n[device.driver.decoder_options]\n{wanted.get(name, "")}{{}}'
         yield (
             DEVICE.format(keys="", driver=driver),
-            discovery.import_module(drivers.decoders, name).Settings,
+            module_lookup.import_module(drivers.decoders, name).Settings,
             f"decoder {name}",
         )
 

@@ -20,8 +20,7 @@ import zenoh
 from drivers.data_types import make_block
 from drivers.errors import LinkUnavailable
 from drivers.links import serial_link
-from drivers.recordings import load_samples
-from drivers.recordings import segment_file as segment
+from drivers.recordings import load_samples, segment_file
 from drivers.zenoh.sample_message import encode_samples
 from drivers.zenoh.session_config import build_session_config
 from monitor.common import topics
@@ -136,15 +135,15 @@ format = "json"
 
 def numbers(folder: Path) -> list[int]:
     """Numbers of all samples in the recording, in its order."""
-    pieces = [piece for path in segment.list_segments(folder) for piece in segment.read_samples(path)]
+    pieces = [piece for path in segment_file.list_segments(folder) for piece in segment_file.read_samples(path)]
     return [round(value * 1e6) for piece in pieces for value in piece.samples.values[:, 0]]
 
 
 def missing(folder: Path) -> int:
     """Samples that are not in the recording; AssertionError for one kept twice, or missing without being counted."""
     due, total = None, 0
-    for path in segment.list_segments(folder):
-        for piece in segment.read_samples(path):
+    for path in segment_file.list_segments(folder):
+        for piece in segment_file.read_samples(path):
             found = [round(value * 1e6) for value in piece.samples.values[:, 0]]
             if due is not None:
                 assert found[0] - due == piece.samples.lost, f"{path.name}: {found[0]} after {due - 1}"
@@ -163,7 +162,7 @@ def test_two_daemons_on_one_folder_record_each_sample_once(tmp_path: Path) -> No
         with daemons() as running:
             first = Daemon(tmp_path, "first", text)
             running.append(first)
-            eventually(lambda: segment.list_segments(folder / "imu"), "the first records")
+            eventually(lambda: segment_file.list_segments(folder / "imu"), "the first records")
             second = Daemon(tmp_path, "second", text)
             running.append(second)
             held = f"{folder}: in use by process {first.pid}; "

@@ -19,8 +19,7 @@ import numpy as np
 from scipy.signal import welch
 
 from drivers.data_types import AXES, Floats
-from monitor.commands import analyze
-from monitor.commands import simulate as simulate_recording
+from monitor.commands import analyze, simulate
 from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEGREE,
@@ -87,10 +86,8 @@ def sides(recording: Path, model: str, seed: int) -> tuple[Side, Side]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "simulated.npz"
         seconds = estimate.curve.n / estimate.rate_hz
-        simulate_recording.run_simulation(
-            simulate_recording.SimulationRequest(
-                load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model
-            )
+        simulate.run_simulation(
+            simulate.SimulationRequest(load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model)
         )
         simulated = analyze.run_analysis(analyze.AnalysisRequest(out)).analysis
     return Side("recorded", recorded), Side("simulated", simulated)

@@ -23,7 +23,7 @@ import psutil
 
 from drivers.data_types import make_block
 from drivers.decoders import vectornav_binary
-from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.common import shipped_config_paths
 from monitor.noise.model_loading import read_model
 
 WARM_S = 25.0
@@ -55,7 +55,7 @@ class Sensors:
         self.ports = [folder / f"tty{i}" for i in range(count)]
         self._masters = [self._plug(port) for port in self.ports]
         n = round(rate_hz * seconds)
-        model = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
+        model = read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
         values = model.start_stream(float(rate_hz), 1).draw_samples_with_temperature(n).values
         ticks = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
         encoder = vectornav_binary.build(vectornav_binary.Settings())

@@ -26,7 +26,7 @@ from unittest import mock
 
 import numpy as np
 
-from drivers.recordings import segment_file as segment
+from drivers.recordings import segment_file
 from monitor.common.device_health import Health
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.output import Output
@@ -424,9 +424,9 @@ def full_disk(folder: Path, times: int) -> Outcome:
 
 def slow_disk(folder: Path, times: int) -> Outcome:
     """Every batch takes two seconds to write."""
-    write = segment.SingleSegmentWriter.write_samples
+    write = segment_file.SingleSegmentWriter.write_samples
 
-    def slowly(writer: segment.SingleSegmentWriter, *arguments: Any) -> None:
+    def slowly(writer: segment_file.SingleSegmentWriter, *arguments: Any) -> None:
         time.sleep(2.0)
         write(writer, *arguments)
 
@@ -450,7 +450,11 @@ def _storage(folder: Path) -> str:
 
 def _check_recording(store: Path, outcome: Outcome) -> None:
     """All that was received is recorded, and what is missing in it is where it says."""
-    ticks = [piece.samples for path in segment.list_segments(store / "board") for piece in segment.read_samples(path)]
+    ticks = [
+        piece.samples
+        for path in segment_file.list_segments(store / "board")
+        for piece in segment_file.read_samples(path)
+    ]
     rows = sum(len(one) for one in ticks)
     assert rows == outcome.received, f"{rows} rows of {outcome.received} received"
 
@@ -470,8 +474,8 @@ def clock_back(folder: Path, times: int) -> Outcome:
     times_s = np.concatenate(
         [
             piece.samples.t_ns / 1e9
-            for path in segment.list_segments(folder / "store" / "board")
-            for piece in segment.read_samples(path)
+            for path in segment_file.list_segments(folder / "store" / "board")
+            for piece in segment_file.read_samples(path)
         ]
     )
     steps = np.diff(times_s)

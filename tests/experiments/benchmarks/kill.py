@@ -23,8 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.data_types import Floats, Ints
-from drivers.recordings import load_samples
-from drivers.recordings import segment_file as segment
+from drivers.recordings import load_samples, segment_file
 from monitor.history.sqlite_store import open_history
 from monitor.history.time_ranges import TimeRange
 from tests.support.terminal import LineTerminal
@@ -182,8 +181,8 @@ class Bench:
     def ticks(self) -> Ints:
         """The counts in all segments; AssertionError where a file cannot be read or a count does not follow."""
         ticks, lost = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-        for path in segment.list_segments(self.folder / "bench"):
-            for piece in segment.read_samples(path):
+        for path in segment_file.list_segments(self.folder / "bench"):
+            for piece in segment_file.read_samples(path):
                 ticks.append(piece.samples.ticks)
                 lost.append(np.zeros(len(piece.samples), np.int64))
                 lost[-1][0] = piece.samples.lost
@@ -194,18 +193,18 @@ class Bench:
 
     def _batches_s(self) -> tuple[float, ...]:
         """Seconds of samples in each batch of the newest segment, which stands as it was written."""
-        newest = segment.list_segments(self.folder / "bench")[-1]
-        return tuple(len(piece.samples) / RATE for piece in segment.read_samples(newest))
+        newest = segment_file.list_segments(self.folder / "bench")[-1]
+        return tuple(len(piece.samples) / RATE for piece in segment_file.read_samples(newest))
 
     def check_files(self) -> None:
         """Every file with the commands' own reader, and the raw ones."""
-        if segment.list_segments(self.folder / "bench"):
+        if segment_file.list_segments(self.folder / "bench"):
             recording = load_samples(self.folder / "bench")
             left_out = [note for note in recording.notes if "left out" in note]
             assert not left_out, left_out
             assert len(recording) == len(self.ticks())
-        for path in segment.list_segments(self.folder / "bench" / "raw"):
-            assert sum(1 for _ in segment.read_chunks(path)), path
+        for path in segment_file.list_segments(self.folder / "bench" / "raw"):
+            assert sum(1 for _ in segment_file.read_chunks(path)), path
         self._check_history()
 
     def _check_history(self) -> None:
@@ -257,7 +256,7 @@ def main() -> None:
 
 def _tell(kills: list[Kill], bench: Bench, status: int) -> None:
     missing: Floats = np.array([one.missing_s for one in kills])
-    files = len(list(bench.folder.rglob(f"*{segment.SUFFIX}")))
+    files = len(list(bench.folder.rglob(f"*{segment_file.SUFFIX}")))
     print(
         f"{len(kills)} kills, {sum(one.rows > 0 for one in kills)} of them while it recorded, {files} files, all read"
     )

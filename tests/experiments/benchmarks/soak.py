@@ -25,8 +25,8 @@ from drivers.decoders import vectornav_binary
 from drivers.driver import SampleCounts
 from drivers.errors import LinkEnded, LinkLost
 from drivers.links.base import Carrier
-from drivers.recordings import segment_file as segment
-from monitor.common import shipped_config_paths as shipped_file_paths
+from drivers.recordings import segment_file
+from monitor.common import shipped_config_paths
 from monitor.daemon.service import Service
 from monitor.history.sqlite_store import open_history
 from monitor.history.time_ranges import TimeRange
@@ -77,7 +77,7 @@ class Wire:
         self._rate_hz = rate_hz
         self._samples = samples
         self._encoder = vectornav_binary.build(vectornav_binary.Settings())
-        self._stream = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(
+        self._stream = read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(
             rate_hz, 1
         )
         self._rng = np.random.default_rng(1)
@@ -187,8 +187,8 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
     print(f"flipped {truth.flipped}, rubbish {truth.rubbish}: {_sum(counts, truth)} of {truth.sent} sent")
     assert _sum(counts, truth) == truth.sent
     recorded = missing = 0
-    for path in segment.list_segments(store / "soak"):
-        for piece in segment.read_samples(path):
+    for path in segment_file.list_segments(store / "soak"):
+        for piece in segment_file.read_samples(path):
             recorded += len(piece.samples)
             missing += piece.samples.lost
     print(f"recorded {recorded}, missing in the recording {missing}: sum {recorded + missing}")

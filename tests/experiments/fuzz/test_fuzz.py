@@ -7,7 +7,7 @@ import psutil
 import pytest
 
 import drivers.decoders
-from drivers import module_lookup as discovery
+from drivers import module_lookup
 from drivers.data_types import Chunk
 from drivers.decoders.base import FrameBuffer, Frames
 from drivers.recordings import FORMATS
@@ -30,7 +30,9 @@ def _within_limits() -> Iterator[None]:
 
 
 def test_every_reader_has_a_target() -> None:
-    decoders = {f"{kind}-{name}" for kind in ("decoder", "wire") for name in discovery.list_modules(drivers.decoders)}
+    decoders = {
+        f"{kind}-{name}" for kind in ("decoder", "wire") for name in module_lookup.list_modules(drivers.decoders)
+    }
     formats = {f"recording-{suffix[1:].replace('.', '-')}" for suffix in FORMATS}
     assert decoders | formats <= TARGETS.keys()
 

@@ -16,7 +16,7 @@ import pytest
 
 from drivers.data_types import make_block
 from drivers.driver import AxisMap
-from drivers.recordings import segment_file as segment
+from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SingleSegmentWriter
 from monitor.commands import doctor
 from monitor.commands.doctor import (
@@ -267,7 +267,9 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     t_ns = 1_760_000_000_000_000_000 + np.arange(60_000) * 10_000_000 + rng.integers(-1000, 1000, 60_000)
     temperature = np.round(25.0 + 0.01 * rng.standard_normal(60_000), 2)
-    writer = SingleSegmentWriter(tmp_path / segment.format_segment_name(1, 1.76e9), segment_metadata("a", AxisMap()))
+    writer = SingleSegmentWriter(
+        tmp_path / segment_file.format_segment_name(1, 1.76e9), segment_metadata("a", AxisMap())
+    )
     for at in range(0, 60_000, 50):
         rows = slice(at, at + 50)
         ticks = np.arange(at, at + 50) * 10
@@ -275,7 +277,7 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
             [make_block(t_ns[rows].copy(), values[rows].copy(), temperature[rows].copy(), ticks)], DaemonState()
         )
     writer.close()
-    list(segment.compress_segment(writer.path))
+    list(segment_file.compress_segment(writer.path))
     (packed,) = tmp_path.iterdir()
     assert 0.8 * SAMPLE_BYTES < packed.stat().st_size / 60_000 < SAMPLE_BYTES
 

@@ -38,13 +38,13 @@ def test_the_schema_of_a_message_is_that_of_its_topic() -> None:
 
 def test_each_drawing_has_a_panel() -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    from monitor.publishing.rerun import result_panels as panels
+    from monitor.publishing.rerun import result_panels
 
     for kind in RESULT_KINDS:
         for drawing in kind.drawings:
-            panel = getattr(panels, drawing.panel)
-            assert issubclass(panel, panels.Panel)
-            assert panel.draw is not panels.Panel.draw
+            panel = getattr(result_panels, drawing.panel)
+            assert issubclass(panel, result_panels.Panel)
+            assert panel.draw is not result_panels.Panel.draw
 
 
 def test_the_size_of_a_result_is_that_of_its_arrays() -> None:

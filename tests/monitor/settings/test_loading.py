@@ -7,7 +7,7 @@ import pytest
 
 import drivers.decoders
 import drivers.links
-from drivers import module_lookup as discovery
+from drivers import module_lookup
 from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
@@ -541,10 +541,10 @@ def test_examples_are_right(path):
 
 
 def test_every_link_can_be_named():
-    known = {*discovery.list_modules(drivers.links, "_link")}
+    known = {*module_lookup.list_modules(drivers.links, "_link")}
     for name in known:
-        module = discovery.import_module(drivers.links, name, "_link")
-        assert module.DEFAULT_DECODER in ("", *discovery.list_modules(drivers.decoders))
+        module = module_lookup.import_module(drivers.links, name, "_link")
+        assert module.DEFAULT_DECODER in ("", *module_lookup.list_modules(drivers.decoders))
 
 
 # --- words

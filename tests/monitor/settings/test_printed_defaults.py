@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import drivers.decoders
-from drivers import module_lookup as discovery
+from drivers import module_lookup
 from drivers.decoders.dbc.settings import SignalSettings
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
@@ -29,11 +29,11 @@ from monitor.settings.schema import (
 from tests.support.settings import read_settings
 
 LINKS = list_link_names()
-DECODERS = discovery.list_modules(drivers.decoders)
+DECODERS = module_lookup.list_modules(drivers.decoders)
 
 
 def decoder_settings(name: str) -> type[SettingsModel]:
-    settings: type[SettingsModel] = discovery.import_module(drivers.decoders, name).Settings
+    settings: type[SettingsModel] = module_lookup.import_module(drivers.decoders, name).Settings
     return settings
 
 

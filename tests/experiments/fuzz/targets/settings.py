@@ -17,7 +17,7 @@ from drivers.data_types import Chunk
 from drivers.decoders import dbc
 from drivers.errors import ConfigError
 from drivers.settings_model import SettingsModel
-from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.common import shipped_config_paths
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
 from monitor.settings import loading
@@ -29,7 +29,7 @@ from tests.experiments.fuzz.targets.decoders import SECOND_DATABASE, SECOND_SIGN
 from tests.experiments.fuzz.targets.files import folder
 from tests.support.settings import read_settings
 
-CONFIG: Final = shipped_file_paths.CONFIG_FOLDER
+CONFIG: Final = shipped_config_paths.CONFIG_FOLDER
 LINES_AT_MOST: Final = 2000
 
 

@@ -16,13 +16,11 @@ import pytest
 from drivers.data_types import Chunk, SampleBlock, concatenate_blocks, make_block
 from drivers.decoders import text
 from drivers.driver import AxisMap
-from drivers.recordings import load_samples
-from drivers.recordings import segment_file as segment
+from drivers.recordings import load_samples, segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
-from monitor.daemon.storage import device_recording as recording_track
-from monitor.daemon.storage import recorder, retention
+from monitor.daemon.storage import device_recording, recorder, retention
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.settings.loading import Device, Driver, Storage
 from tests.support.loopback_link import LoopbackLink
@@ -41,8 +39,8 @@ def rows(first: int, n: int, lost: int = 0, start_ns: int = START_NS) -> SampleB
     return make_block(start_ns + index * 10_000_000, values, 20.0 + index * 1e-4, index.astype(np.int64), lost)
 
 
-def written(folder: Path) -> list[segment.SegmentPiece]:
-    return [piece for path in segment.list_segments(folder) for piece in segment.read_samples(path)]
+def written(folder: Path) -> list[segment_file.SegmentPiece]:
+    return [piece for path in segment_file.list_segments(folder) for piece in segment_file.read_samples(path)]
 
 
 def all_written(keeper: Recorder) -> None:
@@ -54,7 +52,7 @@ def all_written(keeper: Recorder) -> None:
 def _brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder, "WRITE_INTERVAL_S", 0.02)
     monkeypatch.setattr(recorder, "RETRY_S", 0.1)
-    monkeypatch.setattr(recording_track, "RETRY_S", 0.1)
+    monkeypatch.setattr(device_recording, "RETRY_S", 0.1)
     monkeypatch.setattr(recorder, "DELETE_INTERVAL_S", 0.05)
 
 
@@ -75,7 +73,7 @@ def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
     assert np.abs(got.t_ns - expected.t_ns).max() <= 240
     assert [piece.samples.lost for piece in back if piece.samples.lost] == [10]
     assert back[-1].state == DaemonState(RATE, (None, None, 5.0, None, None, None), 1.0)
-    assert len(segment.list_segments(tmp_path / "bench")) > 1
+    assert len(segment_file.list_segments(tmp_path / "bench")) > 1
     whole = load_samples(tmp_path / "bench")
     np.testing.assert_array_equal(whole.values, expected.values)
     assert not any("not used" in note for note in whole.notes)
@@ -88,7 +86,11 @@ def test_segments_that_have_ended_are_packed_and_say_the_same(tmp_path: Path) ->
     for one in given:
         keeper.queue_samples("bench", one, 0)
         all_written(keeper)
-    packed = lambda: [segment.read_metadata(path).packed for path in segment.list_segments(tmp_path / "bench")]  # noqa: E731
+
+    def packed() -> list[bool]:
+        segments = segment_file.list_segments(tmp_path / "bench")
+        return [segment_file.read_metadata(path).packed for path in segments]
+
     wait_for(lambda: len(packed()) >= 3 and all(packed()[:-1]))
     keeper.close(PATIENCE_S)
     np.testing.assert_array_equal(
@@ -105,57 +107,57 @@ def test_raw_bytes_come_back_as_chunks(tmp_path: Path) -> None:
     given = [Chunk(bytes([i] * (i + 1)), 1000 + i, address=i, attachment=b"a" * (i % 3)) for i in range(50)]
     keeper.queue_chunks("bench", given, offset_ns=START_NS)
     keeper.close(PATIENCE_S)
-    (path,) = segment.list_segments(tmp_path / "bench" / "raw")
-    back = list(segment.read_chunks(path))
+    (path,) = segment_file.list_segments(tmp_path / "bench" / "raw")
+    back = list(segment_file.read_chunks(path))
     assert [(one.data, one.t_ns - START_NS, one.address, one.attachment) for one in back] == [
         (one.data, one.t_ns, one.address, one.attachment) for one in given
     ]
-    assert segment.read_metadata(path).carrier == "bytes"
+    assert segment_file.read_metadata(path).carrier == "bytes"
 
 
 @pytest.mark.parametrize("cut", [1, 7, 200, 1999, 2600])
 def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) -> None:
-    path = tmp_path / segment.format_segment_name(1, 1.7e9)
+    path = tmp_path / segment_file.format_segment_name(1, 1.7e9)
     writer = SingleSegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
     data = path.read_bytes()
     path.write_bytes(data[:-cut])
-    back = concatenate_blocks([piece.samples for piece in segment.read_samples(path)])
+    back = concatenate_blocks([piece.samples for piece in segment_file.read_samples(path)])
     assert len(back) % 10 == 0
     assert len(back) >= 60
     np.testing.assert_array_equal(back.values, rows_of(len(back)))
-    newest = segment.read_last_piece(path)
+    newest = segment_file.read_last_piece(path)
     assert newest is not None
     assert newest.samples.ticks[-1] == len(back) - 1
-    list(segment.compress_segment(path))
+    list(segment_file.compress_segment(path))
     np.testing.assert_array_equal(
-        concatenate_blocks([piece.samples for piece in segment.read_samples(path)]).values, back.values
+        concatenate_blocks([piece.samples for piece in segment_file.read_samples(path)]).values, back.values
     )
 
 
-@pytest.mark.parametrize("read", [segment.read_samples, segment.read_last_piece])
+@pytest.mark.parametrize("read", [segment_file.read_samples, segment_file.read_last_piece])
 def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
 ) -> None:
-    path = tmp_path / segment.format_segment_name(1, 1.7e9)
+    path = tmp_path / segment_file.format_segment_name(1, 1.7e9)
     writer = SingleSegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
-    opened = segment.open_regular_file
+    opened = segment_file.open_regular_file
 
     def open_then_pack(name: Path) -> IO[bytes]:
         file = opened(name)
-        monkeypatch.setattr(segment, "open_regular_file", opened)
-        list(segment.compress_segment(path))
+        monkeypatch.setattr(segment_file, "open_regular_file", opened)
+        list(segment_file.compress_segment(path))
         return file
 
-    monkeypatch.setattr(segment, "open_regular_file", open_then_pack)
+    monkeypatch.setattr(segment_file, "open_regular_file", open_then_pack)
     found = read(path)
-    pieces = [found] if isinstance(found, segment.SegmentPiece) else list(found)  # type: ignore[call-overload]
-    assert segment.read_metadata(path).packed
+    pieces = [found] if isinstance(found, segment_file.SegmentPiece) else list(found)  # type: ignore[call-overload]
+    assert segment_file.read_metadata(path).packed
     assert pieces[-1].samples.ticks[-1] == 99
 
 
@@ -215,7 +217,7 @@ def test_a_disk_that_fails_stops_the_recording_with_an_event_until_it_can_go_on(
 
 
 def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, monkeypatch) -> None:
-    monkeypatch.setattr(recording_track, "MAX_QUEUE_BYTES", 500 * recording_track.SAMPLE_BYTES)
+    monkeypatch.setattr(device_recording, "MAX_QUEUE_BYTES", 500 * device_recording.SAMPLE_BYTES)
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES], Broken)
     keeper.start()
     for first in range(0, 20_000, 2000):
@@ -241,12 +243,12 @@ def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, 
 def test_old_segments_go_when_both_their_names_and_their_number_say_so(tmp_path: Path) -> None:
     folder = tmp_path / "bench"
     folder.mkdir()
-    names = [segment.format_segment_name(i, 1.7e9 + 100.0 * i) for i in range(10)]
+    names = [segment_file.format_segment_name(i, 1.7e9 + 100.0 * i) for i in range(10)]
     for name in names:
         (folder / name).write_bytes(b"x")
     (folder / "notes.txt").write_text("mine")
     retention.delete_old_segments([folder], keep_s=350.0, segment_s=100.0)
-    assert [path.name for path in segment.list_segments(folder)] == names[5:]
+    assert [path.name for path in segment_file.list_segments(folder)] == names[5:]
     assert (folder / "notes.txt").exists()
 
 
@@ -256,9 +258,9 @@ def test_neither_a_clock_set_wrong_nor_many_restarts_delete_what_is_new(tmp_path
     folder.mkdir()
     began = [1.7e9 + step_s * i for i in range(9)] + [1.7e9 + newest_s]
     for i, unix_s in enumerate(began):
-        (folder / segment.format_segment_name(i, unix_s)).write_bytes(b"x")
+        (folder / segment_file.format_segment_name(i, unix_s)).write_bytes(b"x")
     retention.delete_old_segments([folder], keep_s=2000.0 if step_s > 1.0 else 350.0, segment_s=100.0)
-    assert len(segment.list_segments(folder)) == 10
+    assert len(segment_file.list_segments(folder)) == 10
 
 
 def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path, monkeypatch) -> None:
@@ -266,8 +268,8 @@ def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path,
     for at, folder in enumerate(folders):
         folder.mkdir()
         for i in range(5):
-            (folder / segment.format_segment_name(i, 1.7e9 + 100.0 * i + at)).write_bytes(b"x")
-    left = lambda: [len(segment.list_segments(folder)) for folder in folders]  # noqa: E731
+            (folder / segment_file.format_segment_name(i, 1.7e9 + 100.0 * i + at)).write_bytes(b"x")
+    left = lambda: [len(segment_file.list_segments(folder)) for folder in folders]  # noqa: E731
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.1 * sum(left()))
     assert retention.delete_until_free(tmp_path, folders, max_used_share=0.75) == ""
     assert left() == [3, 4]
@@ -429,8 +431,8 @@ def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s:
 
 def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     lived(tmp_path)
-    (tmp_path / "bench" / segment.format_segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
-    (tmp_path / "bench" / segment.format_segment_name(901, 1.8e9)).write_bytes(b"")
+    (tmp_path / "bench" / segment_file.format_segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
+    (tmp_path / "bench" / segment_file.format_segment_name(901, 1.8e9)).write_bytes(b"")
     after = station(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())]))
     after.restore.resume_from(after._recorder.find_recording_tail("bench"))
     after.rebuild_window()
@@ -456,7 +458,7 @@ def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_pat
     first.start()
     wait_for((tmp_path / "recording.lock").exists)
     first.queue_samples("bench", rows(0, 20), 0)
-    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
+    wait_for(lambda: bool(segment_file.list_segments(tmp_path / "bench")))
     second.start()
     wait_for(lambda: "in use" in second.state)
     assert second.state == (
@@ -491,7 +493,7 @@ def test_a_second_recorder_without_counts_goes_on_by_time_and_says_what_is_missi
     first.set_estimate_state("bench", DaemonState(RATE))
     first.start()
     first.queue_samples("bench", uncounted(0, 100), 0)
-    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
+    wait_for(lambda: bool(segment_file.list_segments(tmp_path / "bench")))
     second.start()
     wait_for(lambda: "in use" in second.state)
     second.queue_samples("bench", uncounted(50, 50), 0)  # these are in the recording
@@ -510,9 +512,9 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
     first = Recorder(Storage(folder=tmp_path), [SAMPLES])
     first.start()
     first.queue_samples("bench", rows(0, 100), 0)
-    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
+    wait_for(lambda: bool(segment_file.list_segments(tmp_path / "bench")))
     for i in range(2, 8):
-        (tmp_path / "bench" / segment.format_segment_name(i, 1.0e9)).write_bytes(b"old")
+        (tmp_path / "bench" / segment_file.format_segment_name(i, 1.0e9)).write_bytes(b"old")
     (tmp_path / "bench" / "00000099_x.arrows.part").write_bytes(b"of the first")
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.99)
     monkeypatch.setattr(first, "_delete_old", lambda: None)
@@ -534,14 +536,16 @@ def test_raw_bytes_of_two_recorders_are_kept_once(tmp_path: Path) -> None:
     first, second = (Recorder(Storage(folder=tmp_path), [of]) for _ in range(2))
     first.start()
     first.queue_chunks("bench", given[:60], 0)
-    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench" / "raw")))
+    wait_for(lambda: bool(segment_file.list_segments(tmp_path / "bench" / "raw")))
     second.start()
     wait_for(lambda: "in use" in second.state)
     second.queue_chunks("bench", given[30:], 0)
     first.close()
     wait_for(lambda: second.state == "ok")
     second.close()
-    back = [one for path in segment.list_segments(tmp_path / "bench" / "raw") for one in segment.read_chunks(path)]
+    back = [
+        one for path in segment_file.list_segments(tmp_path / "bench" / "raw") for one in segment_file.read_chunks(path)
+    ]
     assert [one.address for one in back] == list(range(100))
 
 
@@ -582,19 +586,19 @@ def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun
     keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()
     keeper.queue_samples("bench", rows(0, 100), 0)
-    wait_for(lambda: bool(segment.list_segments(folder)))
-    (path,) = segment.list_segments(folder)
+    wait_for(lambda: bool(segment_file.list_segments(folder)))
+    (path,) = segment_file.list_segments(folder)
     tamper(path)
     wait_for(lambda: "ok, but" in keeper.state)
     assert f"{path} was " in keeper.state
     assert "with 100 rows in it; a new file is begun" in keeper.state
     assert [one.kind for one in keeper.take_events()] == ["recording_stopped", "recording_back"]
     keeper.queue_samples("bench", rows(100, 100), 0)
-    wait_for(lambda: any(one != path and one.stat().st_size > 9000 for one in segment.list_segments(folder)))
+    wait_for(lambda: any(one != path and one.stat().st_size > 9000 for one in segment_file.list_segments(folder)))
     keeper.close()
-    newest = segment.list_segments(folder)[-1]
+    newest = segment_file.list_segments(folder)[-1]
     np.testing.assert_array_equal(
-        concatenate_blocks([piece.samples for piece in segment.read_samples(newest)]).ticks, np.arange(100, 200)
+        concatenate_blocks([piece.samples for piece in segment_file.read_samples(newest)]).ticks, np.arange(100, 200)
     )
     match tamper.__name__:
         case "put_another":
@@ -629,9 +633,9 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES])
     keeper.start()
     keeper.queue_samples("bench", rows(0, 100), 0)
-    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
+    wait_for(lambda: bool(segment_file.list_segments(tmp_path / "bench")))
     keeper.close()
-    for name in (segment.format_segment_name(1, 1.0e9), segment.format_segment_name(7, 1.7e9)):
+    for name in (segment_file.format_segment_name(1, 1.0e9), segment_file.format_segment_name(7, 1.7e9)):
         path = tmp_path / "bench" / name
         match kind:
             case "fifo":
@@ -647,7 +651,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
     assert len(list(tail.read_pieces(10.0))) == 1
     again.start()
     again.queue_samples("bench", rows(100, 100), 0)
-    wait_for(lambda: segment.parse_segment_number(segment.list_segments(tmp_path / "bench")[-1]) == 8)
+    wait_for(lambda: segment_file.parse_segment_number(segment_file.list_segments(tmp_path / "bench")[-1]) == 8)
     again.close()
     assert again.state == "ok"
 
@@ -666,7 +670,7 @@ def test_something_else_in_place_of_the_folder_is_said_until_it_is_gone(tmp_path
 
 
 def test_a_folder_that_cannot_be_used_costs_only_what_has_no_room_in_memory(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(recording_track, "MAX_QUEUE_BYTES", 500 * recording_track.SAMPLE_BYTES)
+    monkeypatch.setattr(device_recording, "MAX_QUEUE_BYTES", 500 * device_recording.SAMPLE_BYTES)
     (tmp_path / "store").write_text("in the way")
     keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()

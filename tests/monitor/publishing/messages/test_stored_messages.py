@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from monitor.publishing.messages import analysis_json as analysis
-from monitor.publishing.messages import message
+from monitor.publishing.messages import analysis_json, message
 from monitor.publishing.messages.history import MAX_HISTORY_BYTES
 from monitor.publishing.messages.results import ReconcileReply
 from tests.monitor.publishing.messages.made_messages import EXAMPLES, UNIX_S, messages
@@ -39,4 +38,8 @@ def test_every_example_is_compared() -> None:
 
 
 def test_the_schema_of_an_analysis_is_its_tag() -> None:
-    assert json.loads(stored("analyze"))["schema"] == json.loads(stored("analyze_failed"))["schema"] == analysis.SCHEMA
+    assert (
+        json.loads(stored("analyze"))["schema"]
+        == json.loads(stored("analyze_failed"))["schema"]
+        == analysis_json.SCHEMA
+    )

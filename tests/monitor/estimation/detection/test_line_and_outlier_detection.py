@@ -6,7 +6,7 @@ from scipy.signal import butter, lfilter
 
 from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.detection import line_and_outlier_detection as line_detection
+from monitor.estimation.detection import line_and_outlier_detection
 from monitor.estimation.detection.line_and_outlier_detection import (
     BLOCK,
     MAX_MISSING_SHARE,
@@ -19,7 +19,7 @@ from monitor.estimation.detection.line_and_outlier_detection import (
 )
 
 RATE_HZ = 100.0
-FEWEST = line_detection.MIN_ROWS * MIN_STRETCHES
+FEWEST = line_and_outlier_detection.MIN_ROWS * MIN_STRETCHES
 """Samples with which there is a spectrum."""
 
 
@@ -95,10 +95,12 @@ def test_what_adds_less_than_matters_is_not_told():
     assert found(weak) == []
     # clear enough to be found, and left out for its share alone
     parts = [
-        line_detection._filled(part)
-        for part in line_detection._stretches(strong[:, 1], np.zeros(600_000, bool), ROWS, 128)
+        line_and_outlier_detection._filled(part)
+        for part in line_and_outlier_detection._stretches(strong[:, 1], np.zeros(600_000, bool), ROWS, 128)
     ]
-    assert len(line_detection._peaks(line_detection._spectrum(np.stack(parts)), len(parts))) == 1
+    assert (
+        len(line_and_outlier_detection._peaks(line_and_outlier_detection._spectrum(np.stack(parts)), len(parts))) == 1
+    )
     quiet = curve_of(strong)
     quiet.avar[:] *= 2.0 * line.share / MIN_LINE_SHARE
     assert detect_spectral_lines(strong, np.zeros(600_000, bool), RATE_HZ, quiet) == []
@@ -109,7 +111,7 @@ def test_the_strongest_of_an_axis_come_first_and_no_more_than_three():
     for hz, amplitude in ((7.0, 1e-3), (11.0, 3e-3), (23.0, 2e-3), (37.0, 1.5e-3)):
         values[:, 4] += amplitude * np.sin(2.0 * np.pi * hz * np.arange(60_000) / RATE_HZ)
     told = found(values)
-    assert [line.axis for line in told] == [4] * line_detection.MAX_LINES
+    assert [line.axis for line in told] == [4] * line_and_outlier_detection.MAX_LINES
     assert sorted(told, key=lambda line: -line.share) == told
     assert told[0].frequency_hz == pytest.approx(11.0, abs=0.02)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from monitor.reconcile.likelihood import poisson_steps_vs_single_steps as single_steps
+from monitor.reconcile.likelihood import poisson_steps_vs_single_steps
 from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
 from monitor.reconcile.likelihood.state_space_comparison import (
     BackgroundNoise,
@@ -32,7 +32,7 @@ def test_every_shock_gains_what_a_regression_gains(short):
     free = np.zeros(M)
     free[known] = 1e4
     covariance += 1e4 * np.outer(np.arange(M) >= known, np.arange(M) >= known)
-    scores = single_steps._shock_statistics(means, around, 50.0, free)
+    scores = poisson_steps_vs_single_steps._shock_statistics(means, around, 50.0, free)
     for k in (3, 17, 39, 55):
         step = (np.arange(M) >= k).astype(float)
         solved = np.linalg.solve(covariance, np.column_stack([step, means]))
@@ -43,7 +43,7 @@ def test_whitened_columns_have_the_dense_likelihood(short):
     means, covariance = short
     around = build_state_space_noise(REST, BLOCK_S, M * BLOCK_S)
     columns = np.column_stack([means, np.arange(M) >= 20.0])
-    logs = single_steps._whiten(columns, around, 50.0)
+    logs = poisson_steps_vs_single_steps._whiten(columns, around, 50.0)
     assert -0.5 * (logs + columns[:, 0] @ columns[:, 0]) == pytest.approx(
         multivariate_normal.logpdf(means, cov=covariance)
     )
@@ -61,7 +61,9 @@ def test_finds_times():
     y = stepped(times, heights, np.random.default_rng(0))
     means, block_s = compute_block_means(y, TAU0_S, 5.0)
     noise = build_state_space_noise(BackgroundNoise(N * N), block_s, means.size * block_s)
-    assert single_steps._fit_single_steps(means, noise, 5).times * block_s == pytest.approx(times, abs=3.0)
+    assert poisson_steps_vs_single_steps._fit_single_steps(means, noise, 5).times * block_s == pytest.approx(
+        times, abs=3.0
+    )
     found = compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5)
     assert found.single_steps == 3
     assert found.gain < 2.0
@@ -98,7 +100,7 @@ def test_steps_stay_apart_in_neighbouring_blocks():
     """A climb in two blocks side by side: times are refined without ever meeting, where no height could be told."""
     means = np.where(np.arange(M) < 30, 0.0, np.where(np.arange(M) < 31, 20.0, 60.0)) - 29.0
     means = means + 0.1 * np.random.default_rng(0).standard_normal(M)
-    found = single_steps._fit_single_steps(
+    found = poisson_steps_vs_single_steps._fit_single_steps(
         means, build_state_space_noise(BackgroundNoise(0.03), BLOCK_S, M * BLOCK_S), 2
     )
     assert found.times.size == 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from monitor.reconcile.likelihood import poisson_steps_vs_random_walk as poisson_steps
+from monitor.reconcile.likelihood import poisson_steps_vs_random_walk
 from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
 from monitor.reconcile.likelihood.state_space_comparison import (
     BackgroundNoise,
@@ -43,7 +43,7 @@ def enumerated(means, covariance):
 
 def likelihood(means, rest, rate, height, start):
     around = build_state_space_noise(rest, BLOCK_S, means.size * BLOCK_S)
-    return poisson_steps._log_likelihood(means, around, start, rate * BLOCK_S, height)
+    return poisson_steps_vs_random_walk._log_likelihood(means, around, start, rate * BLOCK_S, height)
 
 
 @pytest.mark.parametrize("rest", [BackgroundNoise(1.0), BackgroundNoise(1.0, walk=0.02, correlated=((1.0, 30.0),))])

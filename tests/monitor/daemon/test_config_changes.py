@@ -17,7 +17,7 @@ from structlog.testing import capture_logs
 
 from drivers.data_types import Event
 from drivers.errors import ConfigError
-from monitor.daemon import config_changes as reload
+from monitor.daemon import config_changes
 from monitor.daemon.output import Output
 from monitor.daemon.result_outputs import TableOutput
 from monitor.daemon.service import Service
@@ -40,13 +40,13 @@ def device(name: str, extra: str = "", driver: str = "") -> str:
     )
 
 
-def changed(folder: Path, before: str, after: str) -> reload.ConfigChange:
+def changed(folder: Path, before: str, after: str) -> config_changes.ConfigChange:
     path = folder / "c.toml"
     path.write_text(before)
     config = loading.load_config(path)
     models = {one.name: None if one.model is None else read_model(one.model) for one in config.devices}
     path.write_text(after)
-    return reload.compare_with_file(config, models)
+    return config_changes.compare_with_file(config, models)
 
 
 def test_devices_are_compared_as_they_stand_in_the_file(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_a_model_that_reads_otherwise_begins_its_device_anew(tmp_path: Path) -> 
     path = tmp_path / "c.toml"
     config, models = loading.load_config(path), {"a": read_model(model)}
     model.write_text("sample_rate = 100.0\n[gz.angle_random_walk]\nN = 2e-4\n")
-    assert reload.compare_with_file(config, models).describe_changes() == "restarted: a"
+    assert config_changes.compare_with_file(config, models).describe_changes() == "restarted: a"
 
 
 def test_what_only_a_restart_makes_hold_is_said_again_and_again(tmp_path: Path) -> None:
@@ -78,9 +78,9 @@ def test_what_only_a_restart_makes_hold_is_said_again_and_again(tmp_path: Path) 
     assert change.restart == ("zenoh", "log.format")
     assert change.config.zenoh.mode == "none"
     assert change.config.log.level == "debug"
-    assert reload.compare_with_file(change.config, {"a": None}).restart == ("zenoh", "log.format")
+    assert config_changes.compare_with_file(change.config, {"a": None}).restart == ("zenoh", "log.format")
     (tmp_path / "c.toml").write_text(device("a") + QUIET)
-    assert reload.compare_with_file(change.config, {"a": None}).restart == ()
+    assert config_changes.compare_with_file(change.config, {"a": None}).restart == ()
 
 
 @pytest.mark.parametrize(
@@ -285,4 +285,4 @@ def test_a_fifo_in_place_of_the_file_is_not_waited_for_and_another_folder_needs_
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(ConfigError, match=r"c.toml: cannot be read: is a FIFO, not a regular file"):
-        reload.compare_with_file(change.config, {"a": None})
+        config_changes.compare_with_file(change.config, {"a": None})

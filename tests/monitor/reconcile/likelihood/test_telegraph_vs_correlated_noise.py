@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from monitor.reconcile.likelihood import telegraph_vs_correlated_noise as random_telegraph
+from monitor.reconcile.likelihood import telegraph_vs_correlated_noise
 from monitor.reconcile.likelihood.state_space_comparison import (
     BackgroundNoise,
     build_state_space_noise,
@@ -55,7 +55,7 @@ def short(rest, m, seed, start=0.0):
 
 def likelihood(means, rest, start):
     around = build_state_space_noise(rest, BLOCK_S, means.size * BLOCK_S)
-    return random_telegraph._log_likelihood(means, around, start, A, BLOCK_S / DWELL)
+    return telegraph_vs_correlated_noise._log_likelihood(means, around, start, A, BLOCK_S / DWELL)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -158,9 +158,11 @@ def test_blocks_follow_the_correlation_time():
     means, block_s = compute_block_means(
         np.random.default_rng(0).standard_normal(HOUR),
         TAU0_S,
-        random_telegraph._choose_block_length_s(3600.0, TAU0_S, 8.0, 4.0),
+        telegraph_vs_correlated_noise._choose_block_length_s(3600.0, TAU0_S, 8.0, 4.0),
     )
     assert (means.size, block_s) == (3600, pytest.approx(1.0))
-    assert random_telegraph._choose_block_length_s(3600.0, TAU0_S, 5000.0, 100.0) == pytest.approx(18.0)
-    assert random_telegraph._choose_block_length_s(3600.0, TAU0_S, 64.0, 2.0) == pytest.approx(2.0)
-    assert random_telegraph._choose_block_length_s(3600.0, TAU0_S, 64.0, 1e-3) == pytest.approx(20 * TAU0_S)
+    assert telegraph_vs_correlated_noise._choose_block_length_s(3600.0, TAU0_S, 5000.0, 100.0) == pytest.approx(18.0)
+    assert telegraph_vs_correlated_noise._choose_block_length_s(3600.0, TAU0_S, 64.0, 2.0) == pytest.approx(2.0)
+    assert telegraph_vs_correlated_noise._choose_block_length_s(3600.0, TAU0_S, 64.0, 1e-3) == pytest.approx(
+        20 * TAU0_S
+    )
