@@ -9,8 +9,8 @@ from monitor.common.device_health import Health
 class Output:
     """Receiver of the results of all devices. Subclasses override methods, which must not block.
 
-    All times are on the timeline of the samples, which may differ from the host clock by years. Before the first sample
-    of such a device, the present time is unknown, and no event is published.
+    All times are on the timeline of the samples. For a recording, the timeline may differ from the host clock by years,
+    and the present time is unknown before the first sample.
 
     Parameters
     ----------
@@ -44,4 +44,4 @@ class Output:
         """Publish the status of the device once a second; ``unix_s`` is None if the present time is unknown."""
 
     def remove_device(self, device: str) -> None:
-        """Remove the data of a device that is no longer configured."""
+        """Remove the data of a device that was removed from the configuration."""

@@ -74,7 +74,7 @@ class ResultPublisher:
         """True while coefficients are withheld because the sample rate is uncertain."""
         self._agreement = ModelAgreementMonitor()
         self._batch: list[SampleBlock] = []  # samples that are not published yet
-        self._refitted = False  # True if the fit was updated since the last publication
+        self._refitted = False  # True if the fit has been updated since the last publication
 
     def publish_events(self, events: Sequence[Event]) -> None:
         """Publish events to all outputs."""

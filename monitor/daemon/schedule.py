@@ -1,4 +1,4 @@
-"""Times at which the periodic tasks of a device are due."""
+"""Schedule of the periodic tasks of a device."""
 
 from typing import Literal
 
@@ -26,11 +26,11 @@ class Schedule:
         self._now_s, self._drain = now_s, drain
 
     def is_due(self, task: Task) -> bool:
-        """Return True if a task is due in this round."""
+        """Return True if a task is due in the current round."""
         return self._now_s >= self._next_s.get(task, 0.0)
 
     def claim_if_due(self, task: Task, interval_s: float) -> bool:
-        """Return True if a task must run in this round, and schedule the next run.
+        """Return True if a task must run in the current round, and schedule the next run.
 
         Parameters
         ----------
@@ -46,5 +46,5 @@ class Schedule:
         return True
 
     def postpone(self, task: Task, delay_s: float) -> None:
-        """Postpone a task until at least ``delay_s`` seconds after the beginning of this round."""
+        """Postpone a task until at least ``delay_s`` seconds after the start of the current round."""
         self._next_s[task] = max(self._next_s.get(task, 0.0), self._now_s + delay_s)

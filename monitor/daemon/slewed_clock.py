@@ -36,12 +36,9 @@ class SlewedClock:
     """
 
     def __init__(self, monotonic_ns: int, unix_ns: int) -> None:
-        self._host_ns = (
-            unix_ns - monotonic_ns
-        )  # offset of the host clock at the last call of ``slew_and_return_host_step``
+        self._host_ns = unix_ns - monotonic_ns  # latest offset of the host clock
         self._slewed_at_ns = monotonic_ns
-        # [n, 3] start of each correction, offset at the start, and remaining correction. The array is replaced, never
-        # changed in place, because the reader threads use it as well.
+        # [n, 3] start, initial offset and remaining correction of each slew; replaced as a whole for the reader threads
         self._knots: Ints = np.array([[monotonic_ns, self._host_ns, 0]], np.int64)
 
     @property

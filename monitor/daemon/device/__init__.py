@@ -1,1 +1,1 @@
-"""One device of the daemon: its worker thread, processing pipeline and status."""
+"""Worker thread, processing pipeline and status of a device."""

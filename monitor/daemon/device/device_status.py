@@ -80,7 +80,7 @@ class DeviceStatus:
         return lacking or driver.late_frames_hint or self._publisher.timeline.host_clock_offset_text()
 
     def _missing_estimate_text(self) -> str:
-        """Return the reason why coefficients cannot be estimated, or "" if they can."""
+        """Return the reason why coefficients cannot be estimated, or ""."""
         clock = self._driver.clock
         measured_hz = clock.contradicting_rate_hz
         if measured_hz is not None:

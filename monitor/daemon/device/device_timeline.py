@@ -1,8 +1,8 @@
 """Timeline of the samples of one device: Unix time, present time, and events that wait for a time.
 
 The samples of a live sensor carry host monotonic times, which ``SlewedClock`` converts to Unix time. The samples of a
-recording, or of a device with its own time stamps, carry Unix times. For such a device, events wait for the first
-sample, because the present time on the timeline is unknown before.
+recording, or of a device with its own time stamps, carry Unix times. Events of a recording wait for the first sample,
+because the present time is unknown before the first sample.
 """
 
 import time

@@ -118,7 +118,7 @@ class DevicePipeline:
         return bool(self._pieces)
 
     def process_blocks(self, blocks: Sequence[SampleBlock], rate_hz: float | None, drain: bool) -> None:
-        """Process blocks of samples. While the sample rate is unknown, the samples are discarded.
+        """Process blocks of samples. Samples are discarded while the sample rate is unknown.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ class DevicePipeline:
             self.since_ns = [self.newest_ns + 1] * len(AXES)
 
     def refine_rate(self, rate_hz: float) -> None:
-        """Set the sample rate to a more accurate value."""
+        """Replace the sample rate of all stages by a more accurate value."""
         if self.estimator is None or rate_hz == self.estimator.rate_hz:
             return
         self.estimator.refine_rate(rate_hz)
@@ -226,7 +226,7 @@ class DevicePipeline:
     # --- private methods
 
     def _create_estimator(self, rate_hz: float) -> bool:
-        """Create the estimator for a sample rate; return False if this is not possible."""
+        """Create the estimator for a sample rate; return False if the settings do not allow an estimate."""
         if self.refusal_reason or not self.required_kernels_ready(rate_hz):
             return False
         device = self._device

@@ -61,7 +61,7 @@ class SystemdNotifier:
         return cls(address if known else "", int(usec) / 1e6 if known and watched else None)
 
     def send_ready(self) -> None:
-        """Send the message that the service has started or has finished a reload."""
+        """Send the message that the service has started or that a reload has finished."""
         self.ready_sent = True
         self._send("READY=1")
 

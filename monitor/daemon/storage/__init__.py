@@ -1,1 +1,1 @@
-"""Recorder of the service, and retention of its recordings."""
+"""Recording of samples to segment files, and deletion of old segments."""

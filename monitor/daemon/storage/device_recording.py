@@ -102,10 +102,10 @@ class RecordingTrack:
         self._dropped = 0  # rows that are missing before the oldest row in the queue
         self._taken: list[SampleBlock | Chunk] = []  # taken from the queue and being written
         self._writer: SingleSegmentWriter | None = None
-        self._begin_s = 0.0  # Unix time of the open segment's first row
+        self._begin_s = 0.0  # Unix time of the first row in the open segment
         self._number: int | None = None  # number of the newest segment, or None if it is unknown
         self._rows = 0  # rows or chunks in the open segment
-        self._unsynced = False  # True if rows were written since the last flush to disk
+        self._unsynced = False  # True if rows have been written since the last flush
         self._stopped_s = 0.0  # monotonic time of the last failure
 
     # --- queue

@@ -17,8 +17,7 @@ def delete_old_segments(folders: Sequence[Path], keep_s: float, segment_s: float
     """Delete segments that ended more than ``keep_s`` seconds before the start of the newest segment.
 
     Two estimates of the age must both exceed ``keep_s``: the difference of the times in the file names, and
-    ``segment_s`` times the number of later segments. The second estimate protects segments after an error of the host
-    clock.
+    ``segment_s`` times the number of later segments. The second estimate protects segments if the host clock was wrong.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ LANES: Final = 512
 
 
 def overlapping_avar(values: Floats, factors: Ints, map_axes: EachAxis = map) -> tuple[Floats, Ints]:
-    """Return the overlapping Allan variance of rates and the number of terms.
+    """Return the overlapping Allan variance of rates and the number of second differences.
 
     NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C). Here x is phase, and C is the
     number of second differences (terms). The unit of time is the sample interval. Second differences that contain a

@@ -179,7 +179,7 @@ def _squares(points: Floats, signs: Floats) -> Floats:
 
 
 def _covariance(n: int, m: int) -> Floats:
-    """Return the quadratic form [5, 5] that gives the variance of the total variance.
+    """Return the matrix [5, 5] of the quadratic form in θ for the variance of the total variance.
 
     Longer recordings use a coarse grid, because the autocovariances are smooth. If a recording contains many clusters,
     each additional second difference adds the same amount to the sums.
@@ -201,8 +201,8 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
     """Return the sums [5, 5] of the products of covariances over all pairs of second differences.
 
     The phase is sampled every ``step`` samples, so each pair represents step² pairs. The covariance of quantization
-    noise is nonzero only if phase points coincide, so each such pair represents ``step`` pairs. The two ends of the
-    recording are exceptions, because all reflected second differences contain an end point.
+    noise is nonzero only if phase points coincide, so each pair of coinciding points represents ``step`` pairs. The two
+    ends of the recording are exceptions, because all reflected second differences contain an end point.
     """
     at = np.arange(n + 1)
     lags = phase_autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]

@@ -151,12 +151,12 @@ class AllanWindow:
 
     @property
     def samples_in_window(self) -> int:
-        """Number of samples in the window, including missing ones."""
+        """Number of samples in the window, including missing samples."""
         return min(int(self._state[TOTAL]), self.length)
 
     @property
     def samples_since_reset(self) -> int:
-        """Number of samples since the last reset, including missing ones."""
+        """Number of samples since the window was emptied, including missing samples."""
         return int(self._state[TOTAL])
 
     def discard_samples(self) -> None:

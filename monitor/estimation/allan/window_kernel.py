@@ -104,7 +104,7 @@ def append_staged_samples(
     n : int
         Number of rows.
     """
-    # One statement, because each access to a field changes a reference count.
+    # A single assignment, because each access to a field of a named tuple changes a reference count.
     state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = compiled_view_window_arrays(
         ints, floats, missing, taus
     )
@@ -177,7 +177,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
             phase[now + lane] = phase[before + lane]
             count = missing[before + lane] + 1
             state[LAST_MISSING] = state[TOTAL]
-        if missing[now + lane] != count:  # The memory of zeros is not allocated until it is written.
+        if missing[now + lane] != count:  # Zeros are not written, to save memory.
             missing[now + lane] = count
 
 

@@ -73,7 +73,7 @@ def confidence_interval_end(estimate: float, c0: float, c1: float, c2: float, z:
 def limit_terms_by_measured_avar(
     avar: Floats, edf: Floats, rows: Ints, unit_avar: Floats, filter_memory: int, terms: TermResults
 ) -> None:
-    """Limit each coefficient so that no term exceeds a measured Allan variance.
+    """Limit each coefficient so that the contribution of the term exceeds no measured Allan variance.
 
     N is only limited at τ of more than ``filter_memory`` samples, because a filter in the sensor may have removed white
     noise at shorter τ.

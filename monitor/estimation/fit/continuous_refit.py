@@ -11,8 +11,7 @@ The weights and the selection of terms are recomputed in each of the following c
 - The window has grown by a tenth, or half of the window has been replaced.
 
 Outdated weights increase the error of a coefficient by at most 2 %. To recompute the weights of an axis, the kernel
-returns, and Python calls ``fit_axes``. A call of ``fit_axes`` from the kernel would compile that function a second
-time.
+returns, and Python calls ``fit_axes``. A call from the kernel would compile ``fit_axes`` a second time.
 
 The result contains Q N B K R for every sample, with NaN for coefficients that are not estimated. Confidence intervals
 are only computed by ``Estimator.get_estimate``.
@@ -134,7 +133,7 @@ class ContinuousRefit:
         Returns
         -------
         ndarray of float64, shape (n, 5, 6)
-            Coefficients in SI; NaN where not estimated.
+            Coefficients in SI; NaN for coefficients that are not estimated.
         """
         coefficients = np.empty((len(samples), 5, AXES))
         for start in range(0, len(samples), STAGE_SAMPLES):
@@ -193,7 +192,7 @@ def _follow(
     w = compiled_view_window_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
     curves, output, maps, ages = state
     ints, floats, missing, taus, window = buffers
-    # Local names, because each access to a field in a loop changes a reference count.
+    # Local variables, because each access to a field in a loop changes a reference count.
     counters, phase, scaling, terms, slope = w.state, w.phase, w.scaling, curves.terms, curves.slope
     used, free, misfit, theta, status = maps.used, maps.free, output.misfit, output.theta, output.status
     right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
@@ -246,7 +245,7 @@ def _copy_curve(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, a
 @inlined
 def _project(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, maps: SolutionMaps, right: Floats) -> None:
     lanes = np.uintp(LANES)  # unsigned, because checks for negative indices would be slow
-    # Local names, because each access to a field in a loop changes a reference count.
+    # Local variables, because each access to a field in a loop changes a reference count.
     sums, rest, counts, terms, slope = w.sums, w.rest, w.terms, curves.terms, curves.slope
     unit, inverse, used = scale.unit, scale.inverse, maps.used
     rows, ramp, twist = maps.rows, maps.ramp, maps.twist

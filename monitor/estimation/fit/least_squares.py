@@ -79,7 +79,7 @@ def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full_covar
 @compiled
 def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
     """Compute V⁻¹ X by Cholesky decomposition; return False if the correlation matrix is not positive definite."""
-    # Local names, because each access to a field in a loop changes a reference count.
+    # Local variables, because each access to a field in a loop changes a reference count.
     m, variance, stretch, ignored_direction = rows.size, problem.variance, problem.stretch, problem.ignored_direction
     covariance, columns, weighted = problem.covariance, problem.columns, problem.weighted
     factor, column = np.empty((m, m)), np.empty(m)

@@ -100,7 +100,7 @@ def _select_term(
     if terms.entered[a]:
         terms.status[a], terms.lo[a], terms.hi[a] = 2, low, high
     else:
-        # The bound is never tighter than the bound from an estimate of zero.
+        # A negative estimate is replaced by zero, so that the upper bound is not too small.
         terms.status[a], terms.lo[a] = 1, 0.0
         terms.hi[a] = confidence_interval_end(max(estimate, 0.0), c0, c1, c2, -UPPER_BOUND_Z)
 
