@@ -25,7 +25,7 @@ from tests.support.zenoh_sessions import router
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from tests.monitor.publishing.rerun.test_view import read
+from tests.monitor.publishing.rerun.test_queued_view import read
 
 from monitor.publishing.rerun.queued_view import RerunView
 

@@ -14,7 +14,7 @@ from monitor.history.time_ranges import TimeRange
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from tests.monitor.publishing.rerun.test_view import column, read
+from tests.monitor.publishing.rerun.test_queued_view import column, read
 
 from monitor.publishing.rerun.history_points import history_points
 from monitor.publishing.rerun.queued_view import RerunView
