@@ -7,7 +7,6 @@ The source of the sample times depends on the wire format (``drivers.data_types.
 - Arrival times only: arrival times give the sample times and the number of missing samples (``arrival_timeline``).
 - Sender times: the times from the sender are used unchanged (``sender_times``).
 
-
 Repeated rows are removed (``duplicate_rows``). Measured values are never changed.
 """
 

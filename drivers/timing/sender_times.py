@@ -142,10 +142,10 @@ class SenderTimes:
             self._events.report_event("clock_jumped", int(t[at]), f"time jumped ahead by {steps[at] / NS_PER_S:.6g} s")
 
     def _count_missing(self, steps_s: Floats, period_s: float) -> Ints:
-        """Return the number of missing samples before each row [n]. If most steps are irregular, return zeros.
+        """Return the number of missing samples before each row [n], or zeros if most steps are irregular.
 
-        A short step must be a whole number of periods and exceed the typical deviation. A neighbouring short step shows
-        that the row was only late.
+        Steps below CERTAIN_GAP_PERIODS must be a whole number of periods. A long step next to a short step indicates a
+        late row, not missing samples.
         """
         last_s = self._steps_s[-1] if self._steps_s else period_s
         self._steps_s.extend(steps_s[-STEP_HISTORY:].tolist())

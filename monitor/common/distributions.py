@@ -20,9 +20,7 @@ CORNISH_FISHER_TERMS: Final = 10
 MIN_ASYMPTOTIC_EDF: Final = 1000.0
 """Smallest number of degrees of freedom for which the Cornish-Fisher expansion is exact to rounding."""
 MIN_EXPANDED_EDF: Final = 30.0
-"""Smallest number of degrees of freedom for which the Halley iteration starts from the Cornish-Fisher expansion.
-
-"""
+"""Smallest number of degrees of freedom for which the Halley iteration starts from the Cornish-Fisher expansion."""
 MAX_ITERATIONS: Final = 60
 STEP_TOLERANCE: Final = 1e-7
 """Relative step below which a Halley or Newton iteration ends. The result is then exact to rounding."""

@@ -2,7 +2,6 @@
 
 Each sample has at most one fault, which depends only on the seed and the sample number. If a sample consists of several
 CAN frames, the fault affects the last frame.
-
 """
 
 from dataclasses import dataclass, replace

@@ -51,18 +51,18 @@ def test_holding_back_bursts_changes_no_sample_fault() -> None:
 
 
 @pytest.mark.parametrize("position", [0.0, 0.37, 1.0 - 2**-53])
-def test_what_they_do_to_bytes(where: float) -> None:
+def test_what_they_do_to_bytes(position: float) -> None:
     faults = Faults(SHARES, 1, "bytes")
     chunks = [Chunk(b"first", 7), Chunk(DATA, 7, address=3)]
-    assert faults.apply_fault(FaultKind.WHOLE, where, chunks) == chunks
-    assert faults.apply_fault(FaultKind.LOST, where, chunks) == []
-    assert faults.apply_fault(FaultKind.REPEATED, where, chunks) == [*chunks, *chunks]
-    first, flipped = faults.apply_fault(FaultKind.FLIPPED, where, chunks)
+    assert faults.apply_fault(FaultKind.WHOLE, position, chunks) == chunks
+    assert faults.apply_fault(FaultKind.LOST, position, chunks) == []
+    assert faults.apply_fault(FaultKind.REPEATED, position, chunks) == [*chunks, *chunks]
+    first, flipped = faults.apply_fault(FaultKind.FLIPPED, position, chunks)
     assert first == chunks[0]
     assert (flipped.address, flipped.t_ns) == (3, 7)
     apart = int.from_bytes(flipped.data, "big") ^ int.from_bytes(DATA, "big")
     assert apart.bit_count() == 1
-    first, cut = faults.apply_fault(FaultKind.CUT, where, chunks)
+    first, cut = faults.apply_fault(FaultKind.CUT, position, chunks)
     assert first == chunks[0]
     assert DATA.startswith(cut.data)
     assert 1 <= len(cut.data) < len(DATA)
