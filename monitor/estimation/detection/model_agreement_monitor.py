@@ -69,7 +69,7 @@ def _event(gap: AxisModelComparison, agrees: bool, t_ns: int, since_ns: int) -> 
         "agrees": agrees,
         "gap": gap.gap,
         "threshold": gap.threshold,
-        "ratio": gap.measured_to_model_ratio,
+        "ratio": gap.ratio,
         "tau_lo": lo,
         "tau_hi": hi,
     }
@@ -78,7 +78,7 @@ def _event(gap: AxisModelComparison, agrees: bool, t_ns: int, since_ns: int) -> 
     else:
         text = (
             f"{gap.axis} disagrees with its model at τ {tau}: "
-            f"the deviation is {gap.measured_to_model_ratio:.3g} times the deviation of the model, "
+            f"the deviation is {gap.ratio:.3g} times the deviation of the model, "
             f"a gap of {gap.gap:.3g} σ with a threshold of {gap.threshold:.1f} σ"
         )
     return Event(KIND, t_ns, text, gap.axis, {"model": what}, since_ns, gap.gap)

@@ -62,7 +62,7 @@ class AxisModelComparison:
     samples: int  # number of samples of this axis in the window
 
     @property
-    def measured_to_model_ratio(self) -> float:
+    def ratio(self) -> float:
         """Ratio of the measured Allan deviation to the Allan deviation of the model at the largest |z|."""
         return float(self.measured[self.row] / self.model[self.row])
 

@@ -97,7 +97,7 @@ def test_what_is_wrong_is_found_where_it_is_and_as_large_as_it_is() -> None:
     assert gz.gap == np.nanmax(np.abs(gz.z)) == abs(gz.z[gz.row])
     tau = look.tau_s[gz.row : gz.row + 1]
     expected = np.sqrt(measured.avar("gz", tau, 1 / RATE) / true.avar("gz", tau, 1 / RATE))[0]
-    assert gz.measured_to_model_ratio == pytest.approx(expected, rel=0.03)
+    assert gz.ratio == pytest.approx(expected, rel=0.03)
     assert not any(look.axes[axis].gap > look.axes[axis].threshold for axis in AXES if axis != "gz")
 
 
@@ -108,7 +108,7 @@ def test_a_sensor_that_is_too_quiet_is_found_too() -> None:
     for one in look.axes.values():
         assert one.gap > one.threshold
         assert one.z[one.row] < 0.0
-        assert one.measured_to_model_ratio == pytest.approx(0.8, rel=0.06)
+        assert one.ratio == pytest.approx(0.8, rel=0.06)
 
 
 def test_a_part_of_a_percent_is_told_where_the_window_allows_it() -> None:
