@@ -32,7 +32,6 @@ from monitor.settings import loading
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
 from tests.monitor.publishing.rerun.test_queued_view import read
-
 from tests.support.ports import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 

@@ -25,9 +25,8 @@ from tests.support.zenoh_sessions import router
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from tests.monitor.publishing.rerun.test_queued_view import read
-
 from monitor.publishing.rerun.queued_view import RerunView
+from tests.monitor.publishing.rerun.test_queued_view import read
 
 
 def test_the_keys_of_devices_in_detail() -> None:

@@ -14,11 +14,10 @@ from monitor.history.time_ranges import TimeRange
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from tests.monitor.publishing.rerun.test_queued_view import column, read
-
 from monitor.publishing.rerun.history_points import history_points
 from monitor.publishing.rerun.queued_view import RerunView
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+from tests.monitor.publishing.rerun.test_queued_view import column, read
 from tests.support.waiting import wait_for
 
 T0 = 1_760_000_040
