@@ -18,7 +18,7 @@ PROGRAM = """
     import numpy as np
 
     from drivers.data_types import make_block
-    from monitor.daemon import kernel_parts
+    from monitor.daemon.kernels import kernel_parts
     from monitor.common.compiled import Kernel
     from monitor.drift.compensation.compensator import Compensator
     from monitor.drift.thermal import thermal_response
