@@ -34,6 +34,7 @@ from monitor.reconcile.likelihood.effect_terms import with_size
 from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.recording import Recording, select_usable_axes
+from monitor.reconcile.recording_checks.checks import check_recording
 from monitor.reconcile.result import (
     AxisResult,
     Decision,
@@ -132,7 +133,9 @@ def reconcile(
     NotReady
         If there are too few samples or no axis can be compared with the model.
     """
-    recording, notes = select_usable_axes(recording, model)
+    tell("checking the recording")
+    checked = check_recording(recording, model, seed)
+    recording, notes = select_usable_axes(checked.recording, model)
     regressors = RegressorCache(recording.samples, recording.rate_hz, recording.temperature_c)
     run = RunContext(recording, seed, regressors, each)
     if model is None:
@@ -165,6 +168,7 @@ def reconcile(
         duration_s=recording.samples / recording.rate_hz,
         seed=seed,
         notes=notes,
+        recording_findings=checked.findings,
     )
 
 

@@ -17,6 +17,19 @@ Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]
 """Decision for an axis or a recording."""
 StepKind = Literal["added", "retuned"]
 """Kind of a step: an effect was added, or the size of a known effect was changed."""
+FindingKind = Literal[
+    "unit_error",
+    "axes_permuted",
+    "sample_rate_error",
+    "stuck_axis",
+    "frozen_rows",
+    "missing_rows",
+    "corrupt_rows",
+    "motion",
+    "repeated_rows",
+    "too_short",
+]
+"""Kind of a fault of the recording, the gravest first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +72,18 @@ class ParameterInterval:
     value: float | str
     lo: float | None = None
     hi: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingFinding:
+    """Fault of the recording itself, found before any spectrum is fitted."""
+
+    kind: FindingKind
+    axes: tuple[str, ...]
+    sentence: str  # for people: what is wrong, its size, and what was done
+    parameters: Mapping[str, ParameterInterval]
+    evidence: Mapping[str, float]  # the numbers that decided, by name
+    corrected: bool  # True if the search uses corrected samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +164,7 @@ class Reconciliation:
     duration_s: float
     seed: int
     notes: tuple[str, ...] = field(default=())
+    recording_findings: tuple[RecordingFinding, ...] = ()  # the gravest first
 
 
 def combine_decisions(verdicts: Iterable[Decision]) -> Decision:

@@ -1,0 +1,173 @@
+"""Check for single corrupt rows: a warm-up row at the start, a torn row at the end, or a spike row between them.
+
+The distance of a sample from its neighbours is the smaller of two distances: from the median of the samples before and
+from the median of the samples after. A step is therefore no spike. A row is corrupt if its distance is large, larger
+than in a simulation of the model, and far larger than the distance of all other rows. Many large distances are outliers
+or motion and are left to other checks and to the noise search.
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import AXES, Floats, Ints
+from monitor.reconcile.result import ParameterInterval, RecordingFinding
+
+MIN_DISTANCE: Final = 10.0
+"""Smallest distance of a corrupt row in standard deviations of the noise from sample to sample."""
+MIN_SIMULATED_RATIO: Final = 1.5
+"""Smallest distance relative to the largest distance in a simulation of the model."""
+MAX_ROWS: Final = 4
+"""Largest number of corrupt rows. More rows are outliers or motion."""
+MIN_GAP_RATIO: Final = 2.5
+"""Smallest ratio of the distance of a corrupt row to the largest distance of all other rows."""
+MIN_END_GAP_RATIO: Final = 1.5
+"""The same ratio for rows at the ends, where corrupt rows are more likely."""
+END_ROWS: Final = 3
+"""Number of rows at each end that count as end rows."""
+NEIGHBOURS: Final = 5
+"""Number of samples on each side from which the distance is measured."""
+PREFILTER_DISTANCE: Final = 4.0
+"""Distance between successive samples, in standard deviations, from which a sample is examined."""
+SIGMA_PER_MEAN_STEP: Final = 0.8862269254527580
+"""√π/2, the ratio of σ to the mean distance of two samples of Gaussian noise."""
+BLOCK_SAMPLES: Final = 64
+"""Length of the blocks whose median gives the noise from sample to sample."""
+
+
+def check_corrupt_rows(
+    values: Mapping[str, Floats], rate_hz: float, simulated: Mapping[str, Floats] | None
+) -> tuple[dict[str, Floats], list[RecordingFinding]]:
+    """Return the values with corrupt rows marked as missing on all axes, and the finding.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray, shape (n,)
+        Samples of each axis; NaN means missing.
+    rate_hz : float
+        Sample rate in Hz.
+    simulated : mapping of str to ndarray or None
+        Simulation of the model under test.
+    """
+    limits = dict.fromkeys(values, MIN_DISTANCE)
+    for axis, y in ({} if simulated is None else simulated).items():
+        _, distances = distances_from_neighbours(y)
+        limits[axis] = max(MIN_DISTANCE, MIN_SIMULATED_RATIO * float(distances.max(initial=0.0)))
+    n = next(iter(values.values())).size
+    of_axes = np.zeros((len(values), n))
+    for k, (axis, y) in enumerate(values.items()):
+        rows, distances = distances_from_neighbours(y)
+        of_axes[k, rows] = distances / limits[axis]  # 1 = at the limit
+    corrupt = _corrupt_rows(of_axes.max(axis=0))
+    if not corrupt.size:
+        return dict(values), []
+    axes = tuple(axis for axis, of in zip(values, of_axes, strict=True) if of[corrupt].max() >= 1.0)
+    marked = {axis: y.copy() for axis, y in values.items()}
+    for y in marked.values():
+        y[corrupt] = np.nan
+    return marked, [_describe(corrupt, n, axes, of_axes, rate_hz, list(values), limits)]
+
+
+def distances_from_neighbours(y: Floats) -> tuple[Ints, Floats]:
+    """Return the rows that differ from their neighbours, and their distances in standard deviations of the noise.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Samples of one axis; NaN means missing.
+
+    Examples
+    --------
+    >>> y = np.tile([1.0, -1.0], 100)
+    >>> y[50] = 41.0
+    >>> rows, distances = distances_from_neighbours(y)
+    >>> int(rows[distances.argmax()])
+    50
+    """
+    sigma = noise_of_samples(y)
+    if not sigma > 0.0:
+        return np.empty(0, np.int64), np.empty(0)
+    steps = np.abs(np.diff(y)) > PREFILTER_DISTANCE * sigma
+    some = np.zeros(y.size, np.bool_)
+    some[1:] |= steps
+    some[:-1] |= steps
+    rows = np.flatnonzero(some)
+    away = np.arange(1, NEIGHBOURS + 1)
+    padded = np.concatenate([np.full(NEIGHBOURS, np.nan), y, np.full(NEIGHBOURS, np.nan)])
+    before = _median(padded[rows[:, None] + NEIGHBOURS - away])
+    after = _median(padded[rows[:, None] + NEIGHBOURS + away])
+    distance = np.fmin(np.abs(y[rows] - before), np.abs(y[rows] - after)) / sigma
+    return rows, np.where(np.isfinite(distance), distance, 0.0)
+
+
+def noise_of_samples(y: Floats) -> float:
+    """Return the standard deviation from sample to sample, from the median of blocks; 0 without complete blocks.
+
+    A missing sample makes its block incomplete.
+    """
+    steps = np.abs(np.diff(y))
+    blocks = steps[: steps.size // BLOCK_SAMPLES * BLOCK_SAMPLES].reshape(-1, BLOCK_SAMPLES).mean(axis=1)
+    blocks = blocks[np.isfinite(blocks)]
+    return SIGMA_PER_MEAN_STEP * float(np.median(blocks)) if blocks.size else 0.0
+
+
+def _median(windows: Floats) -> Floats:
+    """Return the median of each row of an array, without NaN; NaN if there are fewer than three samples."""
+    if not windows.size:
+        return np.empty(len(windows))
+    ordered = np.sort(windows, axis=1)  # NaN last
+    counts = np.isfinite(windows).sum(axis=1)
+    at = np.arange(len(windows))
+    low, high = ordered[at, np.maximum(counts - 1, 0) // 2], ordered[at, np.minimum(counts // 2, windows.shape[1] - 1)]
+    return np.where(counts >= 3, 0.5 * (low + high), np.nan)
+
+
+def _corrupt_rows(distance: Floats) -> Ints:
+    """Return the corrupt rows, given for each row its distance relative to the limit."""
+    n = distance.size
+    order = np.argsort(distance)[::-1][: MAX_ROWS + 1]
+    for count in range(min(MAX_ROWS, order.size - 1), 0, -1):
+        rows, least = order[:count], distance[order[count - 1]]
+        at_end = bool(((rows < END_ROWS) | (rows >= n - END_ROWS)).all())
+        gap = MIN_END_GAP_RATIO if at_end else MIN_GAP_RATIO
+        if least >= 1.0 and least >= gap * distance[order[count]]:
+            return np.sort(rows)
+    return np.empty(0, np.int64)
+
+
+def _describe(
+    rows: Ints,
+    n: int,
+    axes: tuple[str, ...],
+    of_axes: Floats,
+    rate_hz: float,
+    names: list[str],
+    limits: Mapping[str, float],
+) -> RecordingFinding:
+    """Return the finding."""
+    which = ", ".join(_name_of_row(int(row), n, rate_hz) for row in rows)
+    k = int(of_axes[:, rows].max(axis=1).argmax())
+    most = float(of_axes[k, rows].max()) * limits[names[k]]
+    plural = rows.size > 1
+    return RecordingFinding(
+        "corrupt_rows",
+        tuple(axis for axis in AXES if axis in axes),
+        f"{which} {'are' if plural else 'is'} corrupt: {names[k]} differs from its neighbours by {most:.3g} standard "
+        f"deviations. The {'rows were' if plural else 'row was'} marked as missing.",
+        {"time": ParameterInterval(float(rows[0]) / rate_hz)},
+        {
+            "rows": float(rows.size),
+            "first_row": float(rows[0]),
+            "distance_sigma": most,
+            "limit_sigma": limits[names[k]],
+        },
+        corrected=True,
+    )
+
+
+def _name_of_row(row: int, n: int, rate_hz: float) -> str:
+    """Return a text for a row."""
+    if row < END_ROWS:
+        return "The first row" if row == 0 else f"Row {row + 1}"
+    return "The last row" if row == n - 1 else f"The row at {row / rate_hz:.6g} s"

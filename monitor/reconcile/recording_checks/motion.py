@@ -1,0 +1,137 @@
+"""Check for motion, knocks and handling, and removal of these samples.
+
+The detector is that of ``analyze --rest``. Motion of a sensor acts on several axes at once. An episode on a single axis
+may be a noise effect and is left to the noise search. If a simulation of the model has such episodes, motion cannot be
+distinguished from the noise of the model, and nothing is removed.
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import AXES, Floats
+from monitor.common.distributions import NORMAL_QUARTILE
+from monitor.common.units import format_rate
+from monitor.estimation.detection.motion_detection import Motion, block_size, detect_motion
+from monitor.reconcile.result import ParameterInterval, RecordingFinding
+
+MIN_MOVING_AXES: Final = 2
+"""Smallest number of axes that an episode must change."""
+MIN_RISE: Final = float(np.log(2.5))
+"""Smallest rise of the logarithm of the variance of a block on a moving axis."""
+MIN_DEVIATION: Final = 6.0
+"""Smallest deviation of a block on a moving axis, in standard deviations of the blocks at rest."""
+MAX_MOVING_SHARE: Final = 0.5
+"""Largest share of samples in motion that can be removed."""
+MAX_NAMED: Final = 3
+"""Largest number of episodes whose times are listed."""
+
+
+def check_motion(
+    values: Mapping[str, Floats], rate_hz: float, simulated: Mapping[str, Floats] | None
+) -> tuple[dict[str, Floats], list[RecordingFinding]]:
+    """Return the values with the samples in motion marked as missing, and the finding.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray, shape (n,)
+        Samples of each axis in rad/s or m/s²; NaN means missing.
+    rate_hz : float
+        Sample rate in Hz.
+    simulated : mapping of str to ndarray or None
+        Simulation of the model under test.
+    """
+    episodes = find_motion(values, rate_hz)
+    if not episodes or (simulated is not None and find_motion(simulated, rate_hz)):
+        return dict(values), []
+    n = next(iter(values.values())).size
+    moving = np.zeros(n, np.bool_)
+    for motion, _ in episodes:
+        moving[motion.since : motion.until] = True
+    share = float(moving.mean())
+    removed = share <= MAX_MOVING_SHARE
+    marked = {axis: np.where(moving, np.nan, y) for axis, y in values.items()} if removed else dict(values)
+    return marked, [_describe(episodes, share, removed, rate_hz)]
+
+
+def find_motion(values: Mapping[str, Floats], rate_hz: float) -> list[tuple[Motion, tuple[str, ...]]]:
+    """Return the episodes of motion that change at least two axes, with these axes.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray, shape (n,)
+        Samples of each axis; NaN means missing.
+    rate_hz : float
+        Sample rate in Hz.
+    """
+    n = next(iter(values.values())).size
+    columns = np.full((n, len(AXES)), np.nan)
+    for axis, y in values.items():
+        columns[:, AXES.index(axis)] = y
+    _, motions = detect_motion(columns, rate_hz)
+    if not motions:
+        return []
+    size = block_size(rate_hz)
+    changed = {axis: _changed_blocks(y, size) for axis, y in values.items()}
+    found = []
+    for motion in motions:
+        blocks = slice(motion.since // size, -(-motion.until // size))
+        axes = tuple(axis for axis, of in changed.items() if of[blocks].any())
+        if len(axes) >= MIN_MOVING_AXES:
+            found.append((motion, axes))
+    return found
+
+
+def _changed_blocks(y: Floats, size: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Return for each block whether its variance or its mean differs from those of most blocks."""
+    blocks = y[: y.size // size * size].reshape(-1, size)
+    used = np.isfinite(blocks).sum(axis=1) >= max(size // 2, 4)
+    changed = np.zeros(len(blocks) + 1, np.bool_)
+    if used.sum() < 4:
+        return changed
+    kept = blocks[used]
+    mean = np.nanmean(kept, axis=1)
+    smallest = np.abs(np.diff(y[np.isfinite(y)]))
+    step = float(smallest[smallest > 0.0].min(initial=0.0)) if (smallest > 0.0).any() else 0.0
+    log_variance = np.log(np.nanvar(kept, axis=1) + step**2 / 12.0 + 1e-30)
+    rise = log_variance - np.median(log_variance)
+    loud = (rise > MIN_RISE) & (rise > MIN_DEVIATION * _scatter(log_variance))
+    floor = float(np.exp(0.5 * np.median(log_variance))) / size**0.5
+    off = np.abs(mean - np.median(mean)) > MIN_DEVIATION * max(_scatter(mean), floor) + step
+    changed[np.flatnonzero(used)] = loud | off
+    return changed
+
+
+def _scatter(x: Floats) -> float:
+    """Return the standard deviation from the distance of the quartiles."""
+    low, high = np.quantile(x, [0.25, 0.75])
+    return 0.5 * float(high - low) / NORMAL_QUARTILE
+
+
+def _describe(
+    episodes: list[tuple[Motion, tuple[str, ...]]], share: float, removed: bool, rate_hz: float
+) -> RecordingFinding:
+    """Return the finding for all episodes."""
+    axes = tuple(axis for axis in AXES if any(axis in of for _, of in episodes))
+    largest = sorted(episodes, key=lambda one: one[0].until - one[0].since, reverse=True)[:MAX_NAMED]
+    times = ", ".join(f"{one.since / rate_hz:.5g} s" for one, _ in sorted(largest, key=lambda one: one[0].since))
+    most = max((one for one, _ in episodes), key=lambda one: one.seconds)
+    count = len(episodes)
+    what = "episode" if count == 1 else "episodes"
+    where = f"at {times}" if count <= MAX_NAMED else f"the longest at {times}"
+    kinds = sorted({motion.kind for motion, _ in episodes})
+    action = (
+        f"{100.0 * share:.2g} % of the samples were marked as missing."
+        if removed
+        else f"{100.0 * share:.2g} % of the samples are in motion, which is too much to remove."
+    )
+    return RecordingFinding(
+        "motion",
+        axes,
+        f"The sensor was moved or knocked: {count} {what} of {' and '.join(kinds)}, {where}, "
+        f"with {most.axis} up to {format_rate(most.axis, most.peak)}. {action}",
+        {"time": ParameterInterval(min(one.since for one, _ in episodes) / rate_hz)},
+        {"episodes": float(count), "share": share, "longest_s": most.seconds},
+        corrected=removed,
+    )

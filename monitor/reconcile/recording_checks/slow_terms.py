@@ -1,0 +1,73 @@
+"""Check which slow terms of the model a recording is too short to show.
+
+A term with a time constant needs several time constants. Rate random walk and bias instability need a visible share of
+the power at the lowest frequency, which is the inverse of the length of the recording.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from monitor.noise.effect import Effect
+from monitor.noise.effects import BiasInstability, ExponentiallyCorrelated, RandomTelegraph, RateRandomWalk
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.result import ParameterInterval, RecordingFinding
+
+MIN_TIME_CONSTANTS: Final = 5.0
+"""Smallest length of a recording in time constants of a term."""
+MIN_POWER_SHARE: Final = 0.05
+"""Smallest share of the power at the lowest frequency that is visible."""
+
+
+def check_slow_terms(axes: tuple[str, ...], samples: int, rate_hz: float, model: NoiseModel) -> list[RecordingFinding]:
+    """Return a finding if the recording is too short for terms of the model.
+
+    Parameters
+    ----------
+    axes : tuple of str
+        Names of the recorded axes.
+    samples : int
+        Number of samples of each axis.
+    rate_hz : float
+        Sample rate in Hz.
+    model : NoiseModel
+        Model under test.
+    """
+    length_s = samples / rate_hz
+    hidden = {axis: names for axis in axes if (names := _invisible_terms(axis, length_s, rate_hz, model))}
+    if not hidden:
+        return []
+    which = "; ".join(f"{', '.join(names)} of {axis}" for axis, names in hidden.items())
+    return [
+        RecordingFinding(
+            "too_short",
+            tuple(hidden),
+            f"The recording of {length_s:.4g} s is too short to test these terms of the model: {which}.",
+            {"duration": ParameterInterval(length_s)},
+            {"terms": float(sum(len(names) for names in hidden.values()))},
+            corrected=False,
+        )
+    ]
+
+
+def _invisible_terms(axis: str, length_s: float, rate_hz: float, model: NoiseModel) -> list[str]:
+    """Return the names of the terms of one axis that the recording does not show."""
+    lowest = np.array([1.0 / length_s])
+    whole = float(model.psd(axis, lowest, 1.0 / rate_hz)[0])
+    return [
+        effect.name.replace("_", " ")
+        for effect in model.effects.get(axis, ())
+        if _is_invisible(effect, length_s, rate_hz, whole)
+    ]
+
+
+def _is_invisible(effect: Effect, length_s: float, rate_hz: float, whole: float) -> bool:
+    """Return True if a recording of this length does not show the effect."""
+    if isinstance(effect, ExponentiallyCorrelated):
+        return effect.correlation_time * MIN_TIME_CONSTANTS > length_s
+    if isinstance(effect, RandomTelegraph):
+        return effect.dwell_time * MIN_TIME_CONSTANTS > length_s
+    if isinstance(effect, RateRandomWalk | BiasInstability) and whole > 0.0:
+        own = float(effect.spectrum(1.0 / rate_hz).density(np.array([1.0 / length_s]))[0])
+        return 0.0 < own < MIN_POWER_SHARE * whole
+    return False
