@@ -34,7 +34,8 @@ from monitor.reconcile.likelihood.effect_terms import with_size
 from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.recording import Recording, select_usable_axes
-from monitor.reconcile.recording_checks.checks import check_recording
+from monitor.reconcile.recording_checks.checks import check_recording, sort_findings
+from monitor.reconcile.recording_checks.sample_rate import describe_sample_rate_error, estimate_sample_rate_error
 from monitor.reconcile.result import (
     AxisResult,
     Decision,
@@ -157,6 +158,8 @@ def reconcile(
     axes = {name: describe_axis(one, null[name], final[name]) for name, one in found.searches.items()}
     if found.sample_rate_error is not None:
         axes = _add_sample_rate_step(axes, found.sample_rate_error, null)
+        rate_finding = describe_sample_rate_error(found.sample_rate_error, recording.rate_hz)
+        checked = replace(checked, findings=sort_findings((rate_finding, *checked.findings)))
     return Reconciliation(
         verdict=combine_decisions([one.verdict for one in axes.values()]),
         axes=axes,
@@ -234,7 +237,13 @@ def _search_all_axes(run: RunContext, model: NoiseModel, null: Mapping[str, Axis
     """
     effects = _effects_by_axis(model, run.recording)
     axes = run.prepare(run.recording, effects, run.seed)
-    error = detect_sample_rate_error(axes, effects)
+    error = estimate_sample_rate_error(
+        {name: axis.coefficients for name, axis in axes.items()},
+        run.recording.rate_hz,
+        effects,
+        model.sample_rate_hz,
+        detect_sample_rate_error(axes, effects),
+    )
     if error is not None:
         ratio = float(error.ratio.value)
         effects = {name: tuple(in_stated_time(effect, ratio) for effect in of) for name, of in effects.items()}

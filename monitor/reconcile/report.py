@@ -8,6 +8,8 @@ In each step, ``found`` holds the location and the threshold that the difference
 step. ``gap`` holds the same diagnostic before and after the step. Its ``null95`` and ``threshold`` belong to the model
 after the step and decide whether a difference is left over. ``scores`` holds all diagnostics: for an axis, the
 comparison with the first model; for a step, the comparison after the step.
+
+``recording_findings`` lists faults of the recording itself, the gravest first, with their evidence.
 """
 
 from math import isfinite
@@ -16,7 +18,15 @@ from typing import Any, Final
 import msgspec
 
 from drivers.sample import AXES
-from monitor.reconcile.result import AxisResult, Location, ParameterInterval, Reconciliation, ReconciliationStep, Score
+from monitor.reconcile.result import (
+    AxisResult,
+    Location,
+    ParameterInterval,
+    Reconciliation,
+    ReconciliationStep,
+    RecordingFinding,
+    Score,
+)
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
 """Name and version of the JSON schema."""
@@ -34,8 +44,21 @@ def encode_report(r: Reconciliation) -> bytes:
         "seed": int(r.seed),
         "fitted_first": bool(r.fitted_first),
         "notes": r.notes,
+        "recording_findings": [_finding_entry(finding) for finding in r.recording_findings],
         "axes": {axis: _axis_entry(r.axes[axis]) for axis in AXES if axis in r.axes},
     })  # fmt: skip
+
+
+def _finding_entry(finding: RecordingFinding) -> dict[str, Any]:
+    """Return the report entry of a fault of the recording."""
+    return {
+        "kind": finding.kind,
+        "axes": finding.axes,
+        "sentence": finding.sentence,
+        "parameters": {name: parameter_entry(bounds) for name, bounds in finding.parameters.items()},
+        "evidence": {name: finite_or_none(number) for name, number in finding.evidence.items()},
+        "corrected": finding.corrected,
+    }
 
 
 def _axis_entry(result: AxisResult) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from monitor.reconcile.recording_checks.corrupt_rows import check_corrupt_rows
 from monitor.reconcile.recording_checks.missing_rows import check_missing_rows
 from monitor.reconcile.recording_checks.motion import check_motion
 from monitor.reconcile.recording_checks.repeated_rows import check_repeated_rows
+from monitor.reconcile.recording_checks.sample_rate import correct_impossible_rate
 from monitor.reconcile.recording_checks.slow_terms import check_slow_terms
 from monitor.reconcile.recording_checks.stuck_values import check_stuck_values
 from monitor.reconcile.recording_checks.unit_error import find_unit_error, triad_evidence
@@ -54,9 +55,13 @@ def check_recording(recording: Recording, model: NoiseModel | None, seed: int) -
     """
     if recording.samples < MIN_SAMPLES:
         return CheckedRecording(recording, ())
+    findings = check_missing_rows(recording.values, recording.rate_hz)
+    impossible = None if model is None else correct_impossible_rate(recording, model)
+    if impossible is not None:
+        recording, finding = impossible
+        findings.append(finding)
     rate_hz = recording.rate_hz
     simulated = None if model is None else _simulate(recording, model, seed)
-    findings = check_missing_rows(recording.values, rate_hz)
     values, found = check_stuck_values(recording.values, rate_hz, simulated)
     findings += found
     values, found = check_corrupt_rows(values, rate_hz, simulated)
@@ -66,6 +71,9 @@ def check_recording(recording: Recording, model: NoiseModel | None, seed: int) -
         findings += found
     values, found = check_motion(values, rate_hz, simulated)
     findings += found
+    if found:  # the distances of rows in motion hide corrupt rows
+        values, found = check_corrupt_rows(values, rate_hz, simulated)
+        findings += found
     findings += check_repeated_rows(values, rate_hz, model)
     if model is not None:
         findings += check_slow_terms(tuple(values), recording.samples, rate_hz, model)

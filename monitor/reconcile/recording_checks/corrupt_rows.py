@@ -1,9 +1,9 @@
 """Check for single corrupt rows: a warm-up row at the start, a torn row at the end, or a spike row between them.
 
 The distance of a sample from its neighbours is the smaller of two distances: from the median of the samples before and
-from the median of the samples after. A step is therefore no spike. A row is corrupt if its distance is large, larger
-than in a simulation of the model, and far larger than the distance of all other rows. Many large distances are outliers
-or motion and are left to other checks and to the noise search.
+from the median of the samples after. A step is therefore no spike. A row is corrupt if its distance on one axis is
+large, larger than in a simulation of the model, and far larger than the distances of all other rows. Many large
+distances are outliers or motion and are left to other checks and to the noise search.
 """
 
 from collections.abc import Mapping
@@ -59,7 +59,7 @@ def check_corrupt_rows(
     for k, (axis, y) in enumerate(values.items()):
         rows, distances = distances_from_neighbours(y)
         of_axes[k, rows] = distances / limits[axis]  # 1 = at the limit
-    corrupt = _corrupt_rows(of_axes.max(axis=0))
+    corrupt = np.unique(np.concatenate([_corrupt_rows(distance) for distance in of_axes]))
     if not corrupt.size:
         return dict(values), []
     axes = tuple(axis for axis, of in zip(values, of_axes, strict=True) if of[corrupt].max() >= 1.0)

@@ -1,8 +1,9 @@
 """Check for single rows that repeat the previous row because the sensor had no new measurement.
 
 The repeats are spread over the recording, as after resampling to a higher rate. Quantized axes repeat by chance too,
-but independently of each other. The check therefore compares the share of rows that repeat on all axes with the product of
-the shares of the axes. The rows are not removed, because the noise search describes them as sample hold on each axis.
+but independently of each other. The check therefore compares the share of rows that repeat on all axes with the
+product of the shares of the axes. The rows are not removed, because the noise search describes them as sample hold on
+each axis.
 """
 
 from collections.abc import Mapping

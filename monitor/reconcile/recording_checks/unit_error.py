@@ -2,8 +2,8 @@
 
 The first evidence is the noise of the three axes relative to the model. A unit error multiplies the noise of all three
 axes by one factor, which is one of a short list. The second evidence is gravity, which every accelerometer triad at
-rest measures. The third evidence is the quantization step of each axis, if the model has one. A common factor that is not
-near the list is the scale factor of another sensor and no unit error.
+rest measures. The third evidence is the quantization step of each axis, if the model has one. A common factor that is
+not near the list is the scale factor of another sensor and no unit error.
 
 Without a model, only gravity is tested.
 """
@@ -19,7 +19,6 @@ from drivers.sample import Floats
 from monitor.common.distributions import Z95
 from monitor.noise.effects import Bias, Resolution
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.preparation.value_statistics import detect_quantization
 from monitor.reconcile.recording_checks.axis_permutation import TriadOrder
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
@@ -42,6 +41,8 @@ GYRO_CONVERSIONS: Final = ("π/180", "180/π", "1000", "1/1000", "1000·180/π")
 """Conversions that occur on gyroscopes. Other conversions are less likely there."""
 ACCELEROMETER_CONVERSIONS: Final = ("9.80665", "1/9.80665", "1000", "1/1000", "1000/9.80665")
 """Conversions that occur on accelerometers. Other conversions are less likely there."""
+LIKELY_BY_GRAVITY: Final = ("1/9.80665", "1000/9.80665", "1000", "2", "1/2", "4", "1/4")
+"""Factors that gravity alone may show, without a model."""
 UNLIKELY_PENALTY: Final = 0.15
 """Distance that is added to the logarithm of an unlikely factor when the nearest factor is chosen."""
 MAX_DISTANCE: Final = log(1.35)
@@ -52,10 +53,16 @@ MAX_FULL_SCALE_DISTANCE: Final = log(1.12)
 """Largest distance from a power of two. The powers are near each other, and surroundings may double the noise."""
 MAX_FULL_SCALE_SPREAD: Final = log(1.12)
 """Largest ratio of the factors of three axes for a wrong full scale, as a logarithm."""
+MAX_SUPPORTED_DISTANCE: Final = log(1.8)
+"""Largest distance of the common factor from a factor that gravity or the quantization steps show."""
 MAX_GRAVITY_DISTANCE: Final = log(1.12)
 """Largest distance of gravity from a conversion. The bias and scale factor of a MEMS accelerometer may reach 10 %."""
-MAX_STEP_DISTANCE: Final = 1e-3
-"""Largest distance of the ratio of quantization steps from a factor, as a logarithm."""
+GRID_SAMPLES: Final = 4096
+"""Number of samples that are compared with the quantization steps."""
+GRID_TOLERANCE: Final = 0.05
+"""Largest distance of a value from the grid in steps."""
+MIN_LEVELS: Final = 3
+"""Smallest number of different levels that show a grid."""
 MIN_ALONE_GRAVITY: Final = 0.5
 """Smallest norm of the mean specific force, m/s², that is taken for gravity without a model."""
 
@@ -66,7 +73,7 @@ class TriadEvidence:
 
     noise: TriadOrder | None
     gravity: float | None  # norm of the mean specific force relative to the expected norm
-    step: float | None  # quantization step relative to the model, median of the axes
+    step: float | None  # quantization step relative to the model; None if the axes do not agree
 
 
 def triad_evidence(
@@ -86,8 +93,8 @@ def triad_evidence(
         Noise of the axes relative to the model.
     """
     steps = [] if model is None else [_step_ratio(values[axis], axis, model) for axis in triad]
-    known = [one for one in steps if one is not None]
-    return TriadEvidence(order, _gravity_ratio(values, triad, model), float(np.median(known)) if known else None)
+    known = {one for one in steps if one is not None}
+    return TriadEvidence(order, _gravity_ratio(values, triad, model), known.pop() if len(known) == 1 else None)
 
 
 def find_unit_error(triad: Sequence[str], evidence: TriadEvidence) -> tuple[float, RecordingFinding] | None:
@@ -101,7 +108,7 @@ def find_unit_error(triad: Sequence[str], evidence: TriadEvidence) -> tuple[floa
         Ratios of the recording to the model.
     """
     name = _of_gravity(triad, evidence) if evidence.noise is None else _of_noise(triad, evidence)
-    if name is None:
+    if name is None or (evidence.noise is None and name not in LIKELY_BY_GRAVITY):
         return None
     factor = {**CONVERSIONS, **FULL_SCALES}[name]
     found = _measured_factor(evidence, name)
@@ -119,44 +126,36 @@ def find_unit_error(triad: Sequence[str], evidence: TriadEvidence) -> tuple[floa
 
 
 def _of_gravity(triad: Sequence[str], evidence: TriadEvidence) -> str | None:
-    """Return the conversion that gravity alone shows, or None."""
-    if evidence.gravity is None or abs(log(evidence.gravity)) < 2.0 * MAX_GRAVITY_DISTANCE:
+    """Return the factor that gravity shows, or None."""
+    if evidence.gravity is None or abs(log(evidence.gravity)) < MAX_GRAVITY_DISTANCE:
         return None
-    name, distance = _nearest(log(evidence.gravity), {k: CONVERSIONS[k] for k in ACCELEROMETER_CONVERSIONS}, triad)
+    factors = {**{k: CONVERSIONS[k] for k in ACCELEROMETER_CONVERSIONS}, **FULL_SCALES}
+    name, distance = _nearest(log(evidence.gravity), factors, triad)
     return name if distance < MAX_GRAVITY_DISTANCE else None
 
 
 def _of_noise(triad: Sequence[str], evidence: TriadEvidence) -> str | None:
     """Return the factor that the noise shows and that the other evidence does not contradict, or None."""
     assert evidence.noise is not None
-    ratios = evidence.noise.log_ratios
-    common, spread = float(np.median(ratios)), float(np.ptp(ratios))
-    if spread > MAX_SPREAD or abs(common) < 0.5 * log(2.0):
-        return None
-    if evidence.step is not None:
-        name, distance = _nearest(log(evidence.step), {**CONVERSIONS, **FULL_SCALES}, triad)
-        if distance < MAX_STEP_DISTANCE and abs(common - log({**CONVERSIONS, **FULL_SCALES}[name])) < MAX_DISTANCE:
-            return name
-    at_rest = evidence.gravity is not None and abs(log(evidence.gravity)) < MAX_GRAVITY_DISTANCE
-    if at_rest:  # the accelerometers are in m/s², and the surroundings or the noise differ
-        return None
+    common, spread = float(np.median(evidence.noise.log_ratios)), float(np.ptp(evidence.noise.log_ratios))
+    certain = _of_steps(evidence) or _of_gravity(triad, evidence)
+    if certain is not None and spread < MAX_SPREAD:
+        # the model may state a wrong noise, so the noise must only be nearer to the factor than to one
+        factor = log({**CONVERSIONS, **FULL_SCALES}[certain])
+        if abs(common - factor) < min(abs(common), MAX_SUPPORTED_DISTANCE):
+            return certain
+    if evidence.gravity is not None and abs(log(evidence.gravity)) < MAX_GRAVITY_DISTANCE:
+        return None  # the accelerometers are in m/s², and the surroundings or the noise differ
     name, distance = _nearest(common, CONVERSIONS, triad)
     scale, scale_distance = _nearest(common, FULL_SCALES, triad)
-    by_gravity = _of_gravity(triad, evidence)
-    if by_gravity is not None and abs(common - log(CONVERSIONS[by_gravity])) < MAX_DISTANCE:
-        return by_gravity
-    if (
-        scale_distance < min(MAX_FULL_SCALE_DISTANCE, distance)
-        and spread < MAX_FULL_SCALE_SPREAD
-        and _gravity_agrees(evidence.gravity, FULL_SCALES[scale])
-    ):
+    if scale_distance < min(MAX_FULL_SCALE_DISTANCE, distance) and spread < MAX_FULL_SCALE_SPREAD:
         return scale
-    return name if distance < MAX_DISTANCE and _gravity_agrees(evidence.gravity, CONVERSIONS[name]) else None
+    return name if distance < MAX_DISTANCE and spread < MAX_SPREAD else None
 
 
-def _gravity_agrees(gravity: float | None, factor: float) -> bool:
-    """Return True if gravity is unknown or shows the same factor."""
-    return gravity is None or abs(log(gravity / factor)) < MAX_GRAVITY_DISTANCE
+def _of_steps(evidence: TriadEvidence) -> str | None:
+    """Return the factor that the quantization steps show, or None."""
+    return next((name for name, f in {**CONVERSIONS, **FULL_SCALES}.items() if f == evidence.step), None)
 
 
 def _nearest(x: float, factors: Mapping[str, float], triad: Sequence[str]) -> tuple[str, float]:
@@ -203,9 +202,19 @@ def _gravity_ratio(values: Mapping[str, Floats], triad: Sequence[str], model: No
 
 
 def _step_ratio(y: Floats, axis: str, model: NoiseModel) -> float | None:
-    """Return the quantization step of an axis relative to the step of the model, or None if one has no step."""
+    """Return the factor of the list, or one, by which the quantization step of the model must be multiplied.
+
+    All values then lie on steps. A coarser grid that fits is preferred, because finer grids may contain the true one.
+    """
     step = next((effect.step for effect in model.effects.get(axis, ()) if isinstance(effect, Resolution)), None)
-    if step is None:
+    values = y[np.isfinite(y)]
+    if step is None or not values.size:
         return None
-    grid = detect_quantization(y)
-    return None if grid is None else grid.step.value / step
+    some = values[np.linspace(0, values.size - 1, min(GRID_SAMPLES, values.size)).astype(np.int64)]
+    away = some - some[0]
+    for factor in sorted({1.0, *CONVERSIONS.values(), *FULL_SCALES.values()}, reverse=True):
+        steps = away / (factor * step)
+        levels = np.rint(steps)
+        if np.unique(levels).size >= MIN_LEVELS and np.abs(steps - levels).max() < GRID_TOLERANCE:
+            return factor
+    return None
