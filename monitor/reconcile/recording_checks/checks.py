@@ -64,15 +64,15 @@ def check_recording(recording: Recording, model: NoiseModel | None, seed: int) -
     simulated = None if model is None else _simulate(recording, model, seed)
     values, found = check_stuck_values(recording.values, rate_hz, simulated)
     findings += found
-    values, found = check_corrupt_rows(values, rate_hz, simulated)
+    values, found = check_corrupt_rows(values, rate_hz, simulated, model)
     findings += found
     for triad in TRIADS:
         values, found = _check_triad(values, triad, rate_hz, model, simulated)
         findings += found
-    values, found = check_motion(values, rate_hz, simulated)
+    values, found = check_motion(values, rate_hz, simulated, model)
     findings += found
     if found:  # the distances of rows in motion hide corrupt rows
-        values, found = check_corrupt_rows(values, rate_hz, simulated)
+        values, found = check_corrupt_rows(values, rate_hz, simulated, model)
         findings += found
     findings += check_repeated_rows(values, rate_hz, model)
     if model is not None:

@@ -12,14 +12,18 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import AXES, Floats, Ints
+from monitor.noise.effects import Outliers
+from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 MIN_DISTANCE: Final = 10.0
 """Smallest distance of a corrupt row in standard deviations of the noise from sample to sample."""
 MIN_SIMULATED_RATIO: Final = 1.5
 """Smallest distance relative to the largest distance in a simulation of the model."""
+MAX_OUTLIER_SIGMA: Final = 6.0
+"""Largest distance of an outlier of the model, relative to the scale of the outliers."""
 MAX_ROWS: Final = 4
-"""Largest number of corrupt rows. More rows are outliers or motion."""
+"""Largest number of corrupt rows in succession or at the ends. More rows are outliers or motion."""
 MIN_GAP_RATIO: Final = 2.5
 """Smallest ratio of the distance of a corrupt row to the largest distance of all other rows."""
 MIN_END_GAP_RATIO: Final = 1.5
@@ -37,7 +41,10 @@ BLOCK_SAMPLES: Final = 64
 
 
 def check_corrupt_rows(
-    values: Mapping[str, Floats], rate_hz: float, simulated: Mapping[str, Floats] | None
+    values: Mapping[str, Floats],
+    rate_hz: float,
+    simulated: Mapping[str, Floats] | None,
+    model: NoiseModel | None = None,
 ) -> tuple[dict[str, Floats], list[RecordingFinding]]:
     """Return the values with corrupt rows marked as missing on all axes, and the finding.
 
@@ -49,11 +56,10 @@ def check_corrupt_rows(
         Sample rate in Hz.
     simulated : mapping of str to ndarray or None
         Simulation of the model under test.
+    model : NoiseModel or None, optional
+        Model under test, whose outliers are no corrupt rows.
     """
-    limits = dict.fromkeys(values, MIN_DISTANCE)
-    for axis, y in ({} if simulated is None else simulated).items():
-        _, distances = distances_from_neighbours(y)
-        limits[axis] = max(MIN_DISTANCE, MIN_SIMULATED_RATIO * float(distances.max(initial=0.0)))
+    limits = {axis: _limit(axis, None if simulated is None else simulated[axis], model) for axis in values}
     n = next(iter(values.values())).size
     of_axes = np.zeros((len(values), n))
     for k, (axis, y) in enumerate(values.items()):
@@ -130,10 +136,22 @@ def _corrupt_rows(distance: Floats) -> Ints:
     for count in range(min(MAX_ROWS, order.size - 1), 0, -1):
         rows, least = order[:count], distance[order[count - 1]]
         at_end = bool(((rows < END_ROWS) | (rows >= n - END_ROWS)).all())
+        if not at_end and np.ptp(rows) >= MAX_ROWS:
+            continue  # separate rows are outliers
         gap = MIN_END_GAP_RATIO if at_end else MIN_GAP_RATIO
         if least >= 1.0 and least >= gap * distance[order[count]]:
             return np.sort(rows)
     return np.empty(0, np.int64)
+
+
+def _limit(axis: str, simulated: Floats | None, model: NoiseModel | None) -> float:
+    """Return the smallest distance of a corrupt row on one axis in standard deviations of the noise."""
+    if simulated is None or model is None:
+        return MIN_DISTANCE
+    _, distances = distances_from_neighbours(simulated)
+    scales = [effect.scale for effect in model.effects.get(axis, ()) if isinstance(effect, Outliers)]
+    outliers = MAX_OUTLIER_SIGMA * max(scales, default=0.0) / max(noise_of_samples(simulated), 1e-300)
+    return max(MIN_DISTANCE, MIN_SIMULATED_RATIO * float(distances.max(initial=0.0)), outliers)
 
 
 def _describe(

@@ -1,8 +1,8 @@
 """Check for motion, knocks and handling, and removal of these samples.
 
 The detector is that of ``analyze --rest``. Motion of a sensor acts on several axes at once. An episode on a single axis
-may be a noise effect and is left to the noise search. If a simulation of the model has such episodes, motion cannot be
-distinguished from the noise of the model, and nothing is removed.
+may be a noise effect and is left to the noise search. The same holds for axes whose model contains steps or changes of
+the noise. If a simulation of the model has episodes, motion cannot be distinguished from noise, and nothing is removed.
 """
 
 from collections.abc import Mapping
@@ -14,8 +14,12 @@ from drivers.sample import AXES, Floats
 from monitor.common.distributions import NORMAL_QUARTILE
 from monitor.common.units import format_rate
 from monitor.estimation.detection.motion_detection import Motion, block_size, detect_motion
+from monitor.noise.effects import BiasStep, NoiseStep, PoissonSteps, RandomTelegraph, TurnOnTransient
+from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
+EVENTS: Final = (BiasStep, NoiseStep, PoissonSteps, RandomTelegraph, TurnOnTransient)
+"""Effects that resemble motion."""
 MIN_MOVING_AXES: Final = 2
 """Smallest number of axes that an episode must change."""
 MIN_RISE: Final = float(np.log(2.5))
@@ -29,7 +33,10 @@ MAX_NAMED: Final = 3
 
 
 def check_motion(
-    values: Mapping[str, Floats], rate_hz: float, simulated: Mapping[str, Floats] | None
+    values: Mapping[str, Floats],
+    rate_hz: float,
+    simulated: Mapping[str, Floats] | None,
+    model: NoiseModel | None = None,
 ) -> tuple[dict[str, Floats], list[RecordingFinding]]:
     """Return the values with the samples in motion marked as missing, and the finding.
 
@@ -41,9 +48,13 @@ def check_motion(
         Sample rate in Hz.
     simulated : mapping of str to ndarray or None
         Simulation of the model under test.
+    model : NoiseModel or None, optional
+        Model under test.
     """
-    episodes = find_motion(values, rate_hz)
-    if not episodes or (simulated is not None and find_motion(simulated, rate_hz)):
+    effects = {} if model is None else model.effects
+    steady = {axis: y for axis, y in values.items() if not any(isinstance(e, EVENTS) for e in effects.get(axis, ()))}
+    episodes = find_motion(steady, rate_hz) if steady else []
+    if not episodes or (simulated is not None and find_motion({a: simulated[a] for a in steady}, rate_hz, axes=1)):
         return dict(values), []
     n = next(iter(values.values())).size
     moving = np.zeros(n, np.bool_)
@@ -55,8 +66,10 @@ def check_motion(
     return marked, [_describe(episodes, share, removed, rate_hz)]
 
 
-def find_motion(values: Mapping[str, Floats], rate_hz: float) -> list[tuple[Motion, tuple[str, ...]]]:
-    """Return the episodes of motion that change at least two axes, with these axes.
+def find_motion(
+    values: Mapping[str, Floats], rate_hz: float, axes: int = MIN_MOVING_AXES
+) -> list[tuple[Motion, tuple[str, ...]]]:
+    """Return the episodes of motion that change several axes, with these axes.
 
     Parameters
     ----------
@@ -64,6 +77,8 @@ def find_motion(values: Mapping[str, Floats], rate_hz: float) -> list[tuple[Moti
         Samples of each axis; NaN means missing.
     rate_hz : float
         Sample rate in Hz.
+    axes : int, optional
+        Smallest number of axes that an episode must change.
     """
     n = next(iter(values.values())).size
     columns = np.full((n, len(AXES)), np.nan)
@@ -77,9 +92,9 @@ def find_motion(values: Mapping[str, Floats], rate_hz: float) -> list[tuple[Moti
     found = []
     for motion in motions:
         blocks = slice(motion.since // size, -(-motion.until // size))
-        axes = tuple(axis for axis, of in changed.items() if of[blocks].any())
-        if len(axes) >= MIN_MOVING_AXES:
-            found.append((motion, axes))
+        moving = tuple(axis for axis, of in changed.items() if of[blocks].any())
+        if len(moving) >= axes:
+            found.append((motion, moving))
     return found
 
 

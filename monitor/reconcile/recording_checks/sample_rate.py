@@ -10,8 +10,8 @@ and both can imitate a ratio. This module therefore examines each feature alone,
 - The estimate of ``search.sample_rate_error`` is accepted if the groups move by nearly this ratio and none stays.
 
 The level of the noise is no evidence, because a rate that is 20 % wrong changes the level by 10 %, and the noise of
-many sensors changes as much from run to run. The edge of a low-pass filter gains too little: at most 7 nats for an error of
-5 % in 60 000 samples of a real sensor.
+many sensors changes as much from run to run. The edge of a low-pass filter gains too little: at most 7 nats for an
+error of 5 % in 60 000 samples of a real sensor.
 """
 
 from collections.abc import Mapping, Sequence

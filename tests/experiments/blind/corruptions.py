@@ -30,11 +30,19 @@ import numpy as np  # noqa: E402
 from scipy.signal import welch  # noqa: E402
 
 from drivers.sample import AXES, Floats  # noqa: E402
+from monitor.noise.effects import Bias  # noqa: E402
 from monitor.noise.model import NoiseModel  # noqa: E402
-from monitor.reconcile.preparation.recording import Recording  # noqa: E402
+from monitor.reconcile.likelihood.axis import RegressorCache  # noqa: E402
+from monitor.reconcile.preparation.recording import Recording, select_usable_axes  # noqa: E402
 from monitor.reconcile.reconcile import reconcile  # noqa: E402
-from monitor.reconcile.recording_checks.checks import check_recording  # noqa: E402
+from monitor.reconcile.recording_checks.checks import check_recording, sort_findings  # noqa: E402
+from monitor.reconcile.recording_checks.sample_rate import (  # noqa: E402
+    describe_sample_rate_error,
+    estimate_sample_rate_error,
+)
 from monitor.reconcile.result import RecordingFinding  # noqa: E402
+from monitor.reconcile.search.axis_preparation import prepare_axes  # noqa: E402
+from monitor.reconcile.search.sample_rate_error import detect_sample_rate_error  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -302,7 +310,26 @@ def answer(case: Case, model: NoiseModel, whole: bool) -> Answer:
     if whole:
         result = reconcile(case.recording, model, 1)
         return Answer(case, result.recording_findings, result.verdict, time.perf_counter() - begin)
-    return Answer(case, check_recording(case.recording, model, 1).findings, "", time.perf_counter() - begin)
+    return Answer(case, checks_before_search(case.recording, model), "", time.perf_counter() - begin)
+
+
+def checks_before_search(recording: Recording, model: NoiseModel) -> tuple[RecordingFinding, ...]:
+    """Return the findings of ``reconcile`` without the search for effects."""
+    checked = check_recording(recording, model, 1)
+    usable, _ = select_usable_axes(checked.recording, model)
+    cache = RegressorCache(usable.samples, usable.rate_hz, usable.temperature_c)
+    effects = {axis: tuple(e for e in model.effects[axis] if not isinstance(e, Bias)) for axis in usable.values}
+    axes = prepare_axes(usable, effects, cache, np.random.default_rng(1))
+    error = estimate_sample_rate_error(
+        {axis: one.coefficients for axis, one in axes.items()},
+        usable.rate_hz,
+        effects,
+        model.sample_rate_hz,
+        detect_sample_rate_error(axes, effects),
+    )
+    if error is None:
+        return checked.findings
+    return sort_findings((describe_sample_rate_error(error, usable.rate_hz), *checked.findings))
 
 
 def main() -> None:
@@ -314,7 +341,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=CASES)
     parser.add_argument("--only", nargs="+", choices=FAULTS, default=FAULTS, help="only these faults")
     parser.add_argument("--models", type=Path, default=Path("corruption-models"), metavar="DIR", help="keep the models")
-    parser.add_argument("--checks-only", action="store_true", help="leave out the search and the sample rate")
+    parser.add_argument("--checks-only", action="store_true", help="leave out the search for effects")
     options = parser.parse_args()
     if "IMU_MONITOR_DATA" not in os.environ:
         parser.error("IMU_MONITOR_DATA does not point to the recordings")
