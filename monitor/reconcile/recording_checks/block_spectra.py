@@ -23,6 +23,8 @@ MAX_MISSING_SHARE: Final = 0.1
 """Largest share of missing samples of a block that is used."""
 MIN_USED_BLOCKS: Final = 8
 """Smallest number of complete blocks for a spectrum."""
+WINDOW_BINS: Final = 2.0
+"""Half width of the main lobe of the Hann window in bins."""
 MEDIAN_ERROR: Final = 1.2533
 """Standard error of the median relative to the standard error of the mean."""
 
@@ -32,6 +34,7 @@ class BlockSpectrum:
     """Spectrum of one axis in bands."""
 
     f_hz: Floats  # [m] centre frequency, Hz
+    reach_hz: Floats  # [m] distance from the centre up to which a line changes the band, Hz
     log_power: Floats  # [m] logarithm of the median power of the blocks, relative to unit²
     error: Floats  # [m] standard error of ``log_power``
 
@@ -72,7 +75,10 @@ def block_spectrum(y: Floats, rate_hz: float) -> BlockSpectrum | None:
     # half the distance between the quantiles at ±1 standard deviation, of the logarithms of the blocks
     low, high = np.quantile(np.log(np.maximum(bands, 1e-300)), [0.1587, 0.8413], axis=0)
     error = MEDIAN_ERROR * 0.5 * (high - low) / np.sqrt(len(blocks))
-    return BlockSpectrum(np.sqrt(edges[:-1] * (edges[1:] - 1.0)) * rate_hz / size, np.log(middle), error)
+    bin_hz = rate_hz / size
+    reach_hz = (0.5 * np.diff(edges) + WINDOW_BINS) * bin_hz
+    f_hz = np.asarray(0.5 * bin_hz * (edges[:-1] + edges[1:] - 1.0), np.float64)
+    return BlockSpectrum(f_hz, reach_hz, np.log(middle), error)
 
 
 def _fill_with_lines(blocks: Floats, missing: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Floats:

@@ -13,7 +13,13 @@ import numpy as np
 from drivers.sample import AXES, Floats
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.preparation.recording import MIN_SAMPLES, Recording
-from monitor.reconcile.recording_checks.axis_permutation import TriadOrder, describe_order, find_order, reorder
+from monitor.reconcile.recording_checks.axis_permutation import (
+    TriadOrder,
+    describe_order,
+    fading_peaks,
+    find_order,
+    reorder,
+)
 from monitor.reconcile.recording_checks.block_spectra import block_spectrum
 from monitor.reconcile.recording_checks.corrupt_rows import check_corrupt_rows
 from monitor.reconcile.recording_checks.missing_rows import check_missing_rows
@@ -98,12 +104,13 @@ def _check_triad(
     order: TriadOrder | None = None
     findings: list[RecordingFinding] = []
     corrected = dict(values)
-    if simulated is not None:
+    if simulated is not None and model is not None:
         recorded = [block_spectrum(values[axis], rate_hz) for axis in triad]
         expected = [block_spectrum(simulated[axis], rate_hz) for axis in triad]
         if not all(recorded) or not all(expected):
             return corrected, []
-        order = find_order([one for one in recorded if one], [one for one in expected if one])
+        peaks = fading_peaks((effect for _, effect in model), values[triad[0]].size / rate_hz)
+        order = find_order([one for one in recorded if one], [one for one in expected if one], peaks)
         described = describe_order(triad, order)
         if described is not None:
             findings.append(described)

@@ -18,6 +18,8 @@ from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 MIN_DISTANCE: Final = 10.0
 """Smallest distance of a corrupt row in standard deviations of the noise from sample to sample."""
+LONE_DISTANCE: Final = 50.0
+"""Smallest distance of a corrupt row on a single axis if there is no model, in the same unit."""
 MIN_SIMULATED_RATIO: Final = 1.5
 """Smallest distance relative to the largest distance in a simulation of the model."""
 MAX_OUTLIER_SIGMA: Final = 6.0
@@ -30,6 +32,12 @@ MIN_END_GAP_RATIO: Final = 1.5
 """The same ratio for rows at the ends, where corrupt rows are more likely."""
 END_ROWS: Final = 3
 """Number of rows at each end that count as end rows."""
+HEAD_SAMPLES: Final = 256
+"""Length of a simulation of the first rows."""
+HEAD_SIMULATIONS: Final = 8
+"""Number of these simulations."""
+MAX_HEAD_RATIO: Final = 3.0
+"""Largest distance of a first row, relative to the largest distance in these simulations, that the model explains."""
 NEIGHBOURS: Final = 5
 """Number of samples on each side from which the distance is measured."""
 PREFILTER_DISTANCE: Final = 4.0
@@ -65,7 +73,13 @@ def check_corrupt_rows(
     for k, (axis, y) in enumerate(values.items()):
         rows, distances = distances_from_neighbours(y)
         of_axes[k, rows] = distances / limits[axis]  # 1 = at the limit
-    corrupt = np.unique(np.concatenate([_corrupt_rows(distance) for distance in of_axes]))
+    corrupt = _drop_outliers(np.unique(np.concatenate([_corrupt_rows(one) for one in of_axes])), of_axes, model)
+    if model is not None and (corrupt < END_ROWS).any():
+        heads = _simulated_head_distances(model, rate_hz)
+        usual = [of_axes[k, corrupt] * limits[axis] < MAX_HEAD_RATIO * heads[axis] for k, axis in enumerate(values)]
+        wrong = [of_axes[k, corrupt] >= 1.0 for k in range(len(values))]
+        explained = (np.logical_and(wrong, usual).sum(axis=0) > 0) & (corrupt < END_ROWS)
+        corrupt = corrupt[~explained]
     if not corrupt.size:
         return dict(values), []
     axes = tuple(axis for axis, of in zip(values, of_axes, strict=True) if of[corrupt].max() >= 1.0)
@@ -142,6 +156,39 @@ def _corrupt_rows(distance: Floats) -> Ints:
         if least >= 1.0 and least >= gap * distance[order[count]]:
             return np.sort(rows)
     return np.empty(0, np.int64)
+
+
+def _drop_outliers(rows: Ints, of_axes: Floats, model: NoiseModel | None) -> Ints:
+    """Return the rows without those between the ends that are rather outliers.
+
+    Outliers occur at several times. Without a model, a moderate distance on one axis may be an outlier, too.
+    """
+    at_end = (rows < END_ROWS) | (rows >= of_axes.shape[1] - END_ROWS)
+    middle = rows[~at_end]
+    if not middle.size:
+        return rows
+    far = of_axes[:, middle]
+    moderate = far.max() < LONE_DISTANCE / MIN_DISTANCE and (far >= 1.0).any(axis=1).sum() < 2
+    return rows[at_end] if np.ptp(middle) >= MAX_ROWS or (model is None and moderate) else rows
+
+
+def _simulated_head_distances(model: NoiseModel, rate_hz: float) -> dict[str, float]:
+    """Return for each axis the largest distance of the first rows in short simulations of the model.
+
+    A filter of the model starts in the state of its first sample. If the filter removes strong noise, this start is
+    visible in the first rows.
+    """
+    found = dict.fromkeys(AXES, 0.0)
+    temperature_c = np.full(HEAD_SAMPLES, 25.0)
+    for seed in range(HEAD_SIMULATIONS):
+        drawn = model.simulate(HEAD_SAMPLES, rate_hz, seed, temperature_c)
+        for k, axis in enumerate(AXES):
+            y = drawn[:, k]
+            sigma = noise_of_samples(y[END_ROWS:])
+            if sigma > 0.0:
+                away = [abs(y[row] - np.median(y[row + 1 : row + 1 + NEIGHBOURS])) for row in range(END_ROWS)]
+                found[axis] = max(found[axis], float(max(away)) / sigma)
+    return found
 
 
 def _limit(axis: str, simulated: Floats | None, model: NoiseModel | None) -> float:

@@ -21,11 +21,15 @@ from monitor.reconcile.result import ParameterInterval, RecordingFinding
 EVENTS: Final = (BiasStep, NoiseStep, PoissonSteps, RandomTelegraph, TurnOnTransient)
 """Effects that resemble motion."""
 MIN_MOVING_AXES: Final = 2
-"""Smallest number of axes that an episode must change."""
+"""Smallest number of axes that must be loud at the same time."""
 MIN_RISE: Final = float(np.log(2.5))
 """Smallest rise of the logarithm of the variance of a block on a moving axis."""
 MIN_DEVIATION: Final = 6.0
 """Smallest deviation of a block on a moving axis, in standard deviations of the blocks at rest."""
+MIN_BLOCK_SAMPLES: Final = 4
+"""Smallest number of samples of a block whose variance is used. At least half of the block must be present as well."""
+MIN_BLOCKS: Final = 4
+"""Smallest number of blocks for a comparison."""
 MAX_MOVING_SHARE: Final = 0.5
 """Largest share of samples in motion that can be removed."""
 MAX_NAMED: Final = 3
@@ -54,7 +58,7 @@ def check_motion(
     effects = {} if model is None else model.effects
     steady = {axis: y for axis, y in values.items() if not any(isinstance(e, EVENTS) for e in effects.get(axis, ()))}
     episodes = find_motion(steady, rate_hz) if steady else []
-    if not episodes or (simulated is not None and find_motion({a: simulated[a] for a in steady}, rate_hz, axes=1)):
+    if not episodes or (simulated is not None and find_motion({a: simulated[a] for a in steady}, rate_hz, axes=0)):
         return dict(values), []
     n = next(iter(values.values())).size
     moving = np.zeros(n, np.bool_)
@@ -69,7 +73,7 @@ def check_motion(
 def find_motion(
     values: Mapping[str, Floats], rate_hz: float, axes: int = MIN_MOVING_AXES
 ) -> list[tuple[Motion, tuple[str, ...]]]:
-    """Return the episodes of motion that change several axes, with these axes.
+    """Return the episodes of motion in which several axes are loud at the same time, with these axes.
 
     Parameters
     ----------
@@ -78,7 +82,7 @@ def find_motion(
     rate_hz : float
         Sample rate in Hz.
     axes : int, optional
-        Smallest number of axes that an episode must change.
+        Smallest number of axes that are loud at the same time. With 0, all episodes are returned.
     """
     n = next(iter(values.values())).size
     columns = np.full((n, len(AXES)), np.nan)
@@ -88,34 +92,30 @@ def find_motion(
     if not motions:
         return []
     size = block_size(rate_hz)
-    changed = {axis: _changed_blocks(y, size) for axis, y in values.items()}
+    loud = {axis: _loud_blocks(y, size) for axis, y in values.items()}
+    together = np.sum(list(loud.values()), axis=0)
     found = []
     for motion in motions:
         blocks = slice(motion.since // size, -(-motion.until // size))
-        moving = tuple(axis for axis, of in changed.items() if of[blocks].any())
-        if len(moving) >= axes:
+        if together[blocks].max(initial=0) >= axes:
+            moving = tuple(axis for axis, of in loud.items() if of[blocks].any() or axis == motion.axis)
             found.append((motion, moving))
     return found
 
 
-def _changed_blocks(y: Floats, size: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Return for each block whether its variance or its mean differs from those of most blocks."""
+def _loud_blocks(y: Floats, size: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Return for each block whether its variance is larger than the variance of most blocks."""
     blocks = y[: y.size // size * size].reshape(-1, size)
-    used = np.isfinite(blocks).sum(axis=1) >= max(size // 2, 4)
-    changed = np.zeros(len(blocks) + 1, np.bool_)
-    if used.sum() < 4:
-        return changed
-    kept = blocks[used]
-    mean = np.nanmean(kept, axis=1)
-    smallest = np.abs(np.diff(y[np.isfinite(y)]))
-    step = float(smallest[smallest > 0.0].min(initial=0.0)) if (smallest > 0.0).any() else 0.0
-    log_variance = np.log(np.nanvar(kept, axis=1) + step**2 / 12.0 + 1e-30)
+    used = np.isfinite(blocks).sum(axis=1) >= max(size // 2, MIN_BLOCK_SAMPLES)
+    loud = np.zeros(len(blocks) + 1, np.bool_)
+    if used.sum() < MIN_BLOCKS:
+        return loud
+    steps = np.abs(np.diff(y[np.isfinite(y)]))
+    step = float(steps[steps > 0.0].min()) if (steps > 0.0).any() else 0.0
+    log_variance = np.log(np.nanvar(blocks[used], axis=1) + step**2 / 12.0 + 1e-30)
     rise = log_variance - np.median(log_variance)
-    loud = (rise > MIN_RISE) & (rise > MIN_DEVIATION * _scatter(log_variance))
-    floor = float(np.exp(0.5 * np.median(log_variance))) / size**0.5
-    off = np.abs(mean - np.median(mean)) > MIN_DEVIATION * max(_scatter(mean), floor) + step
-    changed[np.flatnonzero(used)] = loud | off
-    return changed
+    loud[np.flatnonzero(used)] = rise > max(MIN_RISE, MIN_DEVIATION * _scatter(log_variance))
+    return loud
 
 
 def _scatter(x: Floats) -> float:
