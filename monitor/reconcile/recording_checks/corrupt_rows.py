@@ -112,6 +112,7 @@ def distances_from_neighbours(y: Floats) -> tuple[Ints, Floats]:
     some = np.zeros(y.size, np.bool_)
     some[1:] |= steps
     some[:-1] |= steps
+    some[1:-1] |= some[2:] | some[:-2]  # rows inside a short run of corrupt rows have no steps
     rows = np.flatnonzero(some)
     away = np.arange(1, NEIGHBOURS + 1)
     padded = np.concatenate([np.full(NEIGHBOURS, np.nan), y, np.full(NEIGHBOURS, np.nan)])

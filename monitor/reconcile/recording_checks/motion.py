@@ -30,7 +30,7 @@ MIN_BLOCK_SAMPLES: Final = 4
 """Smallest number of samples of a block whose variance is used. At least half of the block must be present as well."""
 MIN_BLOCKS: Final = 4
 """Smallest number of blocks for a comparison."""
-MAX_MOVING_SHARE: Final = 0.5
+MAX_MOVING_SHARE: Final = 0.4
 """Largest share of samples in motion that can be removed."""
 MAX_NAMED: Final = 3
 """Largest number of episodes whose times are listed."""
@@ -119,9 +119,9 @@ def _loud_blocks(y: Floats, size: int) -> np.ndarray[tuple[int, ...], np.dtype[n
 
 
 def _scatter(x: Floats) -> float:
-    """Return the standard deviation from the distance of the quartiles."""
-    low, high = np.quantile(x, [0.25, 0.75])
-    return 0.5 * float(high - low) / NORMAL_QUARTILE
+    """Return the standard deviation from the distance of the lower quartile, which motion does not change."""
+    low, middle = np.quantile(x, [0.25, 0.5])
+    return float(middle - low) / NORMAL_QUARTILE
 
 
 def _describe(

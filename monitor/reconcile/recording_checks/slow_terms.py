@@ -1,7 +1,7 @@
 """Check which slow terms of the model a recording is too short to show.
 
-A term with a time constant needs several time constants. Rate random walk and bias instability need a visible share of
-the power at the lowest frequency, which is the inverse of the length of the recording.
+A term with a time constant needs several time constants. Rate random walk and bias instability must be visible beside
+the white noise at the lowest frequency, which is the inverse of the length of the recording.
 """
 
 from typing import Final
@@ -9,14 +9,20 @@ from typing import Final
 import numpy as np
 
 from monitor.noise.effect import Effect
-from monitor.noise.effects import BiasInstability, ExponentiallyCorrelated, RandomTelegraph, RateRandomWalk
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    BiasInstability,
+    ExponentiallyCorrelated,
+    RandomTelegraph,
+    RateRandomWalk,
+)
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 MIN_TIME_CONSTANTS: Final = 5.0
 """Smallest length of a recording in time constants of a term."""
-MIN_POWER_SHARE: Final = 0.05
-"""Smallest share of the power at the lowest frequency that is visible."""
+MIN_POWER_RATIO: Final = 0.05
+"""Smallest power at the lowest frequency that is visible, relative to the white noise."""
 
 
 def check_slow_terms(axes: tuple[str, ...], samples: int, rate_hz: float, model: NoiseModel) -> list[RecordingFinding]:
@@ -52,22 +58,18 @@ def check_slow_terms(axes: tuple[str, ...], samples: int, rate_hz: float, model:
 
 def _invisible_terms(axis: str, length_s: float, rate_hz: float, model: NoiseModel) -> list[str]:
     """Return the names of the terms of one axis that the recording does not show."""
-    lowest = np.array([1.0 / length_s])
-    whole = float(model.psd(axis, lowest, 1.0 / rate_hz)[0])
-    return [
-        effect.name.replace("_", " ")
-        for effect in model.effects.get(axis, ())
-        if _is_invisible(effect, length_s, rate_hz, whole)
-    ]
+    effects = model.effects.get(axis, ())
+    white = sum(effect.N**2 for effect in effects if isinstance(effect, AngleRandomWalk))
+    return [effect.name.replace("_", " ") for effect in effects if _is_invisible(effect, length_s, rate_hz, white)]
 
 
-def _is_invisible(effect: Effect, length_s: float, rate_hz: float, whole: float) -> bool:
+def _is_invisible(effect: Effect, length_s: float, rate_hz: float, white: float) -> bool:
     """Return True if a recording of this length does not show the effect."""
     if isinstance(effect, ExponentiallyCorrelated):
         return effect.correlation_time * MIN_TIME_CONSTANTS > length_s
     if isinstance(effect, RandomTelegraph):
         return effect.dwell_time * MIN_TIME_CONSTANTS > length_s
-    if isinstance(effect, RateRandomWalk | BiasInstability) and whole > 0.0:
+    if isinstance(effect, RateRandomWalk | BiasInstability):
         own = float(effect.spectrum(1.0 / rate_hz).density(np.array([1.0 / length_s]))[0])
-        return 0.0 < own < MIN_POWER_SHARE * whole
+        return 0.0 < own < MIN_POWER_RATIO * white
     return False
