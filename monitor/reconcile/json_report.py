@@ -5,6 +5,8 @@ the recording. A number that is not finite is encoded as null.
 
 Each entry of ``steps`` describes one effect that was added or resized. ``found`` is the difference that led to the
 step. ``gap`` compares the same diagnostic before and after the step. ``scores`` lists the gaps of all diagnostics.
+
+``recording_findings`` lists the faults of the recording with their evidence, the most serious fault first.
 """
 
 from math import isfinite
@@ -20,6 +22,7 @@ from monitor.reconcile.result import (
     Location,
     ParameterInterval,
     Reconciliation,
+    RecordingFinding,
 )
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
@@ -37,8 +40,20 @@ def encode_report(result: Reconciliation) -> bytes:
         "seed": int(result.seed),
         "fitted_first": bool(result.fitted_first),
         "notes": result.notes,
+        "recording_findings": [_finding_entry(finding) for finding in result.recording_findings],
         "axes": {axis: _axis_entry(result.axes[axis]) for axis in AXES if axis in result.axes},
     })  # fmt: skip
+
+
+def _finding_entry(finding: RecordingFinding) -> dict[str, Any]:
+    return {
+        "kind": finding.kind,
+        "axes": finding.axes,
+        "sentence": finding.sentence,
+        "parameters": {name: parameter_entry(bounds) for name, bounds in finding.parameters.items()},
+        "evidence": {name: finite_or_none(number) for name, number in finding.evidence.items()},
+        "corrected": finding.corrected,
+    }
 
 
 def _axis_entry(result: AxisResult) -> dict[str, Any]:

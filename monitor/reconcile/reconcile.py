@@ -34,6 +34,11 @@ from monitor.reconcile.likelihood.effect_roles import with_effect_size
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.reconcile_input import Recording, select_usable_axes
+from monitor.reconcile.recording_checks.checks import check_recording, sort_findings
+from monitor.reconcile.recording_checks.sample_rate_from_features import (
+    describe_sample_rate_error,
+    estimate_sample_rate_error,
+)
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AxisResult,
@@ -116,7 +121,9 @@ def reconcile(
     NotReady
         If the recording has too few samples or no axis that can be compared with the model.
     """
-    recording, notes = select_usable_axes(recording, model)
+    report_stage("checking the recording")
+    checked = check_recording(recording, model, seed)
+    recording, notes = select_usable_axes(checked.recording, model)
     regressors = RegressorCache(recording.sample_count, recording.rate_hz, recording.temperature_c)
     run = RecordingContext(recording, seed, regressors, map_function)
     if model is None:
@@ -138,6 +145,8 @@ def reconcile(
     axes = {name: build_axis_result(one, null[name], final[name]) for name, one in found.searches.items()}
     if found.sample_rate_error is not None:
         axes = _add_sample_rate_step(axes, found.sample_rate_error, null)
+        rate_finding = describe_sample_rate_error(found.sample_rate_error, recording.rate_hz)
+        checked = replace(checked, findings=sort_findings((rate_finding, *checked.findings)))
     return Reconciliation(
         verdict=combine_decisions([one.verdict for one in axes.values()]),
         axes=axes,
@@ -149,6 +158,7 @@ def reconcile(
         duration_s=recording.sample_count / recording.rate_hz,
         seed=seed,
         notes=notes,
+        recording_findings=checked.findings,
     )
 
 
@@ -208,7 +218,13 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
     """
     effects = _effects_by_axis(model, run.recording)
     axes = build_repaired_axes(run.recording, effects, run.regressors, np.random.default_rng(run.seed))
-    error = detect_sample_rate_error(axes, effects)
+    error = estimate_sample_rate_error(
+        {name: axis.coefficients for name, axis in axes.items()},
+        run.recording.rate_hz,
+        effects,
+        model.sample_rate_hz,
+        detect_sample_rate_error(axes, effects),
+    )
     if error is not None:
         ratio = float(error.ratio.value)
         effects = {name: tuple(rescale_effect_time(effect, ratio) for effect in of) for name, of in effects.items()}

@@ -11,6 +11,19 @@ Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]
 """Decision for an axis or a recording."""
 StepKind = Literal["added", "retuned"]
 """Kind of change: an effect was added, or the size of an effect was changed."""
+FindingKind = Literal[
+    "unit_error",
+    "axes_permuted",
+    "sample_rate_error",
+    "stuck_axis",
+    "frozen_rows",
+    "missing_rows",
+    "corrupt_rows",
+    "motion",
+    "repeated_rows",
+    "too_short",
+]
+"""Kind of a fault of the recording, the most serious kind first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +65,18 @@ class ParameterInterval:
     value: float | str
     lo: float | None = None
     hi: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingFinding:
+    """Fault of the recording, such as a wrong unit or motion."""
+
+    kind: FindingKind
+    axes: tuple[str, ...]
+    sentence: str  # description for users: fault, size and correction
+    parameters: Mapping[str, ParameterInterval]
+    evidence: Mapping[str, float]  # numbers that led to the decision, by name
+    corrected: bool  # True if the search uses corrected samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +156,7 @@ class Reconciliation:
     duration_s: float
     seed: int
     notes: tuple[str, ...] = ()
+    recording_findings: tuple[RecordingFinding, ...] = ()  # the most serious fault first
 
 
 def combine_decisions(verdicts: Iterable[Decision]) -> Decision:

@@ -86,9 +86,9 @@ def _overview(r: Reconciliation) -> str:
     head = "| axis | verdict | added or retuned | left over |\n|:--|:--|:--|:--|"
     recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {format_duration(r.duration_s)}"
     notes = [f"note: {note}" for note in r.notes]
-    return "\n\n".join(
-        [f"## {words.RESULT_TEXTS[r.verdict]}", words.summarize(r), recorded, "\n".join([head, *rows]), *notes]
-    )
+    faults = [f"recording: {finding.sentence}" for finding in r.recording_findings]
+    title, table = f"## {words.RESULT_TEXTS[r.verdict]}", "\n".join([head, *rows])
+    return "\n\n".join([title, *faults, words.summarize(r), recorded, table, *notes])
 
 
 def _steps_text(r: Reconciliation, result: AxisResult) -> str:

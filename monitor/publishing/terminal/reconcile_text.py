@@ -40,6 +40,9 @@ def print_reconciliation(r: Reconciliation, console: Console) -> None:
         Destination.
     """
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
+    for finding in r.recording_findings:
+        sign = "◐" if finding.corrected else "✖"
+        console.print(Text(f"{sign} recording: {finding.sentence}", style="yellow"), soft_wrap=True)
     console.print(_verdict(r.verdict), Text(words.summarize(r)))
     console.print(_axes_table(r))
     print_notes(r.notes, console)

@@ -157,10 +157,10 @@ def test_of_two_axes_that_correlate_one_leaks():
 def test_without_a_model_the_five_terms_come_first():
     drawn = recording(MODEL, 24_000, 8)
     told = []
-    found = reconcile(drawn, None, 1, tell=told.append)
+    found = reconcile(drawn, None, 1, report_stage=told.append)
     assert found.fitted_first
     assert found.verdict == "agrees"
-    assert told[0] == "fitting the five terms"
+    assert told[:2] == ["checking the recording", "fitting the five terms"]
     for axis in GYRO_AXES:
         sizes = {effect.name: effect for effect in found.baseline.effects[axis]}
         assert pytest.approx(N, rel=0.03) == sizes["angle_random_walk"].N

@@ -1,0 +1,168 @@
+"""Check whether the axes of a triad are in another order than in the model.
+
+The spectrum of each recorded axis is compared with the spectrum of each axis of a simulation. One common factor of the
+three axes is fitted, because the unit may also be wrong. The noise of a real sensor varies from run to run, so the
+noise level of each axis and the power in each band may differ from the model. A permutation is reported if the
+permuted axes fit clearly better than the axes in the order of the file. Two axes with the same spectrum cannot be
+distinguished and keep their order. Noise spectra do not show the sign of an axis.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.noise.effect import Effect
+from monitor.noise.effects import Narrowband
+from monitor.reconcile.recording_checks.block_spectra import BlockSpectrum
+from monitor.reconcile.result import ParameterInterval, RecordingFinding
+
+LEVEL_LOG_SIGMA: Final = 0.12
+"""Standard deviation of the logarithm of the noise power of an axis between runs (empirical)."""
+BAND_LOG_SIGMA: Final = 0.2
+"""Standard deviation of the logarithm of the power in one band, relative to the axis, between runs (empirical)."""
+MAX_BAND_COST_NATS: Final = 10.0
+"""Largest cost of one band in nats. The limit keeps the cost of a moved line small."""
+MAX_AXIS_COST_NATS: Final = 32.0
+"""Largest cost of the level of one axis in nats."""
+CORRELATED_BANDS: Final = 3.0
+"""Number of neighbouring bands with correlated deviations (empirical)."""
+SWAP_PENALTY_NATS: Final = 1.0
+ROTATION_PENALTY_NATS: Final = 8.0
+"""Penalty in nats for a permutation of three axes. If two axes are similar, a rotation fits as well as a swap."""
+MIN_GAIN_NATS: Final = 6.0
+"""Smallest gain in nats of a permutation over the order of the file.
+
+The gain of 46 unchanged triads of real sensors was at most 4.0 nats (``tests/experiments/blind/corruptions``).
+"""
+IDENTITY: Final = (0, 1, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class TriadOrder:
+    """Assignment of the recorded axes of a triad to the axes of the model."""
+
+    order: tuple[int, ...]  # for each recorded axis, the index of the axis of the model
+    gain: float  # gain in nats over the order of the file
+    log_ratios: Floats  # [3] logarithm of the noise of each recorded axis relative to its axis of the model
+    error: float  # standard error of the mean of ``log_ratios``, including the variation between runs
+
+
+def find_axis_order(
+    recorded: Sequence[BlockSpectrum], simulated: Sequence[BlockSpectrum], peaks: Sequence[tuple[float, float]] = ()
+) -> TriadOrder:
+    """Find the best assignment of the recorded axes of a triad to the axes of the model.
+
+    Parameters
+    ----------
+    recorded, simulated : sequence of BlockSpectrum
+        Spectra of the three recorded axes and of the three axes of a simulation, in the order of their columns.
+    peaks : sequence of tuple of float
+        Frequency in Hz, and variance of the logarithm of the power, of each resonance of the model.
+    """
+    cells = [[_compare_spectra(one, other, peaks) for other in simulated] for one in recorded]
+    costs = {
+        order: _assignment_cost([cells[at][to] for at, to in enumerate(order)], order)
+        for order in permutations(IDENTITY)
+    }
+    best = min(costs, key=lambda order: costs[order])
+    gain = costs[IDENTITY] - costs[best]
+    if gain < MIN_GAIN_NATS:
+        best, gain = IDENTITY, 0.0
+    levels = np.array([cells[at][to][0] for at, to in enumerate(best)])
+    return TriadOrder(best, gain, 0.5 * levels, 0.5 * LEVEL_LOG_SIGMA / float(np.sqrt(3.0)))
+
+
+def compute_resonance_variances(effects: Iterable[Effect], duration_s: float) -> list[tuple[float, float]]:
+    """Return the frequency in Hz of each resonance, and the variance of the logarithm of the resonance power.
+
+    The power of a resonance of bandwidth b changes about π b times per second. In a recording of length T, the power
+    is the mean of about 1 + π b T independent values with an exponential distribution.
+
+    Parameters
+    ----------
+    effects : iterable of Effect
+        Effects of the model.
+    duration_s : float
+        Length of the recording in seconds.
+    """
+    return [
+        (one.frequency, 2.0 / (1.0 + np.pi * one.bandwidth * duration_s))
+        for one in effects
+        if isinstance(one, Narrowband)
+    ]
+
+
+def _compare_spectra(
+    recorded: BlockSpectrum, simulated: BlockSpectrum, peaks: Sequence[tuple[float, float]]
+) -> tuple[float, float]:
+    """Return the logarithm of the ratio of the powers of two axes, and the cost in nats of their different shapes."""
+    ratio = recorded.log_power - simulated.log_power
+    level = float(np.median(ratio))
+    variance = recorded.error**2 + simulated.error**2 + BAND_LOG_SIGMA**2
+    for f_hz, peak_variance in peaks:  # in the recording and in the simulation
+        variance = variance + np.where(np.abs(recorded.f_hz - f_hz) <= recorded.reach_hz, 2.0 * peak_variance, 0.0)
+    cost = np.minimum(0.5 * (ratio - level) ** 2 / variance, MAX_BAND_COST_NATS)
+    return level, max(float(cost.sum()) / CORRELATED_BANDS, float(cost.max()))  # one band contains a whole line
+
+
+def _assignment_cost(cells: Sequence[tuple[float, float]], order: tuple[int, ...]) -> float:
+    """Return the cost in nats of one assignment with the best common factor."""
+    levels = np.array([level for level, _ in cells])
+    level_cost = np.minimum(0.5 * ((levels - np.median(levels)) / LEVEL_LOG_SIGMA) ** 2, MAX_AXIS_COST_NATS).sum()
+    moved = sum(at != to for at, to in enumerate(order))
+    penalty = {0: 0.0, 2: SWAP_PENALTY_NATS, 3: ROTATION_PENALTY_NATS}[moved]
+    return float(level_cost) + sum(cost for _, cost in cells) + penalty
+
+
+def describe_axis_order(triad: Sequence[str], found: TriadOrder) -> RecordingFinding | None:
+    """Describe permuted axes, or return None if the axes are in the order of the model.
+
+    Parameters
+    ----------
+    triad : sequence of str
+        Names of the three axes.
+    found : TriadOrder
+        Assignment of the axes.
+    """
+    moved = {triad[at]: triad[to] for at, to in enumerate(found.order) if at != to}
+    if not moved:
+        return None
+    pairs = ", ".join(f"{column} is {axis}" for column, axis in moved.items())
+    return RecordingFinding(
+        "axes_permuted",
+        tuple(moved),
+        f"The columns of the {_sensor_name(triad)} are in another order than in the model: {pairs}. "
+        f"The columns were put in the order of the model.",
+        {column: ParameterInterval(axis) for column, axis in moved.items()},
+        {"gain_nats": found.gain},
+        corrected=True,
+    )
+
+
+def reorder_axes(values: Mapping[str, Floats], triad: Sequence[str], order: Sequence[int]) -> dict[str, Floats]:
+    """Return the values with the axes of a triad in the order of the model.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray
+        Values of all axes.
+    triad : sequence of str
+        Names of the three axes.
+    order : sequence of int
+        For each recorded axis, the index of the axis of the model.
+
+    Examples
+    --------
+    >>> reorder_axes({"gx": 1, "gy": 2, "gz": 3}, ("gx", "gy", "gz"), (1, 2, 0))
+    {'gx': 3, 'gy': 1, 'gz': 2}
+    """
+    moved = {triad[to]: values[triad[at]] for at, to in enumerate(order)}
+    return {axis: moved.get(axis, y) for axis, y in values.items()}
+
+
+def _sensor_name(triad: Sequence[str]) -> str:
+    return "gyroscopes" if triad[0].startswith("g") else "accelerometers"

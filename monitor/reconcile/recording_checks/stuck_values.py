@@ -1,0 +1,137 @@
+"""Check for runs of equal values on one axis or on all axes.
+
+Quantized values also repeat by chance. The length of a run is therefore compared with the repeats in the rest of the
+recording and with the longest run in a simulation of the model. A run at the largest or smallest value of the axis may
+be clipping, which the search for noise effects handles.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import log
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import AXES, Floats
+from monitor.reconcile.result import ParameterInterval, RecordingFinding
+
+MIN_RUN_SAMPLES: Final = 16
+"""Smallest number of equal samples in a run that is reported."""
+WINDOW_SAMPLES: Final = 256
+"""Number of samples in a window for the share of chance repeats."""
+MAX_CHANCE: Final = 1e-9
+"""Largest probability of a reported run by chance."""
+MIN_SIMULATED_RATIO: Final = 3.0
+"""Smallest length of a run relative to the longest run in a simulation of the model."""
+SAME_RUN_SHARE: Final = 0.8
+"""Smallest overlap of two runs that are reported together, as a fraction of the total duration."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Run of equal values on one axis."""
+
+    axis: str
+    first: int  # index of the first sample
+    last: int  # index after the last sample
+    chance_log: float  # logarithm of the probability by chance
+
+
+def check_stuck_values(
+    values: Mapping[str, Floats], rate_hz: float, simulated: Mapping[str, Floats] | None
+) -> tuple[dict[str, Floats], list[RecordingFinding]]:
+    """Mark stuck samples as missing, and return the values with a finding for each group of stuck axes.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray, shape (n,)
+        Samples of each axis; NaN means missing.
+    rate_hz : float
+        Sample rate in Hz.
+    simulated : mapping of str to ndarray or None
+        Simulation of the model under test.
+    """
+    runs = [run for axis, y in values.items() if (run := find_stuck_run(axis, y, simulated)) is not None]
+    marked, findings = dict(values), []
+    while runs:
+        together = [run for run in runs if _overlap_fraction(run, runs[0]) >= SAME_RUN_SHARE]
+        runs = [run for run in runs if run not in together]
+        findings.append(_describe(together, values, rate_hz))
+        for run in together:
+            y = marked[run.axis].copy()
+            y[run.first + 1 : run.last] = np.nan
+            if run.last - run.first < y.size:  # ``select_usable_axes`` excludes a constant axis
+                marked[run.axis] = y
+    return marked, findings
+
+
+def find_stuck_run(axis: str, y: Floats, simulated: Mapping[str, Floats] | None) -> Run | None:
+    """Find the longest run of equal values, or return None if the run may occur by chance.
+
+    Parameters
+    ----------
+    axis : str
+        Name of the axis.
+    y : ndarray of float64, shape (n,)
+        Samples of the axis; NaN means missing.
+    simulated : mapping of str to ndarray or None
+        Simulation of the model under test.
+    """
+    first, last = find_longest_run(y)
+    length = last - first
+    least = float(MIN_RUN_SAMPLES)
+    if simulated is not None and axis in simulated:
+        begin, end = find_longest_run(simulated[axis])
+        least = max(least, MIN_SIMULATED_RATIO * (end - begin))
+    if length < least:
+        return None
+    others = np.concatenate([y[:first], y[last:]])
+    others = others[np.isfinite(others)]
+    if others.size and y[first] in (others.min(), others.max()):
+        return None
+    repeats = np.concatenate([y[1:first] == y[: max(first - 1, 0)], y[last + 1 :] == y[last:-1]]).astype(np.float64)
+    windows = repeats[: repeats.size // WINDOW_SAMPLES * WINDOW_SAMPLES].reshape(-1, WINDOW_SAMPLES).sum(axis=1)
+    most = windows.max() if windows.size else repeats.sum()
+    share = (most + 2.0) / (min(WINDOW_SAMPLES, repeats.size) + 3.0)
+    chance_log = log(y.size) + (length - 1) * log(min(share, 1.0 - 1e-9))
+    return Run(axis, first, last, chance_log) if chance_log < log(MAX_CHANCE) else None
+
+
+def find_longest_run(y: Floats) -> tuple[int, int]:
+    """Return the first index and the index after the last index of the longest run of equal values.
+
+    Examples
+    --------
+    >>> find_longest_run(np.array([1.0, 2.0, 2.0, 2.0, 3.0]))
+    (1, 4)
+    """
+    changes = np.flatnonzero(~(y[1:] == y[:-1])) + 1
+    edges = np.concatenate([[0], changes, [y.size]])
+    at = int(np.diff(edges).argmax())
+    return int(edges[at]), int(edges[at + 1])
+
+
+def _overlap_fraction(one: Run, other: Run) -> float:
+    """Return the overlap of two runs as a fraction of the time from the first start to the last end."""
+    common = min(one.last, other.last) - max(one.first, other.first)
+    return common / (max(one.last, other.last) - min(one.first, other.first))
+
+
+def _describe(runs: list[Run], values: Mapping[str, Floats], rate_hz: float) -> RecordingFinding:
+    axes = tuple(axis for axis in AXES if any(run.axis == axis for run in runs))
+    first, last = min(run.first for run in runs), max(run.last for run in runs)
+    frozen = len(axes) > 1 and len(axes) == len(values)
+    begin_s, duration_s = first / rate_hz, (last - first) / rate_hz
+    whole = last - first == values[axes[0]].size
+    what = (
+        "The whole row repeats" if frozen else f"{' and '.join(axes)} {'keep' if len(axes) > 1 else 'keeps'} one value"
+    )
+    action = "The axis was left out." if whole else "The repeated samples were marked as missing."
+    return RecordingFinding(
+        "frozen_rows" if frozen else "stuck_axis",
+        axes,
+        f"{what} for {duration_s:.5g} s from {begin_s:.5g} s. {action}",
+        {"time": ParameterInterval(begin_s), "duration": ParameterInterval(duration_s)},
+        {"samples": float(last - first), "ln_chance": max(run.chance_log for run in runs)},
+        corrected=True,
+    )

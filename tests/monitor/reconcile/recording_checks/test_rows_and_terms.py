@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from drivers.data_types import AXES
+from monitor.noise.effects import AngleRandomWalk, ExponentiallyCorrelated, RandomSampleHold, RateRandomWalk
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.recording_checks.missing_rows import check_missing_rows
+from monitor.reconcile.recording_checks.repeated_rows import check_repeated_rows
+from monitor.reconcile.recording_checks.slow_terms import check_slow_terms
+from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
+
+MODEL = make_model(step=8.0)
+
+
+def values():
+    return {axis: y.copy() for axis, y in draw(MODEL, 2).values.items()}
+
+
+def test_holes_are_counted():
+    recorded = values()
+    for y in recorded.values():
+        y[100:110] = np.nan
+        y[5000:5200] = np.nan
+    recorded["gx"][9000:9999] = np.nan  # one axis is no row
+    (finding,) = check_missing_rows(recorded, RATE_HZ)
+    assert finding.evidence == {"rows": 210.0, "holes": 2.0, "share": 210 / 16_000}
+    assert (finding.parameters["time"].value, finding.parameters["duration"].value) == (50.0, 2.0)
+
+
+def test_a_complete_recording_has_no_holes():
+    assert check_missing_rows(values(), RATE_HZ) == []
+
+
+def test_repeated_rows_are_measured_and_kept():
+    recorded = values()
+    again = 1 + np.flatnonzero(np.random.default_rng(0).random(15_999) < 0.2)
+    for y in recorded.values():
+        for row in again:
+            y[row] = y[row - 1]
+    (finding,) = check_repeated_rows(recorded, RATE_HZ, MODEL)
+    assert finding.parameters["share"].value == pytest.approx(0.2, abs=0.02)
+    assert not finding.corrected
+
+
+def test_repeats_that_the_model_knows_or_chance_explains_are_no_finding():
+    assert check_repeated_rows(values(), RATE_HZ, MODEL) == []
+    held = MODEL + NoiseModel({"gx": (RandomSampleHold(fraction=0.2),)})
+    recorded = {axis: y.repeat(2) for axis, y in values().items()}
+    assert check_repeated_rows(recorded, RATE_HZ, held) == []
+    assert len(check_repeated_rows(recorded, RATE_HZ, MODEL)) == 1
+
+
+def test_a_term_slower_than_the_recording_is_named():
+    slow = NoiseModel({
+        "gx": (AngleRandomWalk(N=1e-4), ExponentiallyCorrelated(sigma=1e-4, correlation_time=500.0)),
+        "gy": (AngleRandomWalk(N=1e-4), RateRandomWalk(K=1e-7)),
+        "gz": (AngleRandomWalk(N=1e-4), RateRandomWalk(K=1e-4)),
+    })  # fmt: skip
+    (finding,) = check_slow_terms(AXES[:3], 16_000, RATE_HZ, slow)
+    assert finding.axes == ("gx", "gy")
+    assert "exponentially correlated of gx; rate random walk of gy" in finding.sentence
+    assert check_slow_terms(AXES[:3], 100_000_000, RATE_HZ, slow) == []
