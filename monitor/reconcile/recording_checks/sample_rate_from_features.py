@@ -13,8 +13,8 @@ tests each feature separately, relative to the surrounding spectrum.
   group remains at the stated frequency.
 
 The noise level is no evidence for a wrong sample rate. An error of 20 % changes the level by 10 %, and the noise of
-many sensors varies as much from run to run. The cutoff of a low-pass filter is too weak as evidence. For a sample rate that
-is wrong by 5 %, the gain of the cutoff is at most 7 nats in 60 000 samples of a real sensor.
+many sensors varies as much from run to run. The cutoff of a low-pass filter is too weak as evidence. For a sample rate
+that is wrong by 5 %, the gain of the cutoff is at most 7 nats in 60 000 samples of a real sensor.
 """
 
 from collections.abc import Mapping, Sequence
