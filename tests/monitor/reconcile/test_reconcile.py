@@ -157,7 +157,7 @@ def test_of_two_axes_that_correlate_one_leaks():
 def test_without_a_model_the_five_terms_come_first():
     drawn = recording(MODEL, 24_000, 8)
     told = []
-    found = reconcile(drawn, None, 1, tell=told.append)
+    found = reconcile(drawn, None, 1, report_stage=told.append)
     assert found.fitted_first
     assert found.verdict == "agrees"
     assert told[0] == "fitting the five terms"
