@@ -1,7 +1,7 @@
 """Outputs of the daemon: zenoh messages, viewer, log lines, and the table in the terminal.
 
-``monitor.daemon.output_interface.Output`` describes the parameters of the methods. The messages and drawings of each kind
-of result are listed in ``monitor.publishing.result_kinds``.
+``monitor.daemon.output_interface.Output`` describes the parameters of the methods.
+``monitor.publishing.result_kinds`` lists the messages and drawings of each kind of result.
 """
 
 from collections.abc import Callable
