@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.recordings import arrow_format, csv_format, npz_format
+from drivers.recordings import csv_format, npz_format
+from drivers.recordings import parquet_and_arrow_format as arrow_format
 from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 
 

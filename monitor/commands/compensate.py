@@ -19,7 +19,7 @@ from drivers.recordings import iter_blocks, load_samples
 from drivers.recordings.writing import open_recording_writer
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
-from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
+from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.compensation_score import score_at_rest
 from monitor.drift.compensation.compensator import Compensator, DriftInterval
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
@@ -47,7 +47,7 @@ class CompensationRequest:
 
 def run_compensation(
     request: CompensationRequest, report_progress: ProgressCallback = ignore_progress
-) -> CompensationResult:
+) -> DriftCompensationResult:
     """Compensate a recording and write the result.
 
     Parameters
@@ -59,7 +59,7 @@ def run_compensation(
 
     Returns
     -------
-    CompensationResult
+    DriftCompensationResult
         Quality of the uncompensated and the compensated rate of each gyro axis.
 
     Raises
@@ -97,7 +97,7 @@ def run_compensation(
     }
     start_s = 0.0 if found.t_s is None else float(found.t_s[0])
     _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, report_progress)
-    return CompensationResult(
+    return DriftCompensationResult(
         recording=request.recording.name,
         out=request.out,
         method=request.method,

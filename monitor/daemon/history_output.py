@@ -8,7 +8,7 @@ from typing import Any
 from drivers.data_types import Event, Ints, SampleBlock
 from drivers.errors import NotReady, RecordingError
 from monitor.common.device_health import Health
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.estimation.estimate import Estimate
 from monitor.history.history_table import HistoryTable, read_history
 from monitor.history.minute_aggregation import MinuteAggregator
@@ -53,7 +53,7 @@ class HistoryOutput(Output):
     def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Aggregate the temperature of the samples."""
         unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
-        self.writer.queue_item(device, self._minutes[device].add_temperature(unix_s, samples.temperature_c))
+        self.writer.queue_item(device, self._minutes[device].generate_temperature(unix_s, samples.temperature_c))
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Aggregate the coefficients and the Allan deviations of an estimate."""

@@ -1,7 +1,7 @@
 """Outputs of the daemon: zenoh messages, viewer, log lines, and the table in the terminal.
 
-``monitor.daemon.output.Output`` describes the parameters of the methods. ``monitor.publishing.result_kinds`` lists the
-messages and drawings of each kind of result.
+``monitor.daemon.output_interface.Output`` describes the parameters of the methods.
+``monitor.publishing.result_kinds`` lists the messages and drawings of each kind of result.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from drivers.data_types import Event, Ints, SampleBlock
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.common.device_health import Health
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.message import Message

@@ -16,7 +16,7 @@ from drivers.errors import NotReady
 from monitor.daemon.device.device_timeline import DeviceTimeline
 from monitor.daemon.device.pipeline import DevicePipeline
 from monitor.daemon.operations.coefficient_limits import LimitMonitor
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.daemon.schedule import Schedule
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.estimation.detection.model_agreement_monitor import ModelAgreementMonitor

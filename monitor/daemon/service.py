@@ -30,7 +30,7 @@ from monitor.daemon.operations.hooks import Hooks
 from monitor.daemon.operations.log_level import set_log_level
 from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.operations.systemd import SystemdNotifier
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.daemon.result_outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.history.history_table import HistoryTable

@@ -19,8 +19,8 @@ from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.live_total_and_hadamard import LiveTotalAndHadamard
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.allan.uncertainty import (
-    AxisCovarianceTables,
     CovarianceTable,
+    CovarianceTablesByAxis,
     PerTauSpanDegreesOfFreedom,
     deviation_intervals,
 )
@@ -86,7 +86,7 @@ class Estimator:
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
         self._design = make_design_matrix(factors, rate_hz)
-        self._tables = AxisCovarianceTables(factors, length)
+        self._tables = CovarianceTablesByAxis(factors, length)
         self._spans = PerTauSpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
         self._lengths = np.zeros(6, np.int64)  # number of samples in the window since the last restart of each axis

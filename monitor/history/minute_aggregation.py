@@ -57,7 +57,7 @@ class MinuteAggregator:
         self._estimates.add_values(self._numbers.convert_estimate(estimate))
         return full
 
-    def add_temperature(self, unix_s: float, temperature_c: Floats) -> HistoryRow | None:
+    def generate_temperature(self, unix_s: float, temperature_c: Floats) -> HistoryRow | None:
         """Add the mean temperature of a batch. Return the previous row if the batch begins a new row, otherwise None.
 
         Parameters

@@ -24,7 +24,6 @@ from drivers.recordings import (
     FORMATS,
     MAX_VALUE,
     Recording,
-    arrow_format,
     is_recording,
     iter_blocks,
     load_samples,
@@ -32,6 +31,7 @@ from drivers.recordings import (
     open_recording_writer,
     save_samples,
 )
+from drivers.recordings import parquet_and_arrow_format as arrow_format
 from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
 from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recordings.writing import atomic_write_path

@@ -344,7 +344,7 @@ def write_history(path: Path, device: str, now_s: float) -> None:
             scale = (1.0 + wander[i]) * (1.5 if i == 500 else 1.0)
             rows.append(minutes.add_estimate(now_s - 86_400.0 + 60.0 * i, scale_estimate(scale, rng)))
             rows.append(
-                minutes.add_temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)]))
+                minutes.generate_temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)]))
             )
     store = HistoryStore(path)
     times = [now_s - 86_400.0 + 60.0 * i for i in (500, 800, 860)]

@@ -82,4 +82,4 @@ def test_after_the_warm_up_nothing_more_is_compiled_and_each_kernel_has_one_sign
     assert found, "the samples must lead through what follows motion and changes"
     assert {name: counts for name, counts in after.items() if counts != before.get(name)} == {}
     assert {name: counts for name, counts in after.items() if max(counts) > 1} == {}
-    assert after["monitor.estimation.allan.window_kernel.advance"] == [1, 1]
+    assert after["monitor.estimation.allan.window_kernel.append_staged_samples"] == [1, 1]

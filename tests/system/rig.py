@@ -14,7 +14,7 @@ import numpy as np
 from drivers.data_types import Event, SampleBlock, concatenate_blocks
 from monitor.common.device_health import Health
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.daemon.service import Service
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult

@@ -70,7 +70,7 @@ def test_bias_beside_what_its_temperature_lets_expect(tmp_path: Path) -> None:
         wait_for(last_look, "the last message over zenoh")
     assert looks[-1].axes["gz"].model.startswith("difference")
     before = [look.axes["gz"] for look in looks[24 : round(6 * AT_H)]]
-    assert np.mean([one.one_step is not None and one.one_step.side_of(one.bias) == 0 for one in before]) > 0.75
+    assert np.mean([one.one_step is not None and one.one_step.side_of_interval(one.bias) == 0 for one in before]) > 0.75
     told = [event for _, event in caught.events if event.kind == "temperature_unexplained"]
     assert [event.axis for event in told] == ["gz"]
     assert abs(told[0].values["bias"]["size"] / STEP - 1.0) < 0.2

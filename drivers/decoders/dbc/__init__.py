@@ -47,7 +47,7 @@ class DbcDecoder:
     carrier: ClassVar[str] = "frames"
 
     def __init__(self, messages: Sequence[CanMessage], settings: Settings, timing: Timing) -> None:
-        slow = [m for m in messages if m.has_only_temperature and len(messages) > 1]
+        slow = [m for m in messages if m.contains_only_temperature and len(messages) > 1]
         self._slow = slow[0] if slow else None
         self._messages = [m for m in messages if m is not self._slow]
         self._settings = settings

@@ -55,7 +55,7 @@ class Database:
     @property
     def messages(self) -> list[CanMessage]:
         """CAN messages with the configured signals. A message that contains only the counter is the first one."""
-        return sorted(self._used.values(), key=lambda m: not m.has_only_counter)
+        return sorted(self._used.values(), key=lambda m: not m.contains_only_counter)
 
     @contextlib.contextmanager
     def _collecting(self) -> Iterator[None]:
@@ -95,7 +95,7 @@ class Database:
         if "." in name or self._settings.join == "time":
             return [self._find_signal("counter", name)]
         # a message with only the temperature needs no counter
-        inertial = [m.name for m in self._used.values() if not m.has_only_temperature]
+        inertial = [m.name for m in self._used.values() if not m.contains_only_temperature]
         return [self._find_signal("counter", f"{message}.{name}") for message in inertial]
 
     def _add_axis(self, axis: str, entry: SignalSettings) -> None:

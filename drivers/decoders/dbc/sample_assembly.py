@@ -63,12 +63,12 @@ class CanMessage:
         return self.frame_id | (EXTENDED_ID if self.extended else 0)
 
     @property
-    def has_only_counter(self) -> bool:
+    def contains_only_counter(self) -> bool:
         """True if the message contains only the counter."""
         return self.counter is not None and not self.columns and self.valid is None
 
     @property
-    def has_only_temperature(self) -> bool:
+    def contains_only_temperature(self) -> bool:
         """True if the message contains only the temperature."""
         indices = {column.index for column in self.columns}
         return indices == {len(AXES)} and self.valid is None and self.counter is None
@@ -107,7 +107,7 @@ class SampleAssembler:
         self._n = len(messages)
         self._by_count = settings.join == "counter"
         self._counters = [m.counter for m in messages]
-        self._counter_message = next((i for i, m in enumerate(messages) if m.has_only_counter), None)
+        self._counter_message = next((i for i, m in enumerate(messages) if m.contains_only_counter), None)
         self._window_ns = round(settings.window * 1e9) or (1 << 62)
         self._partial = settings.partial
         self.dropped_late_samples = 0

@@ -21,7 +21,7 @@ from monitor.daemon.device.ring_buffer import RingBuffer
 from monitor.daemon.device.window_restore import WindowRestore
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.coefficient_limits import LimitMonitor, read_model_in_force
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.daemon.result_publisher import ResultPublisher
 from monitor.daemon.storage.recorder import Recorder
 from monitor.estimation.window_snapshot import WindowSnapshot

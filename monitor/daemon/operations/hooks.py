@@ -23,7 +23,7 @@ from typing import Final
 import structlog
 
 from drivers.data_types import Event
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Hook
 
@@ -195,7 +195,7 @@ def _wait_for_end(
     """Wait for the end of a command or kill the command; return "" or a description of the error."""
     until_s = time.monotonic() + timeout_s
     while process.poll() is None:
-        pipes.transfer_pipe_data()
+        pipes.exchange_stdin_and_stdout()
         if ending():
             return "killed because the service ended"
         if time.monotonic() > until_s:
@@ -229,7 +229,7 @@ class _Pipes:
         for pipe in (self._in, self._out):
             pipe.close()
 
-    def transfer_pipe_data(self) -> None:
+    def exchange_stdin_and_stdout(self) -> None:
         """Write to the standard input and read from the standard output for up to POLL_S."""
         for key, _ in self._selector.select(POLL_S):
             if key.fileobj is self._in:

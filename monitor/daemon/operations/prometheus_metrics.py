@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Event
 from monitor.common.device_health import Health
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.noise.effect import gyro_and_accel_units

@@ -21,7 +21,7 @@ class AxisCompensation:
 
 
 @dataclass(frozen=True, slots=True)
-class CompensationResult:
+class DriftCompensationResult:
     """Result of the drift compensation of a recording."""
 
     recording: str

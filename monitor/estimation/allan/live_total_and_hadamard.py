@@ -28,7 +28,7 @@ from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.squared_difference_moments import (
     EstimatorMoments,
     PhaseRing,
-    variance_from_sums_of_squares,
+    compute_variance_from_squared_differences,
 )
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
@@ -168,7 +168,9 @@ class LiveTotalAndHadamard:
         _, unit = self._ring()
         sums[sums <= MAX_ROUNDING_SQUARE[statistic] * terms] = 0.0
         weights = (total, hadamard)[statistic].SQUARED_WEIGHTS
-        variance = variance_from_sums_of_squares((sums * unit**2)[None], terms[None], np.array([m]), weights)[0]
+        variance = compute_variance_from_squared_differences(
+            (sums * unit**2)[None], terms[None], np.array([m]), weights
+        )[0]
         return _Result(variance, terms, self._cached_moments(statistic, n, m))
 
     def _cached_moments(self, statistic: int, n: int, m: int) -> EstimatorMoments:

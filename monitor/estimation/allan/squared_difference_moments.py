@@ -78,7 +78,7 @@ def variance_from_squared_differences(
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
     squared_weights : float
-        Divisor in the definition of the variance, see ``variance_from_sums_of_squares``.
+        Divisor in the definition of the variance, see ``compute_variance_from_squared_differences``.
     add_squares : callable
         Function that adds the squared differences at one cluster size to sums [k], and counts the differences [k].
     """
@@ -87,10 +87,12 @@ def variance_from_squared_differences(
     terms = np.zeros(sums.shape, np.int64)
     for i, m in enumerate(factors):
         add_squares(ring, int(m), sums[i], terms[i])
-    return variance_from_sums_of_squares(sums, terms, factors, squared_weights), terms
+    return compute_variance_from_squared_differences(sums, terms, factors, squared_weights), terms
 
 
-def variance_from_sums_of_squares(sums: Floats, terms: Ints, factors: Ints, squared_weights: float) -> Floats:
+def compute_variance_from_squared_differences(
+    sums: Floats, terms: Ints, factors: Ints, squared_weights: float
+) -> Floats:
     """Convert sums of squared phase differences to variances.
 
     Parameters

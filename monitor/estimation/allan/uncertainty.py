@@ -60,7 +60,7 @@ class CovarianceTable:
     bend: Floats  # [m, 4] covariance of ``slope`` with ``batch.rate_slope_per_tau``
 
 
-class AxisCovarianceTables:
+class CovarianceTablesByAxis:
     """Covariance tables of six axes for a growing window.
 
     Axes that use the whole window share a covariance table.

@@ -29,7 +29,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats, Ints
 from monitor.common.distributions import normal_quantile
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.uncertainty import NOISES, PAIRS, AxisCovarianceTables, CovarianceTable, K
+from monitor.estimation.allan.uncertainty import NOISES, PAIRS, CovarianceTable, CovarianceTablesByAxis, K
 from monitor.estimation.estimate import Estimate
 from monitor.noise.model import NoiseModel
 from monitor.noise.spectrum import MIN_FREQUENCY_CYCLES, Spectrum, frequency_grid
@@ -96,7 +96,7 @@ class PreparedModel:
         self._model = model
         self._length = length
         self._expected: dict[str, _Expected] = {}
-        self._tables = AxisCovarianceTables(np.empty(0, np.int64), length)
+        self._tables = CovarianceTablesByAxis(np.empty(0, np.int64), length)
         self._of: tuple[float, tuple[int, ...]] = (0.0, ())  # rate and cluster sizes of the prepared values
 
     def compare_with_estimate(self, estimate: Estimate) -> ModelComparison:
@@ -118,11 +118,11 @@ class PreparedModel:
             estimate.t_ns, estimate.rate_hz, estimate.window_s, estimate.samples, curve.n, curve.tau_s, found
         )
 
-    def _prepare(self, factors: Ints, rate_hz: float) -> AxisCovarianceTables:
+    def _prepare(self, factors: Ints, rate_hz: float) -> CovarianceTablesByAxis:
         """Return the covariance tables. A new rate or new cluster sizes change the expected Allan variances."""
         of = (rate_hz, tuple(factors.tolist()))
         if self._of[1] != of[1]:
-            self._tables = AxisCovarianceTables(factors, self._length)
+            self._tables = CovarianceTablesByAxis(factors, self._length)
         if self._of != of:
             named = (axis for axis in AXES if self._model.effects.get(axis))
             known = {axis: _Expected.from_model(self._model, axis, factors, rate_hz) for axis in named}

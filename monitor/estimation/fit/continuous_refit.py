@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled, inlined
-from monitor.estimation.allan.uncertainty import NOISES, UNLIMITED_SAMPLES, AxisCovarianceTables, CovarianceTable
+from monitor.estimation.allan.uncertainty import NOISES, UNLIMITED_SAMPLES, CovarianceTable, CovarianceTablesByAxis
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.allan.window_kernel import (
     AXES,
@@ -89,11 +89,11 @@ class ContinuousRefit:
         Window to which only this object appends samples.
     rows : int
         Number of cluster sizes of the window that are fitted.
-    tables : AxisCovarianceTables
+    tables : CovarianceTablesByAxis
         Covariances for the fitted cluster sizes.
     """
 
-    def __init__(self, window: AllanWindow, rows: int, tables: AxisCovarianceTables) -> None:
+    def __init__(self, window: AllanWindow, rows: int, tables: CovarianceTablesByAxis) -> None:
         self._window, self._rows, self._tables = window, rows, tables
         avar, terms, slopes = np.zeros((3, AXES, rows))
         self._curves = CurvesOfAxes(avar, terms, np.zeros(AXES), slopes)

@@ -11,7 +11,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from monitor.common.distributions import Z95
 from monitor.common.units import DEVIATION_UNITS, format_duration
-from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
+from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.sage_husa import USED
 from monitor.publishing.plots import style
 
@@ -24,7 +24,7 @@ MAX_LINE_POINTS: Final = 400  # more points would hide the band and the measured
 MEANS_ALPHA: Final = 0.6
 
 
-def save_compensation_plot(result: CompensationResult, path: Path) -> None:
+def save_compensation_plot(result: DriftCompensationResult, path: Path) -> None:
     """Write the plot of a drift compensation to a file.
 
     Parameters
@@ -51,7 +51,7 @@ def save_compensation_plot(result: CompensationResult, path: Path) -> None:
         style.save_figure(figure, path)
 
 
-def _draw_drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
+def _draw_drift(panel: "Axes", axis: str, result: DriftCompensationResult) -> None:
     i, colour = AXES.index(axis), style.axis_colour(axis)
     minutes = np.array([one.end for one in result.intervals]) / result.rate_hz / 60.0
     used = np.array([one.outcome[i] for one in result.intervals]) == USED

@@ -8,7 +8,7 @@ from rich.padding import Padding
 
 from monitor.common.units import DEVIATION_UNITS, format_count, format_duration, format_number
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
+from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.compensation_score import SPANS_S, RestScore
 from monitor.publishing.messages.message import encode_json
 from monitor.publishing.terminal.tables import plain_table, print_notes
@@ -19,12 +19,12 @@ ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
 """JSON keys of the ARMA coefficients."""
 
 
-def print_compensation(result: CompensationResult, console: Console) -> None:
+def print_compensation(result: DriftCompensationResult, console: Console) -> None:
     """Print the results of a drift compensation.
 
     Parameters
     ----------
-    result : CompensationResult
+    result : DriftCompensationResult
         Results to print.
     console : Console
         Terminal or file.
@@ -57,7 +57,7 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
     console.print(f"{result.out} written", highlight=False, soft_wrap=True)
 
 
-def encode_compensation(result: CompensationResult) -> bytes:
+def encode_compensation(result: DriftCompensationResult) -> bytes:
     """Encode the results of a drift compensation as JSON, in SI units."""
     whole = {
         "schema": SCHEMA,
@@ -75,7 +75,7 @@ def encode_compensation(result: CompensationResult) -> bytes:
     return encode_json(whole)
 
 
-def _axis(at: int, one: AxisCompensation, result: CompensationResult) -> dict[str, Any]:
+def _axis(at: int, one: AxisCompensation, result: DriftCompensationResult) -> dict[str, Any]:
     each = result.intervals
     return {
         "model": None if one.model is None else _model(one.model),

@@ -29,7 +29,7 @@ import numpy as np
 from drivers.recordings import segment_file
 from monitor.common.device_health import Health
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.daemon.service import Service
 from monitor.settings import loading
 from tests.support.ports import free_endpoint, free_port

@@ -18,7 +18,7 @@ from structlog.testing import capture_logs
 from drivers.data_types import Event
 from drivers.errors import ConfigError
 from monitor.daemon import config_changes
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.daemon.result_outputs import TableOutput
 from monitor.daemon.service import Service
 from monitor.noise.model_loading import read_model

@@ -16,7 +16,7 @@ from drivers.data_types import Event
 from drivers.recordings import save_samples
 from monitor.common.device_health import Health
 from monitor.daemon.kernels import kernel_compilation, kernel_parts
-from monitor.daemon.output import Output
+from monitor.daemon.output_interface import Output
 from monitor.daemon.result_outputs import TableOutput
 from monitor.daemon.service import Service
 from monitor.estimation.detection.model_comparison import ModelComparison

@@ -204,7 +204,7 @@ def effects(data: bytes) -> None:
 def duration(data: bytes) -> None:
     """Durations: seconds above 0, or a line."""
     try:
-        seconds = loading.seconds(_text(data))
+        seconds = loading.parse_duration_s(_text(data))
     except ConfigError as error:
         one_line(error)
         return
@@ -229,8 +229,8 @@ def command_line(data: bytes) -> None:
     """Arguments that are more than a word."""
     text = _text(data)
     for read in (
-        options.tau,
-        options.order,
+        options.parse_averaging_times,
+        options.parse_arma_order,
         loading.check_viewer_mode,
         lambda word: options.parse_duration("--window", word),
     ):

@@ -10,7 +10,7 @@ from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.allan.uncertainty import (
     PAIRS,
     TABLE_STEP,
-    AxisCovarianceTables,
+    CovarianceTablesByAxis,
     covariance_table,
     deviation_intervals,
 )
@@ -78,7 +78,7 @@ def test_covariance_is_that_of_simulated_curves(source, pair):
     n, factors, runs = 512, np.array([1, 4, 16, 64, 128]), 3000
     t = covariance_table(n, factors)
     rng = np.random.default_rng(11)
-    records = np.stack([source.start(1.0, rng).draw(n) for _ in range(runs)], axis=1)
+    records = np.stack([source.start_series(1.0, rng).draw(n) for _ in range(runs)], axis=1)
     measured = np.cov(overlapping_avar(records, factors)[0])
     stated = t.covariance[:, :, PAIRS.index(pair)]
     # a sample covariance of 3000 curves scatters by 3–5 % of the two deviations
@@ -111,7 +111,7 @@ def test_too_short_a_window_is_nan_not_a_number():
 
 
 def test_tables_are_renewed_as_the_window_grows_and_kept_when_it_is_full():
-    tables = AxisCovarianceTables(np.array([1, 2, 4]), capacity=10_000)
+    tables = CovarianceTablesByAxis(np.array([1, 2, 4]), capacity=10_000)
     made = [tables.table_of_axis(0, n, n) for n in range(8, 10_001)]
     lengths = sorted({t.n for t in made})
     assert len(lengths) < np.log(10_000 / 8) / np.log(TABLE_STEP) + 12

@@ -5,7 +5,7 @@ import pytest
 
 from drivers.data_types import AXES, make_block
 from monitor.estimation.allan.batch import cluster_sizes
-from monitor.estimation.allan.uncertainty import AxisCovarianceTables
+from monitor.estimation.allan.uncertainty import CovarianceTablesByAxis
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
 from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
@@ -27,7 +27,7 @@ def simulated(n, *more, seed=0):
 def follow(values, blocks=(1000,)):
     """The course of the coefficients of values [n, 6], and the window they end with."""
     window = AllanWindow(LENGTH, FACTORS)
-    refit = ContinuousRefit(window, FACTORS.size, AxisCovarianceTables(FACTORS, LENGTH))
+    refit = ContinuousRefit(window, FACTORS.size, CovarianceTablesByAxis(FACTORS, LENGTH))
     courses, at, k, lengths = [], 0, 0, np.zeros(6, np.int64)
     while at < len(values):
         courses.append(refit.advance_and_refit(DESIGN, values[at : at + blocks[k % len(blocks)]], lengths))
@@ -39,7 +39,7 @@ def follow(values, blocks=(1000,)):
 def fresh(window, before):
     """A fit from nothing to the curve of a window; diagonal weights, as at every sample."""
     n = window.samples_in_window
-    table = AxisCovarianceTables(FACTORS, LENGTH).table_of_axis(0, n, n)
+    table = CovarianceTablesByAxis(FACTORS, LENGTH).table_of_axis(0, n, n)
     slope, slopes = window.rate_slopes_per_axis_and_tau()
     avar, terms = window.avar(), window.term_counts()
     return fit_coefficients(
