@@ -414,7 +414,7 @@ def test_garbage_on_the_line(tmp_path: Path) -> None:
 
         def garbage() -> bool:
             cable.write(noise.randbytes(400).replace(b"\n", b"\0"))
-            return "no sample" in run.caught.healths["board"].text
+            return "without a sample" in run.caught.healths["board"].text
 
         wait_for(garbage, "the status to say that samples come no more")
         goes_on(run)

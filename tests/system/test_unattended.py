@@ -10,7 +10,7 @@ from tests.experiments.benchmarks import faults
 
 SAYS = {
     "cable": "the device is gone",
-    "half_baud": "no sample in",
+    "half_baud": "bytes without a sample",
     "can_bus": "bus off",
     "two_daemons": "held by another program",
     "no_descriptors": "Too many open files",

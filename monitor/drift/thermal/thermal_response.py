@@ -170,8 +170,10 @@ def difference_equation_coefficients(
 
     Examples
     --------
-    >>> a, b, c = difference_equation_coefficients(ThermalModelForm(0, (1.0 / np.log(2.0),)), np.array([3.0, 10.0]),
-    1.0) >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12) ([-0.5], [5.0], 1.5)
+    >>> shape = ThermalModelForm(0, (1.0 / np.log(2.0),))
+    >>> a, b, c = difference_equation_coefficients(shape, np.array([3.0, 10.0]), 1.0)
+    >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12)
+    ([-0.5], [5.0], 1.5)
     """
     p = compute_lag_roots(shape, interval_s)
     whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] 1, followed by a

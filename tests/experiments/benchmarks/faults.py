@@ -285,7 +285,7 @@ def half_baud(folder: Path, times: int) -> Outcome:
     """What a port at half the baud rate makes of the bits, for two seconds."""
     with running(folder) as rig:
         rig.board.spoil = at_half_the_baud_rate
-        said = rig.said.wait("no sample in")
+        said = rig.said.wait("bytes without a sample")
         rig.board.spoil = lambda data: data
         rig.well()
         return rig.outcome("half the baud rate, until the message", said)

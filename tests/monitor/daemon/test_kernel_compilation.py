@@ -22,7 +22,7 @@ COUNT_COMPILATIONS = """
 import sys
 from drivers.errors import ConfigError
 from monitor.common import compiled
-from monitor.daemon import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_parts
 from monitor.cli.warm_up import warm_up
 from numba.core import event
 with event.install_recorder("numba:compile") as recorder:
