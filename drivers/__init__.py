@@ -1,1 +1,1 @@
-"""Sensor drivers: links that move bytes, decoders that turn bytes into samples, and clocks that time each sample."""
+"""Sensor drivers. A link receives bytes, a decoder converts bytes to samples, and a sample clock times each sample."""

@@ -1,6 +1,6 @@
 """Masking of passwords in text for logs, status and error messages.
 
-Two kinds of secrets are masked: the password of a URL (``scheme://user:password@host``), and the value of a key such as
+Two kinds of secrets are masked: the password in a URL (``scheme://user:password@host``), and the value of a key such as
 ``password`` in a configuration file or a zenoh endpoint. File names are not secrets. The module does no I/O.
 """
 
@@ -8,7 +8,7 @@ import re
 from typing import Final
 
 MASK: Final = "***"
-# a pattern for the whole URL scheme would take quadratic time
+# Matching the whole URL scheme would take quadratic time, so the pattern matches only its last character.
 
 _URL_PASSWORD: Final = re.compile(r"([a-z0-9+.-]:?//?[^/\s:@\"']*):[^/\s@\"']+@", re.IGNORECASE)
 _NAMED_SECRET: Final = re.compile(

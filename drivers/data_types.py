@@ -1,8 +1,8 @@
 """Data types that modules exchange: ``Chunk`` (received bytes), ``SampleBlock`` (decoded samples) and ``Event``.
 
-Angular rates are in rad/s, accelerations in m/s² and temperatures in °C. ``t_ns`` is a time in nanoseconds on the
-monotonic clock of the host. ``t_ns`` is a Unix time if the source provides Unix times. ``ticks`` are the values of the
-device counter.
+Angular rates are in rad/s, accelerations in m/s² and temperatures in °C. Sample times ``t_ns`` are in nanoseconds. If
+the source provides Unix times, ``t_ns`` is a Unix time; otherwise it is a time on the monotonic clock of the host.
+``ticks`` contains the values of the device counter.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 AXES: Final = ("gx", "gy", "gz", "ax", "ay", "az")
-"""Axes in the order of the columns of every array with six columns: gyroscopes, then accelerometers."""
+"""Column order of every array with six columns: three gyroscope axes, then three accelerometer axes."""
 
 NS_PER_S: Final = 1e9
 """Nanoseconds per second."""
@@ -26,15 +26,15 @@ NO_TICK: Final = -1
 """Value of ``ticks`` for a sample whose frame carried no counter."""
 
 EXTENDED_ID: Final = 1 << 31
-"""Flag of a CAN address with a 29-bit identifier."""
+"""Bit that marks a CAN address as a 29-bit identifier."""
 
 ANY_SOURCE: Final = 1 << 30
-"""Flag of a CAN address that matches every frame with the same J1939 parameter group, from any source address."""
+"""Bit that makes a CAN address match a J1939 parameter group from any source address."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Bytes received by a link, and the arrival time of the bytes."""
+    """Bytes received by a link, with their arrival time."""
 
     data: bytes
     t_ns: int  # arrival time on the monotonic clock of the host, or recorded Unix time if the link replays a file
@@ -44,7 +44,10 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class SampleBlock:
-    """One or more consecutive samples of one device. ``lost`` samples are missing just before the first sample."""
+    """One or more consecutive samples of one device.
+
+    ``lost`` is the number of samples missing just before the first one.
+    """
 
     t_ns: Ints  # [n]
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²; NaN = not measured
@@ -56,7 +59,7 @@ class SampleBlock:
         return int(self.t_ns.size)
 
     def __getitem__(self, rows: slice) -> "SampleBlock":
-        """Return a range of samples. ``lost`` is kept if the range includes the first sample, otherwise set to 0."""
+        """Return a range of samples. ``lost`` is kept if the range includes the first sample and is 0 otherwise."""
         first = rows.indices(len(self))[0]
         return SampleBlock(
             self.t_ns[rows],
@@ -99,15 +102,15 @@ def make_block(
 
 @dataclass(frozen=True, slots=True)
 class ArrivalTimedFormat:
-    """Wire format without a counter. Sample times are estimated from arrival times by regression."""
+    """Wire format without a device counter. A regression estimates the sample times from the arrival times."""
 
 
 @dataclass(frozen=True, slots=True)
 class CounterTimedFormat:
     """Wire format whose frames contain a device counter.
 
-    ``modulus`` is the number of counts after which the counter starts again at 0. ``tick_s`` is the length of one count
-    in seconds, or None if the counter counts samples.
+    The counter wraps to 0 after ``modulus`` counts. ``tick_s`` is the duration of one count in seconds, or None if the
+    counter counts samples.
     """
 
     modulus: int
@@ -152,7 +155,7 @@ class Event:
     t_ns: int
     text: str
     axis: str | None = None
-    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # such as value and limit, by coefficient
+    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # such as value and limit of a coefficient
     since_ns: int | None = None  # time at which the condition began
     sigma: float | None = None  # significance in standard errors
 

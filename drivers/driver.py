@@ -1,9 +1,9 @@
 """Driver of one device, which reads bytes from a link, decodes samples and assigns a time to each sample.
 
-``Driver.run_once`` reads, decodes, time-stamps and passes on samples once. ``Driver.run`` repeats ``run_once`` in the
-thread of the device. If a link cannot be opened, is lost or falls silent, the driver closes the link and reports an
-event. The driver then tries to reopen the link, with growing pauses. A fault of one device does not affect other
-devices.
+``Driver.read_and_push_once`` reads from the link once, decodes the bytes, assigns sample times and passes on the
+samples. ``Driver.run`` repeats these steps in the thread of the device. If a link cannot be opened, is lost or falls
+silent, the driver closes the link and reports an event. The driver then tries to reopen the link after pauses of
+increasing length. A fault of one device does not affect other devices.
 """
 
 import threading
@@ -22,9 +22,9 @@ from drivers.links.base import Link
 from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2
-"""Longest time that one read waits for the first byte."""
+"""Longest time in s that one read waits for the first byte."""
 MIN_RETRY_PAUSE_S: Final = 0.1
-"""Pause before the first attempt to open a lost link again. The pause doubles with each attempt."""
+"""Pause before the first attempt to reopen a lost link. The pause doubles with each attempt."""
 MAX_RETRY_PAUSE_S: Final = 5.0
 """Longest pause between two attempts to open a link."""
 MAX_UNDECODED_BYTES: Final = 2000
@@ -43,7 +43,7 @@ State = Literal["waiting", "running", "lost", "ended"]
 class AxisMap:
     """Mapping of sensor axes to output axes, according to the mounting of the sensor.
 
-    Column i of the output is ``sign[i]`` times column ``source[i]`` of the decoded samples.
+    Output column i is ``sign[i]`` times column ``source[i]`` of the decoded samples.
     """
 
     source: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
@@ -59,7 +59,7 @@ class AxisMap:
 
 @dataclass(slots=True)
 class SampleCounts:
-    """Sample counts of one device since the start."""
+    """Sample counts of one device since the driver was created."""
 
     received: int = 0
     bad: int = 0
@@ -83,11 +83,11 @@ class Driver:
     push
         Function that receives each time-stamped block of samples. The function must not block.
     axes
-        Mapping of sensor axes to output axes. None if the axes are not changed.
+        Mapping of sensor axes to output axes. None leaves the axes unchanged.
     silence_s
-        Time without a byte in s after which the link is opened again; 0 = never.
+        Time in s without a byte after which the link is reopened; 0 = never.
     keep
-        Function that receives the chunks before decoding, to record the raw bytes. The function must not block.
+        Function that records the received chunks before they are decoded. The function must not block.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Driver:
         self.iterations = 0  # number of reads and attempts to open the link; constant while the driver is blocked
         self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, SenderTimedFormat)
         self.first_t_ns: int | None = None
-        """Time of the first sample since the start; None before the first sample."""
+        """Time of the first sample; None until a sample arrives."""
         self._push = push
         self._keep = keep
         self._axes = axes or AxisMap()
@@ -120,7 +120,7 @@ class Driver:
         self._stop = threading.Event()
         self._undecoded_bytes = 0
         self._counts_late = decoder if isinstance(decoder, LateFrameCountingDecoder) else None
-        self._reported_drops = 0  # number of samples dropped by the decoder that have been reported as missing
+        self._reported_drops = 0  # number of samples that the decoder dropped and that have been reported as missing
         self._last_data_s = 0.0
         self._last_sample_s = 0.0
         self._newest_t_ns = 0
@@ -129,7 +129,7 @@ class Driver:
 
     @property
     def late_frames_hint(self) -> str:
-        """Message about the delay of late frames and its remedy; "" if no frame was late recently."""
+        """Message that states the delay of late frames and suggests a remedy; "" if no frame was late recently."""
         return self._counts_late.late_frames_hint if self._counts_late else ""
 
     def take_events(self) -> list[Event]:
@@ -137,7 +137,7 @@ class Driver:
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def stop(self) -> None:
-        """Stop the method ``run``, and close the link to interrupt a waiting read."""
+        """Stop ``run``, and close the link to interrupt a waiting read."""
         self._stop.set()
         self.link.close()
 
@@ -146,12 +146,12 @@ class Driver:
         try:
             self._run()
         except Exception as error:
-            # a bug in the program: the status shows the error, and the thread ends
+            # An unexpected exception is a bug in the program. The status shows the error, and the thread ends.
             self.state, self.text = "lost", f"the reader ended because of a bug in the program: {error!r}"
             raise
 
     def _run(self) -> None:
-        """Read until the driver is stopped or a replay ends. After an error, open the link again."""
+        """Read until the driver is stopped or a replay ends. After a link error, reopen the link."""
         pause_s = MIN_RETRY_PAUSE_S
         while not self._stop.is_set():
             received = self.counts.received
@@ -163,7 +163,7 @@ class Driver:
                     self.clock.note_no_unread_data(opening_ns)
                 self._last_data_s = time.monotonic()
                 while not self._stop.is_set():
-                    self.run_once()
+                    self.read_and_push_once()
             except LinkEnded as error:
                 self.state, self.text = "ended", str(error)
                 self.link.close()
@@ -177,11 +177,11 @@ class Driver:
             pause_s = min(2.0 * pause_s, MAX_RETRY_PAUSE_S)
         self.link.close()
 
-    def run_once(self) -> None:
+    def read_and_push_once(self) -> None:
         """Read from the link once, decode the samples, assign sample times and call ``push``."""
         self.iterations += 1
         asked_ns = time.monotonic_ns()
-        chunks = self.link.poll_chunks(READ_TIMEOUT_S)
+        chunks = self.link.wait_for_chunks_or_timeout(READ_TIMEOUT_S)
         self._report_lost()
         if chunks is None:
             if not self.times_are_unix:
@@ -197,13 +197,13 @@ class Driver:
             return
         self._last_sample_s, self._undecoded_bytes = self._last_data_s, 0
         for one in samples:
-            # the missing samples were dropped by the decoder, or were sent in messages that did not arrive
+            # A missing sample was either dropped by the decoder or sent in a message that did not arrive.
             dropped = min(one.lost, self._decoder_drops() - self._reported_drops)
             self._reported_drops += dropped
             for stamped in self.clock.assign_times(one):
                 self._count_samples(stamped, dropped)
                 self._push(self._axes.map_axes(stamped))
-                dropped = 0  # the dropped samples are missing before the first block only
+                dropped = 0  # the dropped samples are missing only before the first block
         self._count_decoder_drops()
         self._report_lost()
         self._events.extend(self.clock.take_events())
@@ -220,7 +220,10 @@ class Driver:
             self.counts.late = self._counts_late.dropped_late_samples
 
     def _count_samples(self, stamped: SampleBlock, dropped: int) -> None:
-        """Add the samples of a block and the preceding lost samples to the counts, without the ``dropped`` samples."""
+        """Count the samples of a block and the lost samples before the block.
+
+        ``dropped`` samples are not counted as lost.
+        """
         if self.first_t_ns is None:
             self.first_t_ns = int(stamped.t_ns[0])
         self.counts.received += len(stamped)
@@ -231,7 +234,7 @@ class Driver:
             self._unreported_gaps += 1
 
     def _report_lost(self) -> None:
-        """Report missing samples at most once per second, to keep the event queue free for other events."""
+        """Report missing samples at most once per second, so that the queue has room for other events."""
         if not self._unreported_samples or time.monotonic() - self._last_report_s < LOSS_REPORT_INTERVAL_S:
             return
         places = "" if self._unreported_gaps == 1 else f" in {self._unreported_gaps} places"
@@ -249,7 +252,7 @@ class Driver:
         self._count_decoder_drops()
         self._undecoded_bytes += size
         mute_s = self._last_data_s - self._last_sample_s
-        patience_s = max(MIN_UNDECODED_S, 10.0 / (self.clock.rate_hz or 10.0))
+        patience_s = max(MIN_UNDECODED_S, 10.0 / (self.clock.configured_or_measured_rate_hz or 10.0))
         if self._undecoded_bytes < MAX_UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
             return
         why = self.decoder.recent_problem or "wrong baud rate, or another protocol than the configured one"
@@ -257,7 +260,7 @@ class Driver:
         if self.state == "running":
             self._event("link_lost", self.text)
             self.state = "lost"
-            self.clock.note_link_closed()
+            self.clock.count_next_gap_by_arrival()
 
     def _handle_recovery(self) -> None:
         if self.state == "lost":
@@ -270,12 +273,12 @@ class Driver:
             self.state = "lost"
         self.text = f"{error}; trying again"
         self.link.close()
-        self.decoder.reset()
+        self.decoder.forget_stream_state()
         self._reported_drops = self._decoder_drops()
-        self.clock.note_link_closed()
+        self.clock.count_next_gap_by_arrival()
 
     def _event(self, kind: str, text: str) -> None:
-        # the present time, on the clock of the sample times
+        # current time on the same clock as the sample times
         t_ns = self._newest_t_ns if self.times_are_unix else time.monotonic_ns()
         self._events.append(Event(kind, t_ns, text))
 
@@ -286,7 +289,7 @@ def parse_axis_map(table: dict[str, str]) -> AxisMap:
     Parameters
     ----------
     table
-        Sensor axis with an optional sign, by output axis.
+        Mapping from each output axis to a sensor axis with an optional sign.
 
     Raises
     ------

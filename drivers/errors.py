@@ -21,16 +21,16 @@ MAX_TEXT_CHARACTERS: Final = 2000
 
 
 class ImuError(Exception):
-    """Base class of the exceptions of this project. The error text is a single line without control characters."""
+    """Base class of all exceptions of the project. The error text is a single line without control characters."""
 
     def __str__(self) -> str:
-        return sanitize_error_text(super().__str__())
+        return make_printable_and_shorten(super().__str__())
 
 
-def sanitize_error_text(text: str) -> str:
-    """Replace control characters by blanks, and shorten the text to MAX_TEXT_CHARACTERS characters.
+def make_printable_and_shorten(text: str) -> str:
+    """Replace control characters with spaces, and shorten the text to MAX_TEXT_CHARACTERS characters.
 
-    >>> sanitize_error_text("no key \\x1b[2J\\nhere")
+    >>> make_printable_and_shorten("no key \\x1b[2J\\nhere")
     'no key  [2J here'
     """
     text = "".join(c if c.isprintable() else " " for c in text[: MAX_TEXT_CHARACTERS + 1].strip())
@@ -55,12 +55,12 @@ class ConfigError(ImuError, ValueError):
     """
 
     @property
-    def lines(self) -> tuple[str, ...]:
+    def mistake_lines(self) -> tuple[str, ...]:
         """Lines of the error text, one for each mistake."""
-        return tuple(sanitize_error_text(str(line)) for line in self.args)
+        return tuple(make_printable_and_shorten(str(line)) for line in self.args)
 
     def __str__(self) -> str:
-        return sanitize_error_text("; ".join(self.lines))
+        return make_printable_and_shorten("; ".join(self.mistake_lines))
 
 
 class LinkError(ImuError, OSError):
@@ -68,19 +68,19 @@ class LinkError(ImuError, OSError):
 
 
 class LinkUnavailable(LinkError):
-    """A link cannot be opened. The driver repeats the attempt later."""
+    """A link cannot be opened. The driver tries again later."""
 
 
 class LinkLost(LinkError):
-    """An open link has failed. The driver opens the link again."""
+    """An open link has failed. The driver reopens the link."""
 
 
 class LinkEnded(LinkError):
-    """A replayed file has ended."""
+    """The replay has reached the end of the recorded file."""
 
 
 class DecodeError(ImuError, ValueError):
-    """A frame violates its format."""
+    """A received frame violates the wire format."""
 
 
 class RecordingError(ImuError, ValueError):

@@ -10,7 +10,7 @@ EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
     "can": {"can": "python-can", "cantools": "cantools"},
     "reconcile": {"scipy": "SciPy"},
 }
-"""Map from an extra to its modules, and from each module to the name of its package."""
+"""Modules that each extra provides, with the name of the package that contains each module."""
 
 
 def find_missing_packages(extra: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Safe opening and reading of files that are named by users or found in folders.
+"""Safe opening and reading of files that users name or that are found in folders.
 
 ``open_regular_file`` raises an error, and never blocks, if the path is a FIFO, a socket, a device or a directory.
 ``read_small_file`` reads a complete small file, such as a configuration, a model or a CAN database.
@@ -23,17 +23,20 @@ FILE_KINDS: Final = {
 
 
 def expand_user(name: str) -> Path:
-    """Return a path with a leading ``~`` or ``~user`` replaced by the home folder."""
+    """Replace a leading ``~`` or ``~user`` with the home folder, and return the path."""
     return Path(os.path.expanduser(name))
 
 
 def real_path(path: Path) -> Path:
-    """Return the absolute path without symbolic links. Unlike ``Path.resolve``, accept a loop of links."""
+    """Return the absolute path without symbolic links.
+
+    Unlike ``Path.resolve``, this function accepts a loop of links.
+    """
     return Path(os.path.realpath(path))
 
 
 def is_file(path: Path) -> bool:
-    """Return True if the path is an existing file. Unlike ``Path.is_file``, return False for an invalid name."""
+    """Return True if the path is an existing file. Unlike ``Path.is_file``, the result for an invalid name is False."""
     return os.path.isfile(path)
 
 
@@ -53,11 +56,11 @@ def open_regular_file(path: Path) -> IO[bytes]:
     Raises
     ------
     OSError
-        If the file cannot be opened, or is not a regular file. The attribute ``strerror`` contains the reason without
+        If the file cannot be opened or is not a regular file. The attribute ``strerror`` contains the reason without
         the path.
     """
-    check_regular_file(path)  # check before opening, since opening a device may have side effects
-    # the file may have been replaced after the check, so open without blocking and check again
+    check_regular_file(path)  # opening a device file may have side effects
+    # The file may be replaced after the first check, so open it without blocking and check it again.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     try:
         _check_mode(path, os.fstat(descriptor).st_mode)
@@ -75,12 +78,12 @@ def check_regular_file(path: Path) -> None:
     Raises
     ------
     OSError
-        If the file does not exist, or is not a regular file. The attribute ``strerror`` contains the reason without the
+        If the file does not exist or is not a regular file. The attribute ``strerror`` contains the reason without the
         path.
     """
     try:
         mode = os.stat(path).st_mode
-    except ValueError as error:  # a NUL character in the name
+    except ValueError as error:  # the name contains a NUL character
         raise OSError(errno.EINVAL, str(error), str(path)) from error
     _check_mode(path, mode)
 
@@ -105,7 +108,7 @@ def read_small_file(path: Path, *, allow_pipe: bool = False) -> bytes:
         Name of the file.
     allow_pipe
         True if the path may also be a pipe, such as ``/dev/stdin`` or ``<(command)``. Reading a pipe waits for the
-        writing program.
+        program that writes to the pipe.
 
     Returns
     -------
@@ -127,7 +130,7 @@ def read_small_file(path: Path, *, allow_pipe: bool = False) -> bytes:
 def _is_fifo(path: Path) -> bool:
     try:
         return stat.S_ISFIFO(os.stat(path).st_mode)
-    except (OSError, ValueError):  # reading the file reports the error
+    except (OSError, ValueError):  # the error is reported when the file is read
         return False
 
 

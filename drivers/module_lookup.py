@@ -1,4 +1,4 @@
-"""Search for the modules of a package, and suggestions for misspelled names."""
+"""Functions that list and import the modules of a package and suggest corrections of misspelled names."""
 
 import importlib
 import pkgutil
@@ -15,14 +15,14 @@ def list_modules(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
     Parameters
     ----------
     package
-        Package that holds the modules.
+        Package that contains the modules.
     suffix
         End of the module names, such as "_link". The suffix is removed from the returned names.
 
     Returns
     -------
     tuple of str
-        Sorted names. A module called ``base`` is left out.
+        Sorted names. A module named ``base`` is omitted.
     """
     found = (module.name for module in pkgutil.iter_modules(package.__path__))
     return tuple(sorted(n.removesuffix(suffix) for n in found if n != "base" and n.endswith(suffix)))
@@ -34,7 +34,7 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
     Parameters
     ----------
     package
-        Package that holds the module.
+        Package that contains the module.
     name
         Name of the module without its suffix.
     suffix
@@ -52,8 +52,9 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
 
 
 def format_suggestion(word: str, known: Sequence[str]) -> str:
-    """Return the most similar known word as the end of an error message. If no word is similar, the text lists all
-    known words.
+    """Return the end of an error message that suggests the most similar known word.
+
+    If no known word is similar, the text lists all known words.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Units and supported ranges of numbers in options, configuration files, model files and recordings.
 
-Each number is checked against one of the ranges below, so that no computation overflows, divides by zero or exceeds the
-memory. The ranges are wider than the values of any known sensor or application. Products, squares and quotients of
-numbers within the ranges are finite.
+Each number is checked against one of the ranges in this module, so that no computation overflows, divides by zero or
+runs out of memory. The ranges are wider than the values of any known sensor or application. Products, squares and
+quotients of numbers within the ranges are finite.
 
-The type of a field in a settings model contains the range, for example ``Annotated[float, RATE_HZ]``. pydantic then
+The type annotation of a settings field contains the range, for example ``Annotated[float, RATE_HZ]``. pydantic then
 calls ``NumberRange.check``.
 """
 
@@ -26,13 +26,13 @@ HOUR_S: Final = 3600
 DAY_S: Final = 86_400
 """Seconds per day."""
 PREFIXED_UNITS: Final = ("Hz", "bit/s", "byte/s", "byte")
-"""Units that are written with the prefixes k, M, G, T."""
+"""Units that are written with the prefixes k, M, G and T."""
 PREFIXES: Final = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 """Factors and names of the prefixes, largest first."""
 MAX_WRITTEN_INTEGER: Final = 1 << 64
-"""Largest integer that a message quotes. A larger integer may have thousands of digits."""
+"""Largest integer that an error message quotes. A larger integer may have thousands of digits."""
 MAX_QUOTED_CHARACTERS: Final = 60
-"""Maximum number of characters of a value that a message quotes."""
+"""Maximum number of characters of a value that an error message quotes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ class NumberRange:
 # --- time and rates
 
 RATE_HZ: Final = NumberRange("Hz", 1e-3, 1e6)
-"""Sample rate, from about one sample per quarter of an hour to far above the fastest vibration sensors (30 kHz)."""
+"""Sample rate, from about one sample per quarter of an hour to far more than the fastest vibration sensors (30 kHz)."""
 EFFECT_FREQUENCY_HZ: Final = NumberRange("Hz", 1e-12, 1e6, zero=True)
 """Frequency of a spectral line or of random events in a noise model; 0 = none."""
 UPDATE_RATE_HZ: Final = NumberRange("Hz", 1e-6, 1e6)
@@ -110,16 +110,16 @@ DURATION_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S)
 AVERAGING_TIME_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S)
 """Averaging time τ of the Allan variance."""
 DELAY_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S, zero=True)
-"""Time after a start; 0 = at the start."""
+"""Delay after a start; 0 = no delay."""
 SILENCE_S: Final = NumberRange("s", 1e-3, 36_525.0 * DAY_S, zero=True)
 """Time without data after which the program reacts; 0 = never."""
 RUN_TIME_S: Final = NumberRange("s", 0.1, 36_525.0 * DAY_S)
 """Time after which a command ends automatically."""
 JITTER_S: Final = NumberRange("s", 0.0, 0.5)
 READ_TIMEOUT_S: Final = NumberRange("s", 1e-4, 0.1)
-"""Longest wait of one read from a serial port. Closing a port without ``cancel_read`` may take this time."""
+"""Longest wait of one read from a serial port. Closing a port without ``cancel_read`` may take this long."""
 TICK_S: Final = NumberRange("s", 1e-12, DAY_S)
-"""Length of one count of a device clock."""
+"""Duration of one count of a device clock."""
 
 # --- transmission
 
@@ -139,7 +139,7 @@ SEED: Final = NumberRange("", 0, (1 << 63) - 1)
 SAMPLE_COUNT: Final = NumberRange("samples", 1, 10_000_000_000)
 """Number of samples of a simulated recording."""
 COUNTER_MODULUS: Final = NumberRange("counts", 2, 1 << 62)
-"""Number of counts after which a device counter starts again at 0."""
+"""Number of counts after which a device counter wraps to 0."""
 COUNTER_STEP: Final = NumberRange("counts", 1e-9, 1 << 62)
 """Increase of a device counter from one sample to the next."""
 SOURCE_ADDRESS: Final = NumberRange("", 0, 255)
@@ -159,21 +159,21 @@ SCALE: Final = NumberRange("", 1e-15, 1e15, signed=True)
 NOISE_RATIO: Final = NumberRange("times", 1e-6, 1e6)
 """Ratio of two noise levels."""
 
-# --- what a sensor measures
+# --- measured quantities and noise
 
 FULL_SCALE: Final = NumberRange("", 1e-3, 1e6)
 """Full scale of a sensor, in g or °/s."""
 COEFFICIENT: Final = NumberRange("", 1e-30, 1e30)
-"""Noise coefficient in SI units. The range exceeds the values of any sensor; squares and quotients are finite."""
+"""Noise coefficient in SI units. The range covers every sensor, and squares and quotients are finite."""
 PARAMETER: Final = NumberRange("", 1e-30, 1e30, zero=True, signed=True)
 """Parameter of a noise model in SI units."""
 FIT_NUMBER: Final = NumberRange("", 0.0, 1e30, signed=True)
-"""Number in the file of a fitted model."""
+"""Number in a file that contains a fitted model."""
 TEMPERATURE_C: Final = NumberRange("°C", -273.15, 2_000.0)
 
 
 def format_value(value: object) -> str:
-    """Return a value in TOML syntax. Long text is shortened. A list or a table is replaced by "a list" or "a table".
+    """Return a value in TOML syntax. Long text is shortened, and a list or a table becomes "a list" or "a table".
 
     >>> format_value(True), format_value("x"), format_value([1, 2])
     ('true', '"x"', 'a list')

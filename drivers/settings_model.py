@@ -1,7 +1,7 @@
-"""Base class of the settings in a configuration file, and validation of one table of the file.
+"""Base class of the settings in a configuration file, and validation of one table of a configuration file.
 
-Each field of a settings model describes one key by the type with the supported range, a default and a description. A
-field also has an example if there is no default, or if the default turns a function off. ``check_table`` finds all
+Each field of a settings model describes one key with its type, supported range, default and description. A field
+without a default also has an example, as does a field whose default turns a function off. ``check_table`` finds all
 mistakes in a table.
 """
 
@@ -33,7 +33,7 @@ from drivers.module_lookup import format_choices_by_similarity, format_suggestio
 from drivers.number_ranges import format_value
 
 MAX_PASSES: Final = 4
-"""Maximum number of validations of a table. Wrong values are replaced after each validation."""
+"""Maximum number of times that a table is validated. Invalid values are replaced after each validation."""
 EXPECTED: Final = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -45,23 +45,23 @@ EXPECTED: Final = {
     "dict_type": "a table",
     "model_type": "a table",
 }
-"""Description of the expected value, by the type of the pydantic error."""
+"""Description of the expected value for each type of pydantic error."""
 
 T = TypeVar("T")
 Model = TypeVar("Model", bound="SettingsModel")
 
 
 class Conflict(NamedTuple):
-    """Mistake in the combination of several keys."""
+    """Mistake in the combination of several configuration keys."""
 
-    key: str  # key that the message names; "" for the whole table
+    key: str  # key in the error message; "" for the whole table
     text: str
-    others: tuple[str, ...] = ()  # other keys that the mistake depends on
+    others: tuple[str, ...] = ()  # other keys that are part of the mistake
 
 
 @dataclass(frozen=True, slots=True)
 class _ReadContext:
-    """Context of a validation by ``check_table``. Settings created by Python code are validated without a context."""
+    """Context of a validation by ``check_table``. Settings that Python code creates are validated without a context."""
 
     folder: Path | None  # folder of the configuration file; None if the existence of files is not checked
 
@@ -71,25 +71,27 @@ class SettingsModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", validate_by_name=True)
 
-    def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield the mistakes in combinations of keys."""
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
+        """Yield the mistakes in the combination of keys."""
         return iter(())
 
     @model_validator(mode="after")
     def _refuse_conflicts(self, info: ValidationInfo) -> Self:
-        if info.context is None and (found := list(self.find_conflicts())):  # check_table collects the conflicts
+        if info.context is None and (
+            found := list(self.find_conflicting_settings())
+        ):  # otherwise check_table adds them
             raise ConfigError(*(f"{one.key}: {one.text}" for one in found))
         return self
 
 
 class Problem(NamedTuple):
-    """Mistake in a table."""
+    """Mistake in a configuration table."""
 
     key_path: str  # path of the key, such as "signals.gx" or "tau[1]"; "" for the whole table
     text: str
 
     def nest_under(self, table_path: str) -> "Problem":
-        """Return the problem with ``table_path`` prepended to the key path."""
+        """Return the same problem with ``table_path`` prepended to the key path."""
         dot = "." if table_path and self.key_path and not self.key_path.startswith("[") else ""
         return Problem(f"{table_path}{dot}{self.key_path}", self.text)
 
@@ -98,14 +100,14 @@ class Problem(NamedTuple):
 
 
 class TableError(ConfigError):
-    """Mistakes in a table that is not converted to a settings model.
+    """Mistakes in a configuration table that is not converted to a settings model.
 
     Parameters
     ----------
     problems
-        Mistakes and the paths of their keys in the table.
+        Mistakes, with the paths of the keys in the table.
     partial
-        Object with the correct parts of the table, for further checks.
+        Object with the valid parts of the table, for further checks.
     """
 
     def __init__(self, problems: Sequence[Problem], partial: object = None) -> None:
@@ -118,16 +120,16 @@ class TableError(ConfigError):
 class TableCheckResult(Generic[Model]):
     """Result of ``check_table``."""
 
-    value: Model | None  # settings with defaults or examples in place of wrong values; None if they cannot be replaced
+    value: Model | None  # settings with replaced invalid values; None if no replacement is possible
     problems: list[Problem] = field(default_factory=list)
-    partial: dict[str, object] = field(default_factory=dict)  # ``TableError.partial`` by path of the table
+    partial: dict[str, object] = field(default_factory=dict)  # ``TableError.partial`` for each table path
 
     def has_no_problem(self, *key_paths: str) -> bool:
-        """Return True if the given keys, including parent tables and subkeys, have no problem."""
+        """Return True if the given keys, their parent tables and their subkeys have no problem."""
         return not any(_nested(key_path, wrong.key_path) for key_path in key_paths for wrong in self.problems)
 
     def add_problem(self, key_path: str, text: str) -> None:
-        """Add a problem, unless the key already has a problem.
+        """Add a problem unless the key already has a problem.
 
         Parameters
         ----------
@@ -143,7 +145,7 @@ class TableCheckResult(Generic[Model]):
 def check_table(model: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
     """Convert a configuration table to settings, and find all mistakes in the table.
 
-    Wrong values are replaced by defaults or examples, so that the remaining values can be checked.
+    Invalid values are replaced with defaults or examples, so that the remaining values can be checked.
 
     Parameters
     ----------
@@ -152,7 +154,7 @@ def check_table(model: type[Model], table: Mapping[str, Any], folder: Path | Non
     table
         Keys and values from a TOML file.
     folder
-        Folder to which relative paths refer. None if the existence of files is not checked.
+        Folder to which relative paths refer. None skips the check that files exist.
     """
     checked: TableCheckResult[Model] = TableCheckResult(None)
     repaired = copy.deepcopy(dict(table))
@@ -172,12 +174,12 @@ def check_table(model: type[Model], table: Mapping[str, Any], folder: Path | Non
 
 
 def fields_by_key(model: type[SettingsModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a settings model by the key in the configuration file."""
+    """Return the fields of a settings model. The dictionary keys are the keys in the configuration file."""
     return {found.alias or name: found for name, found in model.model_fields.items()}
 
 
 def find_settings_model(annotation: Any) -> type[SettingsModel] | None:
-    """Return the settings model that a type annotation contains; None if the annotation contains no model."""
+    """Return the settings model in a type annotation, or None if the annotation contains no settings model."""
     if isinstance(annotation, type) and issubclass(annotation, SettingsModel):
         return annotation
     return next((found for one in get_args(annotation) if (found := find_settings_model(one))), None)
@@ -190,7 +192,7 @@ def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: TableChec
         checked.partial[key_path] = cause.partial
         yield from (problem.nest_under(key_path) for problem in cause.problems)
     elif isinstance(cause, ConfigError):
-        yield from (Problem(key_path, line) for line in cause.lines)
+        yield from (Problem(key_path, line) for line in cause.mistake_lines)
     elif error["type"] == "extra_forbidden":
         model = _field_at(kind, error["loc"])[0]
         yield Problem(key_path, f"unknown key{format_suggestion(str(error['loc'][-1]), tuple(fields_by_key(model)))}")
@@ -210,7 +212,7 @@ def _describe(error: ErrorDetails) -> str:
 
 def _add_conflicts(checked: TableCheckResult[Any], value: object, key_path: str) -> None:
     if isinstance(value, SettingsModel):
-        for one in value.find_conflicts():
+        for one in value.find_conflicting_settings():
             problem = Problem(one.key, one.text).nest_under(key_path)
             keys = (*one.others, one.key) if one.key else one.others
             if checked.has_no_problem(*(Problem(key, "").nest_under(key_path).key_path for key in keys)):
@@ -225,7 +227,7 @@ def _add_conflicts(checked: TableCheckResult[Any], value: object, key_path: str)
 def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
     *path, last = [part for part in error["loc"] if part != "[key]"]
     found = _field_at(kind, error["loc"])[1]
-    with contextlib.suppress(LookupError):  # an earlier repair may have removed the value
+    with contextlib.suppress(LookupError):  # an earlier replacement may have removed the value
         for part in path:
             table = table[part]
         if error["type"] == "model_type":
@@ -237,7 +239,10 @@ def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
 
 
 def _field_at(kind: type[SettingsModel], location: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:
-    """Return the settings model that contains the last key of a path, and the field; None for an unknown key."""
+    """Return the settings model that contains the last key of a path, and the field.
+
+    The field is None for an unknown key.
+    """
     found = None
     for part in location:
         if found is not None:
@@ -248,7 +253,7 @@ def _field_at(kind: type[SettingsModel], location: Sequence[str | int]) -> tuple
 
 
 def _format_location(location: Sequence[str | int]) -> str:
-    """Format the location of a pydantic error as a path of keys.
+    """Format the location of a pydantic error as a key path.
 
     >>> _format_location(("device", 0, "tau", 1)), _format_location(("scale", "gw", "[key]"))
     ('device[0].tau[1]', 'scale.gw')
@@ -258,28 +263,28 @@ def _format_location(location: Sequence[str | int]) -> str:
 
 
 def _nested(one: str, other: str) -> bool:
-    """Return True if two key paths are equal, or if one key is inside the table or list of the other key."""
+    """Return True if two key paths are equal, or if one path lies within the table or list of the other path."""
     short, long = sorted((one, other), key=len)
     return short == long or (bool(short) and long.startswith(short) and long[len(short)] in ".[")
 
 
-# --- types of fields
+# --- field types
 
 
 ListOf = Annotated[tuple[T, ...], Strict(False)]
-"""List in the file that becomes a tuple in the model. The items are not converted to other types."""
+"""List in the configuration file that becomes a tuple. The items are not converted to other types."""
 
 
 class ConvertedFrom:
-    """Annotation of a field that is converted from another type in the configuration file.
+    """Annotation of a field whose value has another type in the configuration file.
 
     Parameters
     ----------
     kind
-        Type of the value in the file.
+        Type of the value in the configuration file.
     convert
-        Function that converts a value. The arguments are the value and the folder of the configuration file, or None if
-        there is no file. The function raises ConfigError if the value is not valid.
+        Function that converts a value. The arguments are the value and the folder of the configuration file, which is
+        None if there is no file. The function raises ConfigError if the value is invalid.
     """
 
     def __init__(self, kind: Any, convert: Callable[[Any, Path | None], Any]) -> None:
@@ -299,12 +304,12 @@ class ConvertedFrom:
 
 
 class KeywordOrType:
-    """Annotation of a field that accepts keywords, such as "auto", in addition to the values of a type.
+    """Annotation of a field that accepts keywords, such as "auto", as well as values of a type.
 
     Parameters
     ----------
     words
-        Value of each word.
+        Mapping from each keyword to its value.
     kind
         Type of all other values.
     """
@@ -325,7 +330,7 @@ class KeywordOrType:
                 return validate(value)
             except ValidationError as error:
                 (first, *_) = error.errors(include_url=False)
-                if first["loc"]:  # an item of a list is wrong, and the error describes the item
+                if first["loc"]:  # a list item is invalid, and the error describes the item
                     raise
                 raise ConfigError(self._describe(value, first)) from None
 
@@ -353,7 +358,7 @@ def one_of(words: Sequence[str]) -> AfterValidator:
 
 
 def checked_by(check: Callable[[T], object]) -> AfterValidator:
-    """Return a pydantic validator that calls ``check`` and does not change the value."""
+    """Return a pydantic validator that calls ``check`` and leaves the value unchanged."""
 
     def validate(value: T) -> T:
         check(value)
@@ -364,19 +369,19 @@ def checked_by(check: Callable[[T], object]) -> AfterValidator:
 
 def _existing_file(value: str, info: ValidationInfo) -> str:
     path = _beside(value, info)
-    if path is not None and not os.path.exists(path):  # unlike Path.exists, accepts an invalid name
+    if path is not None and not os.path.exists(path):  # Path.exists would raise an error for an invalid name
         raise ConfigError(f"{path}: no such file")
     return value if path is None else str(path)
 
 
 def _file_or_name(value: str, info: ValidationInfo) -> str:
-    """Return the path of an existing file; otherwise the unchanged text."""
+    """Return the path if the file exists; otherwise return the text unchanged."""
     path = _beside(value, info)
     return value if path is None or not os.path.exists(path) else str(path)
 
 
 def _beside(value: str, info: ValidationInfo) -> Path | None:
-    """Return the path relative to the configuration file; None for an empty value or without a configuration file."""
+    """Return the path relative to the configuration file, or None if the value is empty or there is no such file."""
     folder = info.context.folder if info.context else None
     return folder / file_access.expand_user(value) if folder and value else None
 
@@ -384,4 +389,4 @@ def _beside(value: str, info: ValidationInfo) -> Path | None:
 FilePath = Annotated[str, AfterValidator(_existing_file)]
 """Path of an existing file. A relative path refers to the folder of the configuration file."""
 FileOrName = Annotated[str, AfterValidator(_file_or_name)]
-"""Path of a file, or name of a file that is shipped with the program."""
+"""Path of a file, or name of a file that is part of the program."""

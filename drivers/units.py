@@ -1,4 +1,4 @@
-"""Conversion factors to SI for the unit names in settings and CAN databases.
+"""Conversion factors from the unit names in settings and CAN databases to SI units.
 
 Each table maps a unit name to the factor that converts a number to rad/s, m/s² or s. A temperature unit also has an
 offset. Unit names are case-sensitive. An unknown unit raises ``ConfigError``.
@@ -114,7 +114,7 @@ def time_factor(unit: str) -> float:
 
 
 def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
-    # Unicode has two characters for the prefix micro
+    # Unicode has two characters for the prefix micro.
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
         raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices_by_similarity(name, tuple(table))}')

@@ -98,7 +98,7 @@ def test_every_configuration_is_one(toml: str, tmp_path: Path) -> None:
 def test_every_model_is_one_that_can_be_simulated(toml: str) -> None:
     model = NoiseModel.from_toml(toml)
     assert model.sample_rate_hz is not None
-    model.start_stream(model.sample_rate_hz, 1).draw_samples(10)
+    model.start_stream(model.sample_rate_hz, 1).draw_next_samples(10)
 
 
 def test_the_catalogue_is_that_of_the_folder() -> None:

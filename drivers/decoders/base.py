@@ -1,12 +1,12 @@
 """Interface of a decoder, and functions shared by the decoders. Decoders convert bytes to samples and do no I/O.
 
 A decoder module ``drivers/decoders/<protocol>.py`` defines ``Settings`` and ``build(settings) -> Decoder``.
-``Settings`` is a pydantic model with the keys of ``[device.driver.decoder_options]``. ``build`` raises one
-``ConfigError`` with a line for each mistake that the model does not find. Each line of the ``ConfigError`` begins with
-the configuration key, for example "signals.gx: ...".
+``Settings`` is a pydantic model with the keys of ``[device.driver.decoder_options]``. If the model accepts settings
+that are invalid for the decoder, ``build`` raises one ``ConfigError`` with a line for each mistake. Each line of the
+``ConfigError`` begins with the configuration key, for example "signals.gx: ...".
 
-``feed`` never raises an exception for bad bytes. A frame with a wrong checksum or format is dropped and counted in
-``Decoder.bad``. The field ``lost`` of the next sample block includes the number of dropped frames.
+``feed`` never raises an exception because of invalid bytes. A frame with a wrong checksum or format is dropped and
+counted in ``Decoder.bad``. The field ``lost`` of the next sample block includes the number of dropped frames.
 """
 
 from abc import ABC, abstractmethod
@@ -27,7 +27,7 @@ MAX_ACCEL_M_S2: Final = 10_000.0
 VALUE_LIMITS: Final = np.repeat([MAX_GYRO_RAD_S, MAX_ACCEL_M_S2], 3)
 """Largest plausible values [6] in the order of ``AXES``."""
 TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
-"""Lowest and highest plausible temperature."""
+"""Lowest and highest plausible temperature in °C."""
 
 Bytes = NDArray[np.uint8]
 
@@ -50,16 +50,16 @@ class Decoder(Protocol):
         """Description of a recent decoding problem, such as rejected frames; "" if there was no problem."""
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples that these chunks complete.
+        """Return the samples that are complete after the given chunks.
 
         ``t_ns`` of a sample is the arrival time of the chunk that completed the sample.
         """
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Encode samples in the wire format of the device. Device counters are set to ``ticks``."""
+        """Encode samples in the wire format of the device. The encoded device counters are ``samples.ticks``."""
 
-    def reset(self) -> None:
-        """Discard an incomplete frame after the link was opened again."""
+    def forget_stream_state(self) -> None:
+        """Discard a partially received frame after the link has been reopened."""
 
 
 @runtime_checkable
@@ -68,7 +68,7 @@ class AddressFilteringDecoder(Protocol):
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """Addresses to receive, encoded as in ``Chunk.address``."""
+        """Addresses of the chunks to receive, encoded as in ``Chunk.address``."""
 
 
 @runtime_checkable
@@ -81,15 +81,15 @@ class LateFrameCountingDecoder(Protocol):
 
     @property
     def late_frames_hint(self) -> str:
-        """Message about the delay of late frames and its remedy; "" if no frame was late recently."""
+        """Message that states the delay of late frames and suggests a remedy; "" if no frame was late recently."""
 
 
 HINT_FRAMES: Final = 1000
-"""Number of good frames after which a rejected frame is no longer reported."""
+"""Number of valid frames after which an earlier rejected frame is no longer reported."""
 
 
 class RecentRejection:
-    """Reason for the last rejected frame. The reason is discarded after HINT_FRAMES good frames."""
+    """Record of why the last frame was rejected. The reason is discarded after HINT_FRAMES valid frames."""
 
     def __init__(self) -> None:
         self._reason = ""
@@ -97,26 +97,26 @@ class RecentRejection:
 
     @property
     def rejection_reason(self) -> str:
-        """Reason for the last rejected frame; "" if no frame was rejected recently."""
+        """Reason why a frame was rejected; "" if no frame was rejected recently."""
         return self._reason if self._good_frames < HINT_FRAMES else ""
 
     def note_rejection(self, reason: str) -> None:
-        """Store the reason for a rejected frame."""
+        """Store the reason why a frame was rejected."""
         self._reason, self._good_frames = reason, 0
 
     def add_good_frames(self, count: int = 1) -> None:
-        """Add ``count`` to the number of good frames since the last rejected frame."""
+        """Count valid frames since the last rejected frame."""
         self._good_frames += count
 
 
 class BlockBuilder:
-    """Builder of sample blocks from decoded samples. A rejected frame ends the current sample block."""
+    """Builder of sample blocks from decoded samples. A rejected frame ends the current block."""
 
     def __init__(self) -> None:
         self.bad = 0  # rejected frames and implausible samples so far
-        self._missing = 0  # samples missing before the next block
+        self._missing = 0  # number of samples missing before the next block
 
-    def forget_rejected_frames(self) -> None:
+    def forget_missing_samples(self) -> None:
         """Reset the number of samples missing before the next sample block."""
         self._missing = 0
 
@@ -129,7 +129,7 @@ class BlockBuilder:
         bad_before: Ints | None = None,
         bad_after: int = 0,
     ) -> list[SampleBlock]:
-        """Return the plausible samples as blocks.
+        """Build sample blocks from the plausible samples.
 
         A sample with an infinite or implausible value is dropped and counted as missing. NaN marks an axis that is not
         measured. A sample whose axes are all NaN is dropped as well.
@@ -155,7 +155,7 @@ class BlockBuilder:
         temperature_c = np.full(n, np.nan) if temperature_c is None else _valid_temperatures(temperature_c)
         good = _find_plausible(values)
         carried, self._missing = self._missing, bad_after
-        if n and good.all() and not bad_before.any():  # the usual case
+        if n and good.all() and not bad_before.any():  # usually every sample is plausible
             self.bad += bad_after
             return [make_block(t_ns, values, temperature_c, ticks, carried)]
         kept = np.flatnonzero(good)
@@ -177,7 +177,7 @@ class BlockBuilder:
 
 
 def _find_plausible(values: Floats) -> NDArray[np.bool_]:
-    """Return a mask [n] of the plausible samples among ``values`` [n, 6].
+    """Return a mask [n] that is True for each plausible sample in ``values`` [n, 6].
 
     A plausible sample has at least one measured axis, and every measured value is within the range of MEMS IMUs.
     """
@@ -193,16 +193,16 @@ def _valid_temperatures(temperature_c: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Frames that passed the check of their format, in order of arrival."""
+    """Valid frames in order of arrival."""
 
     data: list[bytes]
     t_ns: Ints  # [n] arrival time of the chunk that completed each frame
     bad_before: Ints  # [n] number of frames rejected just before each frame
-    adjacent: NDArray[np.bool_]  # [n] True if the frame follows the previous one without other bytes
+    adjacent: NDArray[np.bool_]  # [n] True if no other bytes lie between the previous frame and this frame
     bad_after: int = 0  # number of frames rejected after the last frame
 
     def select_frames(self, indices: Sequence[int]) -> "Frames":
-        """Return the frames with these indices.
+        """Return the frames at the given indices.
 
         The rejected frames before an omitted frame are added to ``bad_before`` of the next selected frame, or to
         ``bad_after``.
@@ -217,13 +217,13 @@ class Frames:
         return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 
     def stack_frames(self, indices: Ints) -> Bytes:
-        """Return the bytes of frames of equal length as an array [n, length] of uint8."""
+        """Return frames of equal length as a uint8 array [n, length]."""
         data = self.data if indices.size == len(self.data) else [self.data[i] for i in indices.tolist()]
         return np.frombuffer(b"".join(data), np.uint8).reshape(indices.size, -1)
 
 
 NEED_MORE: Final = 0
-"""Result of a ``FrameMatcher`` if the buffer contains only the beginning of the frame."""
+"""Result of a ``FrameMatcher`` if the buffer contains only the beginning of a frame."""
 REJECT: Final = -1
 """Result of a ``FrameMatcher`` if the bytes at the offset are not a valid frame."""
 
@@ -237,7 +237,7 @@ NEED_MORE or REJECT.
 MAX_BYTES_WITHOUT_FRAME: Final = 2000
 """Number of bytes without a valid frame after which a problem is reported. Every supported frame is shorter."""
 NO_OFFSET: Final = -(1 << 62)
-"""Offset in the stream that is smaller than the offset of any received byte."""
+"""Offset that is smaller than the stream offset of every received byte."""
 
 
 class FrameBuffer:
@@ -246,19 +246,18 @@ class FrameBuffer:
     A chunk may begin or end in the middle of a frame, and bytes may be damaged. The payload of a frame may contain the
     sync pattern. After rejecting a candidate frame, the search therefore continues at the next byte. The number of
     frames lost between two valid frames is estimated in two ways, and the larger estimate is used. The first estimate
-    is the number of rejected candidate frames at a distance of at least one frame length. The second estimate is the
-    number of complete frames that fit between the two valid frames. Bytes before the first valid frame are ignored,
-    because reading may begin in the middle of a frame. The buffer keeps at most ``longest`` bytes between two calls of
-    ``feed``.
+    counts the rejected candidate frames that are at least one frame length apart. The second estimate is the number of
+    frames that would fit between the two valid frames. Bytes before the first valid frame are ignored, because reading
+    may begin in the middle of a frame. The buffer keeps at most ``longest`` bytes between two calls of ``feed``.
 
     Parameters
     ----------
     sync
-        Fixed start of a frame; empty if a frame can start with any byte. ``match`` may set the attribute ``sync`` to
-        the first byte of a valid frame, so that only frames with this first byte are searched. The initial sync pattern
-        is restored after MAX_BYTES_WITHOUT_FRAME bytes without a valid frame.
+        Bytes at the start of every frame; empty if a frame can start with any byte. ``match`` may set the attribute
+        ``sync`` to the first byte of a valid frame. The buffer then searches only for frames with this first byte. The
+        initial sync pattern is restored after MAX_BYTES_WITHOUT_FRAME bytes without a valid frame.
     match
-        Function that checks one candidate.
+        Function that checks one candidate frame.
     longest
         Maximum length of a frame in bytes.
     """
@@ -270,9 +269,9 @@ class FrameBuffer:
         self._buffer = b""
         self._arrivals: deque[tuple[int, int]] = deque()  # (stream offset of the end of a chunk, t_ns)
         self._buffer_offset = 0  # stream offset of the first byte in the buffer
-        self.reset()
+        self.forget_stream_state()
 
-    def reset(self) -> None:
+    def forget_stream_state(self) -> None:
         """Discard the buffered bytes and restore the initial sync pattern."""
         self.sync = self._initial_sync
         self._buffer_offset += len(self._buffer)
@@ -287,13 +286,13 @@ class FrameBuffer:
 
     @property
     def recent_problem(self) -> str:
-        """Reason for rejected or missing frames; "" if no frame was rejected recently."""
+        """Reason why frames were rejected or are missing; "" if no frame was rejected recently."""
         if self._skipped_bytes >= MAX_BYTES_WITHOUT_FRAME:
             return f"{self._skipped_bytes} bytes without a valid frame: is the baud rate right, and the decoder?"
         return self._rejection.rejection_reason
 
     def feed(self, chunks: Sequence[Chunk]) -> Frames:
-        """Return all frames that these chunks complete."""
+        """Return all frames that are complete after the given chunks."""
         buffer = self._append_chunks(chunks)
         found: list[bytes] = []
         ends: list[int] = []  # offset in the buffer after each frame
@@ -325,7 +324,7 @@ class FrameBuffer:
         return frames
 
     def _examine_candidate(self, buffer: bytes, at: int) -> tuple[int, int]:
-        """Return the offset of the next candidate frame, and the result of ``FrameMatcher`` for the candidate."""
+        """Return the offset of the next candidate frame, and the length of the frame, NEED_MORE or REJECT."""
         start = buffer.find(self.sync, at)
         if self.sync != self._initial_sync:
             widen_at = at + MAX_BYTES_WITHOUT_FRAME - self._skipped_bytes
@@ -334,7 +333,7 @@ class FrameBuffer:
                 self.sync = self._initial_sync
                 return self._examine_candidate(buffer, widen_at)
         if start < 0:
-            # the buffer may end with the first part of a sync pattern
+            # Keep the last bytes, because the buffer may end with the beginning of a sync pattern.
             start = max(at, len(buffer) - len(self.sync) + 1)
             self._skipped_bytes += start - at
             return start, NEED_MORE
@@ -391,14 +390,15 @@ class RejectingDecoder:
 
     @property
     def recent_problem(self) -> str:
-        """Reason for the last rejected frame; "" if no frame was rejected recently."""
+        """Reason why a frame was rejected; "" if no frame was rejected recently."""
         return self._rejection.rejection_reason
 
 
 class FrameStreamDecoder(RejectingDecoder, ABC):
     """Base class of decoders that find frames in a byte stream.
 
-    A subclass defines ``encode``, ``timing`` and ``_decode``. The parameters are those of ``FrameBuffer``.
+    A subclass defines ``encode``, ``timing`` and ``_decode``. The constructor has the same parameters as
+    ``FrameBuffer``.
     """
 
     carrier: ClassVar[str] = "bytes"
@@ -409,16 +409,16 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
 
     @property
     def recent_problem(self) -> str:
-        """Reason for rejected frames; "" if no frame was rejected recently."""
+        """Reason why frames were rejected; "" if no frame was rejected recently."""
         return self._buffer.recent_problem
 
-    def reset(self) -> None:
-        """Discard an incomplete frame."""
-        self._buffer.reset()
-        self._builder.forget_rejected_frames()
+    def forget_stream_state(self) -> None:
+        """Discard a partially received frame."""
+        self._buffer.forget_stream_state()
+        self._builder.forget_missing_samples()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples of the frames that these chunks complete."""
+        """Return the samples of all frames that are complete after the given chunks."""
         frames = self._buffer.feed(chunks)
         return self._decode(frames) if frames.data else []
 
@@ -436,7 +436,7 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
 
     @abstractmethod
     def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples that the frames contain."""
+        """Decode the samples in the given frames."""
 
 
 Key = TypeVar("Key", bound=Hashable)
@@ -449,7 +449,7 @@ def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, Ints]]:
     [('a', array([0, 2])), ('b', array([1]))]
     """
     distinct = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    if len(distinct) == 1:  # the usual case
+    if len(distinct) == 1:  # usually all keys are equal
         yield keys[0], np.arange(len(keys))
         return
     groups = np.array([distinct[key] for key in keys])
@@ -479,7 +479,7 @@ def quantize(values: Floats, step: float, bits: int) -> Ints:
 
 
 def make_chunks(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
-    """Return one chunk per frame, with the corresponding time in ``t_ns`` [n]."""
+    """Return one chunk per frame, with the times ``t_ns`` [n]."""
     return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
 
 
@@ -489,7 +489,7 @@ def xor_checksum(data: bytes) -> int:
     >>> xor_checksum(b"VNRRG,8") == 0x4B
     True
     """
-    # combining the two halves of one long integer repeatedly is faster than a loop over the bytes
+    # Folding one long integer in half repeatedly is faster than a loop over the bytes.
     bits = 8 << max(len(data) - 1, 0).bit_length()
     folded = int.from_bytes(data, "little")
     while bits > 8:

@@ -12,8 +12,9 @@ byte 4:
 If the first covariance of a quantity is -1, the message does not provide the quantity (sensor_msgs/Imu.msg). The
 message contains no temperature.
 
-The attachment of rmw_zenoh exists in two layouts: labelled (77 bytes) and bare (33 bytes). Both layouts contain the
-identifier of the publisher and a sequence number (i64), which reveals lost messages. The attachment is optional.
+The attachment of an rmw_zenoh message has one of two layouts: labelled (77 bytes) or bare (33 bytes). Both layouts
+contain the identifier of the publisher and a sequence number (i64), which reveals lost messages. The attachment is
+optional.
 """
 
 import struct
@@ -45,8 +46,8 @@ SEQUENCE_OFFSETS: Final = {77: 16, 33: 0}
 In the labelled layout, the string "sequence_number" with its length byte precedes the number.
 """
 MAX_GAP_MESSAGES: Final = 1_000_000_000
-"""Largest number of lost messages, eleven days at 1 kHz. A larger step means that the publisher was restarted."""
-GID_BYTES: Final = 16  # the last bytes of both layouts
+"""Largest number of lost messages, eleven days at 1 kHz. A larger step of the sequence number means a restart."""
+GID_BYTES: Final = 16  # the publisher identifier ends both attachment layouts
 BYTE_ORDERS: Final = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
@@ -69,8 +70,8 @@ class Ros2ImuDecoder(RejectingDecoder):
     def __init__(self) -> None:
         super().__init__()
         self.timing: Timing = SenderTimedFormat()
-        self._lost_in_builder = 0  # lost messages that the builder has counted as bad
-        self._lost = 0  # messages lost before the next message
+        self._lost_in_builder = 0  # number of lost messages that ``BlockBuilder`` has counted as bad
+        self._lost = 0  # number of messages lost before the next message
         self._sequence: int | None = None
         self._publisher = b""
         self._encoded = 0
@@ -80,11 +81,11 @@ class Ros2ImuDecoder(RejectingDecoder):
         """Number of rejected messages and implausible samples."""
         return self._builder.bad - self._lost_in_builder
 
-    def reset(self) -> None:
+    def forget_stream_state(self) -> None:
         """Discard the last sequence number, so that no loss is reported for the next message."""
         self._sequence = None
         self._lost = 0
-        self._builder.forget_rejected_frames()
+        self._builder.forget_missing_samples()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return one sample per message. ``t_ns`` is the time stamp of the message, ``ticks`` the sequence number."""

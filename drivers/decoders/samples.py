@@ -17,7 +17,7 @@ from drivers.settings_model import SettingsModel
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 
 MAX_GAP_SAMPLES: Final = 1_000_000_000
-"""Largest number of lost samples, eleven days at 1 kHz. A larger step means that the publisher was restarted."""
+"""Largest number of lost samples, eleven days at 1 kHz. A larger step of the total means a restart of the publisher."""
 
 
 class Settings(SettingsModel):
@@ -32,9 +32,9 @@ class SamplesDecoder(RejectingDecoder):
     def __init__(self) -> None:
         super().__init__()
         self.timing: Timing = SenderTimedFormat()
-        self._rejected = 0  # messages
+        self._rejected = 0  # number of rejected messages
         self._received: int | None = None  # total number of samples according to the last message
-        self._lost = 0  # samples missing before the next block
+        self._lost = 0  # number of samples missing before the next block
         self._encoded = 0
 
     @property
@@ -42,11 +42,11 @@ class SamplesDecoder(RejectingDecoder):
         """Number of rejected messages and implausible samples."""
         return self._rejected + self._builder.bad
 
-    def reset(self) -> None:
+    def forget_stream_state(self) -> None:
         """Discard the total number of samples, so that no loss is reported for the next message."""
         self._received = None
         self._lost = 0
-        self._builder.forget_rejected_frames()
+        self._builder.forget_missing_samples()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples of each message. ``t_ns`` are the Unix times in the message."""

@@ -2,10 +2,10 @@
 
 The format is big-endian without a sync word: ``id | gyro 3 x i24, status | [acceleration 3 x i24, status] |
 [inclinometer ...] | [temperature 3 x i16, status of each included sensor] | [aux or PPS i24, status] | counter u8 |
-latency u16 | CRC u32``, then CR LF if that is enabled. The identifier states which parts follow. The CRC-32 has the
-polynomial 0x04C11DB7 and the initial value 0xFFFFFFFF, and is not reflected. The CRC is computed over all preceding
-bytes, padded with zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, the frame published in
-geirhovland/stim300, and data sheet TS1524 tables 5-21 to 5-23 as restated by public drivers.
+latency u16 | CRC u32``, then CR LF if the line end is enabled. The identifier states which parts follow. The CRC-32 has
+the polynomial 0x04C11DB7 and the initial value 0xFFFFFFFF, and is not reflected. The CRC covers all preceding bytes,
+padded with zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, the frame published in
+geirhovland/stim300, and tables 5-21 to 5-23 of the data sheet TS1524 as quoted in public drivers.
 
 The datagram contains neither the range of the accelerometer nor the output units, so the range and the units must be
 configured. An "increment" is the change of angle or velocity during one sample. The sample rate converts an increment
@@ -35,15 +35,15 @@ from drivers.settings_model import Conflict, KeywordOrType, SettingsModel, check
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
-# The position of an identifier in each list is the bit mask of its parts. The datagrams F0 to F7 contain PPS (pulse per
-# second) in place of the auxiliary input. Hardware up to revision C sends 97 in place of A7.
+# The index of an identifier in its list is the bit mask of the parts. The datagrams F0 to F7 contain PPS (pulse per
+# second) instead of the auxiliary input. Hardware up to revision C sends 97 in place of A7.
 IDENTIFIERS: Final = {
     **dict(zip((0x90, 0x91, 0x92, 0x93, 0x94, 0xA5, 0xA6, 0xA7), range(8), strict=True)),
     **dict(zip((0x98, 0x99, 0x9A, 0x9B, 0x9C, 0xAD, 0xAE, 0xAF), range(8, 16), strict=True)),
     **dict(zip(range(0xF0, 0xF8), range(8, 16), strict=True)),
     0x97: 7,
 }
-"""Bit mask of the parts that follow the gyroscope part, by identifier."""
+"""Bit mask of the parts that follow the gyroscope part, for each datagram identifier."""
 
 
 def _datagram_size(parts: int) -> int:
@@ -54,11 +54,11 @@ def _datagram_size(parts: int) -> int:
 
 
 SIZES: Final = {identifier: _datagram_size(parts) for identifier, parts in IDENTIFIERS.items()}
-"""Length of a datagram in bytes by identifier, with CRC but without CR LF."""
+"""Length in bytes of the datagram with each identifier, including the CRC but not CR LF."""
 LONGEST: Final = max(SIZES.values())
 
 ACCEL_BITS: Final = {"2g": 21, "5g": 20, "10g": 19, "30g": 18, "80g": 16}
-"""Exponent of the resolution by accelerometer range.
+"""Exponent of the resolution for each accelerometer range.
 
 The least significant bit is 2**-bits g for an acceleration, and 2**-(bits + 3) m/s for an increment.
 """
@@ -68,7 +68,7 @@ CHANNEL_ERROR: Final = 0x08
 
 _BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
 BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
-"""Translation table that reverses the bits of each byte. The CRC of zlib is reflected, the CRC of a datagram is not."""
+"""Translation table that reverses the bits of each byte. The CRC of zlib is reflected, but the STIM300 CRC is not."""
 
 
 def _check_identifier(identifier: int) -> None:
@@ -97,7 +97,7 @@ class Settings(SettingsModel):
     ] = Field("auto", description="first byte of the datagrams, such as 0x93; auto takes it from the first datagram")
     crlf: bool = Field(False, description="true: a simulated sensor ends datagrams with CR LF; both can be read")
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict if an output is an increment and the sample rate is missing."""
         if "increment" in (self.gyro_output, self.accelerometer_output) and self.rate is None:
             yield Conflict("rate", 'missing; an output of "increment" needs the sample rate in Hz')
@@ -225,10 +225,10 @@ def has_valid_crc(frame: bytes) -> bool:
 
 def _reflected_crc(mirrored: bytes) -> int:
     """Return the reflected CRC of a datagram whose bytes have been bit-reversed."""
-    # the padding consists of zeros, which the reversal does not change
+    # Reversing the bits does not change the padding, which consists of zeros.
     return zlib.crc32(bytes(-len(mirrored) % 4), zlib.crc32(mirrored)) ^ 0xFFFFFFFF
 
 
 def build(settings: Settings) -> base.Decoder:
-    """Return a decoder with these settings."""
+    """Return a STIM300 decoder with the given settings."""
     return Stim300Decoder(settings)

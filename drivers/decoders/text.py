@@ -9,9 +9,9 @@ line is rejected if it has the wrong number of columns, or if a field is not a n
 digits. A line with a wrong checksum is rejected.
 
 The first line that arrives after the link was opened is often incomplete. For example, ``-0.012`` without the first
-characters is read as ``12``. The first line is therefore skipped and not counted as bad. A first line with a correct
-checksum is not skipped, and ``first_line = "keep"`` keeps every first line. ``encode`` puts a line end before the first
-line of a block, so that only an empty line is skipped.
+characters is read as ``12``. The first line is therefore skipped without being counted as bad. A first line with a
+correct checksum is kept, and ``first_line = "keep"`` keeps every first line. ``encode`` puts a line end before the
+first line of a block, so that only an empty line is skipped.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,11 +36,11 @@ OVERLONG_HINT: Final = f"more than {MAX_LINE_BYTES} bytes without a line end: is
 SKIP: Final = "-"
 COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)
 TICK_S: Final = 1e-9
-"""Length of a tick in s. The column ``t`` is converted to ticks of 1 ns."""
+"""Duration of one tick in s. The time in the column ``t`` is converted to ticks of 1 ns."""
 DEVICE_WRAP: Final = 1 << 32
-"""Number of counts after which ``millis()`` and ``micros()`` of small boards start again at 0."""
+"""Number of counts after which ``millis()`` and ``micros()`` of Arduino boards wrap to 0."""
 UNWRAPPED_TICKS: Final = 1 << 62
-"""Modulus in ticks for a clock that does not wrap. The modulus corresponds to 146 years."""
+"""Modulus in ticks for a device clock that does not wrap. The modulus corresponds to 146 years."""
 
 
 def _check_columns(columns: tuple[str, ...]) -> None:
@@ -59,7 +59,7 @@ def _check_columns(columns: tuple[str, ...]) -> None:
 
 
 def _unit(look_up: Callable[[str], object], axis: str) -> AfterValidator:
-    """Return a validator for a unit. The error message also explains the conversion of raw counts."""
+    """Return a validator for the unit of a column. The error message also explains the conversion of raw counts."""
 
     def check_unit(unit: str) -> None:
         try:
@@ -128,18 +128,18 @@ class TextDecoder(base.RejectingDecoder):
         self.timing: Timing = _timing(settings)
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
-        self.reset()
+        self.forget_stream_state()
 
-    def reset(self) -> None:
+    def forget_stream_state(self) -> None:
         """Discard an incomplete line, and treat the next line as the first line after opening the link."""
         self._rest = b""
         self._overlong = False
         self._first_line_ended = False  # True if the end of the first line has arrived
-        self._lines_seen = 0  # lines since the link was opened
-        self._builder.forget_rejected_frames()
+        self._lines_seen = 0  # number of lines since the link was opened
+        self._builder.forget_missing_samples()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples of the lines that these chunks complete."""
+        """Return the samples in all lines that are complete after the given chunks."""
         lines: list[bytes] = []
         t_ns: list[int] = []
         for chunk in chunks:
@@ -175,9 +175,9 @@ class TextDecoder(base.RejectingDecoder):
         return self._settings.first_line == "keep" and self._parse_line(line)[0] is not None
 
     def _parse_data_lines(self, lines: list[bytes]) -> tuple[Floats, list[int]]:
-        """Return the numbers [n, columns] of all data lines, and the indices of the data lines.
+        """Return the numbers [n, columns] in all data lines, and the indices of these lines.
 
-        The numbers of a rejected line are infinite.
+        A rejected line is returned as a row of infinite numbers.
         """
         bodies: list[bytes | None] = []  # None stands for a line with a wrong checksum
         counted: list[int] = []
@@ -209,7 +209,7 @@ class TextDecoder(base.RejectingDecoder):
         return np.array(rows).reshape(-1, self._width)
 
     def _parse_regular_lines(self, bodies: list[bytes | None]) -> Floats | None:
-        """Return the numbers [n, columns]; None if a field is missing or is not a number."""
+        """Return the numbers [n, columns], or None if a field is missing or is not a number."""
         separated = [self._comma_separated(body) for body in bodies if body is not None]
         joined = b",".join(separated)
         regular = all(body.count(b",") == self._width - 1 for body in separated)
@@ -233,7 +233,7 @@ class TextDecoder(base.RejectingDecoder):
         return body.replace(b",", b"?").replace(self._delimiter, b",") if self._delimiter != b"," else body
 
     def _parse_line(self, body: bytes) -> tuple[list[float] | None, str]:
-        """Return the numbers of one line and ""; None and the reason if the line is rejected."""
+        """Return the numbers in one line and "". If the line is rejected, return None and the reason."""
         if body == OVERLONG_LINE:
             return None, OVERLONG_HINT
         fields = self._comma_separated(body).split(b",")
@@ -247,7 +247,7 @@ class TextDecoder(base.RejectingDecoder):
     def _build_blocks(self, table: Floats, t_ns: Ints) -> list[SampleBlock]:
         n = len(table)
         bad = np.isinf(table).any(axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):  # an overflow gives an implausible value
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow gives an implausible value, which is rejected
             scaled = table * self._factor + self._offset
         values = np.full((n, 6), np.nan)
         for axis, name in enumerate(AXES):
@@ -330,5 +330,5 @@ def _timing(settings: Settings) -> Timing:
 
 
 def build(settings: Settings) -> base.Decoder:
-    """Return a decoder with these settings."""
+    """Return a decoder of text lines with the given settings."""
     return TextDecoder(settings)

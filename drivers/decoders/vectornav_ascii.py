@@ -30,9 +30,9 @@ COLUMNS: Final = {
     b"$VNIMU,": ((6, 7, 8, 3, 4, 5), 11, 9),
     b"$VNYMR,": ((9, 10, 11, 6, 7, 8), 12, None),
 }
-"""Columns of gx gy gz ax ay az, number of columns, and column of the temperature, by sentence."""
+"""For each sentence: the columns of gx gy gz ax ay az, the number of columns, and the column of the temperature."""
 MAX_UNWANTED_SENTENCES: Final = 100
-"""Number of consecutive unwanted sentences after which a problem is reported."""
+"""Number of consecutive sentences of other types after which a problem is reported."""
 GYRO: Final = "{:+010.6f}"  # rad/s
 ACCEL: Final = "{:+07.3f}"  # m/s²
 
@@ -53,18 +53,18 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
         self.timing: Timing = ArrivalTimedFormat()
         self._wanted = b"" if settings.sentence == "auto" else f"${settings.sentence},".encode()
         self._sentence = self._wanted
-        self._unwanted_sentences = 0  # number of sentences since the last wanted sentence
+        self._unwanted_sentences = 0  # number of sentences of other types since the last sample
 
     @property
     def recent_problem(self) -> str:
-        """Reason for missing samples or rejected sentences; "" if there is no problem."""
+        """Reason why samples are missing or sentences were rejected; "" if there is no problem."""
         if self._unwanted_sentences > MAX_UNWANTED_SENTENCES:
             return "sentences arrive, but none of the wanted kind: set the sensor's async output to VNIMU"
         return super().recent_problem
 
-    def reset(self) -> None:
-        """Discard an incomplete sentence. With ``sentence = "auto"``, select the sentence type again."""
-        super().reset()
+    def forget_stream_state(self) -> None:
+        """Discard a partially received sentence. With ``sentence = "auto"``, select the sentence type again."""
+        super().forget_stream_state()
         self._sentence = self._wanted
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
@@ -100,7 +100,7 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
 
 
 def _parse_numbers(bodies: list[bytes], width: int) -> Floats:
-    """Return the first ``width`` numbers of each sentence; infinity if the sentence is not numeric."""
+    """Return the first ``width`` numbers of each sentence, or infinity for a sentence that is not numeric."""
     split = [body.split(b",", width)[:width] for body in bodies]
     try:
         return np.array([[float(field) for field in fields] for fields in split]).reshape(len(bodies), width)
@@ -109,7 +109,7 @@ def _parse_numbers(bodies: list[bytes], width: int) -> Floats:
 
 
 def _parse_fields(fields: list[bytes], width: int) -> list[float]:
-    """Return the numbers of one sentence; infinity if a field is missing or is not a number."""
+    """Return the numbers of one sentence, or infinity if a field is missing or is not a number."""
     try:
         row = [float(field) for field in fields]
     except ValueError:
@@ -132,5 +132,5 @@ def _match_sentence(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> base.Decoder:
-    """Return a decoder with these settings."""
+    """Return a decoder of VectorNav sentences with the given settings."""
     return VectornavAsciiDecoder(settings)

@@ -33,10 +33,10 @@ FIELD_SIZES: Final = {
     3: (2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12),
     5: (2, 12, 16, 36, 12, 12, 12, 12, 12, 12, 28),
 }
-"""Sizes of the fields in bytes, by group and in the order of the mask bits."""
+"""Sizes in bytes of the fields of each group, in the order of the mask bits."""
 LONGEST: Final = 1 + 1 + 2 * len(FIELD_SIZES) + sum(map(sum, FIELD_SIZES.values())) + 2
 
-# each entry is (group, bit, offset inside the field), in the order of preference
+# Each entry is (group, bit, offset within the field). Preferred fields come first.
 TIME: Final = ((1, 0, 0), (2, 0, 0))
 UNCOMPENSATED_GYRO: Final = ((1, 9, 12), (3, 3, 0))
 UNCOMPENSATED_ACCEL: Final = ((1, 9, 0), (3, 2, 0))
@@ -45,7 +45,7 @@ COMPENSATED_ACCEL: Final = ((1, 8, 0), (3, 9, 0))
 TEMPERATURE: Final = ((1, 10, 12), (3, 4, 0))
 
 TICKS: Final = 1 << 62
-"""Modulus of the device time in ticks of 1 ns.
+"""Number of ticks of 1 ns after which the device time wraps to 0.
 
 TimeStartup is an unsigned 64-bit integer. Its lowest 62 bits fit into int64 and wrap after 146 years.
 """
@@ -62,7 +62,7 @@ class Settings(SettingsModel):
 
 @lru_cache(maxsize=256)
 def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.void] | None:
-    """Return the NumPy structured type of messages with a given header.
+    """Return the structured dtype of messages with a given header.
 
     Parameters
     ----------
@@ -74,8 +74,8 @@ def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.
     Returns
     -------
     dtype or None
-        Structured type of a complete message with the fields time, gyro, accel and temperature. Fields that the message
-        does not contain are omitted. None if the header contains unknown groups or fields.
+        Structured dtype of a complete message with the fields time, gyro, accel and temperature. Fields that the
+        message does not contain are omitted. The result is None if the header contains unknown groups or fields.
     """
     groups = [g for g in range(1, 9) if header[0] >> (g - 1) & 1]
     masks = struct.unpack(f"<{len(groups)}H", header[1:])
@@ -93,7 +93,10 @@ def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.
 
 
 def _build_layout(offsets: dict[tuple[int, int], int], length: int, prefer_compensated: bool) -> np.dtype[np.void]:
-    """Return the type of messages of ``length`` bytes. ``offsets`` maps (group, bit) to the offset of a field."""
+    """Return the structured dtype of messages of ``length`` bytes.
+
+    ``offsets`` maps (group, bit) to the offset of a field.
+    """
     order = -1 if prefer_compensated else 1
     gyro = (UNCOMPENSATED_GYRO, COMPENSATED_GYRO)[::order]
     accel = (UNCOMPENSATED_ACCEL, COMPENSATED_ACCEL)[::order]
@@ -114,12 +117,12 @@ def _build_layout(offsets: dict[tuple[int, int], int], length: int, prefer_compe
 
 
 def _header_end(groups: int) -> int:
-    # bit 7 announces a second group byte, which is not supported
+    # Bit 7 announces a second group byte, which the decoder does not support.
     return 0 if groups == 0 or groups & 0x80 else 2 + 2 * groups.bit_count()
 
 
 HEADER_END: Final = tuple(map(_header_end, range(256)))
-"""Offset of the payload by group byte; 0 for an invalid or unsupported group byte."""
+"""Offset of the payload for each group byte; 0 if the group byte is invalid or not supported."""
 
 
 class VectornavBinaryDecoder(base.FrameStreamDecoder):
@@ -134,7 +137,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Reason for rejected messages, or message about a missing time; "" if there is no problem."""
+        """Reason why messages were rejected, or note that the device time is missing; "" if there is no problem."""
         if self._time_missing:
             return 'messages contain no TimeStartup: enable it in the sensor, or set clock = "arrival"'
         return super().recent_problem
@@ -179,7 +182,10 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return base.REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Encode samples with the fields TimeStartup and Imu of group 1, and MagPres if there are temperatures."""
+        """Encode samples with the fields TimeStartup and Imu of group 1.
+
+        MagPres is added if the samples have temperatures.
+        """
         has_temperature = bool(np.isfinite(samples.temperature_c).any())
         header = bytes.fromhex("01 01 06" if has_temperature else "01 01 02")
         layout = build_message_dtype(header, prefer_compensated=False)
@@ -195,10 +201,10 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
 
 
 def _as_float64(numbers: NDArray[np.float32]) -> Floats:
-    with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
+    with np.errstate(invalid="ignore"):  # converting a signalling NaN causes a warning
         return numbers.astype(np.float64)
 
 
 def build(settings: Settings) -> base.Decoder:
-    """Return a decoder with these settings."""
+    """Return a decoder of VectorNav binary messages with the given settings."""
     return VectornavBinaryDecoder(settings)

@@ -1,4 +1,4 @@
-"""Decoder of the packets of WitMotion WT901, JY61 and BWT61 (UART) and of the Bluetooth models.
+"""Decoder of packets from WitMotion WT901, JY61 and BWT61 sensors (UART) and from Bluetooth models.
 
 UART packets have 11 bytes: ``55 | type | 8 bytes | SUM``. SUM is the low byte of the sum of the ten bytes before it.
 Type 0x51 contains the accelerations xyz and the temperature, type 0x52 the angular rates xyz. The numbers are i16
@@ -30,15 +30,15 @@ TYPES: Final = range(0x50, 0x60)
 UART_LENGTH: Final = 11
 BLUETOOTH_LENGTH: Final = 20
 HEADERS: Final = (b"\x55\x61", b"\x55\x71")
-"""Headers of Bluetooth packets: of a sample, and of the answer to a register read."""
+"""Headers of the two types of Bluetooth packets, which contain a sample or the answer to a register read."""
 MIN_PACKETS_PER_SAMPLE: Final = 2
 CYCLE_SAMPLES: Final = 8
-"""Number of recent samples whose minimum number of packets is the number of packets per sample.
+"""Number of recent samples from which the number of packets per sample is estimated, as the minimum over the samples.
 
-The minimum is used, since a device may send packets of other types only occasionally.
+The minimum is used because some packet types may be sent only occasionally.
 """
 MAX_UNPAIRED_PACKETS: Final = 100
-"""Number of consecutive packets without a pair after which a problem is reported."""
+"""Number of consecutive packets without a 0x51/0x52 pair after which a problem is reported."""
 TEMPERATURE: Final = {"wt901": (1.0 / 100.0, 0.0), "jy61": (1.0 / 340.0, 36.53)}
 """Step and offset of the temperature by model family: °C = raw · step + offset.
 
@@ -82,14 +82,14 @@ class WitmotionDecoder(base.FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Reason for missing samples or rejected packets; "" if there is no problem."""
+        """Reason why samples are missing or packets were rejected; "" if there is no problem."""
         if self._pairs.unpaired > MAX_UNPAIRED_PACKETS:
             return "packets arrive, but no 0x51 directly followed by 0x52: enable both outputs in the sensor"
         return super().recent_problem
 
-    def reset(self) -> None:
-        """Discard an incomplete packet or pair."""
-        super().reset()
+    def forget_stream_state(self) -> None:
+        """Discard a partially received packet, or a 0x51 packet without its 0x52 packet."""
+        super().forget_stream_state()
         self._pairs = PacketPairFinder()
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
@@ -145,7 +145,7 @@ class PacketPairFinder:
         self._first = True
 
     def find_pairs(self, frames: base.Frames) -> tuple[Ints, base.Bytes, Ints, int]:
-        """Find the pairs in the received packets.
+        """Find pairs of 0x51 and 0x52 packets in the received packets.
 
         Returns
         -------
@@ -163,7 +163,8 @@ class PacketPairFinder:
         kinds = joined[:, 1]
         in_order = (kinds[:-1] == ACCEL) & (kinds[1:] == RATE)
         at = np.flatnonzero(in_order & frames.adjacent)
-        # the bytes between the two packets may be the rest of many lost packets, so the pair may not be one sample
+        # Bytes between the two packets may be the rest of many lost packets, so the two packets may not belong
+        # together.
         separated = in_order & ~frames.adjacent & (frames.bad_before == 0)
         elapsed = self._elapsed + np.cumsum(1 + frames.bad_before)
         rejected = self._rejected + np.cumsum(frames.bad_before + separated)
@@ -182,11 +183,11 @@ class PacketPairFinder:
         if not steps.size:
             return steps, 0
         whole = holes == 0
-        whole[0] &= not self._first  # the first count depends on when reading began, not on the packets per sample
+        whole[0] &= not self._first  # reading may have begun within the first sample
         usual = [*self._recent_cycles, *steps[whole].tolist()]
         known = len(self._recent_cycles) + np.cumsum(whole)
         missing = np.zeros(steps.size, np.int64)
-        # only earlier samples are used, so that the result does not depend on the division into chunks
+        # Only earlier samples are used, so that the division into chunks does not affect the result.
         for row in np.flatnonzero(holes).tolist():
             cycle = min(usual[max(known[row] - CYCLE_SAMPLES, 0) : known[row]], default=MIN_PACKETS_PER_SAMPLE)
             missing[row] = max(round(steps[row] / cycle) - 1, 0)
@@ -226,5 +227,5 @@ def _match_bluetooth(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> base.Decoder:
-    """Return a decoder with these settings."""
+    """Return a decoder of WitMotion packets with the given settings."""
     return WitmotionDecoder(settings)

@@ -28,7 +28,7 @@ from drivers.settings_model import SettingsModel
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
-"""Maximum payload in bytes, far above the payload of any MTi configuration.
+"""Maximum payload in bytes, far larger than the payload of any MTi configuration.
 
 The limit prevents a damaged length field from blocking the stream.
 """
@@ -42,9 +42,9 @@ GYRO, GYRO_HR = 0x8020, 0x8040
 
 Format = Literal["float32", "fp12.20", "fp16.32", "float64"]
 FORMATS: Final[tuple[Format, ...]] = ("float32", "fp12.20", "fp16.32", "float64")
-"""Number formats, by the two low bits of a DID."""
+"""Number formats, indexed by the two low bits of a data identifier (DID)."""
 SIZES: Final = (4, 4, 6, 8)
-"""Sizes of one number in bytes, by the two low bits of a DID."""
+"""Size of one number in bytes, indexed by the two low bits of a data identifier (DID)."""
 
 
 class Settings(SettingsModel):
@@ -74,7 +74,7 @@ class PacketLayout:
         Parameters
         ----------
         data_id
-            DID without its low nibble.
+            Data identifier (DID) without its low nibble.
         count
             Number of values in the item.
 
@@ -89,12 +89,12 @@ class PacketLayout:
         return None
 
     def locate_integer(self, data_id: int, size: int) -> int:
-        """Return the offset of an unsigned integer item; 0 if the packet contains no such item.
+        """Return the offset of an item with one unsigned integer, or 0 if the packet contains no such item.
 
         Parameters
         ----------
         data_id
-            DID without its low nibble.
+            Data identifier (DID) without its low nibble.
         size
             Size of the integer in bytes.
         """
@@ -102,7 +102,7 @@ class PacketLayout:
 
 
 def _parse_layout(frame: bytes) -> PacketLayout | None:
-    """Return the layout of a packet; None if the sizes of the items do not match the payload."""
+    """Return the layout of a packet, or None if the sizes of the items do not match the payload."""
     at = 6 if frame[3] == 0xFF else 4
     end = len(frame) - 1
     items: list[tuple[int, int, int]] = []
@@ -133,18 +133,21 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Reason for rejected packets, or message about a missing clock; "" if there is no problem."""
+        """Reason why packets were rejected, or note that the device clock is missing; "" if there is no problem."""
         if self._clock_missing:
             return f'packets contain no {self._settings.clock}: enable it in the device, or set "clock"'
         return super().recent_problem
 
-    def reset(self) -> None:
-        """Discard an incomplete packet and the last temperature."""
-        super().reset()
+    def forget_stream_state(self) -> None:
+        """Discard a partially received packet and the last temperature."""
+        super().forget_stream_state()
         self._temperature_c = np.nan
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples of packets with rates or accelerations. A packet with an invalid layout is bad."""
+        """Return the samples of packets with angular rates or accelerations.
+
+        Packets with an invalid layout are rejected.
+        """
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
@@ -192,7 +195,10 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
 
 
 def _group_by_layout(frames: base.Frames) -> Iterator[tuple[PacketLayout | None, Ints, base.Bytes]]:
-    """Yield each layout with the indices and the bytes [k, length] of its packets. An invalid layout is None."""
+    """Yield each layout with the indices and bytes [k, length] of its packets.
+
+    The layout is None for invalid packets.
+    """
     for _, rows in base.group_indices([len(packet) for packet in frames.data]):
         packets, at = frames.stack_frames(rows), rows
         while at.size:
@@ -206,7 +212,7 @@ def _group_by_layout(frames: base.Frames) -> Iterator[tuple[PacketLayout | None,
 def _read_numbers(packets: base.Bytes, at: int, number_format: int, count: int) -> Floats:
     data = np.ascontiguousarray(packets[:, at : at + count * SIZES[number_format]])
     if number_format == 0:
-        with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
+        with np.errstate(invalid="ignore"):  # converting a signalling NaN causes a warning
             return data.view(">f4").astype(np.float64)
     if number_format == 1:
         return data.view(">i4") / 2.0**20
@@ -222,7 +228,7 @@ def _encode_numbers(triple: Floats, number_format: int) -> bytes:
         return triple.astype(">f4").tobytes()
     if number_format == 3:
         return triple.astype(">f8").tobytes()
-    triple = np.nan_to_num(triple)  # fixed-point formats have no NaN
+    triple = np.nan_to_num(triple)  # fixed-point formats cannot represent NaN
     if number_format == 1:
         return base.quantize(triple, 2.0**-20, 32).astype(">i4").tobytes()
     whole = [min(max(round(x * 2**32), -(2**47)), 2**47 - 1) for x in triple.tolist()]
@@ -253,5 +259,5 @@ def _match_message(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> base.Decoder:
-    """Return a decoder with these settings."""
+    """Return a decoder of MTData2 packets with the given settings."""
     return XsensMtdata2Decoder(settings)

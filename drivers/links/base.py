@@ -1,10 +1,10 @@
-"""Interface of a link. A link receives bytes without interpreting the bytes.
+"""Interface of a link, which receives bytes without interpreting them.
 
 A link module ``drivers/links/<name>_link.py`` defines ``Settings``, ``build(settings) -> Link`` and
 ``DEFAULT_DECODER``. ``Settings`` is a pydantic model with the keys of the link in ``[device.driver]``.
-``DEFAULT_DECODER`` is the name of a decoder, or "" if the user must choose a decoder. ``build`` opens nothing, and
-raises one ``ConfigError`` with a line for each mistake that the model does not find. Each line of the ``ConfigError``
-begins with the configuration key, for example "interface: ...".
+``DEFAULT_DECODER`` is the name of a decoder, or "" if the user must choose a decoder. ``build`` does not open the link.
+If the model accepts settings that are invalid for the link, ``build`` raises one ``ConfigError`` with a line for each
+mistake. Each line of the ``ConfigError`` begins with the configuration key, for example "interface: ...".
 """
 
 import threading
@@ -25,7 +25,7 @@ Carrier = Literal["bytes", "frames", "messages"]
 
 
 class LinkSettings(SettingsModel):
-    """Keys of all links."""
+    """Configuration keys that all links share."""
 
     silence: Annotated[float, SILENCE_S] = Field(
         3.0, description="time without data in s after which the link is opened again; 0 = never"
@@ -33,14 +33,17 @@ class LinkSettings(SettingsModel):
 
 
 class Link(Protocol):
-    """Interface of a link. One thread calls ``open`` and ``poll_chunks``. Any thread may call ``close``."""
+    """Interface of a link.
+
+    One thread calls ``open`` and ``wait_for_chunks_or_timeout``. Any thread may call ``close``.
+    """
 
     carrier: Carrier
     epoch: Literal["monotonic", "unix"]  # clock of Chunk.t_ns
-    name: str  # name in messages, such as "/dev/ttyUSB0 at 460800 baud"
+    name: str  # name used in messages, such as "/dev/ttyUSB0 at 460800 baud"
 
     def open(self) -> None:
-        """Open the link. An open link is not changed.
+        """Open the link. Do nothing if the link is open.
 
         Raises
         ------
@@ -48,7 +51,7 @@ class Link(Protocol):
             If the link cannot be opened. The error text contains the reason and a remedy.
         """
 
-    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
+    def wait_for_chunks_or_timeout(self, timeout_s: float) -> list[Chunk] | None:
         """Return the received chunks, or None if nothing arrives within ``timeout_s`` seconds.
 
         Raises
@@ -60,16 +63,16 @@ class Link(Protocol):
         """
 
     def close(self) -> None:
-        """Close the link, and interrupt a waiting call of ``poll_chunks``. A closed link is not changed."""
+        """Close the link, and interrupt a thread that waits for chunks. Do nothing if the link is closed."""
 
 
 class PolledLink(ABC):
-    """Base class of links that poll a source. A lock prevents that a source is closed during a read.
+    """Base class of links that poll a source. A lock prevents the source from being closed during a read.
 
     Parameters
     ----------
     name
-        Name of the link in messages.
+        Name of the link, used in messages.
     """
 
     def __init__(self, name: str) -> None:
@@ -84,7 +87,7 @@ class PolledLink(ABC):
                 self._open_source()
                 self._closing.clear()
 
-    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
+    def wait_for_chunks_or_timeout(self, timeout_s: float) -> list[Chunk] | None:
         """Return the received chunks, or None if nothing arrives within ``timeout_s`` seconds."""
         deadline = time.monotonic() + timeout_s
         with self._in_use:
@@ -97,7 +100,7 @@ class PolledLink(ABC):
         raise LinkLost(f"{self.name}: the link is closed")
 
     def close(self) -> None:
-        """Interrupt a waiting call of ``poll_chunks``, then close the source."""
+        """Interrupt a waiting call of ``wait_for_chunks_or_timeout``, then close the source."""
         self._closing.set()
         with self._in_use:
             self._close_source()

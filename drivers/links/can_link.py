@@ -1,15 +1,16 @@
-"""CAN buses through python-can, one frame per chunk.
+"""Link to CAN buses through python-can. Each chunk contains one frame.
 
-The hardware, the kernel or python-can filters the frames by the identifiers that the decoder needs.
+The hardware, the kernel or python-can passes on only frames with the identifiers that the decoder needs.
 
-``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. A delayed read would give late times to the
-frames that wait in the queue. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each frame on arrival with the system
-clock of the host. For these interfaces, the age of a frame is subtracted from the time of the read. An age outside the
-range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts relative to the clock of the host. For
-other interfaces, ``Chunk.t_ns`` is the time of the read, and the sample clock removes the jitter by regression.
+``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. If a read is delayed, the frames in the queue
+have arrived earlier than the time of the read. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each frame on
+arrival with the system clock of the host. For these interfaces, the age of a frame is subtracted from the time of the
+read. An age outside the range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts relative to
+the clock of the host. For other interfaces, ``Chunk.t_ns`` is the time of the read, and the sample clock removes the
+jitter by regression.
 
 ``LinkLost`` is raised if the bus is off, the interface is down or the adapter is unplugged. Other error frames are
-counted and ignored. Remote frames are ignored. The link sends only commands that configure an adapter.
+counted and ignored. Remote frames are ignored. The link sends nothing except commands that configure an adapter.
 """
 
 import contextlib
@@ -39,22 +40,22 @@ DEFAULT_DECODER: Final = "dbc"
 MAX_FRAMES: Final = 1000
 """Maximum number of frames per read, 65 ms of a fully loaded bus at 1 Mbit/s."""
 NEXT_FRAME_WAIT_S: Final = 0.0005
-"""Time to wait for another frame after a frame has been received.
+"""Time in s to wait for another frame after a frame has been received.
 
-If the time were 0, python-can would stop at the first frame that the filters reject, although other frames may follow.
+With a time of 0, python-can would stop at the first rejected frame, although more frames may follow.
 """
 MAX_READ_S: Final = 0.01
-"""Longest time from the arrival of the first frame to the end of a read."""
+"""Longest time in s from the arrival of the first frame to the end of a read."""
 MAX_WAIT_S: Final = 0.1
-"""Longest single wait on the bus. A waiting read ends at most this time after the link has been closed."""
+"""Longest single wait for a frame in s. A waiting read ends at most this long after the link has been closed."""
 HOST_STAMPED_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces that stamp a frame with the system clock of the host when the frame arrives."""
 MAX_FRAME_AGE_S: Final = 1.0
 CLOCK_PAIRS: Final = 3
-"""Number of readings of both clocks. The reading that took the shortest time is used."""
+"""Number of times that the Unix clock and the monotonic clock are read. The fastest reading is used."""
 PROBE_TIMEOUT_S: Final = 2.0
 BUS_OFF_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
-"""Interfaces that report the error classes of SocketCAN in the identifier of an error frame."""
+"""Interfaces whose error frames contain the SocketCAN error classes in the identifier."""
 PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
     "udp_multicast": ("msgpack", "msgpack", "imu-monitor[multicast]"),
     "canalystii": ("canalystii", "canalystii", "python-can[canalystii]"),
@@ -63,7 +64,7 @@ PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
     "neovi": ("ics", "python-ics", "python-can[neovi]"),
     "nixnet": ("nixnet", "nixnet", "python-can[nixnet]"),
 }
-"""Module, package and pip requirement of the interfaces that need an optional package.
+"""Module, package and pip requirement of each interface that needs an optional package.
 
 The interfaces slcan, robotell, seeedstudio and serial need pyserial, which is always installed. The interfaces
 socketcan, socketcand and virtual need no package. The other interfaces need a library of the adapter's manufacturer.
@@ -112,12 +113,12 @@ class CanLink(PolledLink):
         self._filters: list[dict[str, Any]] | None = None
         self._bus: can.BusABC | None = None
         self.error_frames = 0
-        self.garbled = 0  # number of lines from the adapter that were not frames
+        self.garbled = 0  # number of lines from a text-based adapter that were not frames
 
     def set_address_filter(self, addresses: Sequence[int]) -> None:
         """Receive only frames with these addresses after the next call of ``open``. An empty sequence means all frames.
 
-        ``EXTENDED_ID`` marks 29-bit identifiers. With ``ANY_SOURCE``, frames of the J1939 parameter group are received
+        ``EXTENDED_ID`` marks 29-bit identifiers. With ``ANY_SOURCE``, frames of a J1939 parameter group are received
         from any source address.
         """
         self._filters = [_filter_for_address(address) for address in addresses] or None
@@ -128,12 +129,12 @@ class CanLink(PolledLink):
     def _open_source(self) -> None:
         import can
 
-        # python-can logs a warning for each missing vendor library
+        # Suppress the warnings that python-can logs for each missing vendor library.
         logging.getLogger("can").setLevel(logging.ERROR)
         s = self._settings
         if missing := describe_missing_package(s.interface):
             raise LinkUnavailable(missing)
-        # exceptions that python-can raises if a vendor library or a key is missing
+        # python-can raises these exceptions if a vendor library or a key is missing.
         wrong_set_up = (NameError, AttributeError, TypeError, ValueError, ArithmeticError, NotImplementedError)
         try:
             _probe_server(s)
@@ -207,7 +208,7 @@ class CanLink(PolledLink):
         return Chunk(bytes(message.data), self._arrival_ns(message), address)
 
     def _arrival_ns(self, message: "can.Message") -> int:
-        """Return the monotonic arrival time of a CAN frame; the present time if the time stamp is unusable."""
+        """Return the monotonic arrival time of a CAN frame, or the current time if the time stamp is unusable."""
         now_ns = time.monotonic_ns()
         if self._settings.interface not in HOST_STAMPED_INTERFACES:
             return now_ns
@@ -215,7 +216,7 @@ class CanLink(PolledLink):
         return now_ns - age_ns if 0 <= age_ns <= MAX_FRAME_AGE_S * 1e9 else now_ns
 
     def _count_error_frame(self, message: "can.Message") -> None:
-        """Count an error frame. Raise LinkLost if it reports bus-off."""
+        """Count an error frame. Raise LinkLost if the error frame reports bus-off."""
         self.error_frames += 1
         if self._settings.interface in BUS_OFF_INTERFACES and message.arbitration_id & BUS_OFF:
             self._close_source()
@@ -227,13 +228,13 @@ class CanLink(PolledLink):
         bus, self._bus = self._bus, None
         if bus is None:
             return
-        # closing the channel of an unplugged adapter fails
+        # Closing the channel of an unplugged adapter fails, so errors are ignored.
         with contextlib.suppress(can.CanError, OSError):
             bus.shutdown()
 
 
 def describe_missing_package(interface: str) -> str:
-    """Return an error message if a package for a python-can interface is missing, otherwise ""."""
+    """Return an error message if a python-can interface needs a missing package; otherwise return ""."""
     module, package, requirement = PACKAGES.get(interface, ("", "", ""))
     if not module or importlib.util.find_spec(module) is not None:
         return ""
@@ -243,8 +244,8 @@ def describe_missing_package(interface: str) -> str:
 def _unix_minus_monotonic_ns() -> int:
     """Return Unix time minus monotonic time in ns.
 
-    The clocks are read several times, because the thread may be interrupted between two readings. The fastest reading
-    is used.
+    Both clocks are read several times, because the thread may be interrupted between two readings. The fastest pair of
+    readings is used.
     """
     pairs = []
     for _ in range(CLOCK_PAIRS):
@@ -264,7 +265,8 @@ def _filter_for_address(address: int) -> dict[str, Any]:
     extended = bool(address & EXTENDED_ID)
     mask = ID_MASK if extended else 0x7FF
     if address & ANY_SOURCE:
-        # SAE J1939-21: if the PDU format is below 240, the third byte is the destination and not part of the group
+        # SAE J1939-21: if the PDU format is below 240, the PDU-specific byte is a destination and not part of the
+        # group.
         broadcast = (address >> 16 & 0xFF) >= 240
         mask = 0x03FF_FF00 if broadcast else 0x03FF_0000
     return {"can_id": address & mask, "can_mask": mask, "extended": extended}

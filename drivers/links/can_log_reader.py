@@ -1,8 +1,8 @@
-"""Reading of CAN logs: .asc, .blf, .log and .trc files, CSV of python-can, and CSV with t, id_hex and data_hex.
+"""Reader of CAN log files in the formats .asc, .blf, .log, .trc and CSV.
 
-A damaged log may cause python-can to read text without end or to allocate a large amount of memory. The readers in this
-module limit the length of lines, the size of objects, and the amount of data between two frames. A reader raises
-ValueError if a limit is exceeded.
+A damaged log can make python-can read text endlessly or allocate too much memory. The readers in this module limit the
+length of lines, the size of objects, and the amount of data between two frames. A reader raises ValueError if a limit
+is exceeded.
 """
 
 import csv
@@ -22,20 +22,20 @@ TEXT_READERS: Final[dict[str, type[can.io.generic.TextIOMessageReader]]] = {
 }  # fmt: skip
 MAX_STANDARD_ID: Final = 0x7FF
 MAX_EXTENDED_ID: Final = 0x1FFF_FFFF
-MAX_FRAME_BYTES: Final = 64  # of CAN FD
+MAX_FRAME_BYTES: Final = 64  # maximum payload of CAN FD
 READ_BYTES: Final = 4096
 MAX_LINE_BYTES: Final = 1 << 20
 MAX_BYTES_WITHOUT_FRAME: Final = 8_000_000
-"""Maximum length of text without a frame, such as comments. python-can needs seconds to read text of this length."""
+"""Maximum number of bytes between two frames, such as comments. python-can needs seconds to read this much text."""
 MAX_OBJECT_BYTES: Final = 64_000_000
-"""Maximum compressed or uncompressed size of an object in a BLF log. Typical objects have some hundred kilobytes."""
+"""Maximum compressed or uncompressed size of an object in a BLF log. Typical objects have a few hundred kilobytes."""
 MAX_OBJECTS_WITHOUT_FRAME_BYTES: Final = 256_000_000
 BLF_OBJECT: Final = b"LOBJ"
 BLF_HEADER_BYTES: Final = blf.OBJ_HEADER_BASE_STRUCT.size
 
 
 def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterator[Chunk]:
-    """Yield the CAN data frames of a log file that python-can can parse.
+    """Yield the CAN data frames of a log file in a format of python-can.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterato
     suffix
         File suffix of the format: ".blf" or a key of TEXT_READERS.
     channel
-        Channel to read. None for all channels.
+        Channel to read. None reads all channels.
 
     Raises
     ------
@@ -57,7 +57,9 @@ def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterato
             yield from _data_frames(iter(reader), channel, lambda: None)
         else:
             lines = _BoundedLineReader(stream)
-            yield from _data_frames(iter(TEXT_READERS[suffix](lines.open_as_text(None))), channel, lines.note_frame)
+            yield from _data_frames(
+                iter(TEXT_READERS[suffix](lines.open_as_text(None))), channel, lines.reset_bytes_since_frame
+            )
     except blf.BLFParseError as error:
         raise ValueError(f"no BLF log: {error}") from error
 
@@ -65,14 +67,14 @@ def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterato
 def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
     """Yield the CAN data frames of a CSV file with the columns t (s), id_hex and data_hex.
 
-    The columns channel or bus, and extended (0 or 1), are optional.
+    The columns ``channel`` (or ``bus``) and ``extended`` (0 or 1) are optional.
 
     Parameters
     ----------
     stream
         Decompressed content of the file.
     channel
-        Channel to read. None for all channels.
+        Channel to read. None reads all channels.
 
     Raises
     ------
@@ -88,7 +90,7 @@ def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
     for row in rows:
         if len(row) != len(columns):
             raise ValueError(f"line {rows.line_num} has {len(row)} fields, not {len(columns)}")
-        lines.note_frame()
+        lines.reset_bytes_since_frame()
         if channel is not None and (channel_column is None or row[channel_column] != channel):
             continue
         address = int(row[identifier], 16)
@@ -97,11 +99,11 @@ def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
 
 
 def _data_frames(
-    messages: Iterator[can.Message], channel: str | None, note_frame: Callable[[], None]
+    messages: Iterator[can.Message], channel: str | None, reset_bytes_since_frame: Callable[[], None]
 ) -> Iterator[Chunk]:
-    """Yield the data frames of one channel, and call ``note_frame`` for each message of any channel."""
+    """Yield the data frames of one channel, and call ``reset_bytes_since_frame`` for each message of any channel."""
     for message in messages:
-        note_frame()
+        reset_bytes_since_frame()
         if message.is_error_frame or message.is_remote_frame:
             continue
         if channel is None or str(message.channel) == channel:
@@ -119,7 +121,7 @@ def _frame_chunk(data: bytes, t_s: float, address: int) -> Chunk:
 
 
 class _BoundedLineReader(io.RawIOBase):
-    """Reader that raises ValueError if a line, or the text between two frames, is too long."""
+    """Reader that raises ValueError if a line or the text between two frames is too long."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
@@ -130,7 +132,7 @@ class _BoundedLineReader(io.RawIOBase):
         """Return a text file. ``newline`` has the same meaning as in the function ``open``."""
         return io.TextIOWrapper(io.BufferedReader(self), "utf-8", newline=newline)
 
-    def note_frame(self) -> None:
+    def reset_bytes_since_frame(self) -> None:
         """Reset the number of bytes since the last frame."""
         self._bytes_without_frame = 0
 
@@ -139,7 +141,7 @@ class _BoundedLineReader(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any, /) -> int:
-        """Read bytes into the buffer, and return their number."""
+        """Read bytes into the buffer, and return the number of bytes read."""
         data = self._stream.read(min(len(buffer), READ_BYTES))
         end = max(data.rfind(b"\n"), data.rfind(b"\r"))
         self._line_bytes = len(data) - end - 1 if end >= 0 else self._line_bytes + len(data)
@@ -153,7 +155,7 @@ class _BoundedLineReader(io.RawIOBase):
 
 
 class _BoundedReader:
-    """Binary file that raises ValueError if a read has a negative or too large size, as in a damaged BLF log."""
+    """Binary file that raises ValueError if a damaged BLF log asks for a negative or excessive number of bytes."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream

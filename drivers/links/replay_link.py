@@ -1,4 +1,4 @@
-"""Replay of a recorded file as if a device sent the data, at an adjustable speed.
+"""Link that replays a recorded file at an adjustable speed, as if a device sent the data.
 
 The chunks depend on the type of the file:
 
@@ -9,12 +9,13 @@ The chunks depend on the type of the file:
 - Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages,
   depending on the original link.
 
-The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. Each chunk of
+The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. A chunk of
 captured bytes gets the time at which a device with the byte rate ``bytes_per_second`` would send the chunk. Without
-``bytes_per_second``, each chunk gets the time of the read.
+``bytes_per_second``, the chunk gets the time of the read.
 
-``poll_chunks`` raises ``LinkEnded`` after all data have been returned. If a file is truncated, the complete part is
-replayed, and the final message mentions the truncation. ``build`` reads the header of a CSV file to choose the decoder.
+``wait_for_chunks_or_timeout`` raises ``LinkEnded`` after all data have been returned. If a file is truncated, the
+intact part is replayed, and the final message mentions the truncation. ``build`` reads the header of a CSV file to
+choose the decoder.
 """
 
 import binascii
@@ -46,35 +47,35 @@ CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
 CAPTURES: Final = (".bin", ".raw", ".txt")
 BATCH_CHUNKS: Final = 1000
 BATCH_BYTES: Final = 1_000_000
-"""Total size of the chunks after which a read ends. A read also ends after BATCH_CHUNKS chunks.
+"""Total number of bytes after which a read ends. A read also ends after BATCH_CHUNKS chunks.
 
 Without these limits, one read could return hours of a recording.
 """
 MAX_MESSAGE_ROWS: Final = 4096
 STEP_S: Final = 0.02
-"""Duration of the chunks if data are replayed at a limited speed, as from a device with a small buffer."""
+"""Duration in s of one chunk if data are replayed at a limited speed, as from a device with a small buffer."""
 CHUNK_BYTES: Final = 4096
 PYTHON_CAN_HEADER: Final = "timestamp,arbitration_id"
 DAMAGE_ERRORS: Final = (
     EOFError, LookupError, OverflowError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error, csv.Error,
 )  # fmt: skip
-"""Exceptions, in addition to ValueError, that readers raise if a file is truncated or damaged."""
+"""Exceptions besides ValueError that readers raise if a file is truncated or damaged."""
 
 PACES: Final = {"recorded": 1.0, "max": float("inf")}
-"""Values of the key ``speed`` that are words, and the corresponding factors."""
+"""Speed factor for each word that the key ``speed`` accepts."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
 TimedChunk = tuple[float, Chunk]
-"""Due time of a chunk in s since the start of the file, and the chunk."""
+"""Chunk, and the time at which it is due, in s since the start of the file."""
 CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
-"""Carrier of each kind of file. A segment of raw data states its carrier."""
+"""Type of chunk that each kind of file contains. A segment of raw data states the type itself."""
 
 DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": "", "raw": ""}
 """Default decoder of each kind of file; "" if the settings must name the decoder."""
 
 
 class Settings(LinkSettings):
-    """Keys of a replay."""
+    """Configuration keys of a replay."""
 
     path: FilePath = Field(
         examples=["recording.csv"], description="recording, CAN log, file of captured bytes, or folder of segments"
@@ -96,7 +97,7 @@ class Settings(LinkSettings):
 
 
 class ReplayLink(PolledLink):
-    """Replay of one file. Each call of ``open`` starts the replay from the beginning."""
+    """Link that replays one file. Each call of ``open`` starts the replay from the beginning."""
 
     def __init__(self, settings: Settings, kind: Kind) -> None:
         super().__init__(f"replay of {settings.path}")
@@ -147,7 +148,7 @@ class ReplayLink(PolledLink):
         return self._started_s + item[0] / self._pace
 
     def _fetch_next(self) -> None:
-        """Fetch the next item. If the file is damaged, end the replay and add a note."""
+        """Fetch the next chunk. If the file is damaged, end the replay and add a note."""
         assert self._items is not None
         try:
             self._next = next(self._items, None)
@@ -173,7 +174,7 @@ class ReplayLink(PolledLink):
         return _read_capture(self._path, self._settings.bytes_per_second)
 
     def _message_rows(self, recording: Recording) -> int:
-        """Return the number of samples per message, which is MAX_MESSAGE_ROWS if the speed is not limited."""
+        """Return the number of samples per message. If the speed is not limited, the number is MAX_MESSAGE_ROWS."""
         t, n = recording.t_s, len(recording)
         if self._pace == float("inf") or n < 2:
             return MAX_MESSAGE_ROWS
@@ -182,7 +183,7 @@ class ReplayLink(PolledLink):
 
 
 def _read_messages(recording: Recording, rows: int) -> Generator[TimedChunk]:
-    """Yield messages of up to ``rows`` samples. The due time of a message is the time of the newest sample."""
+    """Yield messages of up to ``rows`` samples. A message is due at the time of its newest sample."""
     given = 0
     start_ns: int | None = None
     for samples in iter_blocks(recording, rows):
@@ -257,7 +258,7 @@ def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[Timed
 
 
 def _detect_kind(path: Path) -> Kind:
-    """Return the type of a file according to the suffix and the content. Raise ConfigError for an unknown type."""
+    """Detect the type of a file from its suffix and content. Raise ConfigError if the type is unknown."""
     suffix = _plain_suffix(path)
     if path == Path():
         raise ConfigError("path: empty; it is a recording, a CAN log, captured bytes, or a folder of segments")
@@ -299,7 +300,7 @@ def _open_binary(path: Path) -> IO[bytes]:
     if path.suffix.lower() != ".gz":
         return file
     unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")
-    unzipped.myfileobj = file  # GzipFile closes this file together with itself
+    unzipped.myfileobj = file  # closing the GzipFile also closes this file
     return cast("IO[bytes]", unzipped)
 
 
@@ -308,7 +309,7 @@ def _open_text(path: Path) -> IO[str]:
 
 
 def build(settings: Settings) -> Link:
-    """Return a link for the file, without opening the file.
+    """Return a link that replays the file, without opening the file.
 
     Raises
     ------

@@ -1,12 +1,14 @@
-"""Serial ports, local or networked, by any URL that pyserial supports.
+"""Link to local or networked serial ports, which are addressed by any URL that pyserial supports.
 
 A read waits for the first byte, then for the time ``read_timeout`` (10 ms by default) for more bytes, and returns all
-bytes that have arrived. Waiting for more bytes needs a tenth of the processor time of one read per frame, and delays
-bytes by at most ``read_timeout``. If a URL handler has no file descriptor, a read returns at every arrival.
+bytes that have arrived. Waiting for more bytes takes a tenth of the processor time that one read per frame would take.
+The wait delays bytes by at most ``read_timeout``. If a URL handler has no file descriptor, a read returns as soon as
+bytes arrive.
 
-``close`` closes the port only after a waiting read has ended. Otherwise the system could assign the file descriptor to
-another file during the read. ``LinkUnavailable`` names the reason and a remedy if the port cannot be opened.
-``LinkLost`` is raised if the device is unplugged or the connection is closed. The link never writes to the device.
+``close`` closes the port only after a waiting read has ended. Otherwise, the system could assign the file descriptor to
+another file during the read. If the port cannot be opened, the text of ``LinkUnavailable`` states the reason and a
+remedy. ``LinkLost`` is raised if the device is unplugged or the connection is closed. The link never writes to the
+device.
 """
 
 import contextlib
@@ -31,10 +33,13 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = ""
 READ_BYTES: Final = 4096
-"""Maximum number of bytes per read, more than arrive in 10 ms at 3 Mbit/s. At higher rates, reads do not wait."""
+"""Maximum number of bytes per read, which is more than 10 ms of data at 3 Mbit/s.
+
+At higher rates, reads do not wait.
+"""
 STOP_BITS: Final = (1.0, 1.5, 2.0)
 SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
-"""URL schemes that are part of pyserial."""
+"""URL schemes that pyserial supports without extensions."""
 
 
 def _check_port(port: str) -> None:
@@ -85,11 +90,11 @@ class SerialLink(PolledLink):
         self._buffer_filling = False  # True if the last read returned so many bytes that the next read must not wait
 
     def close(self) -> None:
-        """Interrupt a waiting call of ``poll_chunks``, then close the port."""
+        """Interrupt a waiting call of ``wait_for_chunks_or_timeout``, then close the port."""
         self._closing.set()
         cancel = getattr(self._port, "cancel_read", None)  # some URL handlers lack this method
         if cancel is not None:
-            # an error means that the reader has just closed the port, so that no read is waiting
+            # An error means that the port has just been closed, so no read is waiting.
             with contextlib.suppress(OSError, TypeError):
                 cancel()
         super().close()
@@ -111,7 +116,7 @@ class SerialLink(PolledLink):
                 rtscts=s.rtscts,
                 xonxoff=s.xonxoff,
                 timeout=s.read_timeout,
-                # URL handlers without a lock ignore this key
+                # URL handlers that cannot lock a port ignore this key.
                 **({"exclusive": True} if s.exclusive else {}),
             )
         except (OSError, ValueError, NotImplementedError) as error:

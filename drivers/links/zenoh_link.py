@@ -1,16 +1,16 @@
-"""Messages of another system over zenoh, one message per chunk with the attachment.
+"""Link that receives messages over zenoh. Each chunk contains one message and its attachment.
 
-Each link has a separate zenoh session, which does not scout or listen and connects only to the configured endpoints. A
-session with one endpoint is a client, because a router does not forward data from one peer to another peer. A client
-can be opened only if the endpoint answers. A session with several endpoints is a peer, since a client would use only
-the first endpoint that answers. A peer is opened immediately, and zenoh connects in the background. A missing publisher
-therefore causes silence and not ``LinkLost``.
+Each link opens its own zenoh session. The session connects only to the configured endpoints, without discovering other
+programs or accepting connections. A session with one endpoint is a zenoh client, because a router does not forward data
+from one peer to another peer. A client session can be opened only if the endpoint answers. A session with several
+endpoints is a zenoh peer, because a client would use only the first endpoint that answers. A peer session opens
+immediately, and zenoh connects in the background. A missing publisher therefore causes silence and not ``LinkLost``.
 
 zenoh writes messages to a ring channel, which overwrites the oldest message when the channel is full. The decoder
-detects the loss by the sequence numbers. A thread takes the messages from the channel and adds the arrival times,
-because the channels of zenoh have no timeout. No Python callback is used, since a callback that exists at exit blocks
-the process. ``atexit`` closes the session if the program has not, since a thread that waits in zenoh would abort the
-process.
+detects lost messages from the sequence numbers. A thread takes the messages from the channel and adds the arrival
+times, because the channels of zenoh have no timeout. The link registers no Python callback with zenoh, because a
+callback that still exists at exit blocks the process. A session that is still open at exit is closed by ``atexit``,
+because a thread that waits in zenoh would abort the process.
 """
 
 import atexit
@@ -45,7 +45,7 @@ MAX_QUEUED_BYTES: Final = 128_000_000
 
 
 class Settings(LinkSettings):
-    """Keys of a zenoh link."""
+    """Configuration keys of a zenoh link."""
 
     key: str = Field(
         examples=["imu/bench-1/samples"],
@@ -85,7 +85,10 @@ class ZenohLink:
         self._running = False
 
     def open(self) -> None:
-        """Open the session and subscribe. A client needs the router, and a peer needs no other program."""
+        """Open the session and subscribe.
+
+        A client session requires a running router, and a peer session opens immediately.
+        """
         import zenoh
 
         with self._opening:
@@ -112,7 +115,7 @@ class ZenohLink:
             self._receiver.start()
             atexit.register(self.close)
 
-    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
+    def wait_for_chunks_or_timeout(self, timeout_s: float) -> list[Chunk] | None:
         """Return the received messages, or None if nothing arrives within ``timeout_s`` seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or not self._running, timeout_s)
@@ -125,7 +128,7 @@ class ZenohLink:
             return None
 
     def close(self) -> None:
-        """Close the session, and interrupt a waiting call of ``poll_chunks``."""
+        """Close the session, and interrupt a waiting call of ``wait_for_chunks_or_timeout``."""
         with self._opening:
             self._close_session()
 
@@ -133,7 +136,7 @@ class ZenohLink:
         """Move messages from the ring channel to the queue until the session is closed."""
         import zenoh
 
-        handler = subscriber.handler  # a subscriber that waits for messages cannot be undeclared
+        handler = subscriber.handler  # a subscriber that waits for messages cannot be closed
         try:
             while True:
                 sample = handler.recv()
@@ -205,7 +208,7 @@ def build(settings: Settings) -> Link:
     Raises
     ------
     ConfigError
-        If zenoh refuses the key expression, an endpoint or the configuration file.
+        If zenoh rejects the key expression (topic pattern), an endpoint or the configuration file.
     """
     import zenoh
 

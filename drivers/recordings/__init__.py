@@ -1,13 +1,13 @@
 """Reading and writing of recordings in CSV, .npz, Parquet and Arrow files, or in a folder of segments.
 
-``load_samples`` reads a file or a folder and returns a ``Recording``. The recording includes notes about irregularities
-of the file, such as missing values.
+``load_samples`` reads a file or a folder and returns a ``Recording``, which includes notes about irregularities of the
+file, such as missing values.
 
 The reader returns the complete part of a truncated file. Unreadable fields, infinite values and values beyond 1e100
 become missing values.
 
-Sample times keep their jitter, gaps and backward steps. The reader never resamples, sorts or interpolates samples, and
-never unpickles Python objects.
+The reader never resamples, sorts or interpolates samples, so the sample times keep their jitter, gaps and backward
+steps. The reader never unpickles Python objects.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, SampleBlock, make_block
-from drivers.errors import ConfigError, RecordingError, describe_error, sanitize_error_text
+from drivers.errors import ConfigError, RecordingError, describe_error, make_printable_and_shorten
 from drivers.file_access import check_regular_file
 from drivers.number_ranges import DURATION_S, RATE_HZ
 from drivers.recordings import memory_check
@@ -39,9 +39,9 @@ __all__ = [
 ]
 
 MAX_VALUE: Final = 1e100
-"""Largest absolute value. The sum of squares of larger values can exceed the range of float64."""
+"""Largest absolute value. The sum of the squares of larger values could overflow float64."""
 TIME_RESOLUTION_S: Final = 1e-6
-"""Slightly more than the resolution of Unix times in float64."""
+"""Time difference in s that is slightly larger than the resolution of Unix times in float64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Recording:
     temperature_c: Floats  # [n] °C; NaN = missing or absent
     rate_hz: float | None  # rate that the file or the caller states, not a measured rate
     axes: tuple[str, ...]  # axes with a column in the file, in AXES order
-    notes: tuple[str, ...]  # irregularities of the file and how they were handled
+    notes: tuple[str, ...]  # descriptions of irregularities in the file and of their handling
 
     def __len__(self) -> int:
         return int(self.values.shape[0])
@@ -67,9 +67,10 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
     path
         File or folder.
     rate_hz
-        Sample rate in Hz for a file without ``t``. This rate takes precedence over the rate ``fs`` in the file.
+        Sample rate in Hz for a file without the column ``t``. This rate takes precedence over the rate ``fs`` in the
+        file.
     last_s
-        Duration in s of the part to read at the end of the recording. None for the whole recording.
+        Duration in s of the part to read at the end of the recording. None reads the whole recording.
 
     Raises
     ------
@@ -108,7 +109,8 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
     Yields
     ------
     SampleBlock
-        Consecutive samples. In a recording without times, the sample times start at 0 and follow from the sample rate.
+        Consecutive samples. If the recording contains no times, the sample times start at 0 and follow from the sample
+        rate.
     """
     for start in range(0, len(recording), rows):
         part = slice(start, min(start + rows, len(recording)))
@@ -168,11 +170,11 @@ def _read_only_recording(
     for array in (t_s, values, temperature_c):
         if array is not None:
             array.flags.writeable = False
-    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(map(sanitize_error_text, notes)))
+    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(map(make_printable_and_shorten, notes)))
 
 
 def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
-    """Return the common length of all columns. Raise RecordingError if columns are empty or differ in length."""
+    """Return the common length of all columns. Raise RecordingError if the columns are empty or differ in length."""
     first = next(iter(columns))
     n = columns[first].size
     for name, column in columns.items():
@@ -203,10 +205,13 @@ def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> f
 def _usable_times(
     path: Path, t: Floats | None, rate_hz: float | None, notes: list[str]
 ) -> tuple[Floats | None, NDArray[np.bool_] | slice]:
-    """Return the usable times and a mask of the usable rows. If most times are unusable, return None and all rows."""
+    """Return the usable times and a mask of the corresponding rows.
+
+    If most times are unusable, return None and all rows.
+    """
     if t is None:
         return None, slice(None)
-    usable = np.abs(t) < T_LIMIT_S  # False for NaN as well
+    usable = np.abs(t) < T_LIMIT_S  # also False for NaN
     lost = int(t.size - np.count_nonzero(usable))
     if 2 * lost > t.size:
         what = f"{lost} of {t.size} values of t are not times in seconds (first: {t[~usable][0]:g})"
@@ -262,7 +267,7 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
             continue
         parts.append(part)
         rows, size_bytes = rows + len(part), size_bytes + segment.stat().st_size
-        memory_check.ReadLimit(path, size_bytes, free).check_row_count(rows)
+        memory_check.RecordingSizeLimits(path, size_bytes, free).check_row_count(rows)
         notes += [f"{segment.name}: {note}" for note in reversed(part.notes)]
         if last_s is not None and _duration_s(parts) > last_s:
             break
@@ -281,7 +286,7 @@ def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> Non
         except (RecordingError, OSError):
             continue  # the note about the segment is added when the segment is read
         size_bytes += segment.stat().st_size
-        memory_check.ReadLimit(path, size_bytes, free).check_row_count(rows)
+        memory_check.RecordingSizeLimits(path, size_bytes, free).check_row_count(rows)
 
 
 def _duration_s(parts: Sequence[Recording]) -> float:
@@ -295,7 +300,7 @@ def _duration_s(parts: Sequence[Recording]) -> float:
 def _take_last(found: Recording, last_s: float) -> Recording:
     if found.t_s is not None:
         older = np.flatnonzero(found.t_s <= found.t_s[-1] - last_s + TIME_RESOLUTION_S)
-        # the newest sample is always included
+        # The newest sample is always included.
         first = min(int(older[-1]) + 1, len(found) - 1) if older.size else 0
     else:
         first = max(len(found) - max(round(last_s * (found.rate_hz or 0.0)), 1), 0)

@@ -1,7 +1,7 @@
-"""Sizes that the message headers of an Arrow IPC stream state, read before any data are unpacked.
+"""Reader of the sizes that are stated in the message headers of an Arrow IPC stream.
 
-pyarrow allocates the sizes that a file states and offers no limit, so a damaged file could exhaust the memory.
-``iter_batch_sizes`` therefore reads the stated sizes without unpacking data.
+pyarrow allocates the stated sizes without a limit, so a damaged file could exhaust the memory. ``iter_batch_sizes``
+reads the stated sizes without unpacking data, so that a file can be rejected before pyarrow reads it.
 
 Sources: Arrow columnar format, https://arrow.apache.org/docs/format ("Encapsulated message format", "Compression",
 Message.fbs), and FlatBuffers internals.
@@ -16,17 +16,17 @@ from typing import IO, Any, Final
 CONTINUATION: Final = 0xFFFFFFFF
 MAX_METADATA_BYTES: Final = 64_000_000
 """Maximum size of the metadata of one message. A schema with 10 000 columns has about 2 MB."""
-SCHEMA: Final = 1  # values of MessageHeader
+SCHEMA: Final = 1  # values of the Arrow enumeration MessageHeader
 DICTIONARY_BATCH: Final = 2
 RECORD_BATCH: Final = 3
-MESSAGE_HEADER_TYPE: Final = 1  # fields of Message
+MESSAGE_HEADER_TYPE: Final = 1  # field numbers of the Arrow table Message
 MESSAGE_HEADER: Final = 2
 MESSAGE_BODY_LENGTH: Final = 3
-BATCH_LENGTH: Final = 0  # fields of RecordBatch
+BATCH_LENGTH: Final = 0  # field numbers of the Arrow table RecordBatch
 BATCH_BUFFERS: Final = 2
 BATCH_COMPRESSION: Final = 3
-DICTIONARY_DATA: Final = 1  # field of DictionaryBatch
-BUFFER: Final = struct.Struct("<qq")  # offset in the body, length
+DICTIONARY_DATA: Final = 1  # field number of the Arrow table DictionaryBatch
+BUFFER: Final = struct.Struct("<qq")  # offset in the message body, and length
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class StatedBatchSize:
     """Size of one record batch or dictionary batch according to the message header."""
 
     rows: int
-    body_bytes: int  # size in the file
+    body_bytes: int  # size in the file in bytes
     buffers: tuple[int, ...]  # unpacked size of each buffer in bytes
     dictionary: bool  # True for a dictionary batch
 
@@ -55,7 +55,7 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSiz
         file.seek(at)
         mark, size = struct.unpack("<II", file.read(8))
         at += 8
-        if mark != CONTINUATION:  # versions before Arrow 0.15 do not write the mark
+        if mark != CONTINUATION:  # versions before Arrow 0.15 do not write the continuation mark
             size, at = mark, at - 4
         if not 0 < size <= MAX_METADATA_BYTES or at + size > end:
             return
@@ -80,15 +80,15 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSiz
 
 
 def check_batch_buffer_sizes(size: StatedBatchSize, buffer_counts: Sequence[int | None], slack_bytes: int) -> str:
-    """Check that no numeric column unpacks to more bytes than the rows of the batch require.
+    """Check that no numeric column unpacks to more bytes than the rows of a batch require.
 
     Parameters
     ----------
     size
         Stated size of the batch.
     buffer_counts
-        Number of buffers of each column in schema order. Negative for columns that are not read. None if unknown, in
-        which case the buffers of all following columns are checked as well.
+        Number of buffers of each column in schema order. The number is negative for a column that is not read, and None
+        if it is unknown. The buffers of all columns after an unknown number are checked as well.
     slack_bytes
         Allowed size in addition to eight bytes per row.
 
@@ -124,7 +124,7 @@ def count_column_buffers(pa: Any, type_: Any) -> int | None:
     Returns
     -------
     int or None
-        Number of buffers, or None for nested types and view types, which have a variable number of buffers.
+        Number of buffers. None for nested types and view types, which have a variable number of buffers.
     """
     types = pa.types
     if types.is_null(type_):

@@ -2,8 +2,8 @@
 
 An empty field or ``nan`` is a missing value. Blank lines and comment lines before the header line are skipped.
 
-NumPy parses regular text quickly in large pieces. A piece with a damaged line is parsed line by line, so that only the
-damaged line is lost. A last line without a line end is skipped, because the last number may be incomplete.
+NumPy parses text in large pieces. A piece with a damaged line is parsed line by line, so that only the damaged line is
+lost. A last line without a line end is skipped, because the last number may be incomplete.
 
 Lines are counted before parsing, so that ``drivers.recordings.memory_check`` can reject a file that is too large.
 """
@@ -33,19 +33,22 @@ MAX_PREAMBLE_BYTES: Final = 1 << 20
 MAX_EMPTY_MEMBERS: Final = 1000
 """Maximum number of consecutive gzip members without content."""
 MAX_BAD_LINES: Final = 100_000
-"""Number of bad lines after which reading stops if most lines are bad."""
+"""Number of invalid lines after which reading stops if most lines are invalid."""
 COMMENT_MARKS: Final = (b"#", b"%")
 BOM: Final = b"\xef\xbb\xbf"
 GZIP_BYTES: Final = 1 << 16
-"""Number of compressed bytes that are decompressed at once. In a damaged file, at most this part is lost."""
+"""Number of compressed bytes that are decompressed at once.
+
+Damage to a file loses at most this many compressed bytes.
+"""
 GZIP_MAGIC: Final = b"\x1f\x8b"
 GZIP_LEVEL: Final = 1
-"""Compression level. Level 6 reduces the size of noise data by a further 6 % but takes eight times as long."""
+"""Level of gzip compression. Level 6 reduces the size of noise data by a further 6 % but takes eight times as long."""
 
 
 @dataclass(slots=True)
 class _BadLines:
-    """Number of invalid lines, and a description of the first invalid line."""
+    """Count of invalid lines, with a description of the first invalid line."""
 
     count: int = 0
     first: str = ""
@@ -118,7 +121,7 @@ def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
         return
     unzip = zlib.decompressobj(zlib.MAX_WBITS | 16)
     data = file.read(GZIP_BYTES)
-    empty, has_text = 0, False  # number of consecutive empty members; True if the current member contains text
+    empty, has_text = 0, False  # consecutive empty gzip members; True if the current member has text
     while data:
         try:
             text = unzip.decompress(data, READ_BYTES)
@@ -128,12 +131,12 @@ def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
         if text:
             has_text = True
             yield text
-        if unzip.eof:  # another member may follow, since gzip files can be concatenated
+        if unzip.eof:  # another gzip member may follow, because gzip files can be concatenated
             empty = 0 if has_text else empty + 1
             if empty > MAX_EMPTY_MEMBERS:
                 notes.append(f"{empty} consecutive gzip members are empty; the file was read up to these members.")
                 return
-            data = (unzip.unused_data or file.read(GZIP_BYTES)).lstrip(b"\0")  # zeros may separate members
+            data = (unzip.unused_data or file.read(GZIP_BYTES)).lstrip(b"\0")  # zeros may separate gzip members
             unzip, has_text = zlib.decompressobj(zlib.MAX_WBITS | 16), False
             if not data:
                 return
@@ -301,7 +304,10 @@ def _split_fields(line: str) -> list[str]:
 
 
 def _parse_number(field: str) -> float | None:
-    """Return the number in a CSV field, NaN for an empty field, or None for text. Unlike ``float``, reject 1_000."""
+    """Return the number in a CSV field, NaN for an empty field, or None for text.
+
+    Unlike ``float``, 1_000 is rejected.
+    """
     if not field or field.isspace():
         return float("nan")
     try:
@@ -314,8 +320,8 @@ def _parse_number(field: str) -> float | None:
 def open_csv_writer(path: Path, names: Sequence[str], use_gzip: bool = False) -> Iterator[table.AppendColumns]:
     """Open a CSV file for writing, with one header line and one line per sample. Missing values are written as ``nan``.
 
-    If ``use_gzip`` is True, the file is compressed with gzip. The gzip header contains no time stamp, so equal samples
-    give equal files.
+    If ``use_gzip`` is True, the file is compressed with gzip. The gzip header contains no time stamp, so that equal
+    samples give equal files.
     """
     with ExitStack() as stack:
         raw: IO[bytes] = stack.enter_context(path.open("wb"))
@@ -326,7 +332,7 @@ def open_csv_writer(path: Path, names: Sequence[str], use_gzip: bool = False) ->
 
         def append_rows(columns: table.Columns) -> None:
             for start in range(0, columns[names[0]].size, table.BATCH_ROWS):
-                # repr gives the shortest text from which the same float64 can be read
+                # repr gives the shortest text that converts back to the same float64.
                 fields = [map(repr, columns[name][start : start + table.BATCH_ROWS].tolist()) for name in names]
                 file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
 

@@ -35,7 +35,7 @@ FORMATS: Final[Mapping[str, Format]] = {
         arrow_format.read_ipc, partial(arrow_format.open_ipc_writer, stream=True), arrow_format.count_ipc_rows
     ),
 }
-"""Recording formats by suffix."""
+"""Recording format for each file suffix."""
 
 
 def find_format(path: Path) -> Format:

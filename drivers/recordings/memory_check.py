@@ -1,15 +1,15 @@
-"""Limits on the size of a recording, which protect the machine against exhaustion of the memory.
+"""Limits on the size of a recording, so that reading a file cannot exhaust the memory.
 
-Each reader checks the number of samples before allocating memory. A check of the file size is not sufficient, because a
+Each reader checks the number of samples before allocating memory. Checking the file size is not sufficient, because a
 compressed file of a few megabytes can unpack to gigabytes.
 
 Four limits apply (docs/recording.md):
 
-- The samples, including copies during an analysis, must fit into the available memory.
+- The samples and the copies made during an analysis must fit into the available memory.
 - A file contains at most ``MIN_ROW_LIMIT`` rows or ``MAX_ROWS_PER_BYTE`` rows per byte on disk, whichever is more.
 - The unpacked size is at most ``MIN_UNPACKED_LIMIT_BYTES`` or ``MAX_UNPACKING_RATIO`` times the size on disk, whichever
   is more.
-- A file has at most ``MAX_COLUMNS`` columns.
+- A file contains at most ``MAX_COLUMNS`` columns.
 """
 
 import os
@@ -27,19 +27,19 @@ OWN_CGROUPS: Final = Path("/proc/self/cgroup")
 STATM: Final = Path("/proc/self/statm")
 
 COPIES: Final = 3.0
-"""Minimum number of copies of the samples in memory during an analysis."""
+"""Minimum number of copies of the samples that an analysis keeps in memory."""
 ROW_BYTES: Final = 64
-"""Size of one sample in memory: time, six axes and temperature as float64."""
+"""Size in bytes of one sample in memory. A sample consists of the time, six axes and the temperature as float64."""
 MIN_ROW_LIMIT: Final = 20_000_000
 MAX_ROWS_PER_BYTE: Final = 8
-"""Maximum number of rows per byte on disk. A row of measured values needs more than one bit in every format."""
+"""Maximum number of rows per byte on disk. In every format, a row of measured values needs more than one bit."""
 MIN_UNPACKED_LIMIT_BYTES: Final = 2_000_000_000
 MAX_UNPACKING_RATIO: Final = 100
 MAX_COLUMNS: Final = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class ReadLimit:
+class RecordingSizeLimits:
     """Limits on the size of one file or one folder."""
 
     path: Path
@@ -47,7 +47,7 @@ class ReadLimit:
     free: int | None  # available memory in bytes; None if unknown
 
     def check_row_count(self, rows: int) -> None:
-        """Raise an error if a recording with this number of samples must not be read.
+        """Raise an error if a recording has too many samples to be read.
 
         Raises
         ------
@@ -78,15 +78,16 @@ class ReadLimit:
             )
 
 
-def measure_read_limit(path: Path) -> ReadLimit:
+def measure_read_limit(path: Path) -> RecordingSizeLimits:
     """Return the size limits of a file. Raise OSError if the file does not exist."""
-    return ReadLimit(path, path.stat().st_size, available_bytes())
+    return RecordingSizeLimits(path, path.stat().st_size, available_bytes())
 
 
 def available_bytes() -> int | None:
-    """Return the memory available to this process in bytes, or None if unknown.
+    """Return the memory in bytes that is available to this process, or None if unknown.
 
-    The result is the smallest of the free system memory, the control group limit and the resource limit (``ulimit``).
+    The result is the minimum of the available system memory, the control group limit and the resource limit
+    (``ulimit``).
     """
     stated = (available_system_bytes(), available_cgroup_bytes(), available_rlimit_bytes())
     known = [n for n in stated if n is not None]
@@ -100,23 +101,23 @@ def available_system_bytes(meminfo: Path = MEMINFO) -> int | None:
 
 
 def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
-    """Return the memory available under the control group limits of this process, in bytes, or None without a limit.
+    """Return the memory in bytes that the control groups of this process leave available, or None without a limit.
 
-    The page cache counts as available memory, because the kernel can drop the page cache.
+    The page cache counts as available memory, because the kernel can free it at any time.
 
     Parameters
     ----------
     own
         File that lists the control groups of the process.
     root
-        Folder of the control group file system.
+        Folder where the control group file system is mounted.
     """
     left = [n for folder in _cgroup_folders(own, root) if (n := _left_in_cgroup(folder)) is not None]
     return min(left) if left else None
 
 
 def available_rlimit_bytes(statm: Path = STATM) -> int | None:
-    """Return the memory available under the resource limits of this process, in bytes, or None without a limit."""
+    """Return the memory in bytes that the resource limits of this process leave available, or None without a limit."""
     try:
         pages = [int(n) for n in statm.read_text().split()]
     except (OSError, ValueError):
@@ -147,14 +148,14 @@ def _cgroup_folders(own: Path, root: Path) -> Iterator[Path]:
 
 
 def _left_in_cgroup(folder: Path) -> int | None:
-    """Return the memory available in a control group (version 1 or 2) in bytes, or None without a limit."""
+    """Return the memory in bytes that is available in a control group (version 1 or 2), or None without a limit."""
     for limit, usage, prefix in (
         ("memory.max", "memory.current", ""),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_"),
     ):
         try:
             most, used = int((folder / limit).read_text()), int((folder / usage).read_text())
-        except (OSError, ValueError):  # the file does not exist, or its content is "max"
+        except (OSError, ValueError):  # the file does not exist or contains "max"
             continue
         cached = _parse_fields(folder / "memory.stat", " ")
         return most - used + sum(cached.get(f"{prefix}{kind}_file", 0) for kind in ("active", "inactive"))

@@ -1,8 +1,9 @@
-"""Reading and writing of .npz recordings with one array per column. The sample rate ``fs`` in Hz can replace the times
-``t``.
+"""Reading and writing of .npz recordings with one array per column.
+
+The sample rate ``fs`` in Hz can replace the times ``t``.
 
 The reader rejects arrays of Python objects, because unpickling can execute code. A truncated zip archive has no index,
-so the reader searches for the local header of each array.
+so the reader finds each array by its local header.
 """
 
 import io
@@ -30,21 +31,21 @@ from drivers.errors import RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 
-LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
+LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # local file header, PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
 ITEM_DTYPE: Final = np.dtype("<f8")
 NPY_ERRORS: Final = (
     ValueError, TypeError, SyntaxError, EOFError, MemoryError, OverflowError, RuntimeError, TokenError, zlib.error
 )  # fmt: skip
-"""Exceptions that NumPy and zlib raise if an array is damaged."""
+"""Exceptions that NumPy and zlib raise when an array is damaged."""
 COPY_BYTES: Final = 1 << 18
 MAX_INDEX_BYTES: Final = 4_000_000
-"""Maximum size of the index of an archive, about 50 000 arrays."""
+"""Maximum size in bytes of the index of an archive, enough for about 50 000 arrays."""
 MAX_HEADER_BYTES: Final = 1 << 16
 MAX_DEFLATE_RATIO: Final = 1032
 """Highest compression ratio of deflate, https://zlib.net/zlib_tech.html."""
 NUMERIC_KINDS: Final = "fiu"
-"""Characters of ``numpy.dtype.kind`` for the types that a column may have."""
+"""Values of ``numpy.dtype.kind`` that a column may have: float, signed integer and unsigned integer."""
 NPY_MAGIC: Final = b"\x93NUMPY"
 KNOWN_KEYS: Final = frozenset((*table.COLUMNS, *table.ALIASES, "fs"))
 NPY_HEADER: Final = re.compile(
@@ -52,16 +53,16 @@ NPY_HEADER: Final = re.compile(
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
     re.DOTALL,
 )
-"""Header of a numeric array with at most one dimension, as all versions of NumPy write the header.
+"""Pattern of the .npy header of a numeric array with at most one dimension, as all versions of NumPy write it.
 
-The header is matched by a regular expression, and never evaluated as Python code.
+The header is matched by a regular expression and never evaluated as Python code.
 """
 
 
 class _BoundedFile(FileIO):
-    """File that refuses to read more than MAX_INDEX_BYTES at once.
+    """File that raises an error if more than MAX_INDEX_BYTES are read at once.
 
-    ``zipfile`` reads the whole index at once and needs about ten times the size of the index as memory.
+    ``zipfile`` reads the whole index at once and uses about ten times as much memory as the size of the index.
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -77,7 +78,7 @@ class _Header:
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    size_bytes: int  # size of the header
+    size_bytes: int  # size of the header in bytes
 
     @property
     def values(self) -> int:
@@ -89,7 +90,7 @@ def count_npz_rows(path: Path) -> int:
     """Return the number of rows of a .npz file according to the array headers, or 0 if the file is truncated."""
     with _BoundedFile(path) as file:
         if not _has_index(path, file):
-            return 0  # the number of rows of a truncated archive is checked during reading
+            return 0  # the reader checks the number of rows of a truncated archive
         with _open_archive(path, file) as archive:
             return _check_columns(path, archive, table.select_known_columns(path, _array_names(archive), []))
 
@@ -100,7 +101,7 @@ def read_npz(path: Path) -> table.Table:
     Raises
     ------
     RecordingError
-        If the file is not a .npz file, contains no readable number, or exceeds a size limit.
+        If the file is not a .npz file, contains no readable numbers, or exceeds a size limit.
     ConfigError
         If the samples do not fit into memory.
     """
@@ -122,7 +123,7 @@ def read_npz(path: Path) -> table.Table:
 
 
 def _has_index(path: Path, file: IO[bytes]) -> bool:
-    """Return True if a zip archive is complete, that is, has an index. Raise an error for other files."""
+    """Return True if a zip archive is complete, which means that it has an index. Raise an error for other files."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
         raise RecordingError(
             f"{path}: is no .npz file, which is a zip archive with one array per column"
@@ -167,8 +168,10 @@ def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, st
     return rows
 
 
-def _check_size(path: Path, limit: memory_check.ReadLimit, member: zipfile.ZipInfo, key: str, header: _Header) -> None:
-    """Raise RecordingError if a zip member is too small for the number of values that the array header states."""
+def _check_size(
+    path: Path, limit: memory_check.RecordingSizeLimits, member: zipfile.ZipInfo, key: str, header: _Header
+) -> None:
+    """Raise RecordingError if a zip member is too small for the number of values stated in the array header."""
     ratio = 1 if member.compress_type == zipfile.ZIP_STORED else MAX_DEFLATE_RATIO
     packed = min(member.compress_size, limit.size_bytes)
     data_bytes = max(min(member.file_size, ratio * packed) - header.size_bytes, 0)
@@ -182,7 +185,7 @@ def _check_size(path: Path, limit: memory_check.ReadLimit, member: zipfile.ZipIn
 def _read_header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
     """Read the header of an array without reading the data."""
     method = _find_member(archive, key).compress_type
-    if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # zipfile unpacks other methods without a limit
+    if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # zipfile has no size limit for other methods
         raise RecordingError(
             f"{path}: {key} is packed by method {method} of zip, expected stored or deflated as written by NumPy"
         )
@@ -221,7 +224,7 @@ def _read_array(path: Path, archive: zipfile.ZipFile, key: str) -> NDArray[Any]:
 def _member_errors(path: Path, key: str) -> Iterator[None]:
     """Convert exceptions of NumPy and zipfile to RecordingError."""
     try:
-        with warnings.catch_warnings():  # NumPy warns about headers of old versions
+        with warnings.catch_warnings():  # NumPy warns about headers that old versions wrote
             warnings.simplefilter("ignore")
             yield
     except zipfile.BadZipFile as error:
@@ -271,9 +274,10 @@ def _table_of_recovered(
 
 
 def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
-    """Recover the arrays of a truncated .npz file by searching for local zip headers.
+    """Recover the arrays of a truncated .npz file by searching for local file headers.
 
-    Return the arrays by name, and the name of the truncated array or None. Arrays with unknown names are empty.
+    The result is a dictionary of arrays by name, and the name of the truncated array or None. Arrays with unknown names
+    are empty.
     """
     limit = memory_check.measure_read_limit(path)
     arrays: dict[str, NDArray[Any]] = {}
@@ -302,9 +306,9 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
 
 
 class _MemberReader:
-    """Iterator over the unpacked content of a zip member. ``size`` is None if the zip header does not state the size.
+    """Iterator over the unpacked content of a zip member. ``size`` is None if the local file header states no size.
 
-    After iteration, ``end`` is the offset of the end of the member, or None if the member is truncated.
+    After the iteration, ``end`` is the offset of the end of the member, or None if the member is truncated.
     """
 
     def __init__(self, data: mmap, start: int, method: int, size: int | None) -> None:
@@ -342,7 +346,7 @@ class _MemberReader:
 
 
 def _read_up_to_cut(
-    pieces: _MemberReader, limit: memory_check.ReadLimit, unpacked: int, *, wanted: bool
+    pieces: _MemberReader, limit: memory_check.RecordingSizeLimits, unpacked: int, *, wanted: bool
 ) -> NDArray[Any] | None:
     """Return the complete numbers in a zip member, or None if the member is not a numeric array.
 
@@ -355,7 +359,7 @@ def _read_up_to_cut(
     for part in pieces:
         limit.check_unpacked_size(unpacked + pieces.unpacked)
         if len(raw) >= most:
-            continue  # read on to find the end of the member
+            continue  # continue to the end of the member
         raw += part
         if header is None and (header := NPY_HEADER.match(raw)) is not None:
             header = NPY_HEADER.match(bytes(raw[: header.end()]))
@@ -375,8 +379,8 @@ def _read_up_to_cut(
 def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
     """Open a compressed .npz file for writing.
 
-    Each column is first written to a temporary file in the folder of ``path``, because zip members cannot be written in
-    parallel.
+    Each column is first written to a temporary file in the folder of ``path``, because zip members can only be written
+    one after another.
     """
     with ExitStack() as stack:
         collected = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
@@ -392,10 +396,10 @@ def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendCo
 
 
 def _write_array(archive: zipfile.ZipFile, name: str, numbers: IO[bytes]) -> None:
-    """Write an array like ``numpy.savez_compressed``, but copy the numbers from a file instead of memory."""
+    """Write an array like ``numpy.savez_compressed``, but copy the numbers from a file instead of from memory."""
     shape = (numbers.tell() // ITEM_DTYPE.itemsize,)
     numbers.seek(0)
-    member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, so that equal columns give equal bytes
+    member = zipfile.ZipInfo(f"{name}.npy")  # a constant date, so that equal columns give equal bytes
     member.compress_type = zipfile.ZIP_DEFLATED
     with archive.open(member, "w", force_zip64=True) as file:
         header = {"descr": ITEM_DTYPE.str, "fortran_order": False, "shape": shape}

@@ -18,17 +18,20 @@ from drivers.recordings import memory_check, table
 from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
 
 METADATA_KEY: Final = b"imu-monitor"
-"""Key in the schema metadata of a segment that the daemon has recorded."""
+"""Key of the metadata that the daemon writes to the schema of a segment."""
 SEGMENT_COLUMNS: Final = ("ticks", "lost")
 """Columns of a segment that are not measurements. The reader does not report these columns as unused."""
 SLACK_BYTES: Final = 1 << 20
-"""Allowed size of a compressed buffer in addition to the size that its rows need."""
+"""Number of bytes that a compressed buffer may unpack to beyond the bytes that the rows need."""
 MAX_DICTIONARY_BYTES: Final = 64_000_000
 MAX_INDEX_BYTES: Final = 10_000_000
-"""Maximum size of the index of a Parquet file. pyarrow needs about ten times as much memory to read the index."""
-PARQUET_FOOTER: Final = b"\0\0\0\0PAR1"  # last bytes of a file, with zeros in place of the length of the index
+"""Maximum size in bytes of the index of a Parquet file.
+
+pyarrow needs about ten times as much memory to read the index.
+"""
+PARQUET_FOOTER: Final = b"\0\0\0\0PAR1"  # end of a file, with zeros as the length of the index
 ARROW_MAGIC: Final = b"ARROW1\0\0"
-ARROW_END: Final = b"\xff\xff\xff\xff\0\0\0\0"  # end-of-stream mark of Arrow IPC
+ARROW_END: Final = b"\xff\xff\xff\xff\0\0\0\0"  # end-of-stream mark of an Arrow IPC stream
 
 
 def import_pyarrow(path: Path) -> Any:
@@ -64,7 +67,7 @@ def read_parquet(path: Path) -> table.Table:
 
 
 def count_parquet_rows(path: Path) -> int:
-    """Return the number of rows of a Parquet file according to the index of the file."""
+    """Return the number of rows that the index of a Parquet file states."""
     with _open_parquet(path) as file:
         return _check_parquet(path, file, [])[1]
 
@@ -109,7 +112,7 @@ def _open_parquet(path: Path) -> Iterator[Any]:
 def read_ipc(path: Path) -> table.Table:
     """Read the known columns of an Arrow file or stream. If the file is truncated, only the complete batches are read.
 
-    An Arrow file is read as a stream, because the file contains an Arrow stream between two magic strings.
+    An Arrow file is read as a stream, because it consists of an Arrow stream between two magic strings.
 
     Raises
     ------
@@ -160,7 +163,7 @@ def _ipc_start(path: Path) -> int:
 
 
 def _has_end_mark(path: Path, is_file: bool) -> bool:
-    """Return True if an Arrow file or stream is complete, that is, ends with an end mark."""
+    """Return True if an Arrow file or stream ends with an end mark and is therefore complete."""
     mark = ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END
     with open_regular_file(path) as file:
         file.seek(max(path.stat().st_size - len(mark), 0))
@@ -174,7 +177,7 @@ def _ipc_schema(path: Path, file: Any) -> Any:
         file.seek(_ipc_start(path))
         schema = pa.ipc.open_stream(file).schema
         table.check_column_count(path, len(schema))
-        schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
+        schema.names, schema.metadata  # noqa: B018 - raises an exception for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
             f"{path}: is no Arrow IPC file or stream ({first_message_line(error)})"
@@ -234,7 +237,7 @@ def first_message_line(error: Exception) -> str:
 
 @contextmanager
 def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
-    """Open a Parquet file for writing. Each call of the yielded function writes one row group."""
+    """Open a Parquet file for writing. Each call of the yielded function appends one row group."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
@@ -245,7 +248,7 @@ def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.Appe
 
 @contextmanager
 def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[table.AppendColumns]:
-    """Open an Arrow file (Feather version 2) for writing. If ``stream`` is True, the file is an Arrow stream."""
+    """Open an Arrow file (Feather version 2) for writing, or an Arrow stream if ``stream`` is True."""
     pa = import_pyarrow(path)
     schema = _float_schema(pa, names)
     with (pa.ipc.new_stream if stream else pa.ipc.new_file)(str(path), schema) as file:

@@ -1,11 +1,11 @@
-"""Segment files, in which the daemon records samples or raw data as a growing Arrow IPC stream.
+"""Segment files, in which the daemon records samples or raw data. A segment is a growing Arrow IPC stream.
 
 A file name such as ``00000042_2026-11-22T03-00-00Z.arrows`` consists of the segment number and the time of the first
 sample. Each batch of samples includes the state of the daemon (``DaemonState``), so that the daemon can continue after
 a restart.
 
 The daemon appends small uncompressed batches, so that an unfinished segment can be read. The daemon atomically replaces
-each finished segment by a compressed copy.
+each finished segment with a compressed copy.
 """
 
 import errno
@@ -43,7 +43,7 @@ NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
 MAX_BATCH_BYTES: Final = 64_000_000
-"""Maximum unpacked size of a batch. The batches of the daemon are much smaller."""
+"""Maximum unpacked size of a batch in bytes. The batches that the daemon writes are much smaller."""
 MAX_LOST_SAMPLES: Final = 10**11
 """Maximum number of consecutive missing samples in a valid segment."""
 
@@ -51,12 +51,12 @@ Kind = Literal["samples", "raw"]
 
 
 class SegmentMetadata(msgspec.Struct, frozen=True):
-    """Metadata of a segment, which describe the device and the type of data."""
+    """Metadata that describe the device and the type of data in a segment."""
 
     device: str
     kind: Kind
-    axes: str = ""  # mounting of the sensor; a change of the mounting begins a new recording
-    carrier: str = ""  # carrier of the link, for raw data
+    axes: str = ""  # mounting of the sensor; a new mounting starts a new recording
+    carrier: str = ""  # type of chunk that the link delivers, for raw data
     decoder: str = ""
     packed: bool = False  # True if the segment has been compressed
     schema: str = SCHEMA
@@ -67,23 +67,26 @@ class DaemonState(msgspec.Struct, frozen=True):
 
     rate: float | None = None  # sample rate in Hz
     since: tuple[float | None, ...] = (None,) * 6
-    """Unix time in s since which the samples of each axis are used. Set after a noise change or a cleared window."""
+    """Unix time in s of the oldest sample in use for each axis.
+
+    The time is set after a noise change or a cleared window.
+    """
     tick_step: float | None = None  # ticks of the device counter per sample
     theta: tuple[float | None, ...] = ()
-    """Coefficients [5, 6] of the newest fit, row by row."""
+    """Noise coefficients [5, 6] of the newest fit, in row-major order."""
     entered: tuple[bool, ...] = ()
-    """True for each noise term that the newest fit includes [5, 6], row by row."""
+    """Flags [5, 6] in row-major order, True for each noise term that the newest fit includes."""
 
 
 @dataclass(frozen=True, slots=True)
-class SegmentPiece:
+class GapFreeSegmentPart:
     """Consecutive samples of a segment without missing samples in between."""
 
     samples: SampleBlock  # t_ns are Unix times
     state: DaemonState
 
 
-class SingleSegmentWriter:
+class SegmentFileWriter:
     """Writer that appends batches to one segment file.
 
     Parameters
@@ -105,10 +108,10 @@ class SingleSegmentWriter:
         self._schema = _schema(self._pa, origin)
         self._state = DaemonState()
         self._temporary_path = path.with_name(path.name + PARTIAL_SUFFIX)
-        self._temporary_path.unlink(missing_ok=True)  # the file of a program that was killed
+        self._temporary_path.unlink(missing_ok=True)  # remove the file of a program that was killed
         self._file: IO[bytes] = self._temporary_path.open("xb", buffering=0)
         self._writer = self._pa.ipc.new_stream(self._file, self._schema)
-        self._valid_bytes = 0  # total length of all complete batches
+        self._valid_bytes = 0  # total size of all complete batches
 
     def write_samples(self, blocks: Sequence[SampleBlock], state: DaemonState) -> None:
         """Write one batch of samples.
@@ -116,9 +119,9 @@ class SingleSegmentWriter:
         Parameters
         ----------
         blocks
-            Blocks whose ``t_ns`` are Unix times.
+            Sample blocks whose ``t_ns`` are Unix times.
         state
-            State of the daemon after these samples.
+            State of the daemon after the last sample.
         """
         self._write_batch(_sample_batch(self._pa, self._schema, blocks), {b"state": msgspec.json.encode(state)})
 
@@ -127,11 +130,11 @@ class SingleSegmentWriter:
         self._write_batch(_chunk_batch(self._pa, self._schema, chunks), None)
 
     def flush_to_disk(self) -> None:
-        """Flush written batches to the disk, so that the batches survive a power failure."""
+        """Flush written batches to the disk, so that they survive a power failure."""
         os.fdatasync(self._file.fileno())
 
     def describe_external_change(self) -> str:
-        """Describe how another program has changed the open file. Return an empty string if the file is unchanged."""
+        """Describe how another program has changed the open file. The text is empty if the file is unchanged."""
         try:
             named = os.stat(self.path if self._valid_bytes else self._temporary_path, follow_symlinks=False)
         except OSError:
@@ -142,8 +145,10 @@ class SingleSegmentWriter:
         return "was cut or written by another program" if self._valid_bytes and own.st_size != self._valid_bytes else ""
 
     def close_changed_file(self) -> None:
-        """Close a segment file that another program has changed. The end mark is written only if the file length is
-        unchanged."""
+        """Close a segment file that another program has changed.
+
+        The end mark is written only if the file length is unchanged.
+        """
         try:
             if os.fstat(self._file.fileno()).st_size == self._valid_bytes:
                 self._writer.close()
@@ -160,11 +165,11 @@ class SingleSegmentWriter:
                 self._temporary_path.unlink(missing_ok=True)
 
     def _write_batch(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
-        """Write one batch. If writing fails, truncate the file to the complete batches."""
+        """Write one batch. If writing fails, truncate the file after the last complete batch."""
         try:
             self._writer.write_batch(batch, custom_metadata=meta)
         except OSError:
-            # an incomplete batch would hide all later batches
+            # An incomplete batch would make all later batches unreadable.
             self._file.truncate(self._valid_bytes)
             self._file.seek(self._valid_bytes)
             raise
@@ -184,14 +189,14 @@ def format_segment_name(number: int, unix_s: float) -> str:
     number
         Number of the segment in its folder.
     unix_s
-        Unix time of the first row in s.
+        Unix time of the first sample in s.
 
     >>> format_segment_name(42, 1_700_000_000.0)
     '00000042_2023-11-14T22-13-20Z.arrows'
     """
     try:
         when = f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%dT%H-%M-%SZ}"
-    except (ValueError, OverflowError, OSError):  # the time of a sender may not be a valid date
+    except (ValueError, OverflowError, OSError):  # a sender may send a time that is not a valid date
         when = "0000-00-00T00-00-00Z"
     return f"{number:08d}_{when}{SUFFIX}"
 
@@ -228,7 +233,7 @@ def read_metadata(path: Path) -> SegmentMetadata:
         return _check_schema(path, pa.ipc.open_stream(file).schema)
 
 
-def read_last_piece(path: Path) -> SegmentPiece | None:
+def read_last_piece(path: Path) -> GapFreeSegmentPart | None:
     """Return the last samples of a finished segment, or None if the segment is empty.
 
     Raise RecordingError if the file is not a segment. The file is memory-mapped, so that only the last batch is read
@@ -239,14 +244,16 @@ def read_last_piece(path: Path) -> SegmentPiece | None:
     return pieces[-1] if pieces else None
 
 
-def read_samples(path: Path) -> Iterator[SegmentPiece]:
-    """Yield the samples in all complete batches of a segment. Raise RecordingError if the file is not a segment of
-    samples."""
+def read_samples(path: Path) -> Iterator[GapFreeSegmentPart]:
+    """Yield the samples in all complete batches of a segment.
+
+    Raise RecordingError if the file is not a segment of samples.
+    """
     for batch, meta in _read_batches(path, "samples"):
         yield from _split_batch(batch, meta)
 
 
-def _split_batch(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
+def _split_batch(batch: Any, meta: Any) -> Iterator[GapFreeSegmentPart]:
     """Split the samples of a batch where samples are missing. Skip a batch with implausible values."""
     columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
     values = np.column_stack([columns[axis] for axis in AXES])
@@ -258,20 +265,24 @@ def _split_batch(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
     edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), len(rows)]
     for a, b in pairwise(edges):
         part = rows[a:b]
-        yield SegmentPiece(make_block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state)
+        yield GapFreeSegmentPart(
+            make_block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state
+        )
 
 
 def _is_plausible(columns: Mapping[str, Any]) -> bool:
-    """Return True if all times and numbers of missing samples are in the supported ranges."""
-    # a null value converts a column of integers to floats
+    """Return True if all times and all numbers of missing samples are in the supported ranges."""
+    # A null value would convert a column of integers to floats.
     lost, ticks = columns["lost"], columns["ticks"]
     whole = lost.dtype == ticks.dtype == np.int64
     return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= MAX_LOST_SAMPLES)).all())
 
 
 def _decode_state(meta: Any) -> DaemonState:
-    """Decode the state of the daemon from the metadata of a batch. Return an empty state if the metadata are
-    invalid."""
+    """Decode the state of the daemon from the metadata of a batch.
+
+    Return an empty state if the metadata are invalid.
+    """
     try:
         found = msgspec.json.decode(meta.get(b"state", b"{}"), type=DaemonState) if meta else DaemonState()
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -296,8 +307,8 @@ def read_chunks(path: Path) -> Iterator[Chunk]:
                     yield Chunk(data, t_ns, address, attachment)
 
 
-def compress_segment(path: Path) -> Iterator[None]:
-    """Replace a finished segment by a compressed copy.
+def compress_segment_stepwise(path: Path) -> Iterator[None]:
+    """Replace a finished segment with a compressed copy.
 
     The generator yields after each batch, so that the caller can do other work during the compression.
 
@@ -339,7 +350,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any, dict[bytes, bytes] | None]]:
-    """Combine small batches into large batches, each with the state after the last row."""
+    """Combine small batches into large batches. Each large batch contains the daemon state after its last row."""
     waiting: list[Any] = []
     rows = size = 0
     meta: dict[bytes, bytes] | None = None
@@ -365,7 +376,7 @@ def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tupl
     If ``mapped`` is True, the file is memory-mapped, so that unused rows are not read from the disk.
     """
     pa = import_pyarrow(path)
-    # the file is opened only once, because the daemon may replace the file by a compressed file at any time
+    # The file is opened only once, because the daemon may replace it with a compressed file at any time.
     with _arrow_errors(path), open_regular_file(path) as file:
         count = _count_regular_batches(file)
         file.seek(0)
@@ -378,7 +389,7 @@ def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tupl
                 batch, meta = reader.read_next_batch_with_custom_metadata()
                 batch.validate(full=not mapped)
             except (StopIteration, pa.ArrowException, OSError):
-                return  # the stream has ended or is truncated
+                return  # the end of the stream, or a truncated batch
             if batch.num_rows:
                 yield batch, meta
 
@@ -388,14 +399,14 @@ def _count_regular_batches(file: IO[bytes]) -> int:
     count = 0
     for size in iter_batch_sizes(file):
         large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
-        if large or size.dictionary:  # the daemon writes no dictionaries
+        if large or size.dictionary:  # the daemon never writes dictionaries
             break
         count += 1
     return count
 
 
 def _memory_map(pa: Any, file: IO[bytes]) -> Any:
-    """Map a file into memory. Return an empty file unchanged, because empty files cannot be mapped."""
+    """Map a file into memory. An empty file is returned unchanged, because it cannot be mapped."""
     if not os.fstat(file.fileno()).st_size:
         return file
     return pa.BufferReader(pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
@@ -416,14 +427,14 @@ def _arrow_errors(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: is no segment of a recording ({first_message_line(error)})") from error
     except (import_pyarrow(path).ArrowException, UnicodeDecodeError, RecursionError, msgspec.DecodeError) as error:
         raise RecordingError(f"{path}: is no segment of a recording ({first_message_line(error)})") from error
-    except MemoryError as error:  # in a file of another type, the first bytes may be read as a length of gigabytes
+    except MemoryError as error:  # the first bytes of another file type may look like a huge length
         raise RecordingError(
             f"{path}: is no segment of a recording (it claims more bytes than the memory holds)"
         ) from error
 
 
 def _check_schema(path: Path, schema: Any) -> SegmentMetadata:
-    """Return the metadata in an Arrow schema. Raise RecordingError if the schema is not the schema of a segment."""
+    """Return the metadata in an Arrow schema. Raise RecordingError if the schema does not belong to a segment."""
     meta = (schema.metadata or {}).get(METADATA_KEY)
     if meta is None:
         raise RecordingError(f"{path}: is no segment of a recording: it does not state its device")

@@ -13,36 +13,36 @@ from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check
 
 COLUMNS: Final = ("t", *AXES, "temperature")
-"""Names of the known columns."""
+"""Names of the columns that the readers recognize."""
 
 ALIASES: Final = {"temp": "temperature"}
-"""Alternative names of known columns."""
+"""Alternative column names, with the name in COLUMNS."""
 
 EXAMPLE_HEADER: Final = "t,gx,gy,gz,ax,ay,az"
-"""Example of a header line in error messages."""
+"""Example of a header line, quoted in error messages."""
 
 BATCH_ROWS: Final = 1 << 16
-"""Maximum number of rows that are written at once. A truncated Arrow file loses at most this number of rows."""
+"""Maximum number of rows that are written at once. A truncated Arrow file loses at most this many complete rows."""
 
 T_LIMIT_S: Final = 4.6e9
-"""Largest absolute time in s. The difference of two times fits into int64 nanoseconds."""
+"""Largest absolute time in s for which the difference of two times fits into int64 nanoseconds."""
 
 PARTIAL_SUFFIX: Final = ".part"
 """Suffix that is added to a file name while the file is being written."""
 
 Columns = Mapping[str, Floats]
-"""Columns as float64 arrays [n] of equal length. The keys are names in COLUMNS."""
+"""Mapping from names in COLUMNS to float64 arrays [n] of equal length."""
 
 AppendColumns = Callable[[Columns], None]
 """Function that appends rows to a file that is being written."""
 
 OpenWriter = Callable[[Path, Sequence[str]], AbstractContextManager[AppendColumns]]
-"""Function that creates a file with the given columns. The file is complete when the context ends."""
+"""Function that creates a file with the given columns. Leaving the context completes the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Columns and stated sample rate of a recording file, with notes about irregularities."""
+    """Columns and stated sample rate of a recording file, and notes about irregularities."""
 
     columns: dict[str, Floats]  # float64 arrays [n]; the keys are names in COLUMNS; NaN = missing
     fs: float | None  # sample rate in Hz; None if the file states no rate
@@ -63,23 +63,23 @@ def select_known_columns(path: Path, names: Sequence[str], notes: list[str], whe
     Parameters
     ----------
     path
-        Path of the file for error messages.
+        Path of the file, used in error messages.
     names
         Names of all columns in the file.
     notes
         List to which a note about unused columns is appended.
     where
-        Position of the names in the file for error messages, such as " in line 3".
+        Position of the column names in the file, used in error messages, such as " in line 3".
 
     Returns
     -------
     dict
-        Mapping from the known column names to the names in the file.
+        Mapping from each known column name to the column name in the file.
 
     Raises
     ------
     RecordingError
-        If no column is an axis, a known column occurs twice, or the file has too many columns.
+        If the file contains no axis, a known column occurs twice, or the file has too many columns.
     """
     check_column_count(path, len(names))
     known = {*COLUMNS, *ALIASES}
@@ -115,13 +115,13 @@ CONTENTS: Final = (
     (b"\x89PNG", "a picture", ()),
     (b"%PDF", "a PDF document", ()),
 )
-"""First bytes of a file, type of the content, and file suffixes of recordings with this content."""
+"""For each type of file: the first bytes, the name of the type, and the suffixes of recordings of this type."""
 
 
 def describe_suffix_mismatch(path: Path) -> str:
-    """Describe a mismatch between the content and the suffix of a file, for an error message.
+    """Return an error text about a file whose content does not match its suffix.
 
-    The text names the detected type of content and the remedy. The text is empty if the type is unknown.
+    The text states the detected type of file and a remedy. If the type is unknown, the text is empty.
     """
     try:
         with open_regular_file(path) as file:
@@ -141,8 +141,9 @@ def describe_suffix_mismatch(path: Path) -> str:
 
 
 def format_name_list(names: Sequence[str], max_names: int = 12) -> str:
-    """Format a list of names for a message. Long lists and long names are shortened, and control characters are
-    escaped.
+    """Format a list of names for a message.
+
+    Long lists and long names are shortened, and control characters are escaped.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ class AppendSamples(Protocol):
     """Function that appends rows to a recording."""
 
     def __call__(self, t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
-        """Append rows.
+        """Append samples to the recording.
 
         Parameters
         ----------
@@ -37,14 +37,14 @@ class AppendSamples(Protocol):
 
 @contextmanager
 def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[AppendSamples]:
-    """Open a recording for writing. The suffix of the path determines the file format.
+    """Create a recording file and yield a function that appends samples. The file suffix determines the format.
 
     Parameters
     ----------
     path
-        File to write. The file appears when the context ends without exception.
+        File to write. The file appears when the context ends without an exception.
     axes
-        Columns to write, some of AXES.
+        Axes to write, a subset of AXES.
     temperature
         True if a temperature column is written.
 
@@ -80,7 +80,7 @@ def save_samples(
     temperature_c: Floats | None = None,
     axes: Sequence[str] | None = None,
 ) -> None:
-    """Save samples as a recording without loss of precision. The suffix of the path determines the file format.
+    """Save samples as a recording without loss of precision. The file suffix determines the format.
 
     Parameters
     ----------
@@ -112,8 +112,9 @@ def save_samples(
 
 @contextmanager
 def atomic_write_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path, and rename the temporary file to ``path`` at the end of the context. After an exception,
-    the temporary file is removed.
+    """Yield a temporary path, and rename the temporary file to ``path`` at the end of the context.
+
+    If an exception occurs, the temporary file is removed.
 
     Raises
     ------
@@ -122,11 +123,11 @@ def atomic_write_path(path: Path) -> Iterator[Path]:
     """
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: cannot be written: there is no folder {path.parent}")
-    if path.is_dir():  # otherwise the error would be reported only after writing
+    if path.is_dir():  # otherwise the error would occur only after writing
         raise ConfigError(f"{path}: cannot be written: it is a folder")
     part = path.with_name(path.name + PARTIAL_SUFFIX)
     try:
-        if part.exists() and not part.is_file():  # opening a FIFO would wait for a reader
+        if part.exists() and not part.is_file():  # opening a FIFO would wait for a reading program
             part.unlink()
         part.touch()
     except OSError as error:
@@ -136,7 +137,7 @@ def atomic_write_path(path: Path) -> Iterator[Path]:
         os.replace(part, path)
     except (IsADirectoryError, PermissionError) as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
-    except OSError as error:  # the error of a full disk does not name the file
+    except OSError as error:  # the exception for a full disk does not name the file
         error.filename = error.filename or str(path)
         raise
     finally:

@@ -1,1 +1,1 @@
-"""Sample times, detection of missing and repeated samples, and check of the sample rate."""
+"""Assignment of sample times, detection of missing and repeated samples, and check of the sample rate."""

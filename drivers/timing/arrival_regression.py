@@ -1,4 +1,4 @@
-"""Estimation of the sample rate by linear regression of arrival time on sample index."""
+"""Estimation of the sample rate by a linear regression of arrival time on sample index."""
 
 from math import exp, inf, sqrt
 from typing import Final
@@ -6,29 +6,31 @@ from typing import Final
 import numpy as np
 
 FORGET_S: Final = 30.0
-"""Time constant of the exponential forgetting: longer than arrival jitter, shorter than the warm-up of a crystal."""
+"""Time constant of the exponential forgetting in s.
+
+Arrival jitter is faster, and the warm-up of a crystal is slower.
+"""
 MIN_SPAN_S: Final = 2.0
-"""Minimum time between the first and the last point for a rate estimate."""
+"""Minimum time in s between the first and the last point for a rate estimate."""
 MIN_SAMPLES: Final = 20
 """Minimum number of samples for a rate estimate."""
 MIN_FORGETTING_FACTOR: Final = 0.9
-"""Smallest factor by which each new point multiplies the weight of earlier points.
+"""Lower limit of the factor by which a new point reduces the weight of the earlier points.
 
-The effective number of points in the regression is therefore at least ten, even for slow sensors.
+Because of this limit, the effective number of points is at least ten even for slow sensors.
 """
 MIN_POINTS: Final = 5
-"""Minimum number of points for an estimate of the scatter about the line."""
+"""Minimum number of points for an estimate of the scatter about the regression line."""
 UNCERTAINTY_FACTOR: Final = 2.0
-"""Safety factor between the error indicated by the residuals and the stated uncertainty of the rate.
+"""Ratio of the stated uncertainty of the rate to the error that the residuals indicate.
 
-The factor is empirical, because slowly varying delays shift the regression line without appearing in the residuals. In
-simulations with stalls, bursts and slowly varying delays, only slowly varying delays caused larger errors, in the first
-seconds.
+This safety factor is empirical, because slowly varying delays shift the regression line without appearing in the
+residuals. In simulations with stalls, bursts and slowly varying delays, the error exceeded the stated uncertainty only
+for slowly varying delays in the first seconds.
 """
 STANDARD_RATE_TOLERANCE: Final = 0.002
-"""Relative difference up to which a measured rate is replaced by the nearest standard rate.
+"""Largest relative difference at which a measured rate is replaced with the nearest standard rate.
 
-A measured rate with a larger difference is not replaced.
 """
 # fmt: off
 STANDARD_RATES_HZ: Final = np.array([
@@ -44,7 +46,7 @@ class ArrivalRegression:
 
     def __init__(self) -> None:
         self.count = 0
-        self._x0 = self._t0 = 0.0  # newest point
+        self._x0 = self._t0 = 0.0  # index and time of the newest point
         self._first_x = self._first_t = 0.0
         self._w = self._mx = self._mt = self._sxx = self._sxt = self._stt = 0.0
 
@@ -54,18 +56,18 @@ class ArrivalRegression:
         Parameters
         ----------
         index
-            Sample index, which counts missing samples as well.
+            Sample index, which also counts missing samples.
         t_s
             Time of the sample in s.
         nominal_hz
-            Nominal sample rate in Hz, used while there are too few points for an estimate. None if unknown.
+            Nominal sample rate in Hz, which is used until there are enough points for an estimate. None if unknown.
         """
         if self.count == 0:
             self._first_x, self._first_t = index, t_s
             self._nominal_s = 1.0 / nominal_hz if nominal_hz else None
         dx, dt = index - self._x0, t_s - self._t0
         keep = max(exp(-max(dt, 0.0) / FORGET_S), MIN_FORGETTING_FACTOR) if self.count else 0.0
-        # shift the means to the new origin, then update the means (West 1979)
+        # Shift the means to the new origin, then add the new point (West 1979).
         self._mx -= dx
         self._mt -= dt
         self._x0, self._t0 = index, t_s
@@ -81,24 +83,24 @@ class ArrivalRegression:
         self.count += 1
 
     def shift_points(self, samples: float) -> None:
-        """Increase the sample index of all points by the number of samples missing before the first point."""
+        """Increase the index of all points after samples were found to be missing before the first point."""
         self._x0 += samples
         self._first_x += samples
 
     def elapsed_s(self) -> float:
-        """Return the time between the first and the newest point in seconds."""
+        """Return the time from the first to the newest point in seconds."""
         return self._t0 - self._first_t
 
-    def can_tell_gap_from_jitter(self) -> bool:
+    def has_enough_points_for_gaps(self) -> bool:
         """Return True if the regression has enough points to distinguish a gap from jitter."""
         return self._x0 - self._first_x >= MIN_SAMPLES and self.elapsed_s() >= MIN_SPAN_S
 
     def measure_rate(self, final: bool = False) -> tuple[float, float] | None:
-        """Return the measured sample rate and the uncertainty of the rate.
+        """Return the measured sample rate and its uncertainty.
 
-        Delays with standard deviation s cause a relative error of the slope of at most s/S, where S is the standard
-        deviation of the times (Cauchy-Schwarz inequality). For the residuals of the regression, s/S equals √(1/r² − 1),
-        where r is the correlation of time and index.
+        Delays with standard deviation s cause a relative error of at most s/S in the slope of the line, where S is the
+        standard deviation of the times (Cauchy-Schwarz inequality). For the residuals of the regression, s/S = √(1/r² −
+        1), where r is the correlation of time and index.
 
         Parameters
         ----------
@@ -108,12 +110,12 @@ class ArrivalRegression:
         Returns
         -------
         tuple of float, or None
-            Sample rate in Hz and relative uncertainty, or None if there are too few points.
+            Sample rate in Hz and its relative uncertainty, or None if there are too few points.
         """
         enough = (
             self._x0 - self._first_x >= MIN_SAMPLES - 1
             if final
-            else self.can_tell_gap_from_jitter() and self.count >= MIN_POINTS
+            else self.has_enough_points_for_gaps() and self.count >= MIN_POINTS
         )
         if not enough or not self._sxt > 0.0:
             return None
@@ -126,8 +128,8 @@ class ArrivalRegression:
         return found is not None and found[0] * period_s < 1.0 - found[1]
 
     def period_s(self) -> float | None:
-        """Return the sample period in seconds, or None without a nominal rate and enough points."""
-        if self.count >= 2 and self._sxt > 0.0 and (self.can_tell_gap_from_jitter() or self._nominal_s is None):
+        """Return the sample period in seconds. None if there is no nominal rate and there are too few points."""
+        if self.count >= 2 and self._sxt > 0.0 and (self.has_enough_points_for_gaps() or self._nominal_s is None):
             return self._sxt / self._sxx
         return self._nominal_s if self.count else None
 
@@ -143,9 +145,9 @@ class ArrivalRegression:
 
 
 def snap_to_standard_rate(measured_hz: float) -> float:
-    """Round a measured sample rate to the nearest standard rate of sensors within STANDARD_RATE_TOLERANCE.
+    """Replace a measured sample rate with the nearest standard rate within STANDARD_RATE_TOLERANCE.
 
-    A rate that is not near a standard rate is rounded to 5 digits.
+    A rate that is not near any standard rate is rounded to 5 digits.
 
     >>> snap_to_standard_rate(99.97), snap_to_standard_rate(99.32)
     (100.0, 99.32)

@@ -1,10 +1,9 @@
-"""Sample times and missing samples, estimated from arrival times.
+"""Estimation of sample times and missing samples from arrival times.
 
-Sample times lie on a regression line of arrival time on sample index, so that transport jitter has little effect on the
-sample times.
+Sample times lie on a line fitted to arrival time against sample index, so that transport jitter has little effect.
 
-A short delay of the arrivals is attributed to the scheduler of the host. A delay that persists for CATCH_UP_S indicates
-missing samples.
+A short delay of the arrivals is attributed to the scheduler of the host. A delay that lasts for CATCH_UP_S means that
+samples are missing.
 """
 
 from dataclasses import dataclass
@@ -15,28 +14,28 @@ import numpy as np
 
 from drivers.data_types import NS_PER_S, Ints, SampleBlock, make_block
 from drivers.timing.arrival_regression import ArrivalRegression
-from drivers.timing.earliest_sample_time import EarliestSampleTime
+from drivers.timing.sample_time_lower_bound import NewestSampleTimeLowerBound
 
 CATCH_UP_S: Final = 3.0
-"""Time after which a persistent delay of the arrivals indicates missing samples."""
+"""Time in s after which a persistent delay of the arrivals means that samples are missing."""
 MIN_GAP_PERIODS: Final = 3.0
 """Shortest pause between arrivals that can indicate missing samples, in sample periods."""
 MIN_GAP_S: Final = 0.05
 """Shortest pause between arrivals that can indicate missing samples, in seconds."""
 JUMP_S: Final = 1.0
-"""Time by which the clock of a device may advance more than the clock of the host. A larger step is a clock jump."""
+"""Maximum time in s by which a device clock may get ahead of the host clock. A larger step is a clock jump."""
 PERIOD_TOLERANCE: Final = 0.05
 """Assumed relative error of the sample period."""
 MAX_RATE_HZ: Final = 32_000.0
-"""Highest sample rate of an inertial sensor, which limits the number of missing samples."""
+"""Highest plausible sample rate of an inertial sensor, which limits the number of missing samples."""
 MAX_GAP_SAMPLES: Final = 10**10
-"""Maximum number of consecutive missing samples, equivalent to 116 days at 1 kHz."""
+"""Maximum number of consecutive missing samples, which lasts 116 days at 1 kHz."""
 MAX_OFFSET_S: Final = 4.6e9
-"""Largest time since the first sample, half of the range of int64 nanoseconds."""
+"""Largest time in s since the first sample. The value is half of the range of int64 nanoseconds."""
 
 
 class ArrivalTimeline:
-    """Regression line of arrival time on sample index, which gives sample times and missing samples of one device.
+    """Line fitted to arrival time against sample index, which gives the sample times and missing samples of one device.
 
     Parameters
     ----------
@@ -49,15 +48,18 @@ class ArrivalTimeline:
         self.assumed_hz = nominal_hz
         """Sample rate in Hz before a rate has been measured: the configured rate, or the rate before a restart."""
         self.line = ArrivalRegression()
-        self.earliest_time = EarliestSampleTime()
+        self.earliest_time = NewestSampleTimeLowerBound()
         self.index = 0.0
-        """Number of received and missing samples since the start."""
+        """Number of received and missing samples so far."""
         self.arrived_ns = 0
         """Newest arrival time in ns."""
         self.last_t_ns = -(1 << 62)
         """Time of the newest sample in ns."""
         self.origin_ns: int | None = None
-        """Origin of times in seconds, because Unix time in float64 has a resolution of only 240 ns."""
+        """Origin of times in seconds.
+
+        Without an origin, Unix times in float64 would have a resolution of only 240 ns.
+        """
         self._delay: _Delay | None = None
 
     def seconds_since_origin(self, t_ns: int) -> float:
@@ -69,47 +71,47 @@ class ArrivalTimeline:
         self.line = ArrivalRegression()
 
     def undelayed_period_s(self) -> float | None:
-        """Return the sample period in s, unaffected by delayed arrivals.
+        """Return the sample period in s, estimated without delayed arrivals.
 
-        The configured period is used before a period has been measured.
+        Until a period has been measured, the configured period is returned.
         """
         found = self.line.measure_rate() if self.earliest_time.has_enough_arrivals else None
         if found is not None and found[1] < PERIOD_TOLERANCE:
             return 1.0 / found[0]
         return None if self.earliest_time.period_s or not self.assumed_hz else 1.0 / self.assumed_hz
 
-    def assign_line_times(self, samples: SampleBlock, missing: Ints) -> list[SampleBlock]:
-        """Add the newest arrival to the regression, and assign times on the regression line to the samples.
+    def add_arrival_and_assign_times(self, samples: SampleBlock, missing: Ints) -> list[SampleBlock]:
+        """Add the newest arrival to the regression, and assign times on the fitted line to the samples.
 
         Parameters
         ----------
         samples : SampleBlock
             Samples with arrival times.
         missing : array of int64, shape (n,)
-            Number of missing samples before each row.
+            Number of missing samples before each sample.
         """
         index = self.index + np.cumsum(missing + 1)
         passed = float(index[-1]) - self.index
         self.index = float(index[-1])
         self.arrived_ns = int(samples.t_ns[-1])
         arrived_s = self.seconds_since_origin(self.arrived_ns)
-        if self._delay is None:  # a possible gap must not affect the line
-            # the last sample of a chunk has the shortest delay
+        if self._delay is None:  # a delay that may be a gap must not affect the line
+            # The last sample of a chunk has the shortest delay.
             self.line.add_point(self.index, arrived_s, self.nominal_hz)
         self.earliest_time.advance_clock(passed, arrived_s, self.undelayed_period_s())
-        period_s = self.line.period_s() or 1.0 / NS_PER_S  # without a known rate, only the order is preserved
-        # a sample is not taken after its arrival; the tolerance allows for the scatter of the arrivals
+        period_s = self.line.period_s() or 1.0 / NS_PER_S  # without a rate, only the order is known
+        # A sample cannot be taken after its arrival. The tolerance JUMP_S allows for the scatter of the arrivals.
         newest_s = min(self.line.time_at_index_s(self.index), arrived_s + JUMP_S)
         t_s = newest_s - (self.index - index) * period_s
         if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # the times must fit into int64 nanoseconds
             t_s = np.clip(t_s, -MAX_OFFSET_S, MAX_OFFSET_S)
         t_ns = np.rint(t_s * NS_PER_S).astype(np.int64) + (self.origin_ns or 0)
         if t_ns[0] <= self.last_t_ns or (t_ns[1:] <= t_ns[:-1]).any():
-            # the line has moved backwards, or float64 is too coarse: keep the times increasing
+            # The line has moved backwards, or float64 is too coarse. Keep the sample times increasing.
             order = np.arange(len(samples))
             t_ns = np.maximum.accumulate(np.maximum(t_ns - order, self.last_t_ns + 1)) + order
         self.last_t_ns = int(t_ns[-1])
-        return split_at_gaps(samples, t_ns, missing)
+        return retime_and_split_at_gaps(samples, t_ns, missing)
 
     def count_missing_since_arrival(self, arrived_ns: int, arrived: int) -> int:
         """Estimate the number of missing samples from the time since the previous arrival.
@@ -119,7 +121,7 @@ class ArrivalTimeline:
         arrived_ns : int
             Arrival time of the newest sample in ns.
         arrived : int
-            Number of samples that have arrived since the previous arrival.
+            Number of samples that have arrived since the previous arrival time.
         """
         rate_hz = self.line.rate_hz() or self.assumed_hz
         if not rate_hz or not self.arrived_ns:
@@ -131,20 +133,22 @@ class ArrivalTimeline:
         """Discard the current delay of the arrivals, because the link was closed."""
         self._delay = None
 
-    def count_missing_after_delay(self, arrived_ns: int, counted: int, min_gap_samples: float = MIN_GAP_PERIODS) -> int:
-        """Estimate the number of missing samples from a sudden delay that has persisted for CATCH_UP_S.
+    def estimate_missing_from_persistent_delay(
+        self, arrived_ns: int, counted: int, min_gap_samples: float = MIN_GAP_PERIODS
+    ) -> int:
+        """Estimate the number of missing samples from a sudden delay that has lasted for CATCH_UP_S.
 
         Parameters
         ----------
         arrived_ns : int
             Arrival time of the newest sample in ns.
         counted : int
-            Number of samples since the last call that have arrived, or are known to be missing.
+            Number of samples since the last call that have arrived or are known to be missing.
         min_gap_samples : float
             Minimum number of consecutive missing samples to detect.
         """
         period_s = self.line.period_s()
-        if period_s is None or not self.line.can_tell_gap_from_jitter():
+        if period_s is None or not self.line.has_enough_points_for_gaps():
             return 0
         least_s = max(min_gap_samples * period_s, MIN_GAP_S)
         index, arrived_s = self.index + counted, self.seconds_since_origin(arrived_ns)
@@ -158,7 +162,7 @@ class ArrivalTimeline:
         delay = self._delay
         delay.least_s = min(delay.least_s, behind_s)
         delay.line.add_point(index, arrived_s, self.nominal_hz)
-        if delay.least_s < least_s:  # the arrivals have caught up, so the host was delayed
+        if delay.least_s < least_s:  # the arrivals have caught up, so only the host was delayed
             self._delay = None
             return 0
         if arrived_ns - delay.since_ns < CATCH_UP_S * NS_PER_S:
@@ -166,9 +170,9 @@ class ArrivalTimeline:
         gap = min(round(delay.least_s / max(period_s, 1.0 / MAX_RATE_HZ)), MAX_GAP_SAMPLES)
         delay.line.shift_points(gap)
         rest_s = behind_s - gap * period_s
-        if delay.line.is_slower_than(period_s):  # the delay grows because the period is wrong
+        if delay.line.is_slower_than(period_s):  # the delay grows because the assumed period is wrong
             self.line, self._delay = delay.line, None
-        elif rest_s > least_s:  # another delay may have begun in the meantime
+        elif rest_s > least_s:  # another delay may have begun since
             delay.since_ns, delay.least_s = arrived_ns, rest_s
         else:
             self._delay = None
@@ -177,15 +181,15 @@ class ArrivalTimeline:
 
 @dataclass(slots=True)
 class _Delay:
-    """Sudden delay of the arrivals, possibly caused by missing samples."""
+    """Sudden delay of the arrivals, which missing samples may have caused."""
 
     since_ns: int  # time of the first delayed arrival, or of the last reported gap
     least_s: float  # minimum delay of the arrivals since ``since_ns`` relative to the fitted line
     line: ArrivalRegression  # line fitted to the arrivals since the first delayed arrival
 
 
-def split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[SampleBlock]:
-    """Split a block where samples are missing, and assign new times to the samples.
+def retime_and_split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[SampleBlock]:
+    """Split a sample block where samples are missing, and assign new times to the samples.
 
     Parameters
     ----------
@@ -194,7 +198,7 @@ def split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[Sampl
     t_ns : array of int64, shape (n,)
         Time of each sample in ns.
     missing : array of int64, shape (n,)
-        Number of missing samples before each row.
+        Number of missing samples before each sample.
     """
     edges = [0, *(np.flatnonzero(missing[1:]) + 1).tolist(), len(samples)]
     return [

@@ -1,10 +1,11 @@
-"""Detection of missing samples from the counter of a device.
+"""Detection of missing samples from the values of a device counter.
 
-Counter values give the exact number of missing samples. If a short counter may have wrapped several times, the number
-of wraps is estimated from arrival times (``drivers.timing.arrival_timeline``).
+Counter values give the exact number of missing samples. If a counter may have wrapped several times, the number of
+wraps is estimated from arrival times (``drivers.timing.arrival_timeline``).
 
-A counter step that is longer than the elapsed time allows is a counter jump (``drivers.timing.earliest_sample_time``).
-After a counter jump, the number of missing samples is estimated from arrival times.
+A counter step that is larger than the elapsed time allows is a counter jump
+(``drivers.timing.sample_time_lower_bound``). After a counter jump, the number of missing samples is estimated from
+arrival times.
 """
 
 from collections import deque
@@ -18,13 +19,13 @@ from drivers.timing.arrival_timeline import JUMP_S, MAX_GAP_SAMPLES, MAX_RATE_HZ
 from drivers.timing.event_rate_limiter import EventRateLimiter
 
 MAX_STEP_TICKS: Final = 1 << 62
-"""Largest step of the counter."""
+"""Largest possible step of a device counter."""
 MIN_STUCK_SAMPLES: Final = 10
 """Number of consecutive samples with the same counter value after which a stuck counter is reported."""
 STEP_HISTORY: Final = 255
-"""Number of recent counter steps used to determine the typical step."""
+"""Number of recent counter steps from which the typical step is determined."""
 STEP_TOLERANCE: Final = 0.25
-"""Maximum relative difference of a counter step from the typical step."""
+"""Maximum relative difference between a counter step and the typical step."""
 
 
 class CounterGaps:
@@ -33,17 +34,17 @@ class CounterGaps:
     Parameters
     ----------
     counter : CounterTimedFormat
-        Modulus and tick length of the counter.
+        Modulus and tick duration of the counter.
     timeline : ArrivalTimeline
         Arrival times of the samples.
     events : EventRateLimiter
-        Queue for the events about counter jumps and a stuck counter.
+        Queue for events about counter jumps and a stuck counter.
     """
 
     def __init__(self, counter: CounterTimedFormat, timeline: ArrivalTimeline, events: EventRateLimiter) -> None:
         self.typical_step = _TypicalStep()
         self.clock_line = ArrivalRegression()
-        """Regression of device time on sample index. The regression is empty if the tick length is unknown."""
+        """Regression of device time on sample index. The regression is empty if the tick duration is unknown."""
         self._counter = counter
         self._timeline = timeline
         self._events = events
@@ -59,7 +60,7 @@ class CounterGaps:
         tick : int
             Last counter value.
         ticks_per_sample : float
-            Ticks per sample.
+            Number of ticks per sample.
         """
         self._tick = tick
         self.typical_step.add_steps(np.array([round(ticks_per_sample)]))
@@ -69,7 +70,7 @@ class CounterGaps:
         self._tick = None
 
     def count_missing(self, samples: SampleBlock, link_was_closed: bool) -> Ints:
-        """Return the number of missing samples before each row [n].
+        """Return the number of missing samples before each sample [n].
 
         Parameters
         ----------
@@ -98,7 +99,7 @@ class CounterGaps:
         unseen = (
             self._timeline.count_missing_since_arrival(arrived_ns, len(samples)) if first and link_was_closed else 0
         )
-        if not steps.any():  # a stuck counter gives no information
+        if not steps.any():  # a stuck counter says nothing about missing samples
             missing[0] = max(samples.lost, unseen)
         elif self._has_jumped(missing, steps, arrived_ns):
             self._discard_jump(samples, missing, steps, first)
@@ -121,7 +122,7 @@ class CounterGaps:
         self.clock_line = ArrivalRegression()
         at = int(np.argmax(steps))
         missing[at] = steps[at] = 0
-        if self._has_jumped(missing, steps, arrived_ns):  # there is another jump, so no step is reliable
+        if self._has_jumped(missing, steps, arrived_ns):  # a second jump makes every step unreliable
             missing[:] = 0
         if not first:
             missing[at] = self._timeline.count_missing_since_arrival(arrived_ns, len(samples) + int(missing.sum()))
@@ -131,11 +132,11 @@ class CounterGaps:
         if self._counter.tick_s is None or rate_hz is None:
             return seen
         nominal = 1.0 / (rate_hz * self._counter.tick_s)
-        # if the nominal rate is far from the typical step, the typical step is used
+        # If the nominal rate does not match the typical step, the typical step is used.
         return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else seen
 
     def _hidden_wraps(self, steps: Ints, ticks_per_sample: float | None, arrived_ns: int, link_was_closed: bool) -> int:
-        """Estimate the number of additional counter wraps during a pause of the data."""
+        """Estimate how many additional times the counter has wrapped during a pause of the data."""
         if ticks_per_sample is None:
             return 0
         counter, timeline = self._counter, self._timeline
@@ -143,18 +144,18 @@ class CounterGaps:
         rate_hz = timeline.line.rate_hz() or by_ticks_hz
         if rate_hz is None:
             return 0
-        turn = counter.modulus / ticks_per_sample  # samples
+        turn = counter.modulus / ticks_per_sample  # number of samples per wrap of the counter
         counted = int(np.rint(steps / ticks_per_sample).sum())
         if link_was_closed:
             timeline.forget_delay()
             elapsed_s = (arrived_ns - timeline.arrived_ns) / NS_PER_S
             turns = max(0, round((elapsed_s * rate_hz - counted) / turn))
         else:
-            turns = round(timeline.count_missing_after_delay(arrived_ns, counted, turn / 2.0) / turn)
+            turns = round(timeline.estimate_missing_from_persistent_delay(arrived_ns, counted, turn / 2.0) / turn)
         return turns if turns * counter.modulus < MAX_STEP_TICKS else 0
 
     def _find_stuck_counter(self, samples: SampleBlock, steps: Ints) -> Ints:
-        """Report a stuck counter. Return the length of the stuck period before each row [n], in samples."""
+        """Report a stuck counter. Return the number of samples with a stuck counter before each sample [n]."""
         before = self._stuck
         if not before and steps.all():
             return np.zeros(len(samples), np.int64)
@@ -170,7 +171,7 @@ class CounterGaps:
         return np.where(waited >= MIN_STUCK_SAMPLES, waited, 0)
 
     def _has_jumped(self, missing: Ints, steps: Ints, arrived_ns: int) -> bool:
-        """Return True if the device cannot have taken the missing samples in the elapsed time.
+        """Return True if the elapsed time is too short for the number of missing samples.
 
         The elapsed time starts at the earliest possible time of the previous sample, because the previous sample may
         have arrived late.
@@ -183,7 +184,7 @@ class CounterGaps:
             lasted_s = max(lost * (1.0 - PERIOD_TOLERANCE) * period_s, lasted_s)
         elif counter.tick_s is not None:
             lasted_s = max(float(steps.sum(dtype=np.float64)) * counter.tick_s, lasted_s)
-        elif 2 * int(steps.max()) > counter.modulus:  # a step of more than half the modulus is probably a step back
+        elif 2 * int(steps.max()) > counter.modulus:  # a step above half the modulus is probably a step back
             return True
         arrived_s = timeline.seconds_since_origin(arrived_ns)
         taken_s = timeline.earliest_time.newest_sample_not_before_s
@@ -210,7 +211,7 @@ class _TypicalStep:
         self._add_to_mean(near)
         if near.size < moved.size:
             recent = np.array(self._recent)
-            if 2 * self._near(recent).size < recent.size:  # most of the recent steps differ: start again
+            if 2 * self._near(recent).size < recent.size:  # start again if most recent steps differ
                 self._sum = self._count = 0
                 self._add_to_mean(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
 

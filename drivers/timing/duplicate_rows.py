@@ -1,7 +1,7 @@
-"""Detection and removal of repeated rows.
+"""Detection and removal of repeated samples. A row of a sample block contains one sample.
 
 A row is a repeat if an earlier row has the same key (sender time or counter value) and the same values. If many rows
-share keys but not values, the keys are too coarse, and no row is treated as a repeat.
+have the same key but different values, the keys are too coarse, and no row is treated as a repeat.
 """
 
 from collections import deque
@@ -26,11 +26,11 @@ from drivers.timing.event_rate_limiter import EventRateLimiter
 Mask = NDArray[np.bool_]
 
 MIN_NEW_KEYS: Final = 20
-"""Minimum number of rows with different keys before repeats are detected."""
+"""Minimum number of rows with different keys after which repeats are detected."""
 MAX_SHARED_FRACTION: Final = 0.05
-"""Maximum fraction of rows that share a key but not the values. Above this fraction, repeats are not detected."""
+"""Largest fraction of rows with equal keys but different values at which repeats are detected."""
 SHARED_FRACTION_ROWS: Final = 2000
-"""Number of recent rows used to compute the fraction of shared keys."""
+"""Number of recent rows over which the fraction of shared keys is computed."""
 SEARCH_ROWS: Final = 256
 """Number of earlier rows that are compared with a new row."""
 
@@ -41,18 +41,18 @@ class DuplicateDetector:
     Parameters
     ----------
     ordered : bool
-        True for keys that increase, such as sender times. False for a counter that wraps, for which only consecutive
-        rows are compared.
+        True if the keys increase, as sender times do. False for a counter that wraps; only consecutive rows are then
+        compared.
     """
 
     def __init__(self, ordered: bool) -> None:
         self._ordered = ordered
         self._last = -(1 << 62)
         self._tail: deque[tuple[Ints, Floats]] = deque()
-        self._kept = 0  # number of rows in the tail
+        self._kept = 0  # number of rows kept for comparison
         self._fresh = self._shared = 0.0
 
-    def find_repeats(self, keys: Ints, values: Floats) -> tuple[Mask | None, int]:
+    def find_repeats_and_count_shared_keys(self, keys: Ints, values: Floats) -> tuple[Mask | None, int]:
         """Find the rows that repeat an earlier row.
 
         Parameters
@@ -67,7 +67,7 @@ class DuplicateDetector:
         repeats : array of bool, shape (n,), or None
             True for each repeated row. None if no row is a repeat.
         shared : int
-            Number of rows that share the key of an earlier row but not the values.
+            Number of rows with the key of an earlier row but different values.
         """
         n = len(keys)
         fresh = int(keys[0]) > self._last if self._ordered else int(keys[0]) != self._last
@@ -75,7 +75,7 @@ class DuplicateDetector:
             steps = np.diff(keys)
             fresh = bool((steps > 0).all() if self._ordered else (steps != 0).all())
         newest = int(keys[-1])
-        if self._ordered and newest > self._last - NS_PER_S:  # otherwise the clock was set back
+        if self._ordered and newest > self._last - NS_PER_S:  # otherwise the sender clock was set back
             newest = max(self._last, newest if n == 1 else int(keys.max()))
         self._last = newest
         if fresh:
@@ -97,8 +97,10 @@ class DuplicateDetector:
         return (repeats if repeats.any() else None), int((~same).sum())
 
     def _same_key(self, keys: Ints, at: int) -> tuple[Ints, Ints]:
-        """Return the row indices of pairs with the same key. The later row of each pair has an index of at least
-        ``at``."""
+        """Return the row indices of pairs with the same key.
+
+        The later row of each pair has an index of at least ``at``.
+        """
         order = np.argsort(keys, kind="stable") if self._ordered else np.arange(len(keys))
         pairs = np.flatnonzero(np.diff(keys[order]) == 0)
         of, row = order[pairs], order[pairs + 1]
@@ -106,7 +108,7 @@ class DuplicateDetector:
         return of[known], row[known]
 
     def _update_shared_fraction(self, fresh: int, shared: int) -> None:
-        """Count rows with new keys and rows with shared keys, with forgetting after SHARED_FRACTION_ROWS rows."""
+        """Update the fraction of rows with shared keys, which is computed over about SHARED_FRACTION_ROWS rows."""
         self._fresh += fresh
         self._shared += shared
         if self._fresh + self._shared > SHARED_FRACTION_ROWS:
@@ -122,14 +124,14 @@ class DuplicateDetector:
 
 
 class RowFilter:
-    """Filter that removes rows from blocks and preserves the number of missing samples.
+    """Filter that removes rows from sample blocks and preserves the number of missing samples.
 
     Parameters
     ----------
     timing : Timing
         Timing of the wire format, which determines the key of a row.
     events : EventRateLimiter
-        Queue for the events about repeated rows.
+        Queue for events about repeated rows.
     """
 
     def __init__(self, timing: Timing, events: EventRateLimiter) -> None:
@@ -148,7 +150,7 @@ class RowFilter:
             keys, key_name = samples.ticks, "count"
         else:
             return samples
-        repeats, shared = self._detector.find_repeats(keys, samples.values)
+        repeats, shared = self._detector.find_repeats_and_count_shared_keys(keys, samples.values)
         t_ns = int(samples.t_ns[-1])
         if shared:
             text = f"{{n}} rows have the same {key_name} as another row and other values; all rows are kept"
@@ -164,7 +166,7 @@ class RowFilter:
     def select_rows(self, samples: SampleBlock, rows: Ints) -> SampleBlock | None:
         """Return the selected rows of a block, or None if the selection is empty.
 
-        Samples that are missing before a removed row are counted before the next row.
+        Samples that are missing before a removed row are counted as missing before the next remaining row.
 
         Parameters
         ----------

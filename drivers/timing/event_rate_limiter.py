@@ -5,7 +5,7 @@ from typing import Final
 from drivers.data_types import NS_PER_S, Event
 
 MIN_EVENT_INTERVAL_S: Final = 1.0
-"""Minimum time between two events of the same kind."""
+"""Minimum time in s between two events of the same kind."""
 
 
 class EventRateLimiter:
@@ -20,7 +20,7 @@ class EventRateLimiter:
         self._held_back: dict[tuple[str, str], tuple[int, str, int]] = {}
 
     def report_event(self, kind: str, t_ns: int, text: str, n: int = 0) -> None:
-        """Add an event, or hold the event back if the previous event of the same kind is too recent.
+        """Add an event, or hold the event back if an event of the same kind was added recently.
 
         Parameters
         ----------
@@ -37,14 +37,14 @@ class EventRateLimiter:
         held = self._held_back.pop(key, None)
         if "{n}" in text:
             n += held[2] if held else 0
-        else:  # keep the text of the first event, and count the other events
+        else:  # keep the text of the first event, and count the later events
             n = held[2] + 1 if held else 0
             text = held[1] if held else text
         self._held_back[key] = (t_ns, text, n)
         self.release_held_events(t_ns)
 
     def release_held_events(self, t_ns: int) -> None:
-        """Release held events whose waiting time has ended at the time ``t_ns``."""
+        """Release the held events whose waiting time has ended at the time ``t_ns``."""
         for (kind, what), (at_ns, text, n) in [*self._held_back.items()] if self._held_back else ():
             if kind not in self._last_ns or abs(t_ns - self._last_ns[kind]) >= MIN_EVENT_INTERVAL_S * NS_PER_S:
                 del self._held_back[(kind, what)]

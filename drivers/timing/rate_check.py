@@ -1,8 +1,8 @@
 """Check of the configured sample rate against the measured sample rate.
 
-An incorrect sample rate shifts the Allan deviation along τ and scales the noise coefficients. A difference within the
-tolerance of an oscillator is corrected by using the measured rate. After a larger difference, results that depend on
-the sample rate must not be published, because the cause is unknown (docs/decisions/rate-is-a-label.md,
+An incorrect sample rate shifts the Allan deviation along τ and scales the noise coefficients. If the difference is
+within the tolerance of an oscillator, the measured rate is used. If the difference is larger, its cause is unknown, and
+results that depend on the sample rate must not be published (docs/decisions/rate-is-a-label.md,
 docs/decisions/contradicted-rate.md).
 """
 
@@ -11,14 +11,16 @@ from typing import Final
 from drivers.timing.arrival_regression import snap_to_standard_rate
 
 AGREEMENT_LIMIT: Final = 0.005
-"""Relative difference up to which two rates agree. The resulting error of N and K is at most 0.25 %."""
+"""Largest relative difference at which two rates agree. The resulting error of N and K is at most 0.25 %."""
 CONTRADICTION_LIMIT: Final = 0.02
-"""Relative difference above which the measured rate contradicts the configured rate. Sensor oscillators are more
-accurate."""
+"""Relative difference above which the measured rate contradicts the configured rate.
+
+Sensor oscillators are more accurate.
+"""
 HYSTERESIS_FACTOR: Final = 0.75
-"""Ratio of the threshold for the end of a contradiction to the threshold for the beginning."""
+"""Ratio of the threshold that ends a contradiction to the threshold that starts a contradiction."""
 UPDATE_THRESHOLD: Final = 0.001
-"""Relative change of the measured rate above which the rate in use is updated."""
+"""Relative change of the measured rate above which the sample rate in use is updated."""
 
 
 class RateCheck:
@@ -27,7 +29,7 @@ class RateCheck:
     Parameters
     ----------
     configured_hz : float
-        Sample rate of the configuration in Hz.
+        Configured sample rate in Hz.
 
     Examples
     --------
@@ -50,7 +52,7 @@ class RateCheck:
         """True if the measured rate contradicts the configured rate."""
 
     def compare_with_measured_rate(self, measured_hz: float, relative_uncertainty: float) -> None:
-        """Compare the configured sample rate with a new measurement.
+        """Compare the configured sample rate with a newly measured rate.
 
         Parameters
         ----------

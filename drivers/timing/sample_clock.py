@@ -1,11 +1,11 @@
 """Sample clock, which assigns a time to each sample and detects missing and repeated samples.
 
-The source of the sample times depends on the wire format (``drivers.data_types.Timing``). There are three sources.
+The wire format (``drivers.data_types.Timing``) determines which of three sources gives the sample times:
 
-- Device counter: counter values give the number of missing samples, arrival times give the sample times
+- Device counter: counter values give the number of missing samples, and arrival times give the sample times
   (``counter_gaps``).
 - Arrival times only: arrival times give the sample times and the number of missing samples (``arrival_timeline``).
-- Sender times: the times from the sender are used unchanged (``sender_times``).
+- Sender times: the times from the sender are used unchanged (``sender_time_gaps``).
 
 Repeated rows are removed (``duplicate_rows``). Measured values are never changed.
 """
@@ -23,15 +23,15 @@ from drivers.timing.counter_gaps import CounterGaps
 from drivers.timing.duplicate_rows import RowFilter
 from drivers.timing.event_rate_limiter import EventRateLimiter
 from drivers.timing.rate_check import RateCheck
-from drivers.timing.sender_times import SenderTimes
+from drivers.timing.sender_time_gaps import SenderTimeGapDetector
 
 MAX_RESUME_DELAY_S: Final = 10.0
-"""Assumed maximum delay of the last sample before a restart."""
+"""Assumed maximum delay in s of the last sample before a restart."""
 RATE_CHECK_S: Final = 30.0
 RATE_CHECK_SAMPLES: Final = (2 * MIN_SAMPLES, round(MIN_SPAN_S * MAX_RATE_HZ))
-"""Numbers of samples after which the rate check is abandoned without a measured rate.
+"""Number of samples after which the rate check is abandoned if no rate has been measured.
 
-The first number applies after RATE_CHECK_S, the second number before.
+The first value applies after the time RATE_CHECK_S, and the second value applies before.
 """
 
 
@@ -39,14 +39,14 @@ The first number applies after RATE_CHECK_S, the second number before.
 class LastSample:
     """Time, counter value and rates of the last sample before a restart."""
 
-    t_ns: int  # on the clock of the sample times of the device
-    tick: int  # counter of the device; NO_TICK = none
+    t_ns: int  # on the same clock as the sample times of the device
+    tick: int  # counter value; NO_TICK = none
     rate_hz: float | None
-    ticks_per_sample: float | None  # ticks per sample
+    ticks_per_sample: float | None  # number of counter ticks per sample
 
 
 class SampleClock:
-    """Clock that assigns sample times and detects missing samples of one device.
+    """Clock of one device, which assigns sample times and detects missing samples.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class SampleClock:
     rate_hz : float or None
         Configured sample rate in Hz, or None to measure the sample rate.
     arrivals_are_timed : bool
-        False if arrival times are unrelated to the sample rate, as for bytes from a file.
+        False if arrival times are unrelated to the sample rate, as for bytes that are read from a file.
     """
 
     def __init__(self, timing: Timing, rate_hz: float | None, arrivals_are_timed: bool = True) -> None:
@@ -65,13 +65,13 @@ class SampleClock:
         self._rows = RowFilter(timing, self._events)
         self._timeline = ArrivalTimeline(rate_hz)
         self._counter: CounterGaps | None = None
-        self._sender: SenderTimes | None = None
+        self._sender: SenderTimeGapDetector | None = None
         if isinstance(timing, CounterTimedFormat):
             self._counter = CounterGaps(timing, self._timeline, self._events)
         elif isinstance(timing, SenderTimedFormat):
-            self._sender = SenderTimes(self._timeline, self._rows, self._events)
+            self._sender = SenderTimeGapDetector(self._timeline, self._rows, self._events)
         self._stamped = 0  # number of time-stamped samples
-        self._stamped_s = 0.0  # arrival or sender time from the first to the newest sample, in s
+        self._stamped_s = 0.0  # arrival or sender time from first to newest sample in s
         self._ended = self._resumed = self._paused = False
         self._idle_ns: int | None = None  # last time at which the link held no unread data
 
@@ -89,12 +89,12 @@ class SampleClock:
 
     @property
     def dropped_repeated_rows(self) -> int:
-        """Number of dropped rows that repeat an earlier row."""
+        """Number of samples that were dropped because they repeat an earlier sample."""
         return self._rows.dropped_repeated_rows
 
     @property
     def dropped_late_rows(self) -> int:
-        """Number of dropped rows that arrived after the sample had been counted as missing."""
+        """Number of samples that were dropped because they arrived after having been counted as missing."""
         return 0 if self._sender is None else self._sender.dropped_late_rows
 
     @property
@@ -103,14 +103,14 @@ class SampleClock:
         return None if self._counter is None else self._counter.typical_step.mean_ticks_per_sample
 
     @property
-    def rate_hz(self) -> float | None:
+    def configured_or_measured_rate_hz(self) -> float | None:
         """Configured or measured sample rate in Hz, or None if the rate is unknown or unsupported.
 
-        A contradicting measured rate replaces the configured rate (``drivers.timing.rate_check``).
+        A measured rate that contradicts the configured rate replaces it (``drivers.timing.rate_check``).
         """
         if self._check is not None:
             return self._check.rate_hz
-        if not self._timeline.line.can_tell_gap_from_jitter():
+        if not self._timeline.line.has_enough_points_for_gaps():
             return self._timeline.assumed_hz
         measured = self._timeline.line.rate_hz()
         return snap_to_standard_rate(measured) if measured and RATE_HZ.supports(measured) else None
@@ -118,16 +118,16 @@ class SampleClock:
     @property
     def measured_hz(self) -> float | None:
         """Sample rate in Hz measured with the clock of the host, or None if unknown."""
-        return self._timeline.line.rate_hz() if self._timeline.line.can_tell_gap_from_jitter() else None
+        return self._timeline.line.rate_hz() if self._timeline.line.has_enough_points_for_gaps() else None
 
     @property
     def contradicting_rate_hz(self) -> float | None:
-        """Measured sample rate in Hz if the configured rate is contradicted, otherwise None."""
+        """Measured sample rate in Hz if it contradicts the configured rate; otherwise None."""
         return self._check.measured_hz if self._check is not None and self._check.contradicted else None
 
     @property
     def rate_check_pending(self) -> bool:
-        """True if samples have arrived but the configured sample rate has not been checked."""
+        """True if samples have arrived but the configured sample rate has not been checked yet."""
         if self._check is None or self._check.measured_hz is not None or self._ended:
             return False
         if not self._stamped:
@@ -138,7 +138,7 @@ class SampleClock:
         return self._arrivals_are_timed or self._sender is not None or self._has_device_clock
 
     def compare_rates_at_end(self) -> None:
-        """Check the configured sample rate at the end of the data."""
+        """Check the configured sample rate after the end of the data."""
         if not self._ended and self._check is not None and self._check.measured_hz is None:
             self._check_rate(final=True)
         self._ended = True
@@ -147,14 +147,14 @@ class SampleClock:
         """Remove and return the queued events. If ``ended`` is True, include all held events."""
         return self._events.take_events(ended)
 
-    def note_link_closed(self) -> None:
-        """Record that the link was closed. The next arrival time then gives the number of missing samples."""
+    def count_next_gap_by_arrival(self) -> None:
+        """Record that the link was closed. The number of missing samples then follows from the next arrival time."""
         self._paused = True
 
     def note_no_unread_data(self, host_t_ns: int) -> None:
-        """Record a host time at which the link contained no unread data.
+        """Record a time on the host clock at which the link contained no unread data.
 
-        The last recorded time before the first sample limits the delay of the first sample.
+        The last such time before the first sample limits the possible delay of the first sample.
         """
         self._idle_ns = host_t_ns
 
@@ -169,14 +169,15 @@ class SampleClock:
         Returns
         -------
         list of SampleBlock
-            Samples with assigned times, split where samples are missing. ``lost`` is the number of missing samples
-            before a block.
+            Blocks of samples with assigned times, split where samples are missing. ``lost`` is the number of missing
+            samples before a block.
         """
         timeline = self._timeline
         if timeline.origin_ns is None:
             timeline.origin_ns = int(samples.t_ns[0])
             if self._idle_ns is not None:
-                # the first sample was not taken before the link was empty, so the previous sample is one period older
+                # The first sample was taken after the link was empty, so the sample before it is at most one period
+                # older.
                 period_s = 1.0 / (timeline.nominal_hz or MAX_RATE_HZ)
                 timeline.earliest_time.start_clock(min(timeline.seconds_since_origin(self._idle_ns), 0.0) - period_s)
         self._events.release_held_events(int(samples.t_ns[-1]))
@@ -195,7 +196,7 @@ class SampleClock:
         return self._counter is not None and self._counter.clock_line.count > 0
 
     def _check_rate(self, final: bool = False) -> None:
-        """Compare the configured sample rate with the rate by the device clock or by arrival times.
+        """Compare the configured sample rate with the rate measured by the device clock or from arrival times.
 
         If ``final`` is True, arrival times are not used, because a short series of arrival times is inaccurate.
         """
@@ -209,10 +210,10 @@ class SampleClock:
             self._check.compare_with_measured_rate(*found)
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Assign times and missing samples according to the timing of the wire format."""
+        """Assign times and numbers of missing samples according to the timing of the wire format."""
         if self._sender is not None:
             return self._sender.split_at_missing_samples(samples)
-        if self._paused and self.rate_hz is None:
+        if self._paused and self.configured_or_measured_rate_hz is None:
             self._timeline.restart_line()  # the number of missing samples is unknown
         if self._counter is not None and (samples.ticks != NO_TICK).all():
             missing = self._counter.count_missing(samples, self._paused)
@@ -221,17 +222,17 @@ class SampleClock:
                 self._counter.forget_last_tick()
             missing = self._missing_by_arrival(samples)
         self._paused = False
-        return self._timeline.assign_line_times(samples, missing)
+        return self._timeline.add_arrival_and_assign_times(samples, missing)
 
     def _missing_by_arrival(self, samples: SampleBlock) -> Ints:
-        """Estimate the number of missing samples before each row [n] from arrival times."""
+        """Estimate the number of missing samples before each sample [n] from arrival times."""
         missing = np.zeros(len(samples), np.int64)
         arrived_ns = int(samples.t_ns[-1])
         if self._paused:
             missing[0] = max(samples.lost, self._timeline.count_missing_since_arrival(arrived_ns, len(samples)))
             self._timeline.forget_delay()
         else:
-            missing[0] = samples.lost + self._timeline.count_missing_after_delay(
+            missing[0] = samples.lost + self._timeline.estimate_missing_from_persistent_delay(
                 arrived_ns, len(samples) + samples.lost
             )
         return missing

@@ -1,1 +1,1 @@
-"""zenoh sessions, diagnosis of connection errors, and the message format of samples."""
+"""Configuration of zenoh sessions, diagnosis of connection errors, and the message format of samples."""

@@ -1,9 +1,9 @@
-"""Diagnosis of connection errors, since zenoh does not report a cause.
+"""Diagnosis of connection errors, because zenoh does not report their cause.
 
 The functions connect to an endpoint with the configuration of the failed attempt. For TLS, the test includes the
-handshake with the same certificates. The result is one line. The result is "" if no program listens at the endpoint, or
-if the protocol is QUIC or UDP. The test of an endpoint may take twice ``timeout_s``, so a thread that handles samples
-must not run the test.
+handshake with the same certificates. The result is one line of text, or "" if no program listens at the endpoint or the
+protocol is QUIC or UDP. Testing an endpoint may take twice ``timeout_s``, so a thread that processes samples must not
+run the test.
 """
 
 import json
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 TIMEOUT_S: Final = 2.0
 LOGIN_REFUSED: Final = "answers, but refuses the login: check user and password"
-"""Reason that remains if connection and handshake succeed."""
+"""Only possible reason if the connection and the handshake succeed."""
 UNKNOWN_AUTHORITY: Final = "does not accept our certificate: it is not signed by its authority"
 _ENDPOINT: Final = re.compile(r"(tcp|tls|ws|wss)/\[?([^\]?#]+?)\]?:(\d+)(?:[?#].*)?")
 _TLS_REASONS: Final = {
@@ -36,30 +36,30 @@ _TLS_REASONS: Final = {
 
 
 def explain_refusals(endpoints: Sequence[str], config: "zenoh.Config") -> str:
-    """Return the reasons why endpoints refuse a connection. Endpoints without a known reason are omitted.
+    """Return the reasons why endpoints refuse a connection. An endpoint without a known reason is omitted.
 
     Parameters
     ----------
     endpoints
         Endpoints such as "tcp/127.0.0.1:7447".
     config
-        Configuration of the session.
+        Configuration of the zenoh session.
     """
     found = [(endpoint, explain_refusal(endpoint, config)) for endpoint in endpoints]
     return "; ".join(f"{mask_secrets(endpoint)}: {reason}" for endpoint, reason in found if reason)
 
 
 def explain_refusal(endpoint: str, config: "zenoh.Config", timeout_s: float = TIMEOUT_S) -> str:
-    """Return the reason why an endpoint refuses a connection; "" if the reason is unknown.
+    """Return the reason why an endpoint refuses a connection, or "" if the reason is unknown.
 
     Parameters
     ----------
     endpoint
         Endpoint such as "tcp/127.0.0.1:7447".
     config
-        Configuration of the session.
+        Configuration of the zenoh session.
     timeout_s
-        Longest wait for the connection, and for the handshake, in s.
+        Longest wait in s for the connection, and again for the handshake.
     """
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None:
@@ -87,9 +87,9 @@ def _explain_handshake_failure(plain: socket.socket, host: str, config: "zenoh.C
         return f"our certificates cannot be read: {describe_error(error)}"
     try:
         with context.wrap_socket(plain, server_hostname=host) as secure:
-            secure.recv(1)  # in TLS 1.3 a refusal of our certificate is sent after the handshake
+            secure.recv(1)  # TLS 1.3 rejects a certificate after the handshake
     except TimeoutError:
-        return LOGIN_REFUSED  # the other side waits for the first message of zenoh
+        return LOGIN_REFUSED  # the endpoint waits for the first zenoh message
     except ssl.SSLCertVerificationError as error:
         return f"its certificate is not valid: {error.verify_message}"
     except ssl.SSLError as error:

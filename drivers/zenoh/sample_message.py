@@ -1,12 +1,12 @@
 """Conversion between ``SampleBlock`` and the msgpack map that is published under ``<prefix>/<device>/samples``.
 
-``docs/samples-format.md`` documents the format. The daemon and the replay of a recording write the messages, and the
-decoder ``samples`` reads the messages.
+``docs/samples-format.md`` documents the format. The daemon and the replay of a recording write these messages, and the
+decoder ``samples`` reads them.
 
-If the samples are evenly spaced to within half a microsecond, ``t`` and ``t0`` are the Unix times of the newest and the
-first sample in seconds, and ``rate`` is the sample rate in Hz. Otherwise ``t`` contains the Unix time of each sample in
-seconds as little-endian float64, with a resolution of 0.24 µs. Unknown keys and columns are ignored. A message with
-inconsistent or too large sizes raises ``DecodeError``.
+If the samples are evenly spaced to within half a microsecond, ``t0`` and ``t`` are the Unix times of the first and the
+newest sample in seconds, and ``rate`` is the sample rate in Hz. Otherwise, ``t`` contains the Unix time of each sample
+in seconds as little-endian float64, with a resolution of 0.24 µs. Unknown keys and columns are ignored. A message whose
+sizes are inconsistent or too large raises ``DecodeError``.
 """
 
 from collections.abc import Sequence
@@ -22,16 +22,16 @@ from drivers.errors import DecodeError
 
 SCHEMA: Final = "imu-monitor/samples/1"
 SCHEMAS: Final = (SCHEMA, "imu-monitor/compensated/1")
-"""Names of all schemas with this format."""
+"""Names of all schemas that use this message format."""
 TEMPERATURE: Final = "temperature"
 COLUMNS: Final = (*AXES, TEMPERATURE)
 MAX_ROWS: Final = 1_000_000
 MAX_COLUMNS: Final = 64
-MAX_BYTES: Final = 1 << 26  # a million rows of seven columns
+MAX_BYTES: Final = 1 << 26  # enough for a million samples with seven columns
 MAX_GRID_DEVIATION_NS: Final = 500
-"""Largest deviation of a sample time from an even grid, twice the resolution of Unix seconds in float64."""
+"""Largest deviation in ns of a sample time from an even grid, twice the resolution of Unix seconds in float64."""
 T_LIMIT_S: Final = 4.6e9
-"""Largest absolute Unix time, from the year 1824 to 2115. The difference of two times fits into int64 nanoseconds."""
+"""Largest absolute Unix time in s (years 1824 to 2115). The difference of two times fits into int64 nanoseconds."""
 RATE_LIMITS_HZ: Final = (1e-6, 1e9)
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
@@ -56,11 +56,11 @@ _DECODER: Final = msgspec.msgpack.Decoder(_Payload)
 
 
 @dataclass(frozen=True, slots=True)
-class SampleMessage:
-    """Content of one message."""
+class DecodedSampleMessage:
+    """Decoded content of one sample message."""
 
     device: str
-    total_samples: int  # number of samples that the publisher has received since its start, including this message
+    total_samples: int  # samples that the publisher has received since its start, including this message
     block: SampleBlock  # t_ns are Unix times
 
 
@@ -74,14 +74,14 @@ def encode_samples(
     device
         Name of the device.
     total_samples
-        Number of samples of the device since the start, including the samples of the message.
+        Number of samples received from the device since the start, including the samples in the message.
     block
-        Samples to encode. The message omits axes without a value. If all values are NaN, the message contains all six
+        Samples to encode. Axes that contain only NaN are omitted. If all values are NaN, the message contains all six
         axes.
     unix_offset_ns
         Offset from ``t_ns`` to Unix time in ns.
     schema
-        Name of the schema.
+        Name of the message schema.
     """
     table = np.column_stack((block.values, block.temperature_c))
     measured: NDArray[np.bool_] = ~np.all(np.isnan(table), axis=0)
@@ -104,7 +104,7 @@ def encode_samples(
     )
 
 
-def decode_samples(data: bytes) -> SampleMessage:
+def decode_samples(data: bytes) -> DecodedSampleMessage:
     """Decode the samples of one message. Raise DecodeError if the message is invalid."""
     try:
         payload = _DECODER.decode(data)
@@ -122,7 +122,7 @@ def decode_samples(data: bytes) -> SampleMessage:
         elif name in AXES:
             values[:, AXES.index(name)] = column
     rows = make_block(t_ns, values, temperature_c, lost=payload.lost)
-    return SampleMessage(payload.device, payload.samples, rows)
+    return DecodedSampleMessage(payload.device, payload.samples, rows)
 
 
 def _encode_times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:

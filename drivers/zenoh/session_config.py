@@ -1,4 +1,4 @@
-"""Configuration of zenoh sessions. By default, a session is a peer that does not scout or listen.
+"""Configuration of zenoh sessions. By default, a session neither searches for other programs nor accepts connections.
 
 The link, the publisher and the command ``watch`` open separate sessions.
 """
@@ -24,11 +24,11 @@ DEFAULT_CONFIGURATION: Final[Mapping[str, Any]] = {
     "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
     "transport/link/rx/max_message_size": 64_000_000,
 }
-"""Default configuration of a session.
+"""Default configuration of a zenoh session.
 
-The defaults of zenoh would scout and listen on all interfaces, and accept messages of 1 GiB. A lost connection is
-retried at least once per second. A message longer than 64 MB is dropped, and the connection stays open. A message of
-64 MB could contain an hour of samples at 1 kHz.
+With the defaults of zenoh, a session would search for other programs and listen on all network interfaces, and would
+accept messages of 1 GiB. A lost connection is retried at least once per second. A message longer than 64 MB is dropped,
+and the connection stays open. A message of 64 MB could contain an hour of samples at 1 kHz.
 """
 
 SECRET_FILES: Final = (
@@ -37,7 +37,7 @@ SECRET_FILES: Final = (
     "transport/auth/usrpwd/dictionary_file",
     "transport/auth/pubkey/private_key_file",
 )
-"""Configuration keys of files that other users must not read."""
+"""Configuration keys that name files which other users must not be able to read."""
 PUBLIC_FILES: Final = (
     "transport/link/tls/root_ca_certificate",
     "transport/link/tls/listen_certificate",
@@ -45,27 +45,27 @@ PUBLIC_FILES: Final = (
     "transport/auth/pubkey/public_key_file",
     "transport/auth/pubkey/known_keys_file",
 )
-"""Configuration keys of files that other users may read."""
+"""Configuration keys that name files which other users may read."""
 
 
 def build_session_config(
     overrides: Mapping[str, Any], file: str | Path | None = None, defaults: Mapping[str, Any] = DEFAULT_CONFIGURATION
 ) -> "zenoh.Config":
-    """Return the configuration of a session.
+    """Return the configuration of a zenoh session.
 
     Parameters
     ----------
     overrides
-        Values by configuration key, which take precedence over the file. A value of None is ignored.
+        Values of configuration keys, which take precedence over the file. A value of None is ignored.
     file
-        zenoh configuration file. None for the defaults of zenoh.
+        zenoh configuration file. None uses the defaults of zenoh.
     defaults
-        Values for keys that the file does not set.
+        Values of keys that the file does not set.
 
     Raises
     ------
     zenoh.ZError
-        If zenoh refuses the file or a value.
+        If zenoh rejects the file or a value.
     """
     import zenoh
 
@@ -87,8 +87,8 @@ def build_session_config(
 def format_zenoh_error(error: Exception) -> str:
     """Return the text of a zenoh error in one line.
 
-    Source code positions are removed. Quotations from a configuration file are also removed, since a quotation may
-    contain a password.
+    Source code positions are removed. Quotations from a configuration file are also removed, because they may contain
+    passwords.
     """
     text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error))
     text = re.sub(r"\s*-->\s*(\d+):(\d+)\s*\n.*\n\s*=\s*", r"line \1, column \2: ", text, flags=re.DOTALL)
@@ -102,7 +102,7 @@ def format_zenoh_error(error: Exception) -> str:
 
 
 def is_unconnected(session: "zenoh.Session") -> bool:
-    """Return True if an open session has no connection. Return False for a closed session."""
+    """Return True if a session is open but has no connection."""
     import zenoh
 
     with contextlib.suppress(zenoh.ZError):
@@ -119,7 +119,7 @@ def find_connect_endpoints(config: "zenoh.Config") -> tuple[str, ...]:
 
 
 def find_secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
-    """Return the configured files with private keys or passwords, which other users must not be able to read."""
+    """Return the configured files that contain private keys or passwords and must not be readable by other users."""
     return _named_files(config, SECRET_FILES)
 
 
@@ -129,7 +129,7 @@ def _named_files(config: "zenoh.Config", keys: Sequence[str] | None = None) -> t
 
 
 def _check_file(path: Path) -> None:
-    """Raise ZError if the path is not a regular file. zenoh would wait forever for a FIFO."""
+    """Raise ZError if the path is not a regular file, because zenoh would wait forever when reading a FIFO."""
     import zenoh
 
     try:

@@ -1,7 +1,7 @@
-"""Command line of the program, which turns every error into one line of text and an exit status.
+"""Command line of the program. Every error becomes one line of text and an exit status.
 
-The exit status is 0 for success, 1 for a failure at run time, and 2 for a wrong argument or input file. The exit status
-3 means that the data do not support an answer.
+The exit status is 0 for success, 1 for a failure at run time, and 2 for an invalid argument or input file. The exit
+status 3 means that the data do not support an answer.
 """
 
 import contextlib
@@ -34,11 +34,10 @@ from monitor.cli import (
 )
 from monitor.cli.shared.errors import DEBUG, INTERRUPTED, error_message_and_exit_status
 
-# The limits must be set before NumPy is imported. Threads of the linear algebra libraries do not pay off here,
-# because the matrices are small.
+# The thread limits must be set before NumPy is imported. The matrices are too small for parallel linear algebra.
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_pool, "1")
-# pydantic would otherwise search all installed packages for plug-ins
+# Without this setting, pydantic would search all installed packages for plug-ins.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 app = typer.Typer(
@@ -54,7 +53,7 @@ def _print_version(wanted: bool) -> None:
 
         try:
             version = metadata.version("imu-monitor")
-        except metadata.PackageNotFoundError:  # the program runs from a checkout that is not installed
+        except metadata.PackageNotFoundError:  # the program runs from a source tree without installation
             version = "(version unknown: the package is not installed)"
         typer.echo(f"imu-monitor {version}")
         raise typer.Exit
@@ -99,14 +98,14 @@ app.add_typer(_thermal, name="thermal")
 def main() -> None:
     """Run the program with the arguments of the process, and exit with the status of the command.
 
-    Every error is printed as one line on standard error. The option ``--debug`` may be given before or after the name
-    of the command, and adds the traceback of an error.
+    Every error is printed as one line on standard error. The option ``--debug`` adds the traceback, and may precede or
+    follow the name of the command.
     """
     arguments, debug = _split_debug(sys.argv[1:])
     threading.excepthook = partial(report_failed_thread, debug)
     _ignore_impossible_width(os.environ)
     try:
-        # without standalone mode, typer returns the status of an Exit
+        # In this mode, typer returns the status of an Exit exception instead of ending the process.
         status = app(args=arguments, prog_name="imu-monitor", standalone_mode=False)
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -116,20 +115,20 @@ def main() -> None:
         line, status = error_message_and_exit_status(error)
         if isinstance(error, OSError):
             _discard_output()
-        if not isinstance(error, BrokenPipeError):  # the reader of the output has gone, so a message is useless
+        if not isinstance(error, BrokenPipeError):  # nobody reads the output of a broken pipe
             _fail(line, status)
-    if status == INTERRUPTED:  # typer converts Ctrl-C to an Exit
+    if status == INTERRUPTED:  # typer converts Ctrl-C to an Exit exception
         _fail("interrupted", INTERRUPTED)
     sys.exit(status)
 
 
 def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
-    """Print the reason why a thread ended as one line on standard error.
+    """Print one line on standard error that says why a thread ended.
 
     Parameters
     ----------
     debug : bool
-        True if the traceback is printed as well.
+        True if the traceback is also printed.
     failed : threading.ExceptHookArgs
         Thread and its exception.
     """
@@ -144,21 +143,21 @@ def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
 
 
 def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:
-    """Remove terminal sizes of zero from the environment, because tables without columns would be empty."""
+    """Remove terminal sizes of zero from the environment, because tables of zero width would be empty."""
     for name in ("COLUMNS", "LINES"):
         if not re.fullmatch(r"0*[1-9][0-9]{0,4}", environment.get(name, "")):
             environment.pop(name, None)
 
 
 def _split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
-    """Return the arguments without ``--debug``, and True if ``--debug`` was given."""
+    """Return the arguments without ``--debug``, and a flag that is True if ``--debug`` was given."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
     return [*(one for one in arguments[:end] if one != DEBUG), *arguments[end:]], DEBUG in arguments[:end]
 
 
 def _discard_output() -> None:
-    """Redirect standard output to the null device, because writing the buffered text at exit would fail again."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # standard output is closed, or is not a file
+    """Redirect standard output to the null device, because flushing the buffered text at exit would fail again."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # standard output is closed or not a file
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
@@ -166,6 +165,6 @@ def _discard_output() -> None:
 
 def _fail(line: str, status: int) -> NoReturn:
     if sys.stderr is not None:
-        with contextlib.suppress(OSError, ValueError):  # standard error cannot be written, so only the status remains
+        with contextlib.suppress(OSError, ValueError):  # if standard error fails, only the status remains
             print(f"imu-monitor: {line}", file=sys.stderr, flush=True)  # noqa: T201
     sys.exit(status)

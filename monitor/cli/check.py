@@ -1,4 +1,4 @@
-"""Command ``check``: prints the mistakes in a configuration file, or the keys with their defaults."""
+"""Command ``check``: prints the mistakes in a configuration file, or all keys with their defaults."""
 
 from pathlib import Path
 from typing import Annotated
@@ -22,8 +22,8 @@ def check(
     ] = None,
 ) -> None:
     """Read a configuration file and report all mistakes. No device is opened."""
-    from monitor.commands.check import check_configuration
-    from monitor.common.units import format_count
+    from monitor.commands.check_configuration import check_configuration
+    from monitor.common.unit_formatting import format_count
 
     if print_defaults:
         typer.echo(_defaults(link, decoder), nl=False)

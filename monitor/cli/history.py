@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MAX_TABLE_ROWS: Final = 24
 Get = Callable[["HistoryQuery"], "HistoryTable"]
-"""Function that returns the results of a query."""
+"""Function that runs a query of the history and returns the result."""
 
 
 def history(
@@ -80,7 +80,7 @@ def history(
     if json == Path("-"):
         return
     console = Console()
-    history_text.print_history(past, axes, SYMBOLS if axis else history_text.LETTERS, console)
+    history_text.print_history_summary(past, axes, SYMBOLS if axis else history_text.LETTERS, console)
     if axis is not None and len(past):
         few_s = max(width_of(past.span, None, MAX_TABLE_ROWS), past.step_s)
         few = past if few_s == past.step_s else get(HistoryQuery(asked.span, few_s, ("coefficients", "status"), axes))
@@ -104,7 +104,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:
-    """Return a function that reads the history file, even while a daemon writes to the file."""
+    """Return a function that queries the history file, even while a daemon writes to the file."""
     from monitor.history import history_table as past
     from monitor.history.sqlite_store import open_history
 
@@ -134,7 +134,7 @@ def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str
 
 
 def _history_path(source: Path) -> Path:
-    """Return the path of the history file for a configuration file, a storage folder or a history file."""
+    """Return the path of the history file, given a configuration file, a storage folder or the history file itself."""
     from monitor.history.sqlite_store import FILE_NAME
     from monitor.settings import loading
 
@@ -154,9 +154,9 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
     Raises
     ------
     NotReady
-        If there is no history yet.
+        If the history is still empty.
     ConfigError
-        If no device has this name, or if a name is needed to choose between devices.
+        If no device has this name, or if there are several devices and no name is given.
     """
     from drivers.errors import NotReady
     from drivers.module_lookup import format_suggestion
@@ -173,7 +173,7 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
 
 
 def _span(since: str | None, until: str | None) -> "TimeRange | None":
-    """Return the time range of the options ``--from`` and ``--to``, or None if both options are missing."""
+    """Return the time range given by the options ``--from`` and ``--to``, or None if both options are missing."""
     from monitor.history.time_ranges import TimeRange, parse_time
 
     if since is None and until is None:

@@ -30,6 +30,7 @@ def reconcile(
     rate: options.Rate = None,
     last: options.Last = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
 ) -> None:
     """Compare recordings with a noise model, and find the effects that are missing in the model."""
     require_extra("reconcile", "reconcile")
@@ -50,14 +51,14 @@ def reconcile(
         with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
             if several:
-                every = reconciling.ComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
+                every = reconciling.RecordingsComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
                 runs = reconciling.compare_recordings(every, tell)
                 data, show = comparison_json.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
-                one = reconciling.run_reconciliation(
+                one = reconciling.reconcile_and_write_report(
                     reconciling.ReconciliationRequest(recordings[0], tested, out, seed, rate, last_s=last_s), tell
                 )
-                data, show = json_report.encode_report(one), partial(text.print_reconciliation, one)
+                data, show = json_report.encode_report(one), partial(text.print_reconciliation, one, details=details)
     except NotReady:
         if json is not None:
             output.write_file_or_stdout("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")

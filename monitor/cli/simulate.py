@@ -1,4 +1,4 @@
-"""Command ``simulate``: writes a recording of a noise model."""
+"""Command ``simulate``: simulates a noise model and writes the samples to a recording."""
 
 from pathlib import Path
 from typing import Annotated

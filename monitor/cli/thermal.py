@@ -1,4 +1,4 @@
-"""Commands ``thermal fit`` and ``thermal predict``: describe the bias as a function of temperature."""
+"""Commands ``thermal fit`` and ``thermal predict``: fit and apply a model of bias as a function of temperature."""
 
 from pathlib import Path
 from typing import Annotated

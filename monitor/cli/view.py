@@ -1,4 +1,4 @@
-"""Command ``view``: shows several daemons in one viewer."""
+"""Command ``view``: shows the devices of several daemons in one viewer."""
 
 from typing import Annotated
 

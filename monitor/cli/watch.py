@@ -1,4 +1,4 @@
-"""Command ``watch``: shows a live table of several daemons."""
+"""Command ``watch``: shows a live table of the devices of several daemons."""
 
 import threading
 

@@ -1,1 +1,1 @@
-"""Commands that process recordings and configurations, for example ``analyze``, ``simulate`` and ``reconcile``."""
+"""Implementation of the commands that process recordings and configurations, such as ``analyze`` and ``simulate``."""

@@ -1,7 +1,8 @@
 """Command ``analyze``: reads a recording and computes Allan deviations, noise coefficients, motion and noise changes.
 
 Total and Hadamard deviations take four times as long as Allan deviations, so they are computed only on request.
-Independent axes and results are computed in parallel threads, because the numerical kernels release the GIL.
+Independent axes and results are computed in parallel threads. The threads run in parallel because the numerical kernels
+release the global interpreter lock of Python.
 """
 
 import os
@@ -16,25 +17,29 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature_effect, temperature_varied
+from monitor.drift.thermal.temperature_removal import (
+    TemperatureRemovalComparison,
+    remove_temperature_effect,
+    temperature_varied,
+)
 from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.allan.hadamard import HadamardCurve, compute_hadamard_curve
-from monitor.estimation.allan.total import TotalCurve, compute_total_curve
-from monitor.estimation.analysis import RecordingAnalysis, analyze, detect_events
-from monitor.estimation.regular_grid import resample_with_temperature
+from monitor.estimation.allan.total import TotalVarianceCurve, compute_total_curve
+from monitor.estimation.analysis import RecordingAnalysis, analyze, detect_disturbances
+from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.publishing.plots.allan_figure import additional_deviations
 from monitor.publishing.plots.dynamic_figure import ChangeMark
-from monitor.publishing.terminal.thermal_output import temperature_notes
+from monitor.publishing.terminal.thermal_output import notes_on_temperature_dependence
 
 
 class TooFewSamples(NotReady):
-    """Error for a recording with too few samples for any result.
+    """Exception for a recording that has too few samples for any result.
 
     Parameters
     ----------
     why : str
-        Message.
+        Text of the exception.
     samples : int
         Number of samples in the recording.
     """
@@ -51,10 +56,10 @@ class AnalysisRequest:
     recording: Path
     rate_hz: float | None = None
     tau: TauGrid = "octave"
-    window_s: float | None = None  # window length of dynamic Allan deviations; None = not computed
-    exclude_motion: bool = False  # True if samples in motion are excluded
+    window_s: float | None = None  # window length for dynamic Allan deviations; None = not computed
+    exclude_motion: bool = False  # True to exclude samples during motion
     total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
-    last_s: float | None = None  # length of the end of the recording that is used; None for all
+    last_s: float | None = None  # duration at the end of the recording to use; None = all
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,29 +67,29 @@ class AnalysisResults:
     """Results of an analysis."""
 
     analysis: RecordingAnalysis
-    total: TotalCurve | None = None
+    total: TotalVarianceCurve | None = None
     hadamard: HadamardCurve | None = None
     dynamic: DynamicAllan | None = None
-    lacking: str = ""  # reason why dynamic Allan deviations are missing
-    without_temperature: TemperatureRemoval | None = (
-        None  # coefficients without the effect of temperature, if it explains any axis
+    lacking: str = ""  # reason why the dynamic Allan deviations are missing
+    without_temperature: TemperatureRemovalComparison | None = (
+        None  # coefficients without temperature effect; None if no axis has any
     )
 
 
 def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = ignore_progress) -> AnalysisResults:
-    """Read a recording and analyse it.
+    """Read and analyze a recording.
 
     Parameters
     ----------
     request : AnalysisRequest
         Recording to analyse and results to compute.
     report_progress : callable, optional
-        Progress callback.
+        Function that receives the progress.
 
     Raises
     ------
     RecordingError, ConfigError
-        If the recording cannot be read, or is too short for a requested averaging time or window, or if there is not
+        If the recording cannot be read or is too short for a requested averaging time or window, or if there is not
         enough memory.
     TooFewSamples
         If the recording has too few samples for any result.
@@ -110,14 +115,14 @@ def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
         except NotReady as error:
             raise TooFewSamples(str(error), len(found)) from error
         tell("motion and changes" + (", total and Hadamard deviations" if request.total_and_hadamard else ""), None)
-        events = pool.submit(detect_events, result)
+        events = pool.submit(detect_disturbances, result)
         others = pool.submit(_total_and_hadamard, result, request.tau) if request.total_and_hadamard else None
         warmth = pool.submit(_without_temperature, result, blocks, found.rate_hz)
         courses, lacking = _dynamic_curves(result, request, tell)
         total, hadamard = others.result() if others else (None, None)
         found_all = events.result()
         without = warmth.result()
-        said = [] if without is None else temperature_notes(without)
+        said = [] if without is None else notes_on_temperature_dependence(without)
         found_all = replace(
             found_all,
             notes=(*found_all.notes, *said, *([lacking] if lacking else [])),
@@ -129,7 +134,7 @@ def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
 
 
 def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> None:
-    """Save the results as a picture, or as an HTML page if the file name ends in ``.html``.
+    """Save the results as a figure, or as an HTML page if the file name ends in ``.html``.
 
     Parameters
     ----------
@@ -138,7 +143,7 @@ def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> Non
     path : Path
         File to write.
     title : str
-        Title of the picture or page.
+        Title of the figure or page.
 
     Raises
     ------
@@ -160,11 +165,11 @@ def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> Non
 
 def _without_temperature(
     result: RecordingAnalysis, blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> TemperatureRemoval | None:
+) -> TemperatureRemovalComparison | None:
     """Return the coefficients without the effect of temperature, or None if the temperature is missing or constant."""
     if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
         return None
-    _, temperature_c, _, _ = resample_with_temperature(blocks, rate_hz)
+    _, temperature_c, _, _ = place_samples_and_temperature_on_grid(blocks, rate_hz)
     return remove_temperature_effect(result, temperature_c)
 
 
@@ -183,8 +188,8 @@ def _dynamic_curves(
     return shown, ""
 
 
-def _total_and_hadamard(result: RecordingAnalysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
-    """Return the total and Hadamard deviations at octaves, or at the requested averaging times."""
+def _total_and_hadamard(result: RecordingAnalysis, tau: TauGrid) -> tuple[TotalVarianceCurve, HadamardCurve | None]:
+    """Return the total and Hadamard deviations at octave-spaced or requested averaging times."""
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors
     short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]

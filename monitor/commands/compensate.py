@@ -1,8 +1,8 @@
 """Command ``compensate``: removes the gyro drift from a recording and measures the improvement.
 
 The method ``adaptive`` processes the samples one by one, as the daemon does. The method ``fixed`` does not adapt the
-estimated noise of the drift. All methods are evaluated on the same samples at rest. The first third of the samples at
-rest is not evaluated, because some methods use the first third for learning.
+estimated drift noise. All methods are evaluated on the same samples, which were taken while the sensor was at rest. The
+first third of the samples at rest is excluded from the evaluation, because some methods use it for learning.
 """
 
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
 from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.compensation_score import score_at_rest
-from monitor.drift.compensation.compensator import Compensator, DriftInterval
+from monitor.drift.compensation.compensator import Compensator, MeasuredAndPredictedDrift
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.compensation.sage_husa import MIN_CONFIRMED_INTERVALS, REJECTED, STEPPED, USED
-from monitor.estimation.regular_grid import resample_with_temperature
+from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 
 METHODS: Final = ("adaptive", "fixed", *REFERENCE_METHODS)
 GYROS: Final = AXES[:3]
 LEARNING_SHARE: Final = 1.0 / 3.0
-"""Share of the samples at rest that is used for learning and excluded from the evaluation."""
+"""Fraction of the samples at rest that is used for learning and excluded from the evaluation."""
 BLOCK_ROWS: Final = 1 << 16
 
 
@@ -41,34 +41,33 @@ class CompensationRequest:
     out: Path
     method: str = "adaptive"
     rate_hz: float | None = None
-    order: Order | None = None  # order of the ARMA model of the drift; None selects it by criterion
-    last_s: float | None = None  # length of the end of the recording that is used; None for all
+    order: Order | None = None  # order of the ARMA drift model; None = selected by a criterion
+    last_s: float | None = None  # duration at the end of the recording to use; None = all
 
 
 def run_compensation(
     request: CompensationRequest, report_progress: ProgressCallback = ignore_progress
 ) -> DriftCompensationResult:
-    """Compensate a recording and write the result.
+    """Remove the gyro drift from a recording and write the compensated recording.
 
     Parameters
     ----------
     request : CompensationRequest
         Recording to compensate and method to use.
     report_progress : callable, optional
-        Progress callback.
+        Function that receives the progress.
 
     Returns
     -------
     DriftCompensationResult
-        Quality of the uncompensated and the compensated rate of each gyro axis.
+        Quality of the uncompensated and compensated angular rates of each gyro axis.
 
     Raises
     ------
     ConfigError, RecordingError
-        If the method is unknown, if the recording cannot be read or has no gyro axis, or if the result cannot be
-        written.
+        If the method is unknown, the recording cannot be read or has no gyro axis, or the result cannot be written.
     NotReady
-        If the sensor was never at rest for long enough. No file is written.
+        If the sensor was never at rest for long enough. In this case, no file is written.
     """
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
@@ -77,7 +76,9 @@ def run_compensation(
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
         raise ConfigError(f"{request.recording}: there is no gyro axis; columns gx, gy, gz in rad/s are needed")
-    values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
+    values, temperature_c, rate_hz, notes = place_samples_and_temperature_on_grid(
+        list(iter_blocks(found)), found.rate_hz
+    )
     orders = ORDERS if request.order is None else (request.order,)
     live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
     out = _run(live, values, report_progress)
@@ -113,7 +114,7 @@ def run_compensation(
 
 
 def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
-    """Compensate the drift as the daemon does, but identify each drift model without delay."""
+    """Compensate the drift as the daemon does, except that each drift model is identified without delay."""
     out = np.empty_like(values)
     size = live.interval_samples
     for start in range(0, len(values), size):
@@ -124,8 +125,8 @@ def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
     return out
 
 
-def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray[np.bool_]:
-    """Return a mask [n, 3] that is True for samples of intervals at rest with a known bias."""
+def _at_rest(intervals: tuple[MeasuredAndPredictedDrift, ...], n: int, size: int) -> NDArray[np.bool_]:
+    """Return a mask [n, 3] that is True for samples in intervals at rest with a known bias."""
     mask = np.zeros((n, len(GYROS)), dtype=bool)
     for one in intervals:
         mask[one.end - size : one.end] = (one.outcome == USED) & np.isfinite(one.expected)
@@ -133,7 +134,7 @@ def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray
 
 
 def _split_learning(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return two masks for the samples at rest: the first third for learning, and the rest for the evaluation."""
+    """Split the samples at rest into two masks: the first third for learning, and the remainder for evaluation."""
     count = np.cumsum(rest, axis=0)
     first = count <= LEARNING_SHARE * count[-1]
     return rest & first, rest & ~first
@@ -157,7 +158,7 @@ def _evaluate_axis(
     learned: NDArray[np.bool_],
     judged: NDArray[np.bool_],
     live: Compensator,
-    intervals: tuple[DriftInterval, ...],
+    intervals: tuple[MeasuredAndPredictedDrift, ...],
 ) -> AxisCompensation:
     before = values[:, at] - np.nanmean(values[learned[:, at], at])
     first = int(np.argmax(judged[:, at]))

@@ -1,7 +1,7 @@
 """Command ``doctor``: checks a machine and a configuration for unattended operation.
 
-Each check returns findings with advice, and raises no error. The checks bind ports for a moment, connect to routers,
-and create and remove an empty file in the storage folder. No device is opened.
+Each check returns findings with advice and never raises an error. The checks briefly bind ports, connect to zenoh
+routers, and create and remove an empty file in the storage folder. No device is opened.
 """
 
 import contextlib
@@ -29,41 +29,41 @@ from drivers.extras import find_missing_packages
 from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
 from drivers.number_ranges import DAY_S
-from monitor.commands.check import check_configuration
+from monitor.commands.check_configuration import check_configuration
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, describe_lock_holder
-from monitor.common.units import format_count
+from monitor.common.unit_formatting import format_count
 from monitor.settings.file_permissions import contains_secret
 from monitor.settings.loading import Config, Storage
 
 Mark = Literal["well", "doubt", "wrong"]
 
 SAMPLE_BYTES: Final = 35.0
-"""Size of a sample with six axes, temperature and counter in a compressed recording.
+"""Size in bytes of a sample with six axes, temperature and counter in a compressed recording.
 
-Sensors with a high resolution need 32.5 to 33.3 bytes per sample. Sensors with a coarse resolution need 17 to 23 bytes.
+High-resolution sensors need 32.5 to 33.3 bytes per sample. Coarse-resolution sensors need 17 to 23 bytes.
 """
 RAW_BYTES: Final = 60.0
-"""Approximate size of the received bytes of a sample. The size depends on the protocol."""
+"""Approximate number of received bytes per sample. The number depends on the protocol."""
 CONNECT_TIMEOUT_S: Final = 2.0
 TIME_ERROR: Final = 5
-"""Return value of adjtimex(2) if the clock is not synchronised."""
+"""Return value of adjtimex(2) if the clock is not synchronized."""
 CAN_TYPE: Final = "280"
-"""ARPHRD_CAN, in /sys/class/net/NAME/type."""
+"""Content of /sys/class/net/NAME/type for a CAN interface (ARPHRD_CAN)."""
 MAX_PORT: Final = 65535
 UNIT: Final = "imu-monitor.service"
 PACKAGE: Final = "imu-monitor"
 PACKAGES: Final = ("monitor", "drivers")
-"""Packages of the program. Other packages may have the same names, because the names are common."""
+"""Packages of the program. Other packages may have the same names, because these names are common."""
 TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
-"""Regular expression for the host and the port of a zenoh endpoint over TCP or TLS."""
+"""Regular expression that matches the host and the port of a zenoh endpoint over TCP or TLS."""
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
-"""Regular expression for the requirement of a package: name, versions and marker."""
+"""Regular expression that matches the name, versions and marker of a package requirement."""
 LOOPBACK: Final = ("127.", "::1", "localhost")
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check."""
+    """Result of one check of the machine or the configuration."""
 
     mark: Mark
     about: str
@@ -75,7 +75,7 @@ _well, _doubt, _wrong = partial(Finding, "well"), partial(Finding, "doubt"), par
 
 
 def examine_machine(config_path: Path | None = None) -> list[Finding]:
-    """Check the machine, and also the configuration file if a path is given."""
+    """Check the machine, and the configuration file if a path is given."""
     machine = [
         *check_library_versions(),
         *_check_shadowed_packages(sys.path),
@@ -112,7 +112,7 @@ def _check_configured(config: Config) -> Iterator[Finding]:
 
 
 def _check_permissions(path: Path, about: str = "permissions", secret: bool = True) -> Finding:
-    """Check which users may write a file, and which users may read a file that contains a password."""
+    """Check which users may write a file. If the file contains a password, also check which users may read it."""
     try:
         seen = path.stat()
     except OSError as error:
@@ -171,10 +171,10 @@ def _check_serial_port(about: str, port: str) -> Finding:
 
 
 def _processes_using(port: Path) -> Iterator[str]:
-    """Yield the programs that have opened a port, as far as the user may see the programs."""
+    """Yield the programs that have opened a serial port. Only programs that the user may inspect are found."""
     wanted = str(port.resolve())
     for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # the process belongs to another user, or has ended
+        with contextlib.suppress(OSError):  # the process belongs to another user or has ended
             if process.name != str(os.getpid()) and wanted in map(os.readlink, (process / "fd").iterdir()):
                 yield f"{(process / 'comm').read_text().strip()} (pid {process.name})"
 
@@ -185,13 +185,13 @@ def check_can_interface(subject: str, interface: str, channel: str, sysfs: Path 
     Parameters
     ----------
     subject : str
-        Subject of the finding.
+        Subject of the finding, shown before the result.
     interface : str
-        Interface of python-can.
+        Name of the python-can interface.
     channel : str
-        Channel of the interface.
+        Channel of the CAN interface.
     sysfs : Path, optional
-        Folder with the network interfaces of the kernel.
+        Folder in which the kernel lists the network interfaces.
     """
     if missing := describe_missing_package(interface):
         text, _, command = missing.partition(": ")
@@ -210,7 +210,7 @@ def check_can_interface(subject: str, interface: str, channel: str, sysfs: Path 
         return _wrong(subject, f"{channel}: no such interface; existing CAN interfaces: {there}", up)
     if kind != CAN_TYPE:
         return _wrong(subject, f"{channel}: not a CAN interface", up)
-    if not flags & 1:  # IFF_UP
+    if not flags & 1:  # the flag IFF_UP is not set
         return _wrong(subject, f"{channel}: is down", up)
     return _well(subject, f"{channel}: is up")
 
@@ -238,7 +238,7 @@ def _check_zenoh(config: Config) -> Iterator[Finding]:
 
 
 def _parse_endpoint(about: str, endpoint: str, failure: str) -> tuple[str, int] | Finding:
-    """Return the host and port of a TCP endpoint, or a finding if the endpoint cannot be checked."""
+    """Return the host and the port of a TCP endpoint, or a finding if the endpoint cannot be checked."""
     match = TCP_ENDPOINT.fullmatch(endpoint)
     if match is None:
         return _well(about, f"{endpoint}: not checked, since only TCP endpoints can be checked")
@@ -248,12 +248,12 @@ def _parse_endpoint(about: str, endpoint: str, failure: str) -> tuple[str, int] 
 
 
 def check_port_free(subject: str, endpoint: str) -> Finding:
-    """Check that a port is free by listening on the port for a moment.
+    """Check that a port is free by listening on it briefly.
 
     Parameters
     ----------
     subject : str
-        Subject of the finding.
+        Subject of the finding, shown before the result.
     endpoint : str
         Zenoh endpoint.
     """
@@ -310,8 +310,7 @@ def _check_metrics(config: Config) -> Iterator[Finding]:
 
 
 def _check_reconcile(config: Config) -> Iterator[Finding]:
-    """Check that the packages for the command ``reconcile`` are installed, if a folder for the reports is
-    configured."""
+    """If a folder for reports is configured, check that the packages for the command ``reconcile`` are installed."""
     missing = " and ".join(find_missing_packages("reconcile"))
     if missing and any(one.reconcile_folder for one in config.devices):
         text = f"reconcile_folder is set, but {missing} is not installed: the service refuses command/reconcile"
@@ -348,7 +347,7 @@ def _check_in_use(own: Storage) -> Iterator[Finding]:
 
 
 def recorded_bytes_per_day(config: Config) -> float | None:
-    """Return the number of bytes that all devices record per day, or None if the rate of a device is unknown.
+    """Return the number of bytes recorded per day for all devices, or None if the sample rate of a device is unknown.
 
     Examples
     --------
@@ -375,13 +374,13 @@ def check_disk_space(storage: Storage, bytes_per_day: float | None, total_bytes:
     Parameters
     ----------
     storage : Storage
-        Settings of the storage.
+        Storage settings.
     bytes_per_day : float or None
         Number of bytes that are recorded per day; None if unknown.
     total_bytes : int
-        Size of the disk in bytes.
+        Capacity of the disk in bytes.
     free_bytes : int
-        Free space of the disk in bytes.
+        Free space on the disk in bytes.
     """
     allowed = free_bytes - (1.0 - storage.disk_share) * total_bytes
     if bytes_per_day is None:
@@ -404,13 +403,13 @@ def check_disk_space(storage: Storage, bytes_per_day: float | None, total_bytes:
     return _well("storage", text)
 
 
-# --- the machine
+# --- machine
 
 
 def check_library_versions() -> list[Finding]:
-    """Check the version of each installed library against the requirements of the program."""
+    """Check whether each installed library has a version that the program supports."""
     about, wrong, count = "libraries", [], 0
-    for name, versions, optional in required_libraries():
+    for name, versions, optional in library_requirements():
         install = f'pip install "{name}{versions}"'
         try:
             there = metadata.version(name)
@@ -427,8 +426,11 @@ def check_library_versions() -> list[Finding]:
     return wrong or [_well(about, f"Python {sys.version.split()[0]}, {count} libraries with the required versions")]
 
 
-def required_libraries() -> Iterator[tuple[str, str, bool]]:
-    """Yield the name, the required versions and the optional flag of each library, except libraries for tests."""
+def library_requirements() -> Iterator[tuple[str, str, bool]]:
+    """Yield the name and the required versions of each library, and whether it is optional.
+
+    Test libraries are omitted.
+    """
     try:
         lines = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
@@ -443,14 +445,14 @@ def required_libraries() -> Iterator[tuple[str, str, bool]]:
 
 
 def version_satisfies(version: str, bounds: str) -> bool:
-    """Return True if a version is within bounds such as ``>=0.41,<0.42``. Other kinds of bounds are ignored.
+    """Return True if a version satisfies bounds such as ``>=0.41,<0.42``. Other kinds of bounds are ignored.
 
     Parameters
     ----------
     version : str
         Version of the installed library.
     bounds : str
-        Bounds, separated by commas.
+        Version bounds, separated by commas.
 
     Examples
     --------
@@ -463,7 +465,7 @@ def version_satisfies(version: str, bounds: str) -> bool:
 
 
 def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
-    """Check that no other module has the same name as a package of the program and is found first."""
+    """Check that Python does not find another module with the name of a package of the program first."""
     own = Path(__file__).resolve().parents[2]
     found = []
     for entry in module_path:
@@ -471,7 +473,7 @@ def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
         if folder == own:
             break
         for name in PACKAGES:
-            # a folder without __init__.py is a namespace package, and Python prefers a regular package on a later path
+            # A folder without __init__.py is a namespace package. Python prefers a regular package on a later path.
             places = (folder / name / "__init__.py", folder / f"{name}.py")
             foreign = next((one for one in places if one.is_file()), None)
             if foreign is not None:
@@ -499,7 +501,7 @@ def _check_kernels() -> Finding:
 
 
 def check_clock() -> Finding:
-    """Check that the system clock is synchronised, because the results contain times of the system clock."""
+    """Check that the system clock is synchronized, because the results contain system times."""
     state = _adjtimex()
     if state is None:
         return _doubt("clock", "the system does not report whether it is synchronised")
@@ -521,7 +523,7 @@ def _check_systemd_unit() -> list[Finding]:
 
 
 def check_systemd_unit_state(unit_properties: Mapping[str, str]) -> list[Finding]:
-    """Return the findings about the properties that ``systemctl show`` printed, or an empty list without a unit.
+    """Return the findings about the properties that ``systemctl show`` prints. The list is empty if there is no unit.
 
     Examples
     --------
@@ -548,7 +550,7 @@ def check_systemd_unit_state(unit_properties: Mapping[str, str]) -> list[Finding
 def _adjtimex() -> int | None:
     try:
         library = ctypes.CDLL(None, use_errno=True)
-        question = ctypes.create_string_buffer(512)  # modes = 0: nothing is set
+        question = ctypes.create_string_buffer(512)  # modes = 0 only reads the clock
         state = int(library.adjtimex(question))
     except (OSError, AttributeError, TypeError):
         return None
@@ -556,7 +558,7 @@ def _adjtimex() -> int | None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the first four numbers of a version, filled with zeros."""
+    """Return the first four numbers of a version. Missing numbers are 0."""
     numbers = [int(part) for part in re.split(r"[^\d.]", version)[0].split(".") if part]
     return (*numbers, 0, 0, 0, 0)[:4]
 
@@ -584,6 +586,6 @@ def _group(gid: int) -> str:
 
 
 def worst_mark(findings: Iterable[Finding]) -> Mark:
-    """Return the worst mark of all findings."""
+    """Return the most severe mark among all findings."""
     marks = {one.mark for one in findings}
     return "wrong" if "wrong" in marks else "doubt" if "doubt" in marks else "well"

@@ -1,10 +1,10 @@
-"""Progress callback of the commands."""
+"""Callback that reports the progress of a command."""
 
 from collections.abc import Callable
 
 ProgressCallback = Callable[[str, float | None], None]
-"""Callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
+"""Callback that receives the current step and its completed fraction from 0 to 1, which is None if unknown."""
 
 
 def ignore_progress(_step: str, _share: float | None) -> None:
-    """Show no progress."""
+    """Ignore the progress of a command."""

@@ -22,7 +22,7 @@ from drivers.recordings import FORMATS, iter_blocks, load_samples
 from drivers.recordings import Recording as Samples
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.estimation.regular_grid import resample_with_temperature
+from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.json_report import SCHEMA, encode_report
 from monitor.reconcile.preparation.reconcile_input import Recording
@@ -48,7 +48,7 @@ class ReconciliationRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class ComparisonRequest:
+class RecordingsComparisonRequest:
     """Several recordings of one sensor, the noise model, and the options of the command ``reconcile``."""
 
     recordings: tuple[Path, ...]
@@ -59,7 +59,7 @@ class ComparisonRequest:
     last_s: float | None = None  # length of the end of each recording that is used; None for all
 
 
-def run_reconciliation(
+def reconcile_and_write_report(
     request: ReconciliationRequest, report_progress: ProgressCallback = ignore_progress
 ) -> Reconciliation:
     """Compare a recording with a noise model and write the report.
@@ -84,9 +84,7 @@ def run_reconciliation(
     try:
         recording, notes = _to_regular_grid(found)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            result = reconcile(
-                recording, request.model, request.seed, pool.map, lambda what: report_progress(what, None)
-            )
+            result = reconcile(recording, request.model, request.seed, pool.map, report_progress)
     except NotReady as error:
         _write(request.out / REPORT, _encode_failure(str(error), len(found)))
         raise
@@ -96,12 +94,14 @@ def run_reconciliation(
     return result
 
 
-def compare_recordings(request: ComparisonRequest, report_progress: ProgressCallback = ignore_progress) -> Comparison:
+def compare_recordings(
+    request: RecordingsComparisonRequest, report_progress: ProgressCallback = ignore_progress
+) -> Comparison:
     """Compare several recordings with a noise model and with each other, and write the reports.
 
     Parameters
     ----------
-    request : ComparisonRequest
+    request : RecordingsComparisonRequest
         Recordings, noise model and options.
     report_progress : callable, optional
         Progress callback.
@@ -126,7 +126,7 @@ def compare_recordings(request: ComparisonRequest, report_progress: ProgressCall
             path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s
         )
         try:
-            result = run_reconciliation(one, _tell_for(report_progress, f"{name}, {at} of {len(named)}"))
+            result = reconcile_and_write_report(one, _tell_for(report_progress, f"{name}, {at} of {len(named)}"))
         except NotReady as error:
             silent[name] = str(error)
             if model is None:
@@ -231,7 +231,9 @@ def create_report_folder(folder: Path) -> None:
 
 def _to_regular_grid(found: Samples) -> tuple[Recording, list[str]]:
     """Return the recording on a regular time grid, and notes about the resampling."""
-    values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
+    values, temperature_c, rate_hz, notes = place_samples_and_temperature_on_grid(
+        list(iter_blocks(found)), found.rate_hz
+    )
     columns = {axis: np.ascontiguousarray(values[:, AXES.index(axis)], np.float64) for axis in found.axes}
     return Recording(columns, rate_hz, temperature_c), notes
 

@@ -26,7 +26,7 @@ from monitor.drift.thermal.thermal_results import (
     choose_interval_s,
     compare_model_with_means,
 )
-from monitor.estimation.regular_grid import resample_with_temperature
+from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 
 SCHEMA: Final = "imu-monitor/thermal-model/1"
 
@@ -215,7 +215,7 @@ def _read_interval_means(
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
     """Return the interval means of each recorded axis, and notes about the recording."""
     found = load_samples(recording, rate_hz, last_s)
-    values, temperature_c, rate, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
+    values, temperature_c, rate, notes = place_samples_and_temperature_on_grid(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")
     interval_s = interval_s or choose_interval_s(temperature_c.size / rate, rate)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from monitor.common.units import format_count
+from monitor.common.unit_formatting import format_count
 
 MAX_PROBLEMS: Final = 3
 

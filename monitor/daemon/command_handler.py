@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import structlog
 
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.operations.reconcile_on_request import ReconcileJob, Reconciler
+from monitor.daemon.operations.reconcile_on_request import Reconciler, WindowCopyForReconcile
 from monitor.publishing.messages.results import ResetReply
 from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 
@@ -68,5 +68,5 @@ class CommandHandler:
             return
         received, device = worker.driver.counts.received, worker.device
         newest_s = worker.timeline.to_unix_s(worker.pipeline.newest_ns)
-        job = ReconcileJob(worker.name, newest_s, received, *window, device.model, device.reconcile_folder)
+        job = WindowCopyForReconcile(worker.name, newest_s, received, *window, device.model, device.reconcile_folder)
         self._reconciler.start_reconciliation(job, command)

@@ -13,14 +13,14 @@ import numpy as np
 from drivers.data_types import Event, SampleBlock, merge_contiguous_blocks
 from drivers.driver import Driver
 from drivers.errors import NotReady
-from monitor.daemon.device.device_timeline import DeviceTimeline
 from monitor.daemon.device.pipeline import DevicePipeline
+from monitor.daemon.device.unix_timeline import DeviceTimeline
 from monitor.daemon.operations.coefficient_limits import LimitMonitor
-from monitor.daemon.output_interface import Output
+from monitor.daemon.outputs.output import Output
 from monitor.daemon.schedule import Schedule
-from monitor.drift.compensation.live_compensation import LiveCompensation
+from monitor.drift.compensation.live_compensation import LiveDriftCompensation
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.detection.model_agreement_monitor import ModelAgreementMonitor
-from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings.loading import Device
@@ -82,7 +82,7 @@ class ResultPublisher:
             for output in self.outputs:
                 output.publish_event(self.device.name, self._unix_s(event.t_ns), self._received, event)
 
-    def publish_samples_if_due(self, blocks: Sequence[SampleBlock]) -> bool:
+    def batch_samples_and_publish_if_due(self, blocks: Sequence[SampleBlock]) -> bool:
         """Add samples to the batch, and publish the batch if it is due; return True if it was published."""
         self._batch += blocks
         interval_s = min(self.device.publish_s, MAX_BATCH_S)
@@ -143,17 +143,17 @@ class ResultPublisher:
         for output in self.outputs:
             output.publish_result(self.device.name, self._unix_s(t_ns), self._received, result)
 
-    def _compensated(self, live: LiveCompensation, samples: SampleBlock) -> None:
+    def _compensated(self, live: LiveDriftCompensation, samples: SampleBlock) -> None:
         """Publish samples after drift compensation, and the state of the drift compensation."""
         at = 0
         while at < len(samples):
             piece = samples[at : at + live.compensator.samples_to_interval_end]
             at += len(piece)
             compensated = live.compensate_block(piece)
-            self.pipeline.update_drift_models()
+            self.pipeline.adopt_and_identify_drift_models()
             offsets_ns = self.timeline.unix_offsets_ns(compensated)
             for output in self.outputs:
-                output.publish_compensated_samples(
+                output.publish_drift_compensated_samples(
                     self.device.name, self.published - len(samples) + at, compensated, offsets_ns
                 )
         for drift in live.take_drift_updates():
@@ -165,7 +165,7 @@ class ResultPublisher:
         pipeline = self.pipeline
         if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim_if_due("refit", interval_s):
             return
-        fitted = pipeline.fit_kernels_ready
+        fitted = pipeline.fit_kernels_can_run
         pipeline.advanced = not fitted  # the curve is fitted as soon as the kernels are ready
         try:
             latest = pipeline.estimator.get_estimate(fit_coefficients=fitted)

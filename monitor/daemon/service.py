@@ -24,17 +24,19 @@ from monitor.daemon import config_changes
 from monitor.daemon.command_handler import CommandHandler
 from monitor.daemon.config_changes import ConfigChange
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.history_output import HistoryOutput
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.hooks import Hooks
 from monitor.daemon.operations.log_level import set_log_level
 from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.operations.systemd import SystemdNotifier
-from monitor.daemon.output_interface import Output
-from monitor.daemon.result_outputs import TableOutput, ViewerOutput, ZenohOutput
+from monitor.daemon.outputs.history_output import HistoryOutput
+from monitor.daemon.outputs.output import Output
+from monitor.daemon.outputs.table_output import TableOutput
+from monitor.daemon.outputs.viewer_output import ViewerOutput
+from monitor.daemon.outputs.zenoh_output import ZenohOutput
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.history.history_table import HistoryTable
-from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings.loading import Config, Device, Storage, VirtualTable
@@ -141,7 +143,7 @@ class Service:
             if output is not None:
                 output.start()
         for worker in self.workers:
-            worker.start()
+            worker.start_reader_and_resume_recording()
         if self.recorder is not None:
             self.recorder.start()
             threading.Thread(target=self._rebuild_windows, args=(self.workers,), name="rebuild", daemon=True).start()
@@ -206,7 +208,7 @@ class Service:
     def _rebuild_windows(self, workers: Sequence[DeviceWorker]) -> None:
         self._ready.all.wait()
         for worker in workers:
-            worker.rebuild_window()
+            worker.refill_window_from_recording()
 
     def _build_worker(self, device: Device) -> DeviceWorker:
         link, simulated = device.link, None
@@ -249,7 +251,7 @@ class Service:
         order = [device.name for device in change.config.devices]
         self.workers = sorted([*self.workers, *built], key=lambda worker: order.index(worker.name))
         if self.viewer is not None:
-            self.viewer.set_devices(_device_infos(change.config.devices))
+            self.viewer.set_detailed_devices(_device_features(change.config.devices))
         for worker in built:
             self._start_added(worker)
 
@@ -257,7 +259,7 @@ class Service:
         self.zenoh.add_device(worker.name)
         if self.recorder is not None:
             self.recorder.add_recordings(_segment_origins(self.config.storage, worker.device))
-        worker.start()
+        worker.start_reader_and_resume_recording()
         if self.recorder is not None:
             threading.Thread(target=self._rebuild_windows, args=([worker],), name="rebuild", daemon=True).start()
 
@@ -300,7 +302,7 @@ class Service:
         )
         if tried and not self._unit.ready_sent:
             self._unit.send_ready()
-        turns = {worker.name: worker.read_attempts for worker in self.workers}
+        turns = {worker.name: worker.reader_progress_count for worker in self.workers}
         stuck = self._unit.send_watchdog({name: count for name, count in turns.items() if count is not None}, now_s)
         self._unit.send_status(format_service_status(healths, states, stuck))
 
@@ -393,13 +395,13 @@ def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) ->
 
     own = config.viewer
     return RerunView(
-        ViewerSettings(own.mode, own.port, own.web_port, own.memory), _device_infos(config.devices), recall
+        ViewerSettings(own.mode, own.port, own.web_port, own.memory), _device_features(config.devices), recall
     )
 
 
-def _device_infos(devices: Sequence[Device]) -> list[DeviceInfo]:
+def _device_features(devices: Sequence[Device]) -> list[ViewerDeviceDescription]:
     return [
-        DeviceInfo(
+        ViewerDeviceDescription(
             device.name,
             "simulated" if isinstance(device.link, VirtualTable) else device.link.name,
             device.model is not None,

@@ -1,1 +1,1 @@
-"""Bias drift: models of the bias against temperature, and compensation of the gyro drift."""
+"""Models of the bias as a function of temperature, and compensation of the gyro drift."""

@@ -1,9 +1,10 @@
-"""Analysis of a whole recording: Allan deviations, confidence intervals, noise coefficients and detected events.
+"""Analysis of a whole recording, which gives Allan deviations, noise coefficients and events.
 
-``analyze`` computes the Allan variance and fits the noise coefficients. ``detect_events`` searches the recording for
-motion, noise changes, spectral lines and outliers. The search takes longer than the fit.
+The function ``analyze`` computes the Allan variance and fits the noise coefficients. The function
+``detect_disturbances`` searches the recording for motion, noise changes, spectral lines and outliers, which takes more
+time.
 
-By default, samples in motion remain in the Allan variance, because the motion detector may mistake samples at rest for
+By default, the Allan variance includes samples in motion, because the motion detector may mistake samples at rest for
 motion. The search for events always ignores samples in motion.
 """
 
@@ -26,25 +27,28 @@ from monitor.estimation.allan.batch import (
 )
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
-from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.line_and_outlier_detection import detect_spectral_lines, outlier_share_of_axes
-from monitor.estimation.detection.motion_detection import Motion, detect_motion
+from monitor.estimation.detection.change_detection import Change, NoiseAndBiasChangeDetector
+from monitor.estimation.detection.line_and_outlier_detection import (
+    detect_spectral_lines_per_axis,
+    outlier_share_of_axes,
+)
+from monitor.estimation.detection.motion_detection import MotionEpisode, detect_motion
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit_coefficients, make_design_matrix
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
+    curve_contradicts_five_terms,
     find_low_pass,
-    is_contradicted_by_curve,
     power_spectrum,
     refit_with_low_passes,
 )
-from monitor.estimation.regular_grid import resample_to_grid
+from monitor.estimation.regular_grid import place_samples_on_grid
 
 MIN_SAMPLES: Final = 50
-"""Minimum number of samples of a recording."""
+"""Minimum number of samples that a recording must contain."""
 DETECTOR_CHUNK_ROWS: Final = 65_536
-"""Number of samples passed to the change detector in one call."""
+"""Number of samples that are passed to the change detector at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +58,13 @@ class RecordingAnalysis:
     estimate: Estimate
     seconds: float
     notes: tuple[str, ...]
-    values: Floats  # [n, 6] on the grid, SI; NaN = missing, or removed because of motion
+    values: Floats  # [n, 6] samples on a regular time grid, SI units; NaN if missing, or removed because of motion
     fit: Fit
-    bandwidth_hz: Floats  # [6] cutoff of the sensor's low-pass filter; NaN if no filter has been found
-    motions: tuple[Motion, ...] = ()
+    bandwidth_hz: Floats  # [6] cutoff frequency of the sensor's low-pass filter; NaN if no filter has been found
+    motions: tuple[MotionEpisode, ...] = ()
     changes: tuple[Change, ...] = ()
     motion_removed: bool = False  # True if ``values`` contains no samples in motion
-    axes_of_temperature: tuple[str, ...] = ()  # axes on which temperature explains most of the slow variance
+    axes_of_temperature: tuple[str, ...] = ()  # axes on which temperature explains most of the bias variance
 
 
 def analyze(
@@ -71,34 +75,35 @@ def analyze(
     map_axes: EachAxis = map,
     remove_motion: bool = False,
 ) -> RecordingAnalysis:
-    """Compute the Allan deviations of a recording, and fit the noise coefficients.
+    """Compute the Allan deviations of a recording, and fit the noise coefficients to them.
 
     Parameters
     ----------
     blocks : sequence of SampleBlock
         Recording with time stamps.
     rate_hz : float or None
-        Stated sample rate in Hz. If None, the rate is estimated from the time stamps.
+        Sample rate in Hz that the user has stated. If None, the rate is estimated from the time stamps.
     tau : TauGrid
-        Grid of averaging times, or a tuple of averaging times in seconds.
+        Name of a grid of averaging times, or a tuple of times in seconds.
     reading_notes : iterable of str
-        Notes of the file reader. The analysis lists these notes first.
+        Notes from reading the file, which are placed before the notes of the analysis.
     map_axes : EachAxis
-        Function that maps over the axes. The ``map`` method of a thread pool processes the axes in parallel.
+        Function that applies a computation to each axis. The method ``map`` of a thread pool processes the axes in
+        parallel.
     remove_motion : bool
-        True to remove the samples in motion.
+        True to remove samples in motion before the Allan variance is computed.
 
     Raises
     ------
     NotReady
-        If fewer than ``MIN_SAMPLES`` samples can be used.
+        If the recording contains fewer than ``MIN_SAMPLES`` usable samples.
     ConfigError
         If every averaging time is shorter than one sample or longer than half the recording.
     """
-    values, rate, found = resample_to_grid(blocks, rate_hz)
+    values, rate, found = place_samples_on_grid(blocks, rate_hz)
     if len(values) < MIN_SAMPLES:
         raise NotReady(f"{len(values)} samples; at least {MIN_SAMPLES} are needed for an analysis")
-    motions: tuple[Motion, ...] = ()
+    motions: tuple[MotionEpisode, ...] = ()
     if remove_motion:
         values, motions = _without_motion(values, rate)
         found = [*found, *analysis_notes.describe_motions(motions, rate, removed=True)]
@@ -124,15 +129,15 @@ def analyze(
     )
 
 
-def detect_events(result: RecordingAnalysis, alarms_per_day: float = 1.0 / 30.0) -> RecordingAnalysis:
-    """Search a recording for motion, noise changes, spectral lines and outliers, and add the results to the analysis.
+def detect_disturbances(result: RecordingAnalysis, alarms_per_day: float = 1.0 / 30.0) -> RecordingAnalysis:
+    """Search a recording for motion, noise changes, spectral lines and outliers.
 
     Parameters
     ----------
     result : RecordingAnalysis
-        Result of ``analyze``.
+        Analysis of the recording, to which the results are added in a copy.
     alarms_per_day : float
-        Accepted false alarms of the change detector per day, for all axes together.
+        Accepted number of false alarms of the change detector per day, for all axes together.
     """
     rate = result.estimate.rate_hz
     moving = np.zeros(len(result.values), np.bool_)
@@ -141,13 +146,13 @@ def detect_events(result: RecordingAnalysis, alarms_per_day: float = 1.0 / 30.0)
         moving, listed = detect_motion(result.values, rate)
         motions = tuple(listed)
         notes += analysis_notes.describe_motions(motions, rate, removed=False)
-    detector = ChangeDetector(rate, alarms_per_day)
+    detector = NoiseAndBiasChangeDetector(rate, alarms_per_day)
     for begin in range(0, len(result.values), DETECTOR_CHUNK_ROWS):
         rows, struck = result.values[begin : begin + DETECTOR_CHUNK_ROWS], moving[begin : begin + DETECTOR_CHUNK_ROWS]
         detector.process_samples(np.where(struck[:, None], np.nan, rows) if struck.any() else rows)
     changes = tuple(sorted(detector.take_changes(), key=lambda change: change.since))
     notes += analysis_notes.describe_changes(changes, rate)
-    found = detect_spectral_lines(result.values, moving, rate, result.estimate.curve)
+    found = detect_spectral_lines_per_axis(result.values, moving, rate, result.estimate.curve)
     moved = bool(motions) and not result.motion_removed
     notes = analysis_notes.replace_guessed_causes(notes, result.estimate.curve, result.fit, found, moved)
     notes += analysis_notes.describe_lines_and_outliers(found, outlier_share_of_axes(result.values, moving))
@@ -155,22 +160,22 @@ def detect_events(result: RecordingAnalysis, alarms_per_day: float = 1.0 / 30.0)
 
 
 def fit_other_samples(result: RecordingAnalysis, samples: Floats, map_axes: EachAxis = map) -> Fit:
-    """Fit the noise coefficients to other samples, with the sample rate and the averaging times of an analysis.
+    """Fit noise coefficients to other samples with the sample rate and averaging times of an existing analysis.
 
     Parameters
     ----------
     result : RecordingAnalysis
-        Analysis with the sample rate and the averaging times.
+        Analysis from which the sample rate and the averaging times are taken.
     samples : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s², for example after temperature compensation; NaN means missing.
     map_axes : EachAxis
-        Function that maps over the axes.
+        Function that applies a computation to each axis.
     """
     _, found, _ = _fit_curve(samples, result.estimate.rate_hz, result.estimate.curve.factors, map_axes)
     return found
 
 
-def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
+def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[MotionEpisode, ...]]:
     moving, motions = detect_motion(values, rate_hz)
     left = len(values) - int(moving.sum())
     if left < MIN_SAMPLES:
@@ -184,13 +189,13 @@ def _fit_curve(
     n = len(values)
     avar, terms = overlapping_avar(values, factors, each)
     columns, covariances = make_design_matrix(factors, rate_hz), covariance_table(n, factors)
-    measured = MeasuredCurve(
+    measured = MeasuredVariancesAndSlopes(
         avar, terms, rate_slope_from_thirds(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
     )
     found = fit_coefficients(columns, covariances, measured)
     filters = [
         find_low_pass(columns, covariances, measured.select_axis(axis), power_spectrum(values[:, axis]))
-        if is_contradicted_by_curve(found, axis)
+        if curve_contradicts_five_terms(found, axis)
         else None
         for axis in range(values.shape[1])
     ]

@@ -1,7 +1,6 @@
-"""Notes for users on the results of an analysis.
+"""Textual notes for users on the results of an analysis.
 
-All functions return lists of notes. Times in notes are in seconds since
-the first sample.
+The public functions return lists of notes. Times in notes are in seconds since the first sample.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -11,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from monitor.common.units import format_axis_value, format_two_significant_digits
+from monitor.common.unit_formatting import format_axis_value, format_two_significant_digits
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.line_and_outlier_detection import (
@@ -19,28 +18,28 @@ from monitor.estimation.detection.line_and_outlier_detection import (
     SpectralLine,
     allan_variance_share_of_line,
 )
-from monitor.estimation.detection.motion_detection import Motion
+from monitor.estimation.detection.motion_detection import MotionEpisode
 from monitor.estimation.fit.coefficient_fit import Fit
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.estimation.fit.least_squares import K, Q
 from monitor.estimation.fit.low_pass_search import LowPass
 
 Run = tuple[int, int]
-"""Indices of the first and the last averaging time of a range."""
+"""Range of averaging times, given by the indices of the first and the last one."""
 
 MAX_NOTES: Final = 10
 DEPARTURE_SIGMA: Final = 3.0
-"""Minimum residual, in standard deviations, of an averaging time that contradicts the fit."""
+"""Minimum residual, in standard deviations, at which an Allan variance contradicts the fit."""
 LINE_FREQUENCY_TOLERANCE: Final = 0.01
-"""Maximum relative frequency difference of spectral lines that share one note."""
+"""Maximum relative frequency difference between spectral lines that are reported in the same note."""
 MIN_OUTLIER_SHARE: Final = 0.001
-"""Minimum reported share of outliers."""
+"""Minimum share of outliers that is reported."""
 MIN_EXPLAINING_SHARE: Final = 0.05
-"""Minimum share of the Allan variance for a spectral line that explains a poor fit."""
+"""Minimum share of the Allan variance that a spectral line must contribute to explain a poor fit."""
 MIN_Q_SHARE: Final = 0.2
-"""Minimum share of the Allan variance for a spectral line that resembles quantization noise."""
+"""Minimum share of the Allan variance that a spectral line must contribute to be mistaken for quantization noise."""
 Q_ROWS: Final = 3
-"""Number of shortest averaging times that determine the quantization noise coefficient Q."""
+"""Number of averaging times, from the shortest, that determine the quantization noise coefficient Q."""
 BANDWIDTH_OR_VIBRATION: Final = "the likely cause is the bandwidth of the sensor or a vibration"
 BELOW_WHITE_NOISE: Final = (
     "the Allan variance at the shortest averaging times is below white noise, as after a low-pass filter; N is the "
@@ -50,7 +49,7 @@ MOTION_LEFT_IN: Final = "motion of the sensor may be the cause; --rest removes t
 UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be the cause"
 ORDINALS: Final = ("", "first", "second", "third", "fourth")
 MIN_DEPARTURE_RATIO: Final = 0.5
-"""Minimum residual of a reported averaging time, relative to the largest residual of the axis."""
+"""Minimum residual of an averaging time that is reported, relative to the largest residual of the axis."""
 
 
 def describe_unexplained_curve(
@@ -61,9 +60,9 @@ def describe_unexplained_curve(
     Parameters
     ----------
     curve : AllanCurve
-        Measured curve.
+        Measured Allan curve.
     fit : Fit
-        Fit to the curve.
+        Fit to the Allan curve.
     low_passes : sequence of LowPass or None
         Low-pass filter of each axis, or None.
     rate_hz : float
@@ -84,16 +83,16 @@ def describe_unexplained_curve(
 def describe_misfit(
     curve: AllanCurve, fit: Fit, lines: Sequence[SpectralLine] = (), includes_motion: bool = False
 ) -> list[str]:
-    """Describe the axes whose Allan variance differs from the fit, grouped by the likely cause.
+    """Describe the axes whose Allan variance differs from the fit, and group these axes by the likely cause.
 
     Parameters
     ----------
     curve : AllanCurve
-        Measured curve.
+        Measured Allan curve.
     fit : Fit
-        Fit to the curve.
+        Fit to the Allan curve.
     lines : sequence of SpectralLine
-        Reported spectral lines.
+        Detected spectral lines.
     includes_motion : bool
         True if the Allan curve includes samples in motion.
     """
@@ -136,7 +135,7 @@ def replace_guessed_causes(
     fit : Fit
         Fit to the Allan curve.
     lines : sequence of SpectralLine
-        Reported spectral lines.
+        Detected spectral lines.
     includes_motion : bool
         True if the Allan curve includes samples in motion.
     """
@@ -146,17 +145,17 @@ def replace_guessed_causes(
     return kept + [note for note in known if note not in kept] + _quantization_notes(curve, fit, lines)
 
 
-def describe_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list[str]:
-    """Report the number and the total duration of the episodes of motion.
+def describe_motions(motions: Sequence[MotionEpisode], rate_hz: float, removed: bool) -> list[str]:
+    """Describe the number and the total duration of motion episodes.
 
     Parameters
     ----------
-    motions : sequence of Motion
-        Episodes of motion.
+    motions : sequence of MotionEpisode
+        Detected episodes of motion.
     rate_hz : float
         Sample rate in Hz.
     removed : bool
-        True if the samples in motion have been removed.
+        True if the samples in motion have been removed from the analysis.
     """
     if not motions:
         return []
@@ -169,12 +168,12 @@ def describe_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -
 
 
 def describe_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
-    """Report changes of the noise and the bias.
+    """Describe the detected changes of the noise and the bias.
 
     Parameters
     ----------
     changes : sequence of Change
-        Changes in order of time.
+        Changes in chronological order.
     rate_hz : float
         Sample rate in Hz.
     """
@@ -192,7 +191,7 @@ def describe_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
 
 
 def describe_lines_and_outliers(lines: Sequence[SpectralLine], outlier_shares: Floats) -> list[str]:
-    """Report the spectral lines and the share of outliers of each axis.
+    """Describe the spectral lines and the share of outliers on each axis.
 
     Parameters
     ----------
@@ -221,7 +220,7 @@ def describe_lines_and_outliers(lines: Sequence[SpectralLine], outlier_shares: F
 
 
 def _group_by_frequency(found: Sequence[SpectralLine]) -> list[list[SpectralLine]]:
-    """Group spectral lines of the same frequency, starting with the strongest line."""
+    """Group spectral lines of similar frequency, starting with the strongest line."""
     groups: list[list[SpectralLine]] = []
     left = sorted(found, key=lambda one: -one.share)
     while left:
@@ -248,11 +247,11 @@ def _count_omitted(count: int, what: str) -> list[str]:
 
 
 def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
-    """Return the range of averaging times with the largest ratio of Allan variance and fit.
+    """Return the range of averaging times at which the Allan variance and the fit differ by the largest factor.
 
-    Only residuals above ``DEPARTURE_SIGMA`` are considered. The largest residual in standard deviations is often
-    misleading. Noise outside the five terms raises the fit, and the Allan variance is then below the fit at other
-    averaging times.
+    Only residuals above ``DEPARTURE_SIGMA`` standard deviations are considered. The largest residual in standard
+    deviations would often be misleading. If noise outside the five terms raises the fit, the Allan variance is below
+    the fit at other averaging times.
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -278,9 +277,9 @@ def _group_axes(found: Sequence[tuple[str, str]]) -> list[str]:
 def _group_by_line(
     names: Mapping[SpectralLine, str], curve: AllanCurve, runs: Mapping[int, Run]
 ) -> dict[str, dict[int, Run]]:
-    """Group axes by the spectral line that contributes most to the Allan variance in the given range.
+    """Group axes by the spectral line that contributes most to the Allan variance in a range of averaging times.
 
-    The key is empty for axes without a line of at least ``MIN_EXPLAINING_SHARE``.
+    The key is empty for axes on which no line contributes a share of at least ``MIN_EXPLAINING_SHARE``.
     """
     found: dict[str, dict[int, Run]] = {}
     for i, (first, last) in runs.items():

@@ -1,4 +1,4 @@
-"""Results of the live estimator."""
+"""Result types of the live estimator."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -12,39 +12,41 @@ from monitor.estimation.fit.coefficient_values import Coefficients, Status
 
 
 @dataclass(frozen=True, slots=True)
-class PerSampleCoefficients:
+class CoefficientsAfterEachSample:
     """Noise coefficients after each of n consecutive samples."""
 
-    t_ns: Ints  # [n] host monotonic clock, nanoseconds
-    value: Floats  # [n, 5, 6] Q N B K R in SI; NaN where not estimated
+    t_ns: Ints  # [n] times of the samples on the monotonic clock of the host, nanoseconds
+    value: Floats  # [n, 5, 6] Q, N, B, K, R in SI units; NaN if not estimated
 
 
-def concatenate_coefficients(blocks: Collection[PerSampleCoefficients]) -> PerSampleCoefficients | None:
-    """Concatenate the coefficients of successive blocks. Return None if there are no blocks."""
+def concatenate_successive_coefficients(
+    blocks: Collection[CoefficientsAfterEachSample],
+) -> CoefficientsAfterEachSample | None:
+    """Concatenate the coefficients of successive blocks of samples, or return None if there are no blocks."""
     if not blocks:
         return None
-    return PerSampleCoefficients(
+    return CoefficientsAfterEachSample(
         np.concatenate([part.t_ns for part in blocks]), np.concatenate([part.value for part in blocks])
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Allan deviations and fitted noise coefficients of one device at one moment."""
+    """Allan deviations and fitted noise coefficients of one device at one point in time."""
 
     t_ns: int  # time of the newest sample
     rate_hz: float
-    window_s: float  # length of the full window
-    samples: int  # number of samples received since the start
+    window_s: float  # length of the full sliding window
+    samples: int  # number of samples that have been received since the start
     curve: AllanCurve
-    fitted: Floats  # [m, 6] Allan variance of the fitted model; NaN without a fit or at excluded averaging times
+    fitted: Floats  # [m, 6] Allan variance of the fitted model; NaN at averaging times that are not used in the fit
     coefficients: Coefficients
     k_or_r: NDArray[np.bool_]  # [6] True if rate random walk and rate ramp cannot be distinguished
     display_curve: AllanCurve | None = (
-        None  # Allan curve of the newest samples, see ``window.samples_per_displayed_tau``
+        None  # Allan curve of the newest samples, see ``window.newest_samples_per_displayed_tau``
     )
-    history: PerSampleCoefficients | None = (
-        None  # coefficients since the previous estimate, if computed after every sample
+    history: CoefficientsAfterEachSample | None = (
+        None  # coefficients after each sample since the previous estimate, if they are computed
     )
 
     def without_coefficients(self) -> "Estimate":

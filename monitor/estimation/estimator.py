@@ -1,7 +1,7 @@
-"""Live estimator of the Allan deviations and noise coefficients of one device in a sliding window.
+"""Live estimator that computes the Allan deviations and noise coefficients of one device in a sliding window.
 
-Cluster sizes are numbers of samples. The sample rate only determines the averaging times in seconds and the units of
-the coefficients.
+The estimator counts in samples. The sample rate is only used to convert cluster sizes to averaging times in seconds and
+coefficients to SI units.
 """
 
 from collections import deque
@@ -17,45 +17,45 @@ from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.live_total_and_hadamard import LiveTotalAndHadamard
-from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.allan.uncertainty import (
     CovarianceTable,
     CovarianceTablesByAxis,
-    PerTauSpanDegreesOfFreedom,
+    DegreesOfFreedomWithSpanPerTau,
     deviation_intervals,
 )
-from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, samples_per_displayed_tau
-from monitor.estimation.estimate import Estimate, PerSampleCoefficients, concatenate_coefficients
+from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, newest_samples_per_displayed_tau
+from monitor.estimation.estimate import CoefficientsAfterEachSample, Estimate, concatenate_successive_coefficients
 from monitor.estimation.fit.coefficient_fit import (
     Fit,
-    MeasuredCurve,
+    MeasuredVariancesAndSlopes,
     concatenate_fits,
     empty_fit,
     fit_coefficients,
     make_design_matrix,
 )
-from monitor.estimation.fit.continuous_refit import ContinuousRefit
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
-    is_contradicted_by_curve,
+    curve_contradicts_five_terms,
     power_spectrum,
     refit_with_low_passes,
     search_low_pass_in_steps,
 )
-from monitor.estimation.window_snapshot import WindowSnapshot, copy_window
+from monitor.estimation.fit.per_sample_refit import ContinuousRefit
+from monitor.estimation.window_sample_snapshot import WindowSnapshot, copy_window
 
 SETTLING_FITS: Final = 10
-"""Number of successive fits until convergence. Each fit reduces the error to a quarter."""
+"""Number of successive fits until the fit has converged. Each fit reduces the error to about a quarter."""
 MIN_SAMPLES: Final = 8
-"""Minimum number of samples for an estimate."""
+"""Minimum number of samples from which an estimate is computed."""
 SPECTRUM_SAMPLES: Final = 65_536
-"""Number of newest samples in the search for a low-pass filter."""
+"""Number of newest samples that are used to search for a low-pass filter."""
 MAX_HISTORY_SAMPLES: Final = 65_536
 """Maximum number of samples whose coefficients are stored between two calls of ``Estimator.get_estimate``."""
 
 
 class Estimator:
-    """Live estimator of the Allan deviations and noise coefficients of one device.
+    """Live estimator that computes the Allan deviations and noise coefficients of one device.
 
     Parameters
     ----------
@@ -64,9 +64,9 @@ class Estimator:
     window_s : float
         Length of the sliding window in seconds.
     tau : TauGrid
-        Grid of averaging times, or a tuple of averaging times in seconds.
+        Name of a grid of averaging times, or a tuple of times in seconds.
     every_sample : bool
-        True to fit the coefficients after every sample. False to fit them in ``get_estimate`` only.
+        True to fit the coefficients after every sample, False to fit them only in ``get_estimate``.
 
     Raises
     ------
@@ -79,33 +79,33 @@ class Estimator:
         length = min(max(round(window_s * rate_hz), MIN_LENGTH), MAX_LENGTH)
         self.window_s = length / rate_hz
         factors = cluster_sizes(length, rate_hz, tau)
-        spans = samples_per_displayed_tau(factors, rate_hz, length)
+        spans = newest_samples_per_displayed_tau(factors, rate_hz, length)
         self._m = factors.size
-        # The first m rows are used for the fit, and the other m rows for the display.
+        # Every cluster size occurs twice: the first m are used for the fit, the other m for the display.
         rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
         self._design = make_design_matrix(factors, rate_hz)
         self._tables = CovarianceTablesByAxis(factors, length)
-        self._spans = PerTauSpanDegreesOfFreedom(factors, spans, self._design.columns)
+        self._spans = DegreesOfFreedomWithSpanPerTau(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
-        self._lengths = np.zeros(6, np.int64)  # number of samples in the window since the last restart of each axis
+        self._lengths = np.zeros(6, np.int64)  # number of samples of each axis in the window since its last restart
         self._refit = ContinuousRefit(self._window, self._m, self._tables) if every_sample else None
-        self._history: deque[PerSampleCoefficients] = deque()
+        self._history: deque[CoefficientsAfterEachSample] = deque()
         self._history_samples = 0  # total number of samples in ``_history``
         self._total_hadamard = LiveTotalAndHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
-        # axes whose Allan variance the five noise terms do not explain
-        self._contradicting: list[tuple[CovarianceTable, MeasuredCurve] | None] = [None] * 6
+        # Inputs of the fit for axes whose Allan variance the five noise terms do not explain, otherwise None.
+        self._contradicting: list[tuple[CovarianceTable, MeasuredVariancesAndSlopes] | None] = [None] * 6
         self._low_passes: list[LowPass | None] = [None] * 6
-        self._search_axis = 0  # axis of the current search for a low-pass filter
+        self._search_axis = 0  # axis that is searched for a low-pass filter
         self._search: Generator[None, None, LowPass | None] | None = None
         self._samples = 0
         self._newest_ns = 0
 
     @property
     def samples_received(self) -> int:
-        """Total number of received samples. ``empty_window`` does not change this number."""
+        """Total number of received samples, which ``empty_window`` does not reset."""
         return self._samples
 
     @property
@@ -123,7 +123,7 @@ class Estimator:
         return copy_window(self._window, self.rate_hz)
 
     def add_samples(self, samples: SampleBlock) -> None:
-        """Add a block of samples, and the missing samples before the block, to the window."""
+        """Append a block of samples to the window, after the missing samples that precede the block."""
         if samples.lost > self._window.length:
             self.empty_window()
         elif samples.lost:
@@ -135,8 +135,9 @@ class Estimator:
             self._lengths += len(samples)
         else:
             self._history.append(
-                PerSampleCoefficients(
-                    samples.t_ns, self._refit.advance_and_refit(self._design, samples.values, self._lengths)
+                CoefficientsAfterEachSample(
+                    samples.t_ns,
+                    self._refit.append_and_refit_after_each_sample(self._design, samples.values, self._lengths),
                 )
             )
             self._history_samples += len(samples)
@@ -146,7 +147,7 @@ class Estimator:
         self._newest_ns = int(samples.t_ns[-1])
 
     def empty_window(self) -> None:
-        """Remove all samples from the window."""
+        """Remove all samples from the window, and discard the fit."""
         self._window.discard_samples()
         self._lengths[:], self._theta[:] = 0, np.nan
         self._entered[:] = False
@@ -154,7 +155,7 @@ class Estimator:
             self._refit.restart_all_fits()
 
     def restart_axis(self, axis: int, samples_to_keep: int) -> None:
-        """Discard old samples of one axis after a change of the noise.
+        """Discard the old samples of one axis after a noise change.
 
         Parameters
         ----------
@@ -170,24 +171,24 @@ class Estimator:
             self._refit.restart_fit_of_axis(axis)
 
     def fit_state(self) -> tuple[NDArray[np.bool_], Floats]:
-        """Return the fitted noise terms and the squared coefficients in SI units.
+        """Return the noise terms in the fit, and the squared coefficients in SI units.
 
-        Both arrays have the shape (5, 6). ``restore_fit`` accepts both arrays.
+        Both arrays have the shape (5, 6) and can be passed to ``restore_fit``.
         """
         return (self._entered if self._refit is None else self._refit.terms_in_fit).copy(), self._theta.copy()
 
     def restore_fit(self, terms_in_fit: NDArray[np.bool_], theta: Floats) -> None:
-        """Continue with a fit from before a restart of the program.
+        """Continue with the fit that was stored before a restart of the program.
 
-        The fit is repeated until convergence, because a live fit updates the weights only once. The result depends on
-        the previous fit, because the threshold for dropping a term is lower than the threshold for adding a term.
+        A live fit updates the weights only once, so the fit is repeated until it has converged. The result depends on
+        the previous fit, because the threshold for dropping a noise term is lower than the threshold for adding it.
 
         Parameters
         ----------
         terms_in_fit : ndarray of bool, shape (5, 6)
-            True for each noise term in the fit.
+            True for noise terms that were included in the fit.
         theta : ndarray of float64, shape (5, 6)
-            Squared coefficients Q², N², B², K², R² in SI.
+            Squared coefficients Q², N², B², K², R² in SI units.
         """
         self._entered, self._theta = terms_in_fit.copy(), theta.copy()
         if self._window.samples_in_window >= MIN_SAMPLES:
@@ -195,21 +196,21 @@ class Estimator:
                 self.get_estimate()
 
     def refine_rate(self, rate_hz: float) -> None:
-        """Set a more accurate sample rate.
+        """Set a more accurate value of the sample rate.
 
-        Cluster sizes in samples do not change. Averaging times in seconds and the units of the coefficients change.
+        The cluster sizes in samples remain the same, but the averaging times in seconds and the coefficients change.
         """
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
         self._design = make_design_matrix(self._factors, rate_hz)
 
     def get_estimate(self, fit_coefficients: bool = True) -> Estimate:
-        """Return the Allan deviations of the window and the fitted noise coefficients.
+        """Return the Allan deviations of the samples in the window, and the fitted noise coefficients.
 
         Parameters
         ----------
         fit_coefficients : bool
-            False to compute the Allan deviations without a fit.
+            True to fit the noise coefficients, False to compute only the Allan deviations.
 
         Raises
         ------
@@ -225,7 +226,7 @@ class Estimator:
         curve = self._curve(avar[own], terms[own], result.edf, n)
         quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)
-        history = concatenate_coefficients(self._history)
+        history = concatenate_successive_coefficients(self._history)
         self._history.clear()
         self._history_samples = 0
         return Estimate(
@@ -233,13 +234,13 @@ class Estimator:
             result.k_or_r, quick, history,
         )  # fmt: skip
 
-    def step_slow_statistics(self) -> tuple[TotalCurve, HadamardCurve] | None:
-        """Run one step of the total deviation, the Hadamard deviation and the search for a low-pass filter.
+    def step_slow_statistics(self) -> tuple[TotalVarianceCurve, HadamardCurve] | None:
+        """Run one step of the slow computations: total deviation, Hadamard deviation and search for a low-pass filter.
 
         Returns
         -------
-        tuple of TotalCurve and HadamardCurve, or None
-            Total and Hadamard deviations if the step completes the computation, otherwise None.
+        tuple of TotalVarianceCurve and HadamardCurve, or None
+            Total and Hadamard deviations if this step completes them, otherwise None.
         """
         rounds = self._total_hadamard.rounds
         self._total_hadamard.compute_next_tau()
@@ -251,9 +252,9 @@ class Estimator:
         )
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
-        """Fit restarted axes separately, because the covariances depend on the number of samples."""
+        """Fit all axes, but each restarted axis separately, because it has fewer samples."""
         lengths = np.minimum(self._lengths, self._window.samples_in_window)
-        slope, slopes = self._window.rate_slopes_per_axis_and_tau(lengths)
+        slope, slopes = self._window.drift_slopes_by_axis_and_tau(lengths)
         before = self._entered if self._refit is None else self._refit.terms_in_fit
         shorter = [axis for axis in range(len(lengths)) if lengths[axis] < self._window.samples_in_window]
         groups = [np.flatnonzero(lengths == self._window.samples_in_window), *(np.array([axis]) for axis in shorter)]
@@ -262,7 +263,7 @@ class Estimator:
         for axes in groups:
             n = int(lengths[axes[0]])
             table = self._tables.table_of_axis(int(axes[0]), n, self._window.samples_in_window)
-            measured = MeasuredCurve(
+            measured = MeasuredVariancesAndSlopes(
                 avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[: self._m, axes] * self.rate_hz,
                 before[:, axes],
             )  # fmt: skip
@@ -270,7 +271,7 @@ class Estimator:
             self._theta[:, axes] = one.theta
             for column, axis in enumerate(axes.tolist()):
                 self._contradicting[axis] = (
-                    (table, measured.select_axis(column)) if is_contradicted_by_curve(one, column) else None
+                    (table, measured.select_axis(column)) if curve_contradicts_five_terms(one, column) else None
                 )
             fits.append(
                 refit_with_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]

@@ -1,14 +1,14 @@
-"""Number of missing samples in each gap of a recording, determined from the time stamps.
+"""Counting of the missing samples in each gap of a recording, based on the time stamps.
 
-A missing sample delays all later time stamps by one period, whereas a late sample does not affect later time stamps.
-For each gap, the median delays of ``ROWS_BESIDE_GAP`` rows before and after the gap are compared. The increase of the
-median delay, rounded to whole periods, is the number of missing samples. The number is limited to the number that the
-clock reported.
+A missing sample delays all later time stamps by one sample period, whereas a late sample does not affect later time
+stamps. For each gap, the median delay of ``ROWS_BESIDE_GAP`` samples after the gap is compared with the median delay
+before the gap. The increase, rounded to whole periods, is the number of missing samples. It cannot exceed the number
+that the clock reported.
 
-A delayed sender may send many late rows. The range after the gap is therefore extended by twice the number of rows that
-seem to be missing. If the range contains other gaps, the smallest median delay is used.
+A sender that was delayed may send many samples late. The range after the gap is therefore extended by twice the number
+of samples that seem to be missing. If the range contains other gaps, the smallest median delay is used.
 
-The sample period is the median over stretches without a gap, so missing samples do not bias the period.
+The sample period is the median over parts of the recording without a gap, so missing samples do not bias the period.
 """
 
 from typing import Final
@@ -19,54 +19,58 @@ from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 
 ROWS_BESIDE_GAP: Final = 60
-"""Number of rows on each side of a gap. Most of these rows must be on time.
+"""Number of samples on each side of a gap from which the median delay is computed.
 
-Some bus adapters send twenty rows late at once.
+Most of these samples must be on time.
+
+Some bus adapters send twenty late samples at once.
 """
 MIN_SHIFT_PERIODS: Final = 2.0 / 3.0
-"""Minimum increase of the delay, in periods, that counts as missing samples."""
+"""Minimum increase of the delay, in sample periods, that is attributed to missing samples."""
 MAX_CATCH_UP_ROWS: Final = 10_000
-"""Maximum number of rows that a delayed sender may need to catch up."""
+"""Maximum number of samples that a delayed sender may need to catch up."""
 MAX_RATE_VARIATION: Final = 0.01
 """Maximum relative variation of the sample rate after a gap.
 
-A larger decrease of the median delay indicates a delayed sender.
+A delay that decreases faster indicates a sender that catches up.
 """
 STRETCH_ROWS: Final = (256, 128, 64, 32, 16, 8, 4, 2)
-"""Distances in rows between two time stamps for the sample rate, from preferred to last."""
+"""Numbers of samples between the two time stamps from which the period is computed, in order of preference."""
 MIN_STRETCH_RATIO: Final = 4
-"""A distance is used if at least one in this many rows starts a stretch without a gap."""
+"""A number from ``STRETCH_ROWS`` is used if at least a quarter of all intervals of this length contain no gap."""
 
 
-def count_missing_samples(t_ns: Ints, rows_after_gaps: Ints, missing_by_clock: Ints, rows_after_jumps: Ints) -> Ints:
-    """Return the number of missing samples before each gap.
+def count_missing_before_gaps(
+    t_ns: Ints, rows_after_gaps: Ints, missing_by_clock: Ints, rows_after_jumps: Ints
+) -> Ints:
+    """Return the number of missing samples in each gap.
 
     Parameters
     ----------
     t_ns : ndarray of int64, shape (n,)
-        Time stamps in nanoseconds, in the order of the rows.
+        Time stamps of the samples in nanoseconds, in the order of the recording.
     rows_after_gaps : ndarray of int64, shape (k,)
-        Indices of the first row after each gap, in ascending order.
+        Index of the first sample after each gap, in ascending order.
     missing_by_clock : ndarray of int64, shape (k,)
-        Number of missing samples before each gap, as reported by the clock. The clock counts late samples as missing.
+        Number of missing samples in each gap that the clock reported. The clock counts late samples as missing.
     rows_after_jumps : ndarray of int64
-        Indices of rows after a jump of the time stamps. Only rows between two jumps are compared.
+        Index of the first sample after each jump of the time stamps. Samples are only compared between two jumps.
 
     Returns
     -------
     ndarray of int64, shape (k,)
-        Number of missing samples, at most ``missing_by_clock``.
+        Number of missing samples in each gap, at most ``missing_by_clock``.
 
     >>> t_ns = 10_000_000 * np.arange(300)
     >>> t_ns[100:110] += 10_000_000  # late
     >>> t_ns[200:] += 10_000_000  # missing
-    >>> count_missing_samples(t_ns, np.array([100, 200]), np.array([1, 1]), np.array([], int)).tolist()
+    >>> count_missing_before_gaps(t_ns, np.array([100, 200]), np.array([1, 1]), np.array([], int)).tolist()
     [0, 1]
     """
     period_ns = _period_ns(t_ns, np.concatenate([rows_after_gaps, rows_after_jumps]))
     if not period_ns > 0.0:
         return missing_by_clock
-    # A double cannot represent Unix time with a resolution of a fraction of a period.
+    # The first time stamp is subtracted, because a double cannot resolve Unix time to a fraction of a period.
     late = (t_ns - t_ns[0]) / period_ns - np.arange(t_ns.size)
     ends = np.unique(np.concatenate([[0], rows_after_gaps, rows_after_jumps, [t_ns.size]]))
     return _count_missing(late, rows_after_gaps, missing_by_clock, ends, np.searchsorted(ends, rows_after_gaps))
@@ -87,9 +91,9 @@ def _period_ns(t_ns: Ints, edges: Ints) -> float:
 
 @compiled
 def _count_missing(late: Floats, rows: Ints, claimed: Ints, ends: Ints, at: Ints) -> Ints:
-    """Count the missing samples before each gap.
+    """Count the missing samples in each gap.
 
-    ``late`` [n] is the delay of each row in periods. Gap k begins at row ``ends[at[k]]``.
+    ``late`` [n] is the delay of each sample in periods. Sample ``ends[at[k]]`` is the first sample after gap k.
     """
     holes = rows.size
     reach = np.empty(holes, np.int64)

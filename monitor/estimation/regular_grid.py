@@ -1,11 +1,11 @@
 """Resampling of a recording to a regular time grid.
 
-The clock for live samples also assigns the times of recorded samples. Missing samples become NaN.
-``missing_sample_count`` then corrects the number of missing samples, because the clock cannot distinguish a late sample
-from a missing one.
+The times of recorded samples are assigned by the same clock as those of live samples. Missing samples become NaN.
+Because the clock cannot distinguish a late sample from a missing one, ``missing_sample_count`` corrects the number of
+missing samples.
 
-Rows with the same values and the same time stamp as an earlier row are removed. Rows that repeat the previous values at
-a later time are kept. A sample rate stated by the user has priority over the time stamps.
+Samples with the same values and the same time stamp as an earlier sample are removed. Samples that repeat the previous
+values at a later time are kept. A sample rate that the user states takes precedence over the time stamps.
 """
 
 from collections.abc import Sequence
@@ -19,38 +19,38 @@ from drivers.number_ranges import RATE_HZ
 from drivers.timing.arrival_regression import snap_to_standard_rate
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
-from drivers.timing.sender_times import FORWARD_JUMP_S
-from monitor.common.units import format_axis_value, format_two_significant_digits
-from monitor.estimation.detection.coarse_quantization import QuantizationStep, find_coarsely_quantized_axes
-from monitor.estimation.detection.repeated_share import estimate_repeated_row_share
-from monitor.estimation.missing_sample_count import count_missing_samples
+from drivers.timing.sender_time_gaps import FORWARD_JUMP_S
+from monitor.common.unit_formatting import format_axis_value, format_two_significant_digits
+from monitor.estimation.detection.coarse_quantization import QuantizationStepAndNoise, find_coarsely_quantized_axes
+from monitor.estimation.detection.repeated_share import estimate_stale_sample_share
+from monitor.estimation.missing_sample_count import count_missing_before_gaps
 
 MIN_RATE_DEVIATION: Final = 0.002
-"""Minimum reported deviation of the stated rate from the time stamps, relative to the rate."""
+"""Minimum relative deviation of the stated rate from the rate of the time stamps that is reported."""
 LARGE_RATE_DEVIATION: Final = 0.02
-"""Relative deviation of the stated rate that is reported even if the time stamps are inaccurate."""
+"""Relative deviation of the stated rate that is reported even if the time stamps are irregular."""
 STEP_TOLERANCE: Final = 0.02
-"""Maximum relative difference of equal time steps."""
+"""Maximum relative difference between time steps that count as equal."""
 MAX_CLOCK_NOTES: Final = 10
-"""Maximum number of notes of the clock."""
+"""Maximum number of notes that the clock contributes."""
 MIN_REPEATED_SHARE: Final = 0.01
-"""Minimum reported share of repeated rows."""
+"""Minimum share of repeated samples that is reported."""
 MAX_GAP_SAMPLES: Final = 1_000_000
 """Maximum number of missing samples that are stored for one gap, at 48 bytes per sample.
 
-A longer gap is replaced by one missing sample, which excludes all differences across the gap.
+A longer gap is replaced by one missing sample, which still excludes all differences across the gap.
 """
 SEGMENTS: Final = 8
-"""Number of segments of a recording. The rates of the segments give the standard error of the mean rate."""
+"""Number of segments into which a recording is divided to compute the standard error of the mean rate."""
 RATE_SIGMA: Final = 5.0
-"""Minimum significant deviation of the rate, in standard errors of the mean rate."""
+"""Minimum deviation of the rate that counts as significant, in standard errors of the mean rate."""
 UNIT_TOLERANCE: Final = 0.05
-"""Maximum deviation of a time step from a multiple of the time unit, as a share of the unit."""
+"""Maximum deviation of a time step from a multiple of the time unit, as a fraction of the unit."""
 UNEVEN_STEP_SHARE: Final = 0.5
-"""Minimum reported deviation of the outer fifth of the time steps, as a share of a period."""
+"""Minimum reported deviation of the 10 % and 90 % quantiles of the time steps, as a fraction of the sample period."""
 
 
-def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
+def place_samples_on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
     """Place the samples of a recording on a regular time grid, with NaN for missing samples.
 
     Parameters
@@ -58,37 +58,37 @@ def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tu
     blocks : sequence of SampleBlock
         Recording with time stamps.
     rate_hz : float or None
-        Stated sample rate in Hz. If None, the rate is estimated from the time stamps.
+        Sample rate in Hz that the user has stated. If None, the rate is estimated from the time stamps.
 
     Returns
     -------
     values : ndarray of float64, shape (n, 6)
-        Samples in rad/s and m/s². Do not modify the array, which may share memory with ``blocks``.
+        Samples in rad/s and m/s². The array may share memory with ``blocks`` and must not be modified.
     rate_hz : float
         Sample rate in Hz.
     notes : list of str
-        Irregularities of the time stamps and the values.
+        Notes for the user on irregularities of the time stamps and the values.
     """
     _, _, values, rate, notes = _resample(blocks, rate_hz)
     return values, rate, notes
 
 
-def resample_with_temperature(
+def place_samples_and_temperature_on_grid(
     blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> tuple[Floats, Floats, float, list[str]]:
-    """Place the samples and the temperatures of a recording on a regular time grid.
+    """Place the samples and temperatures of a recording on a regular time grid.
 
     Parameters
     ----------
     blocks, rate_hz
-        As for ``resample_to_grid``.
+        See ``place_samples_on_grid``.
 
     Returns
     -------
     values, rate_hz, notes
-        As for ``resample_to_grid``.
+        See ``place_samples_on_grid``.
     temperature_c : ndarray of float64, shape (n,)
-        Second result: temperature in °C; NaN means not measured.
+        Temperature in °C, returned after ``values``; NaN means not measured.
     """
     stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
     missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost).tolist()
@@ -129,7 +129,7 @@ def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[S
 
 
 def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int]:
-    """Return the number of missing samples before each block, and the number of gaps without missing samples."""
+    """Return the number of missing samples before each block, and the number of gaps that only contain late samples."""
     lost = np.array([samples.lost for samples in stamped], np.int64)
     short = (lost > 0) & (lost <= MAX_GAP_SAMPLES)
     rows = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
@@ -140,12 +140,12 @@ def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, in
     jumps = np.flatnonzero((steps < -JUMP_S * NS_PER_S) | (steps > FORWARD_JUMP_S * NS_PER_S)) + 1
     breaks = np.concatenate([rows[lost > MAX_GAP_SAMPLES], jumps])
     missing = lost.copy()
-    missing[short] = count_missing_samples(t_ns, rows[short], lost[short], breaks)
+    missing[short] = count_missing_before_gaps(t_ns, rows[short], lost[short], breaks)
     return missing, int((short & (missing == 0)).sum())
 
 
 def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
-    """Return all samples in one array [n, 6]. Contiguous blocks are not copied."""
+    """Return all samples in one array [n, 6], which is not a copy if the blocks are contiguous."""
     missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
     if not missing.any() and (whole := _contiguous([samples.values for samples in stamped])) is not None:
         return whole
@@ -160,7 +160,7 @@ def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
 
 
 def _contiguous(parts: Sequence[Floats]) -> Floats | None:
-    """Return the parts as a view of their common base array, or None if the parts are not contiguous."""
+    """Return contiguous parts as a view of their common base array, or None if the parts are not contiguous."""
     whole = parts[0].base
     if len(parts) == 1:
         return parts[0]
@@ -201,7 +201,7 @@ def _late_notes(late: int) -> list[str]:
 
 
 def _repeated_notes(values: Floats) -> list[str]:
-    share = estimate_repeated_row_share(values)
+    share = estimate_stale_sample_share(values)
     if share < MIN_REPEATED_SHARE:
         return []
     percent = 100.0 * share
@@ -211,8 +211,8 @@ def _repeated_notes(values: Floats) -> list[str]:
     ]
 
 
-def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
-    alike: dict[str, list[QuantizationStep]] = {}
+def _resolution_notes(found: Sequence[QuantizationStepAndNoise]) -> list[str]:
+    alike: dict[str, list[QuantizationStepAndNoise]] = {}
     for one in found:
         alike.setdefault(format_axis_value(AXES[one.axis], one.step), []).append(one)
     notes = []
@@ -262,16 +262,16 @@ def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
 
 
 def _is_even(steps: Ints) -> bool:
-    """Return True if all time steps are equal within ``STEP_TOLERANCE``. Integer differences could overflow."""
+    """Return True if all time steps are equal within ``STEP_TOLERANCE``."""
     return float(steps.max()) - float(steps.min()) <= STEP_TOLERANCE * float(steps.min())
 
 
 def _unit_s(steps: Ints) -> float:
-    """Return the largest time unit in seconds that divides all time steps, or 0 if there is none."""
+    """Return the time unit in seconds of which all time steps are multiples, or 0 if there is none."""
     on = steps[steps > 0]
     if not on.size:
         return 0.0
-    # The mean is more accurate than a single step, because time stamps are rounded to nanoseconds.
+    # The mean of several steps is more accurate than a single step, because time stamps are rounded to nanoseconds.
     unit = float(on[on < 1.5 * on.min()].mean())
     whole = np.abs(steps / unit - np.rint(steps / unit)) < UNIT_TOLERANCE
     return unit / NS_PER_S if whole.all() else 0.0
@@ -282,7 +282,7 @@ def _count_and_time(
 ) -> tuple[Floats, Floats] | None:
     """Return the cumulative number of samples and the elapsed time in seconds at the segment boundaries.
 
-    The number includes missing samples. Jumps of the time stamps are excluded. The result is None if no time passes.
+    Missing samples are counted, and jumps of the time stamps are excluded. If no time passes, the result is None.
     """
     rows = np.unique(np.linspace(0, steps.size, SEGMENTS + 1).astype(np.int64))
     starts = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])

@@ -1,1 +1,1 @@
-"""Long-term history of the results. Rows of one minute are merged into wider rows later."""
+"""Long-term storage of results as rows of one minute, which are later merged into rows of longer periods."""

@@ -1,7 +1,8 @@
-"""Reading of the stored results of a time range as a table with a limited number of buckets.
+"""Reading of stored results as a table with a limited number of time buckets.
 
-``read_history`` merges the rows of each bucket while reading, so the memory depends on the number of requested points
-and not on the length of the time range. A bucket is at least as wide as the stored rows.
+The function ``read_history`` merges the stored rows that fall into the same time bucket while it reads them. The
+required memory therefore depends on the number of requested points and not on the length of the time range. A time
+bucket is at least as wide as the stored rows.
 """
 
 import math
@@ -15,51 +16,51 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 from drivers.errors import NotReady
 from drivers.number_ranges import DAY_S
-from monitor.common.units import format_utc
-from monitor.history.bucket import HistoryRow, Singles, merge_rows, select_columns
+from monitor.common.unit_formatting import format_utc
+from monitor.history.history_row import HistoryRow, Singles, merge_rows, select_columns
 from monitor.history.sqlite_store import HistoryReader
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 
 DEFAULT_POINTS: Final = 1000
-"""Approximate number of buckets in a table. If rows differ in width, there may be up to twice as many."""
+"""Approximate number of time buckets in a table. If the stored rows differ in width, there may be twice as many."""
 MAX_EVENTS: Final = 1000
 BUCKET_WIDTHS_S: Final = (
     *(60, 300, 900, 1800, 3600, 10_800, 21_600, 43_200),
     *(days * DAY_S for days in (1, 2, 4, 7, 30, 90, 365)),
 )
-"""Permitted bucket widths [s]. A width is a multiple of every row width that is not larger."""
+"""Allowed widths of time buckets [s]. Each width is a multiple of all row widths that are not larger."""
 
 
 @dataclass(frozen=True, slots=True)
 class HistoryTable:
-    """History of one device with k columns in p time buckets."""
+    """Stored results of one device, with k columns and p time buckets."""
 
     device: str
-    span: TimeRange  # requested time range, clipped to the stored time range
-    step_s: int  # width of the buckets, unless the stored rows are wider
-    start_s: Ints  # [p] Unix time
+    span: TimeRange  # requested time range, limited to the stored time range
+    step_s: int  # width of the time buckets, unless the stored rows are wider
+    start_s: Ints  # [p] Unix time of the start of each time bucket
     width_s: Ints  # [p]
-    names: tuple[str, ...]  # [k], see ``columns``
+    names: tuple[str, ...]  # [k] column names, see ``estimate_to_columns``
     n: Ints  # [p, k] number of values
-    low: Singles  # [p, k] SI; NaN if the bucket has no value
+    low: Singles  # [p, k] minimum, SI units; NaN if there is no value
     high: Singles
     last: Singles
     counts: Ints  # [p, 4] increments of bucket.COUNTS within each bucket
-    state: Ints  # [p] index of the worst of bucket.STATES
-    events: tuple[StoredEvent, ...]  # the newest events
-    events_in_all: int  # number of events in the time range
+    state: Ints  # [p] index of the worst state in bucket.STATES
+    events: tuple[StoredEvent, ...]  # newest events in the time range
+    events_in_all: int  # total number of events in the time range
 
     def __len__(self) -> int:
         return int(self.start_s.size)
 
     @property
     def end_s(self) -> Ints:
-        """Unix time of the end of each bucket [s], shape [p]."""
+        """Unix time of the end of each time bucket [p] in seconds."""
         return self.start_s + self.width_s
 
     def select_column(self, name: str) -> "ColumnStatistics":
-        """Return the statistics of one column. All values of an unknown column are missing."""
+        """Return the statistics of one column. For an unknown column, all values are NaN."""
         if name not in self.names:
             nothing: Floats = np.full(len(self), np.nan)
             return ColumnStatistics(np.zeros(len(self), np.int64), nothing, nothing, nothing)
@@ -73,17 +74,17 @@ class HistoryTable:
         return tuple(found)
 
     def list_tau_labels(self) -> tuple[str, ...]:
-        """Return the averaging times in the column names of Allan deviations [s], in ascending order."""
+        """Return the averaging times [s] that occur in the names of Allan deviation columns, in ascending order."""
         found = {name.split(".sigma.")[1] for name in self.names if ".sigma." in name}
         return tuple(sorted(found, key=float))
 
 
 @dataclass(frozen=True, slots=True)
 class ColumnStatistics:
-    """Statistics of one column over p buckets."""
+    """Statistics of one column over p time buckets."""
 
     n: Ints  # [p] number of values
-    low: Floats  # [p] NaN if the bucket has no value
+    low: Floats  # [p] minimum; NaN if there is no value
     high: Floats
     last: Floats
 
@@ -96,7 +97,7 @@ def read_history(
     step_s: int | None = None,
     points: int = DEFAULT_POINTS,
 ) -> HistoryTable:
-    """Read the history of a device as a table.
+    """Read the stored results of a device as a table.
 
     Parameters
     ----------
@@ -105,20 +106,20 @@ def read_history(
     device
         Name of the device.
     span
-        Time range; None for the last stored day.
+        Time range to read. None means the last stored day.
     wants_column
-        Function that returns True for the name of a column to read.
+        Function that returns True for the names of columns to read.
     step_s
-        Minimum bucket width [s]; None for the width that follows from ``points``.
+        Minimum width of a time bucket [s]. None means that ``points`` determines the width.
     points
-        Approximate number of buckets.
+        Approximate number of time buckets.
 
     Raises
     ------
     NotReady
-        If the time range contains no rows and no events.
+        If the time range contains neither rows nor events.
     RecordingError
-        If a row cannot be read.
+        If a row is damaged.
     """
     held = reader.stored_range(device)
     if held is None:
@@ -149,7 +150,7 @@ def build_table(
     events: Sequence[StoredEvent],
     events_in_all: int,
 ) -> HistoryTable:
-    """Arrange rows as a table.
+    """Build a table from history rows.
 
     Parameters
     ----------
@@ -158,13 +159,13 @@ def build_table(
     span
         Time range of the table.
     step_s
-        Bucket width [s].
+        Width of a time bucket [s].
     rows
-        Rows, ordered by time.
+        Rows in chronological order.
     events
         Events in the time range.
     events_in_all
-        Number of events in the time range, including those not in ``events``.
+        Total number of events in the time range, including events that are not in ``events``.
     """
     names = tuple(dict.fromkeys(name for row in rows for name in row.names))
     rows = [select_columns(row, names) for row in rows]
@@ -188,7 +189,7 @@ def build_table(
 
 
 def choose_bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
-    """Return the smallest permitted bucket width [s] for about ``points`` buckets, at least ``step_s``.
+    """Return the smallest allowed width [s] of at least ``step_s`` that gives about ``points`` time buckets.
 
     >>> choose_bucket_width_s(TimeRange(0.0, 86_400.0)), choose_bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
     (300, 172800)
@@ -200,9 +201,9 @@ def choose_bucket_width_s(span: TimeRange, step_s: int | None = None, points: in
     span
         Time range.
     step_s
-        Minimum bucket width [s].
+        Minimum width of a time bucket [s].
     points
-        Approximate number of buckets.
+        Approximate number of time buckets.
     """
     least_s = max((span.end_s - span.start_s) / points, step_s or 0)
     return next(
@@ -212,7 +213,7 @@ def choose_bucket_width_s(span: TimeRange, step_s: int | None = None, points: in
 
 
 def _clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
-    """Clip a time range to the stored rows plus one day, because events may precede or follow the rows."""
+    """Limit a time range to the stored rows plus one day, because events may precede or follow the rows."""
     start_s, end_s = max(span.start_s, held[0] - DAY_S), min(span.end_s, held[1] + DAY_S)
     return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
 

@@ -1,8 +1,8 @@
-"""Query of a device's history, parsed from the parameters of a zenoh selector.
+"""Query of the stored results of a device, given as the parameters of a zenoh selector (request address).
 
-Parameters are ``_time=[…]`` (default: the last day), ``step=15min``, ``what=coefficients,deviations,status,events``,
-``axis=gz,gx`` and ``letter=N,B``. Other parameters that begin with ``_`` belong to zenoh and are ignored. Any other
-parameter raises ConfigError.
+Examples of parameters are ``_time=[…]`` (default: the last day), ``step=15min``,
+``what=coefficients,deviations,status,events``, ``axis=gz,gx`` and ``letter=N,B``. Other parameters that begin with
+``_`` are reserved for zenoh and ignored. An unknown parameter raises ConfigError.
 """
 
 import re
@@ -14,7 +14,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
 from monitor.estimation.fit.coefficient_values import SYMBOLS
-from monitor.history.column_conversion import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
+from monitor.history.estimate_to_columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
 from monitor.history.time_ranges import TimeRange, parse_duration_s, parse_zenoh_range
 
 COEFFICIENTS: Final = "coefficients"
@@ -23,25 +23,25 @@ STATUS: Final = "status"
 EVENTS: Final = "events"
 PARTS: Final = (COEFFICIENTS, DEVIATIONS, STATUS, EVENTS)
 DEFAULT_PARTS: Final = (COEFFICIENTS, STATUS, EVENTS)
-"""Parts that are returned by default. Deviations would be larger than all other parts together."""
+"""Parts of the results that are returned by default. Allan deviations would be larger than all other parts together."""
 PARAMETER_NAMES: Final = ("_time", "step", "what", "axis", "letter")
 MAX_PARAMETERS_LENGTH: Final = 1000
-"""Longest accepted parameter string [characters]."""
+"""Maximum length of the parameter string in characters."""
 _PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$)")
 
 
 @dataclass(frozen=True, slots=True)
 class HistoryQuery:
-    """Query of a history by time range, bucket width, parts, axes and coefficients."""
+    """Query of stored results by time range, width of the time buckets, parts, axes and coefficients."""
 
-    span: TimeRange | None = None  # None: the last day of the stored history
-    step_s: int | None = None  # None: chosen by the reader
+    span: TimeRange | None = None  # None means the last stored day
+    step_s: int | None = None  # width of the time buckets; None means chosen automatically
     what: tuple[str, ...] = DEFAULT_PARTS
     axes: tuple[str, ...] = AXES
     symbols: tuple[str, ...] = SYMBOLS
 
     def selects_column(self, name: str) -> bool:
-        """Return True if the query requests the column ``name``.
+        """Return True if the query selects the column ``name``.
 
         >>> query = HistoryQuery(axes=("gz",))
         >>> query.selects_column("gz.N.lo"), query.selects_column("gx.N"), HistoryQuery().selects_column("rate")
@@ -81,14 +81,14 @@ def parse_query(parameters: str, now_s: float) -> HistoryQuery:
     Parameters
     ----------
     parameters
-        Parameters, separated by semicolons.
+        Parameters of the selector, separated by semicolons.
     now_s
         Current Unix time [s].
 
     Raises
     ------
     ConfigError
-        If a parameter is unknown, or its value is not valid.
+        If a parameter is unknown or has an invalid value.
     """
     given = _split(parameters)
     for key in given:
@@ -107,7 +107,7 @@ def parse_query(parameters: str, now_s: float) -> HistoryQuery:
 
 
 def _split(parameters: str) -> Mapping[str, str]:
-    """Split parameters into keys and values at the semicolons outside the brackets of a time range."""
+    """Split a parameter string into keys and values at semicolons that are not inside the brackets of a time range."""
     if len(parameters) > MAX_PARAMETERS_LENGTH:
         raise ConfigError(f"parameters of {len(parameters)} characters; at most {MAX_PARAMETERS_LENGTH}")
     return {key.strip(): (value or "").strip() for key, value in _PART.findall(parameters)}

@@ -1,13 +1,14 @@
-"""History file: one SQLite file in WAL mode, with one writer and any number of readers in threads and processes.
+"""Storage of history rows and events in an SQLite file.
 
-Rows have three widths: one minute for a week, 15 minutes for three months, and six hours for all earlier times. The age
-of a row is measured from the newest row of the device, or from the current time if the current time is earlier.
-``HistoryStore.merge_old_rows`` merges the rows of one wider bucket per transaction, so each moment belongs to exactly
-one row even if the process is killed. A row for an existing bucket is merged with the stored row, so restarts and
-repeated replays create no duplicate rows.
+With the write-ahead log (WAL) of SQLite, one writer and any number of readers can access the file at the same time.
+Rows cover one minute for a week, 15 minutes for three months, and six hours for all earlier times. The age of a row is
+measured from the newest row of the device, or from the current time if that is earlier.
+``HistoryFileWriter.merge_old_rows`` replaces old rows by one wider row per transaction. Even if the process is killed,
+no result is lost or stored twice. A new row for a stored period is merged with the stored row, so restarts and repeated
+replays do not create duplicates.
 
-RecordingError is raised for a file that is damaged, has a newer version or is not a history. Such a file is never
-modified. ``sqlite3.Error`` is raised if the disk is full or read-only.
+A file that is damaged, has a newer version or is not a history file raises RecordingError and is never modified. A full
+or read-only disk raises ``sqlite3.Error``.
 """
 
 import contextlib
@@ -25,7 +26,7 @@ import msgspec
 from drivers.errors import RecordingError
 from drivers.file_access import check_folder_or_absent, check_regular_file
 from drivers.number_ranges import DAY_S
-from monitor.history.bucket import (
+from monitor.history.history_row import (
     MAX_COLUMNS,
     STATES,
     HistoryRow,
@@ -49,7 +50,7 @@ FILE_NAME: Final = "history.sqlite"
 VERSION: Final = 1
 APPLICATION: Final = 0x494D5548  # "IMUH"
 LEVELS: Final = ((60, 7 * DAY_S), (900, 90 * DAY_S), (21_600, None))
-"""Width of rows [s], and the age at which they are merged into rows of the next width [s]; None: never."""
+"""Width of rows [s], and the age [s] at which they are merged into wider rows. None means never."""
 BUSY_TIMEOUT_S: Final = 5.0
 CACHE_KIB: Final = 2048
 SCHEMA: Final = """
@@ -69,7 +70,7 @@ CREATE INDEX event_time ON event (device, t);
 """
 TABLES: Final = frozenset({"device", "layout", "row", "event"})
 SQLITE_SUFFIXES: Final = ("-wal", "-shm", "-journal")
-"""Suffixes of the additional files of an SQLite database."""
+"""Suffixes of the additional files that belong to an SQLite database."""
 DELETED: Final = "was deleted or renamed"
 REPLACED: Final = "was replaced by another file"
 EMPTIED: Final = "was emptied"
@@ -83,23 +84,23 @@ _FileState = tuple[int, int, int, int]
 
 
 class UnusableHistory(RecordingError):
-    """The history file is damaged or is not a history."""
+    """Exception for a history file that is damaged or is not a history file."""
 
 
-class HistoryStore:
-    """Writer of a history file. Only one thread may use a writer.
+class HistoryFileWriter:
+    """Writer of a history file, which only one thread may use.
 
     Parameters
     ----------
     path
-        History file. Missing files and folders are created.
+        Path of the history file. A missing file or folder is created.
 
     Raises
     ------
     RecordingError
-        If the file is not a history, is damaged, or was written by a newer version.
+        If the file is damaged, is not a history file, or was written by a newer version.
     sqlite3.Error, OSError
-        If the file cannot be opened at present.
+        If the file cannot be opened, possibly only temporarily.
     """
 
     def __init__(self, path: Path) -> None:
@@ -107,7 +108,7 @@ class HistoryStore:
         check_folder_or_absent(path.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         _check_files(path)
-        path.touch()  # creates an inode that can be compared after SQLite has opened the file
+        path.touch()  # Creates the inode, which is compared after SQLite has opened the file.
         before = os.stat(path)
         self._files = _file_states(path)
         self._db = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
@@ -128,12 +129,12 @@ class HistoryStore:
         if not _is_history(self._db, self.path):
             self._db.execute("PRAGMA journal_mode = WAL")
             with self._transaction():
-                if not _is_history(self._db, self.path):  # another process may have created the tables
+                if not _is_history(self._db, self.path):  # Another process may have created the tables in the meantime.
                     for statement in SCHEMA.split(";"):
                         self._db.execute(statement)
                     self._db.execute(f"PRAGMA application_id = {APPLICATION}")
                     self._db.execute(f"PRAGMA user_version = {VERSION}")
-        # each commit is flushed to disk, about once a minute, so a power failure loses at most one commit
+        # Commits occur about once a minute and are flushed to disk, so a power failure loses at most one commit.
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
 
@@ -145,16 +146,16 @@ class HistoryStore:
         Parameters
         ----------
         rows
-            Pairs of device name and row.
+            Device name and row of each entry.
         events
-            Pairs of device name and event.
+            Device name and event of each entry.
 
         Raises
         ------
         UnusableHistory
             If the file is damaged.
         sqlite3.OperationalError
-            If the file cannot be written now.
+            If the file cannot be written, possibly only temporarily.
         """
         with _damage_as_unusable(self.path), self._transaction():
             for device, row in rows:
@@ -164,21 +165,21 @@ class HistoryStore:
         self._files = _file_states(self.path)
 
     def merge_old_rows(self, now_s: float, max_buckets: int = 100) -> int:
-        """Merge old rows into wider rows, and return the number of merged buckets.
+        """Merge old rows into wider rows, and return the number of wider rows.
 
         Parameters
         ----------
         now_s
             Current Unix time [s].
         max_buckets
-            Largest number of buckets to merge in this call.
+            Maximum number of wider rows to create in this call.
 
         Raises
         ------
         UnusableHistory
             If the file is damaged.
         sqlite3.OperationalError
-            If the file cannot be written now.
+            If the file cannot be written, possibly only temporarily.
         """
         done = 0
         with _damage_as_unusable(self.path):
@@ -197,9 +198,9 @@ class HistoryStore:
         return done
 
     def describe_external_change(self) -> str:
-        """Return a description of the change that another program made to the history file; "" if there is no change.
+        """Describe how another program has changed the history file. The result is empty if there is no change.
 
-        Without this check, SQLite would continue to write to a deleted file.
+        Without this check, SQLite would continue to write to a file that has been deleted.
         """
         now = _file_states(self.path)
         if now == self._files:
@@ -214,23 +215,23 @@ class HistoryStore:
     def close(self) -> None:
         """Close the history file.
 
-        SQLite does not merge the write-ahead log of a deleted or renamed file, so the method merges the log. The method
-        empties the log if another program has overwritten the file, since SQLite would apply the log to the new
-        content.
+        SQLite does not merge the write-ahead log into a file that has been deleted or renamed, so the method merges it
+        explicitly. If another program has overwritten the file, the method empties the log, because SQLite would apply
+        it to the new content.
         """
         before, now = self._files[0], _file_states(self.path)[0]
         if before is not None and (now is None or now[:2] != before[:2]):
-            with contextlib.suppress(sqlite3.Error):  # if the disk is full, the log keeps the data
+            with contextlib.suppress(sqlite3.Error):  # on a full disk, the log keeps the data
                 self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
         elif now != before and not self._committed_by_others():
-            with contextlib.suppress(OSError):  # there may be no log
+            with contextlib.suppress(OSError):  # the log may not exist
                 os.truncate(f"{self.path}-wal", 0)
         self._db.close()
 
     # --- rows
 
     def _put(self, device: int, row: HistoryRow) -> None:
-        """Store a row. If a stored row covers the same bucket, merge the two rows."""
+        """Store a row, merged with the stored row of the same period if there is one."""
         for width_s, _ in LEVELS[::-1]:
             start_s = row.start_s // width_s * width_s
             held = self._stored_row(device, width_s, start_s)
@@ -255,13 +256,13 @@ class HistoryStore:
         )
 
     def _newest_end_s(self) -> dict[int, float]:
-        """Return the end of the newest row of each device in Unix seconds; -inf if a device has no rows."""
+        """Return the Unix time at which the newest row of each device ends, or -inf if a device has no rows."""
         devices = [one for (one,) in self._db.execute("SELECT id FROM device").fetchall()]
         spans = {device: _stored_span(self._db, device) for device in devices}
         return {device: -math.inf if span is None else span[1] for device, span in spans.items()}
 
     def _merge_oldest(self, device: int, width_s: int, wider_s: int, limit_s: float) -> bool:
-        """Merge the oldest rows into a wider row. Return False if the wider row would end after ``limit_s``."""
+        """Merge the oldest rows into a wider row, or return False if the wider row would end after ``limit_s``."""
         oldest = self._db.execute(
             "SELECT min(start) FROM row WHERE device = ? AND width = ?", (device, width_s)
         ).fetchone()[0]
@@ -281,7 +282,7 @@ class HistoryStore:
         return True
 
     def _thin_events(self, device: int) -> None:
-        """Thin the events of a device by day, month and year until at most half of MAX_EVENTS remain."""
+        """Delete less important events per day, month and year until at most half of MAX_EVENTS remain."""
         for span_s in THINNING_SPANS_S:
             with self._transaction():
                 thin_events(self._db, device, span_s)
@@ -296,7 +297,7 @@ class HistoryStore:
         return self._devices[name]
 
     def _refresh_identifiers(self) -> None:
-        """Clear the cached identifiers of devices and layouts if another connection has changed the file."""
+        """Clear the cached identifiers of devices and column layouts if another connection has changed the file."""
         version = self._data_version()
         if version != self._version:
             self._version = version
@@ -321,7 +322,7 @@ class HistoryStore:
             yield
             self._db.execute("COMMIT")
         except BaseException:
-            self._devices.clear()  # identifiers created in this transaction may no longer exist
+            self._devices.clear()  # Identifiers that were created in this transaction may no longer exist.
             self._layouts.clear()
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
@@ -329,7 +330,7 @@ class HistoryStore:
 
 
 class HistoryReader:
-    """Reader of a history file. All results refer to the moment at which ``open_history`` opened the file."""
+    """Reader of a history file, whose results refer to the moment at which the file was opened."""
 
     def __init__(self, db: sqlite3.Connection, path: Path) -> None:
         self._db = db
@@ -341,17 +342,19 @@ class HistoryReader:
         return tuple(name for (name,) in self._db.execute("SELECT name FROM device ORDER BY name"))
 
     def stored_range(self, device: str) -> tuple[float, float] | None:
-        """Return the start and end of the stored rows of a device in Unix seconds; None if there are no rows."""
+        """Return the Unix times at which the stored rows of a device start and end, or None if there are no rows."""
         return _stored_span(self._db, self._id(device))
 
     def newest_result_s(self, device: str) -> float:
-        """Return the Unix time of the newest result of a device [s]; NaN if there are no rows."""
+        """Return the Unix time [s] of the newest result of a device, or NaN if there are no rows."""
         query = "SELECT newest FROM row WHERE device = ? AND width = ? ORDER BY start DESC LIMIT 1"
         found = [self._db.execute(query, (self._id(device), width_s)).fetchone() for width_s, _ in LEVELS]
         return max((one[0] for one in found if one is not None), default=math.nan)
 
     def read_rows(self, device: str, span: TimeRange) -> Iterator[HistoryRow]:
-        """Yield the rows that overlap a time range, wide rows first. Rows of one width are in order of time.
+        """Yield the rows that overlap a time range.
+
+        Wide rows come first, and rows of equal width are in chronological order.
 
         Parameters
         ----------
@@ -376,7 +379,7 @@ class HistoryReader:
                     yield row
 
     def read_events(self, device: str, span: TimeRange, max_events: int) -> tuple[list[StoredEvent], int]:
-        """Return the newest events in a time range in order of time, and the total number of events in the range.
+        """Return the newest events in a time range in chronological order, and the total number of events.
 
         Parameters
         ----------
@@ -385,7 +388,7 @@ class HistoryReader:
         span
             Time range.
         max_events
-            Largest number of events to return.
+            Maximum number of events to return.
         """
         return read_events(self._db, self._id(device), span, max_events)
 
@@ -401,7 +404,7 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
     Raises
     ------
     RecordingError
-        If the file does not exist or cannot be read.
+        If the file does not exist or is not a readable history file.
     """
     try:
         os.stat(path)
@@ -433,7 +436,7 @@ def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | N
 
 
 def _is_history(db: sqlite3.Connection, path: Path) -> bool:
-    """Return True for a history and False for an empty database. Raise RecordingError for any other database."""
+    """Return True for a history file and False for an empty database. Raise RecordingError for any other database."""
     (version,), (application,) = (
         db.execute(f"PRAGMA {what}").fetchone() for what in ("user_version", "application_id")
     )
@@ -451,7 +454,10 @@ def _is_history(db: sqlite3.Connection, path: Path) -> bool:
 
 
 class _LayoutCache:
-    """Cache of layouts. A layout is a tuple of column names, which the history file stores once with an identifier."""
+    """Cache of column layouts.
+
+    A layout is a tuple of column names, which the file stores only once, with an identifier.
+    """
 
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
@@ -459,12 +465,12 @@ class _LayoutCache:
         self._names: dict[int, tuple[str, ...]] = {}
 
     def clear(self) -> None:
-        """Clear the cache."""
+        """Remove all column layouts from the cache."""
         self._ids.clear()
         self._names.clear()
 
     def layout_id(self, names: tuple[str, ...]) -> int:
-        """Return the identifier of a layout. A new layout is inserted."""
+        """Return the identifier of a column layout, which is inserted into the database if necessary."""
         if names not in self._ids:
             self._ids[names] = _identifier(self._db, "layout", "names", " ".join(names))
         return self._ids[names]
@@ -493,7 +499,7 @@ def _identifier(db: sqlite3.Connection, table: str, column: str, text: str) -> i
 
 
 def _open_read_only(path: Path) -> sqlite3.Connection:
-    """Open a database for reading, as immutable if there is no log and the folder is not writable."""
+    """Open a database for reading. Without a log in a read-only folder, the database is opened as immutable."""
     uri = f"{path.resolve().as_uri()}?mode=ro"
     db = sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
     try:
@@ -507,7 +513,7 @@ def _open_read_only(path: Path) -> sqlite3.Connection:
 
 
 def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:
-    """Return the states of the database and of the write-ahead log; None for a missing file or an empty log."""
+    """Return the states of the database and its write-ahead log, or None for a missing file or an empty log."""
     found: list[_FileState | None] = []
     for one in (path, Path(f"{path}-wal")):
         try:
@@ -528,7 +534,7 @@ def _check_files(path: Path) -> None:
 
 @contextlib.contextmanager
 def _damage_as_unusable(path: Path) -> Iterator[None]:
-    """Convert errors of a damaged file to UnusableHistory. Temporary errors are not converted."""
+    """Convert errors that a damaged file causes to UnusableHistory, but not temporary errors."""
     try:
         yield
     except sqlite3.OperationalError:

@@ -1,8 +1,8 @@
-"""Events of a history file: insertion, reading and thinning.
+"""Functions that insert, read and delete the events in a history file.
 
-If a device has more than MAX_EVENTS events, only the first, the last and the most significant event of each kind, axis
-and day are kept. If more than half of MAX_EVENTS remain, the same is done for each month, and then for each year.
-``represented_events`` of the last event includes the number of deleted events.
+If a device has more than MAX_EVENTS events, the events are thinned out. Only the first, the last and the most
+significant event of each kind, axis and day are kept. If more than half of MAX_EVENTS remain, days are replaced by
+months, and then by years. The field ``represented_events`` of the last event includes the number of deleted events.
 """
 
 import math
@@ -17,25 +17,25 @@ from drivers.number_ranges import DAY_S
 from monitor.history.time_ranges import TimeRange
 
 MAX_EVENTS: Final = 20_000
-"""Largest number of events per device."""
+"""Maximum number of events per device."""
 THINNING_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
-"""Lengths of the time ranges in which only a few events are kept [s]."""
+"""Lengths of the periods in which only a few events are kept [s]."""
 MAX_TEXT_LENGTH: Final = 2000
 _FIELDS: Final = "t, kind, text, axis, what, since, sigma, stands_for"
 
 
 @dataclass(frozen=True, slots=True)
 class StoredEvent:
-    """Stored event of a device."""
+    """Event of a device in a history file."""
 
     t_s: float  # Unix time
     kind: str
     text: str
     axis: str | None = None
     what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    since_s: float | None = None  # Unix time of the beginning of the reported condition
+    since_s: float | None = None  # Unix time at which the reported condition began
     sigma: float | None = None
-    represented_events: int = 1  # this event, and deleted earlier events of the same kind
+    represented_events: int = 1  # number of events that this event represents, including deleted earlier events
 
 
 def insert_event(db: sqlite3.Connection, device_id: int, event: StoredEvent) -> None:
@@ -58,7 +58,7 @@ def insert_event(db: sqlite3.Connection, device_id: int, event: StoredEvent) -> 
 def read_events(
     db: sqlite3.Connection, device_id: int, span: TimeRange, max_events: int
 ) -> tuple[list[StoredEvent], int]:
-    """Return the newest events in a time range in order of time, and the total number of events in the range.
+    """Return the newest events in a time range in chronological order, and the total number of events.
 
     Parameters
     ----------
@@ -69,13 +69,13 @@ def read_events(
     span
         Time range.
     max_events
-        Largest number of events to return.
+        Maximum number of events to return.
     """
     where = "device = ? AND t >= ? AND t <= ?"
     bounds = (device_id, clamp_to_sqlite_range(span.start_s), clamp_to_sqlite_range(span.end_s))
     found = db.execute(
         f"SELECT {_FIELDS} FROM event WHERE {where} ORDER BY t DESC, id DESC LIMIT ?",
-        (*bounds, max_events + 2),  # events exactly at the ends may be excluded by the time range
+        (*bounds, max_events + 2),  # the time range may exclude events exactly at its ends
     ).fetchall()
     events = [
         StoredEvent(t, kind, text, axis, _decode_values(values), *rest)
@@ -100,7 +100,7 @@ def count_events(db: sqlite3.Connection, device_id: int) -> int:
 
 
 def thin_events(db: sqlite3.Connection, device_id: int, interval_s: int) -> None:
-    """Delete all events except the first, last and most significant event of each kind, axis and time range.
+    """Delete all events except the first, last and most significant event of each kind, axis and period.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def thin_events(db: sqlite3.Connection, device_id: int, interval_s: int) -> None
     device_id
         Identifier of the device.
     interval_s
-        Length of the time ranges [s].
+        Length of the periods [s].
     """
     groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
     rows = db.execute(
@@ -128,12 +128,12 @@ def thin_events(db: sqlite3.Connection, device_id: int, interval_s: int) -> None
 
 
 def clamp_to_sqlite_range(t_s: float) -> float:
-    """Clamp a time to ±1e18 s for comparisons in SQLite."""
+    """Limit a time to ±1e18 s, so that SQLite can compare it."""
     return max(min(t_s, 1e18), -1e18)
 
 
 def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
-    """Encode event values as JSON, with null for NaN. Values that are too long are replaced by ``{}``."""
+    """Encode event values as JSON, with null for NaN. If the JSON text is too long, it is replaced by ``{}``."""
     text = msgspec.json.encode(what).decode()
     return text if len(text) <= MAX_TEXT_LENGTH else "{}"
 

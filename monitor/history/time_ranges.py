@@ -1,9 +1,9 @@
-"""Parsing and formatting of times, durations and time ranges. Results are Unix times in seconds.
+"""Parsing and formatting of times, durations and time ranges, which are represented as Unix times in seconds.
 
-A selector of zenoh contains ``_time=[<start>..<end>]`` or ``_time=[<start>;<duration>]``. The start or the end may be
-omitted. A bracket that points outwards excludes the start or the end from the range. Times in a selector are ``now()``,
-``now(-1h)`` or RFC 3339 times in UTC. Times in options are ``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or
-``now``.
+In a zenoh selector (request address), a time range is written as ``_time=[<start>..<end>]`` or
+``_time=[<start>;<duration>]``. The start or the end may be omitted. A bracket that points outwards excludes the start
+or the end from the range. Times in a selector have the form ``now()``, ``now(-1h)`` or RFC 3339. Times in command
+options have a form such as ``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or ``now``.
 """
 
 import math
@@ -27,17 +27,17 @@ UNITS_S: Final = {
     "d": float(DAY_S),
     "w": 7.0 * DAY_S,
 }
-"""Length of each unit [s]. zenoh writes ``m`` for minutes, the configuration file ``min``."""
+"""Length of each unit of time [s]. Minutes are written as ``m`` in zenoh and as ``min`` in the configuration file."""
 MAX_DURATION_S: Final = 1e11
-"""Longest valid duration, about three thousand years."""
-MAX_DATE_S: Final = 253_402_300_800.0  # the year 10000
+"""Maximum duration [s], about three thousand years."""
+MAX_DATE_S: Final = 253_402_300_800.0  # Unix time of the year 10000
 _DURATION: Final = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-z]*)\s*")
 _NOW: Final = re.compile(r"now\(\s*([+-]?)\s*([^)]*)\)")
 
 
 @dataclass(frozen=True, slots=True)
 class TimeRange:
-    """Time range from ``start_s`` to ``end_s`` in Unix seconds. The start or the end may be infinite.
+    """Time range from ``start_s`` to ``end_s`` in Unix seconds, which may be unbounded on either side.
 
     >>> TimeRange(10.0, 20.0).contains(20.0), TimeRange(10.0, 20.0, end_included=False).contains(20.0)
     (True, False)
@@ -45,17 +45,17 @@ class TimeRange:
 
     start_s: float
     end_s: float
-    start_included: bool = True  # True if the start belongs to the range
-    end_included: bool = True  # True if the end belongs to the range
+    start_included: bool = True  # True if the range includes its start
+    end_included: bool = True  # True if the range includes its end
 
     def contains(self, t_s: float) -> bool:
-        """Return True if the time range contains ``t_s``."""
+        """Return True if the time range contains the Unix time ``t_s``."""
         after = t_s >= self.start_s if self.start_included else t_s > self.start_s
         before = t_s <= self.end_s if self.end_included else t_s < self.end_s
         return after and before
 
     def format_for_zenoh(self) -> str:
-        """Format the time range for a zenoh selector. Times before 1970 or after 9999 are omitted."""
+        """Format the time range for a zenoh selector. A start or end before 1970 or after 9999 is omitted."""
         ends = [
             "" if not 0.0 <= one < MAX_DATE_S else f"{datetime.fromtimestamp(one, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
             for one in (self.start_s, self.end_s)
@@ -63,7 +63,7 @@ class TimeRange:
         return f"{'[' if self.start_included else ']'}{'..'.join(ends)}{']' if self.end_included else '['}"
 
     def overlaps(self, start_s: float, end_s: float) -> bool:
-        """Return True if the time range overlaps a row from ``start_s`` (included) to ``end_s`` (excluded).
+        """Return True if the time range overlaps a history row from ``start_s`` (included) to ``end_s`` (excluded).
 
         >>> TimeRange(60.0, 120.0).overlaps(0.0, 60.0), TimeRange(60.0, 120.0).overlaps(120.0, 180.0)
         (False, True)
@@ -71,9 +71,9 @@ class TimeRange:
         Parameters
         ----------
         start_s
-            Start of the row, Unix time [s].
+            Unix time at which the row starts [s].
         end_s
-            End of the row, Unix time [s].
+            Unix time at which the row ends [s].
         """
         before = start_s <= self.end_s if self.end_included else start_s < self.end_s
         return before and end_s > self.start_s
@@ -97,7 +97,7 @@ def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
     Raises
     ------
     ConfigError
-        If the text is not a time range, or the range ends before it begins.
+        If the text is not a time range, or if the range ends before it begins.
     """
     text = text.strip()
     if len(text) < 2 or text[0] not in "[]" or text[-1] not in "[]":
@@ -119,7 +119,7 @@ def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
 
 
 def parse_time(text: str, now_s: float) -> float:
-    """Parse a time in a command option, and return the Unix time [s].
+    """Parse a time that is given in a command option, and return the Unix time [s].
 
     >>> parse_time("-1d", 90_000.0), parse_time("1970-01-02", 0.0), parse_time("1970-01-01T00:01:30Z", 0.0)
     (3600.0, 86400.0, 90.0)
@@ -147,7 +147,7 @@ def parse_time(text: str, now_s: float) -> float:
 
 
 def parse_duration_s(text: str) -> float:
-    """Parse a positive duration, and return the duration in seconds.
+    """Parse a positive duration, and return it in seconds.
 
     >>> parse_duration_s("15min"), parse_duration_s("1d"), parse_duration_s("90")
     (900.0, 86400.0, 90.0)
@@ -155,7 +155,7 @@ def parse_duration_s(text: str) -> float:
     Raises
     ------
     ConfigError
-        If the text is not a duration, or the duration is zero or too long.
+        If the text is not a duration, or if the duration is zero or too long.
     """
     seconds = _duration_s(text)
     if seconds <= 0.0:
@@ -174,7 +174,7 @@ def _zenoh_time(text: str, now_s: float) -> float:
 
 
 def _instant(text: str) -> float:
-    """Parse an RFC 3339 time. A date without a time is midnight, and a time without an offset is in UTC."""
+    """Parse an RFC 3339 time. A date alone means midnight, and a time without an offset is in UTC."""
     try:
         found = datetime.fromisoformat(text.strip())
         found = found if found.tzinfo is not None else found.replace(tzinfo=UTC)

@@ -1,15 +1,16 @@
-"""Background writer of the history, which writes queued rows and events to a file in a thread.
+"""Background writer, which writes queued history rows and events to a file in a thread.
 
-The thread writes the queue in one transaction and then merges a few old rows. If a write fails (disk full, read-only or
-busy), the data remain in the queue and the write is repeated. If the queue is full, new data are dropped and counted.
+The thread writes all queued data in one transaction and then merges a few old rows. If a write fails, for example
+because the disk is full, the data remain in the queue and the write is repeated. If the queue is full, new data is
+dropped and counted.
 
-A file of a newer version is not modified. An unusable file is renamed and replaced by a new file, unless there are
-already MAX_RENAMED_FILES renamed files. Before each write and every CHECK_S, the thread checks whether another program
-has deleted, replaced or emptied the file. The thread then opens or creates the file again.
+A file of a newer version is not modified. An unusable file is renamed and replaced by a new file, unless
+MAX_RENAMED_FILES files have already been renamed. Before each write and every CHECK_S seconds, the thread checks
+whether another program has deleted, replaced or emptied the file. If so, the thread opens or creates the file again.
 
-Only one process at a time writes the history of a folder (``FolderLock``). While another process holds the lock, rows
-and events are discarded, because the other process stores the same results. After the other process has ended, the
-writer discards the first row of each device, because the other process has stored a part of the same minute.
+Only one process at a time writes the history files in a folder (``FolderLock``). While another process holds the lock,
+rows and events are discarded, because that process stores the same results. After that process has ended, the first row
+of each device is discarded, because part of the same minute has already been stored.
 """
 
 import contextlib
@@ -27,36 +28,36 @@ import structlog
 
 from drivers.errors import RecordingError
 from monitor.common.folder_lock import HISTORY_LOCK, FolderLock
-from monitor.history.bucket import HistoryRow
+from monitor.history.history_row import HistoryRow
 from monitor.history.sqlite_store import (
     DELETED,
     EMPTIED,
     MOVE_HINT,
     REPLACED,
     SQLITE_SUFFIXES,
-    HistoryStore,
+    HistoryFileWriter,
     UnusableHistory,
 )
 from monitor.history.stored_events import StoredEvent
 
 QUEUE_CAPACITY: Final = 4096
-"""Capacity of the queue in rows and events: about three days of one device, or 12 MB."""
+"""Maximum number of rows and events in the queue, which corresponds to about three days of one device or 12 MB."""
 RETRY_S: Final = 5.0
 CHECK_S: Final = 10.0
-"""Interval between two checks of the file while the queue is empty."""
+"""Interval in seconds at which the file is checked while the queue is empty."""
 MAX_RENAMED_FILES: Final = 10
-"""Largest number of renamed files. After that, a user must move an unusable file away."""
+"""Maximum number of renamed files. When it is reached, a user must remove an unusable file."""
 BATCH_SIZE: Final = 256
 MERGES_PER_STEP: Final = 50
 CLOSE_TIMEOUT_S: Final = 10.0
 RENAMED_SUFFIX: Final = ".aside-"
-"""Separator between the name of a history file and the time of renaming."""
+"""Text between the name of a renamed history file and the time at which it was renamed."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 class HistoryWriter:
-    """Background writer of one history file.
+    """Background thread that writes one history file.
 
     Parameters
     ----------
@@ -68,25 +69,25 @@ class HistoryWriter:
 
     def __init__(self, path: Path, now_s: Callable[[], float]) -> None:
         self.path = path
-        self.dropped = 0  # rows and events since creation
+        self.dropped = 0  # number of dropped rows and events
         self.written = 0
         self._now_s = now_s
         self._error = ""
-        self._note = ""  # description of the newest change of the file
+        self._note = ""  # description of the latest change that another program made to the file
         self._folder = FolderLock(path.parent, HISTORY_LOCK)
-        self._excluded = False  # True if another process writes the history of this folder
-        # devices whose first row has been discarded; None if no rows are to be discarded
+        self._excluded = False  # True if another process writes the history files in the folder
+        # Devices whose first row has been discarded, or None if no rows must be discarded.
         self._resumed_devices: set[str] | None = None
         self._waiting: deque[tuple[str, HistoryRow | StoredEvent]] = deque()
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._closing = threading.Event()
-        self._store: HistoryStore | None = None
+        self._store: HistoryFileWriter | None = None
         self._thread = threading.Thread(target=self._run, name="history", daemon=True)
 
     @property
     def state(self) -> str:
-        """Status of the writer: "ok", or a description of the problem."""
+        """Status text, which is "ok" or describes a problem."""
         dropped = f"{self.dropped} results not stored" if self.dropped else ""
         if self._error:
             return f"{self._error} ({dropped})" if dropped else self._error
@@ -94,18 +95,18 @@ class HistoryWriter:
         return f"ok, but {but}" if but else "ok"
 
     def start(self) -> None:
-        """Start the thread."""
+        """Start the background thread."""
         self._thread.start()
 
     def queue_item(self, device: str, item: HistoryRow | StoredEvent | None) -> None:
-        """Add a row or an event to the queue. If the queue is full, the item is dropped and counted.
+        """Add a history row or an event to the queue. If the queue is full, the item is dropped and counted.
 
         Parameters
         ----------
         device
             Name of the device.
         item
-            Row or event to write. None is ignored.
+            History row or event to write. None is ignored.
         """
         with self._lock:
             if item is None or self._discards(device, item):
@@ -117,7 +118,7 @@ class HistoryWriter:
         self._wake.set()
 
     def close(self) -> None:
-        """Write the remaining data and stop the thread. After CLOSE_TIMEOUT_S, log a warning."""
+        """Write the remaining data and stop the thread. Log a warning if this takes longer than CLOSE_TIMEOUT_S."""
         self._closing.set()
         self._wake.set()
         if self._thread.is_alive():
@@ -126,7 +127,7 @@ class HistoryWriter:
                 _log.warning("history writer did not end in time", path=str(self.path))
 
     def _discards(self, device: str, what: HistoryRow | StoredEvent) -> bool:
-        """Return True if an item must be discarded because another process stores the item."""
+        """Return True if a row or an event must be discarded because another process stores it."""
         if self._excluded:
             return True
         if self._resumed_devices is None or device in self._resumed_devices or isinstance(what, StoredEvent):
@@ -197,13 +198,13 @@ class HistoryWriter:
             with self._lock:
                 self._excluded, self._resumed_devices = False, set()
 
-    def _current_store(self) -> HistoryStore:
-        """Return the open history store. The store is opened again if another program has changed the file."""
+    def _current_store(self) -> HistoryFileWriter:
+        """Return the open history file. If another program has changed the file, it is opened again."""
         change = "" if self._store is None else self._store.describe_external_change()
         if change:
             self._close_store()
         if self._store is None:
-            self._store = HistoryStore(self.path)
+            self._store = HistoryFileWriter(self.path)
         if change in (DELETED, EMPTIED):
             self._set_note(f"{self.path} {change}; a new one was begun")
         elif change == REPLACED:
@@ -211,7 +212,7 @@ class HistoryWriter:
         return self._store
 
     def _move_aside(self, error: UnusableHistory) -> bool:
-        """Rename an unusable history file. Return False if the file cannot be renamed."""
+        """Rename an unusable history file, or return False if it cannot be renamed."""
         taken = {
             one.name for one in self.path.parent.iterdir() if one.name.startswith(f"{self.path.name}{RENAMED_SUFFIX}")
         }
@@ -224,7 +225,7 @@ class HistoryWriter:
         name = f"{self.path.name}{RENAMED_SUFFIX}{when:%Y-%m-%dT%H-%M-%SZ}"
         name = next(one for one in chain([name], (f"{name}.{i}" for i in count(2))) if one not in taken)
         try:
-            for end in (*SQLITE_SUFFIXES, ""):  # SQLite would apply additional files to a new database
+            for end in (*SQLITE_SUFFIXES, ""):  # SQLite would apply the additional files to a new database
                 with contextlib.suppress(FileNotFoundError):
                     os.rename(f"{self.path}{end}", self.path.with_name(f"{name}{end}"))
         except OSError as failed:

@@ -1,1 +1,1 @@
-"""Noise models of an IMU, with the Allan variance, the spectrum and the simulation of all effects."""
+"""Noise models of an IMU, which give the Allan variance, the spectrum and simulated samples."""

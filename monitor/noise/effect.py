@@ -1,14 +1,15 @@
-"""Base classes of the effects of a noise model.
+"""Base classes of the effects in a noise model.
 
-An effect is a frozen dataclass of parameters. There are four kinds of effects:
+An effect is a frozen dataclass of parameters. There are five kinds of effects.
 
 - A ``Source`` adds noise or a bias to an axis.
-- An ``AxisLeak`` adds the measurement of another axis times a coefficient.
-- ``NoiseStep`` multiplies the white noise of an axis.
+- An ``AxisLeak`` adds the measurement of another axis, multiplied by a coefficient.
+- A A ``WhiteNoiseGain`` and ``HeavyTails`` multiply the white noise of an axis by a factor.
+- An ``AxisPermutation`` replaces the output of an axis by the output of another axis.
 - A ``Transform`` modifies the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
 
-Simulated samples depend only on the random generator and the sample index, not on the division into blocks. Effects do
-not read files or clocks, and have no global state.
+Simulated samples depend only on the random generator and the sample index, not on how the samples are divided into
+blocks. Effects do not access files, clocks or global state.
 """
 
 from abc import ABC, abstractmethod
@@ -26,53 +27,53 @@ from drivers.number_ranges import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, Numbe
 from monitor.noise.spectrum import Spectrum
 
 QUANTITIES: Final = {"s": DELAY_S, "Hz": EFFECT_FREQUENCY_HZ, "1/s": EFFECT_FREQUENCY_HZ}
-"""Number range of the parameters with a given unit. Parameters with other units use ``PARAMETER``."""
+"""Allowed number range by unit of the parameter. For other units, the range is ``PARAMETER``."""
 MAX_EVENTS_PER_SAMPLE: Final = 1000.0
-"""Maximum mean number of random events per sample, which limits time and memory."""
+"""Maximum mean number of random events per sample. The limit bounds the computing time and the memory."""
 GYROS, ACCELEROMETERS = AXES[:3], AXES[3:]
 
 
 @dataclass(slots=True)
 class SampleBlockContext:
-    """Sample index, temperature and work array of the simulated block."""
+    """Sample index, temperature and work array of a block of samples that is being simulated."""
 
-    first: int  # index of the first sample, counted from the start of the stream
-    temperature_c: Floats  # [n] °C; NaN without a temperature
+    first: int  # index of the first sample, counted from the start of the simulation
+    temperature_c: Floats  # [n] temperature, °C; NaN if there is none
     scratch: Floats  # [n] work array with arbitrary content
 
 
 class RunningEffect:
-    """Simulated effect of one axis."""
+    """Effect on one axis during a simulation."""
 
     def drawn_random_values(self) -> dict[str, Any]:
-        """Return the random values drawn so far, such as phases and event times."""
+        """Return the random values that have been drawn so far, such as phases and event times."""
         return {}
 
 
 class NoiseSeries(RunningEffect, ABC):
-    """Simulated time series of a source."""
+    """Time series of a source during a simulation."""
 
     @abstractmethod
     def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        """Add the next samples of the series to ``values``, in the unit of the axis.
+        """Add the next samples of the time series to ``values``, in the unit of the axis.
 
         Parameters
         ----------
         values : ndarray of float64, shape (n,)
-            Sum of the sources of the axis, updated in place. The array must not be empty.
+            Sum of all sources of the axis, updated in place. The array must not be empty.
         block : SampleBlockContext
-            Index, temperature and work array of the block.
+            Sample index, temperature and work array of the block.
         """
 
-    def draw_samples(self, n: int, first_index: int = 0) -> Floats:
-        """Return the next samples of the series.
+    def draw_next_samples(self, n: int, first_index: int = 0) -> Floats:
+        """Return the next samples of the time series.
 
         Parameters
         ----------
         n : int
             Number of samples.
         first_index : int
-            Index of the first sample, counted from the start of the stream.
+            Index of the first sample, counted from the start of the simulation.
         """
         values = np.zeros(n)
         if n:
@@ -81,18 +82,18 @@ class NoiseSeries(RunningEffect, ABC):
 
 
 class StatelessSeries(NoiseSeries):
-    """Time series that a function of the block computes."""
+    """Time series without memory, whose samples a function computes for each block."""
 
     def __init__(self, function: Callable[[Floats, SampleBlockContext], object]) -> None:
         self._function = function
 
     def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        """Call the function with ``values`` and ``block``."""
+        """Add the samples that the function computes for the block."""
         self._function(values, block)
 
 
 class RunningTransform(RunningEffect, ABC):
-    """Simulated transform of one axis."""
+    """Transform of one axis during a simulation."""
 
     @abstractmethod
     def transform_in_place(self, values: Floats) -> None:
@@ -100,28 +101,46 @@ class RunningTransform(RunningEffect, ABC):
 
 
 class MemorylessTransform(RunningTransform):
-    """Transform whose output depends only on the current sample."""
+    """Transform without memory, whose output depends only on the current sample."""
 
     def __init__(self, function: Callable[[Floats], object]) -> None:
         self._function = function
 
     def transform_in_place(self, values: Floats) -> None:
-        """Call the function with ``values``."""
+        """Apply the function to the next samples [n] in place."""
         self._function(values)
 
 
+class RunningGain(RunningEffect, ABC):
+    """Simulated gain of the white noise of one axis."""
+
+    @abstractmethod
+    def compute_gain(self, first: int, n: int) -> Floats:
+        """Return the gain of ``n`` samples, shape (n,).
+
+        Parameters
+        ----------
+        first : int
+            Index of the first sample, counted from the start of the stream.
+        n : int
+            Number of samples.
+        """
+
+
 class ParameterTable:
-    """Table of parameters in a model file. Subclasses are frozen dataclasses with ``parameter_field`` fields.
+    """Table of parameters in a model file.
+
+    Subclasses are frozen dataclasses whose fields are defined by ``parameter_field``.
 
     Raises
     ------
     ConfigError
-    If a parameter is not a finite number or is outside the allowed range.
+        If a parameter is not a finite number or is out of range.
     """
 
     __slots__ = ()
 
-    name: ClassVar[str]  # name in model files, equal to the module name
+    name: ClassVar[str]  # name of the table in model files, equal to the module name
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__module__.rpartition(".")[2]
@@ -135,25 +154,25 @@ class ParameterTable:
 
 
 class Effect(ParameterTable, ABC):
-    """Effect on one axis."""
+    """Effect of a noise model on one axis."""
 
     __slots__ = ()
 
-    description: ClassVar[str]  # description of the effect for users, one sentence
+    description: ClassVar[str]  # one sentence that describes the effect to users
 
     @property
     def events_hz(self) -> float:
-        """Mean number of random events per second."""
+        """Mean number of random events per second that the effect causes."""
         return 0.0
 
     def check_axis(self, axis: str) -> None:
-        """Raise ConfigError if the effect is not possible on the given axis."""
+        """Raise ConfigError if the effect cannot be applied to the given axis."""
 
     def check_rate(self, rate_hz: float) -> None:
         """Raise ConfigError if the effect cannot be simulated at the given sample rate."""
         for f in fields(self):  # type: ignore[arg-type]
             value = getattr(self, f.name)
-            if f.metadata.get("below_nyquist") and not value < 0.5 * rate_hz:
+            if f.metadata.get("below_nyquist") and not (value or 0.0) < 0.5 * rate_hz:
                 raise ConfigError(
                     f"{self.name}: {f.name} must be below {0.5 * rate_hz:g} Hz, half the sample rate, is {value!r}"
                 )
@@ -173,14 +192,14 @@ class Source(Effect):
 
     @abstractmethod
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the spectrum of samples with the interval ``tau0_s`` in seconds.
+        """Return the spectrum of samples at intervals of ``tau0_s`` seconds.
 
-        The spectrum is NaN if the temperature or the length of the recording determines the spectrum.
+        The spectrum is NaN if it depends on the temperature or on the length of the recording.
         """
 
     @abstractmethod
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
-        """Start a simulated time series.
+        """Start a time series for a simulation.
 
         Parameters
         ----------
@@ -191,7 +210,7 @@ class Source(Effect):
         """
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the overlapping Allan variance in the squared unit of the axis.
+        """Return the overlapping Allan variance in squared units of the axis.
 
         Parameters
         ----------
@@ -203,12 +222,12 @@ class Source(Effect):
         return self.spectrum(tau0_s).avar(tau_s)
 
     def two_sided_psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return the two-sided power spectral density in unit²/Hz, without spectral lines and slopes.
+        """Return the two-sided power spectral density in unit²/Hz, excluding spectral lines and slopes.
 
         Parameters
         ----------
         f_hz : ndarray, float64
-            Frequencies, 0 < f ≤ 1/(2 τ0), Hz.
+            Frequencies with 0 < f ≤ 1/(2 τ0), Hz.
         tau0_s : float
             Sample interval, s.
         """
@@ -216,15 +235,33 @@ class Source(Effect):
 
 
 class AxisLeak(Effect):
-    """Effect that adds ``coefficient`` times the measurement of the axis ``source``.
+    """Effect that adds the measurement of the axis ``source``, multiplied by ``coefficient``.
 
-    The added measurement does not contain leaks into the source axis, so axes can leak into each other.
+    The added measurement does not include leaks into the axis ``source``, so two axes can leak into each other.
     """
 
     __slots__ = ()
 
     source: str
     coefficient: float
+
+
+class WhiteNoiseGain(Effect):
+    """Effect that multiplies the white noise of an axis by a gain that changes in time."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> "RunningGain":
+        """Start a simulated gain.
+
+        Parameters
+        ----------
+        rate_hz : float
+            True sample rate, Hz.
+        rng : numpy.random.Generator
+            Random generator of the effect.
+        """
 
 
 class Transform(Effect):
@@ -234,11 +271,11 @@ class Transform(Effect):
 
     @abstractmethod
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum after the transform, or a spectrum of NaN if no formula is known."""
+        """Return the spectrum after the transform, or NaN if no formula is known."""
 
     @abstractmethod
     def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
-        """Start a simulated transform.
+        """Start a transform for a simulation.
 
         Parameters
         ----------
@@ -261,27 +298,27 @@ def parameter_field(
     maximum: float = inf,
     number_range: NumberRange | None = None,
 ) -> Any:
-    """Return a dataclass field with units and an allowed range. By default, all numbers ≥ 0 are allowed.
+    """Return a dataclass field for a parameter with a unit and a range. By default, all numbers ≥ 0 are allowed.
 
     Parameters
     ----------
     gyro_unit, accelerometer_unit : str
-        SI units for gyroscopes and accelerometers. The unit of dimensionless parameters is "1". With None,
-        accelerometers have the unit of gyroscopes.
+        SI units for gyroscopes and accelerometers, or "1" for dimensionless parameters. If ``accelerometer_unit`` is
+        None, both units are the same.
     signed : bool
-        True if negative values are allowed.
+        True to allow negative values.
     positive : bool
-        True if zero is not allowed.
+        True to exclude zero.
     whole_number : bool
-        True if only whole numbers are allowed.
+        True to allow only whole numbers.
     optional : bool
-        True if the parameter may be None.
+        True to allow None.
     below_nyquist : bool
         True if the parameter is a frequency that must be below half the sample rate.
     maximum : float
-        Largest allowed value.
+        Maximum value.
     number_range : NumberRange or None
-        Supported range. With None, the unit determines the range.
+        Allowed range. None means that the unit determines the range.
     """
     metadata = {
         "units": (gyro_unit, accelerometer_unit or gyro_unit),
@@ -301,23 +338,28 @@ def source_axis_field() -> Any:
     return field(metadata={"units": ("axis", "axis"), "axis": True})
 
 
+def choice_field(*choices: str) -> Any:
+    """Return a dataclass field for one of several words. The field may be absent."""
+    return field(default=None, metadata={"units": ("text", "text"), "choices": choices, "optional": True})
+
+
 def gyro_and_accel_units(table: type[ParameterTable]) -> Mapping[str, tuple[str, str]]:
-    """Return the units of every parameter of an effect, for gyroscopes and accelerometers."""
+    """Return the units of each parameter for gyroscopes and for accelerometers."""
     return {f.name: f.metadata["units"] for f in fields(table)}  # type: ignore[arg-type]
 
 
 def required_parameters(table: type[ParameterTable]) -> tuple[str, ...]:
-    """Return the names of the parameters without a default value."""
+    """Return the names of all parameters that have no default value."""
     return tuple(f.name for f in fields(table) if f.default is MISSING)  # type: ignore[arg-type]
 
 
 def first_sample_at_or_after(time_s: float, rate_hz: float) -> int:
-    """Return the index of the first sample at or after a time. Rounding errors of 1e-6 samples are allowed.
+    """Return the index of the first sample at or after a time, with a tolerance of 1e-6 samples.
 
     Parameters
     ----------
     time_s : float
-        Time since the start, s.
+        Time since the start of the simulation, s.
     rate_hz : float
         Sample rate, Hz.
     """
@@ -325,9 +367,11 @@ def first_sample_at_or_after(time_s: float, rate_hz: float) -> int:
 
 
 def _find_mistake(value: Any, allows: Mapping[str, Any]) -> str:
-    """Return an error message if the value is not allowed, otherwise an empty string."""
+    """Return an error message if a parameter value is not allowed, otherwise an empty string."""
     if allows.get("axis"):
         return "" if value in AXES else f"must be one of {', '.join(AXES)}"
+    if choices := allows.get("choices"):
+        return "" if value is None or value in choices else f"must be one of {', '.join(choices)}"
     if value is None and allows["optional"]:
         return ""
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):

@@ -1,8 +1,8 @@
-"""Noise model of an IMU with the effects of each axis.
+"""Noise model of an IMU, which consists of effects on each axis.
 
-Simulation, comparison with measurements and ``reconcile`` use the same model. Allan variance and power spectral density
-include linear transforms and leaks. Both quantities are NaN if they depend on the temperature or on the length of the
-recording.
+The same model is used for simulations, for the comparison with measurements and by the command ``reconcile``. The Allan
+variance and the power spectral density include linear transforms and leaks between axes. They are NaN if they depend on
+the temperature or on the length of the recording.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,6 +15,7 @@ from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
 from monitor.noise.effect import AxisLeak, Effect, Source, Transform
 from monitor.noise.effects import TRANSFORM_ORDER
+from monitor.noise.effects.coupling.axis_permutation import AxisPermutation
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
@@ -26,7 +27,7 @@ from monitor.noise.temperature import Temperature
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Noise model of an IMU. Axes that are not in ``effects`` have no noise.
+    """Noise model of an IMU, in which axes without effects have no noise.
 
     Parameters
     ----------
@@ -35,17 +36,17 @@ class NoiseModel:
     sample_rate_hz : float or None
         Default sample rate of simulations in Hz.
     temperature : Temperature or None
-        Simulated temperature, used if no recording provides a temperature.
+        Simulated temperature, which is used unless a recording provides the temperature.
 
     Raises
     ------
     ConfigError
-        If an axis is unknown, an effect is not possible on an axis, or two sample rate errors differ.
+        If an axis is unknown, if an effect cannot be applied to an axis, or if two sample rate errors differ.
 
     Examples
     --------
-    >>> from monitor.noise.effects import AngleRandomWalk, Bias
-    >>> model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4),)}) + NoiseModel({"gz": (Bias(value=0.1),)})
+    >>> from monitor.noise.effects import AngleRandomWalk, ConstantBias
+    >>> model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4),)}) + NoiseModel({"gz": (ConstantBias(value=0.1),)})
     >>> print(model)
     axis  effect             parameters
     gz    angle_random_walk  N = 0.0001 rad/√s
@@ -71,15 +72,15 @@ class NoiseModel:
             raise ConfigError(f"sample_rate_error: a recording has one clock, but ratio is {given}")
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:
-        """Yield the axis name and the effect for all effects, in the order of the axes."""
+        """Yield pairs of axis name and effect in the order of the axes."""
         for axis in AXES:
             for effect in self.effects.get(axis, ()):
                 yield axis, effect
 
     def __add__(self, other: "NoiseModel") -> "NoiseModel":
-        """Return a model with the effects of both models.
+        """Return a noise model that combines the effects of two models.
 
-        The sample rate and the temperature of the left model have priority.
+        The sample rate and the temperature of the left model take precedence.
         """
         if not isinstance(other, NoiseModel):
             return NotImplemented
@@ -100,13 +101,13 @@ class NoiseModel:
 
     @property
     def _clock(self) -> SampleRateError:
-        """Sample rate error of the model. The ratio is 1 if the model has none."""
+        """Sample rate error of the model, with a ratio of 1 if the model has no such effect."""
         return next((e for _, e in self if isinstance(e, SampleRateError)), SampleRateError(ratio=1.0))
 
     # --- second moments
 
     def avar(self, axis: str, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the overlapping Allan variance of one axis in unit²; NaN means unknown.
+        """Return the overlapping Allan variance of one axis in unit², or NaN if it is unknown.
 
         Parameters
         ----------
@@ -120,7 +121,7 @@ class NoiseModel:
         return self.spectrum(axis, tau0_s).avar(np.asarray(tau_s, np.float64))
 
     def two_sided_psd(self, axis: str, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return the two-sided power spectral density of one axis in unit²/Hz, without spectral lines and slopes.
+        """Return the two-sided power spectral density of one axis in unit²/Hz, excluding spectral lines and slopes.
 
         Parameters
         ----------
@@ -134,7 +135,7 @@ class NoiseModel:
         return self.spectrum(axis, tau0_s).density(np.asarray(f_hz, np.float64))
 
     def spectrum(self, axis: str, tau0_s: float) -> Spectrum:
-        """Return the spectrum of one axis after leaks and transforms.
+        """Return the spectrum of one axis, including leaks and transforms.
 
         Parameters
         ----------
@@ -143,6 +144,7 @@ class NoiseModel:
         tau0_s : float
             Stated sample interval, s.
         """
+        axis = next((e.source for e in self.effects.get(axis, ()) if isinstance(e, AxisPermutation)), axis)
         true_s = tau0_s / self.true_to_stated_rate_ratio
         leaking: dict[str, float] = {}
         for effect in self.effects.get(axis, ()):
@@ -154,7 +156,7 @@ class NoiseModel:
         return self._clock.convert_to_stated_rate(self._measured(axis, total))
 
     def _own(self, axis: str, tau0_s: float) -> Spectrum:
-        """Return the spectrum of the sources of an axis, without leaks."""
+        """Return the spectrum of the sources of an axis, excluding leaks."""
         effects = self.effects.get(axis, ())
         stepped = any(isinstance(effect, NoiseStep) for effect in effects)
         total = zero_spectrum(tau0_s)
@@ -170,7 +172,7 @@ class NoiseModel:
         return spectrum
 
     def transforms_in_order(self, axis: str) -> list[Transform]:
-        """Return the transforms of an axis in the order of execution."""
+        """Return the transforms of an axis in the order in which they are applied."""
         found = [effect for effect in self.effects.get(axis, ()) if isinstance(effect, Transform)]
         return sorted(found, key=lambda transform: TRANSFORM_ORDER.index(type(transform)))
 
@@ -184,7 +186,7 @@ class NoiseModel:
         rate_hz : float
             Stated sample rate, Hz.
         has_temperature : bool
-            True if a temperature is available, from the model or from a recording.
+            True if the model or a recording provides a temperature.
 
         Raises
         ------
@@ -194,7 +196,7 @@ class NoiseModel:
         check_effects_can_be_simulated(self.effects, rate_hz * self.true_to_stated_rate_ratio, has_temperature)
 
     def start_stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
-        """Start an endless simulation of six axes. The same rate and seed produce the same samples.
+        """Start an endless simulation of six axes, which is reproducible for the same rate and seed.
 
         Parameters
         ----------
@@ -203,7 +205,8 @@ class NoiseModel:
         seed : int
             Seed of the random generators.
         temperature_c : ndarray, shape (n,), or None
-            Temperature of a recording in °C, used instead of the simulated temperature. The last value is repeated.
+            Temperature of a recording in °C, which replaces the simulated temperature. After its end, the last value is
+            repeated.
 
         Raises
         ------
@@ -213,16 +216,16 @@ class NoiseModel:
         return ModelStream(self.effects, self.temperature, rate_hz, self.true_to_stated_rate_ratio, seed, temperature_c)
 
     def simulate(self, n: int, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> Floats:
-        """Simulate ``n`` samples [n, 6] in rad/s and m/s².
+        """Simulate n samples [n, 6] in rad/s and m/s².
 
         Parameters
         ----------
         n : int
             Number of samples.
         rate_hz, seed, temperature_c
-            As for ``start_stream``.
+            See ``start_stream``.
         """
-        return self.start_stream(rate_hz, seed, temperature_c).draw_samples(n)
+        return self.start_stream(rate_hz, seed, temperature_c).draw_next_samples(n)
 
     # --- text
 
@@ -233,7 +236,7 @@ class NoiseModel:
         Raises
         ------
         ConfigError
-            If the text is not a valid model. Each line of the message names a table of the file.
+            If the text is not a valid noise model. Each line of the message names a table in the text.
         """
         effects, rate_hz, temperature = parse_model_toml(text)
         model = cls(sample_rate_hz=rate_hz, temperature=temperature)
@@ -244,5 +247,5 @@ class NoiseModel:
         return model
 
     def to_toml(self) -> str:
-        """Return the text of a model file. ``from_toml`` converts the text back to an equal model."""
+        """Return the noise model as the text of a model file, from which ``from_toml`` creates an equal model."""
         return format_model_toml(self.effects, self.sample_rate_hz, self.temperature)

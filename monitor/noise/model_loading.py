@@ -1,4 +1,4 @@
-"""Reading of noise models from the catalogue ``config/models`` or from a user's file."""
+"""Functions that read noise models from the catalogue ``config/models`` or from a file."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def read_model(path: Path) -> NoiseModel:
     Raises
     ------
     ConfigError
-        If the file cannot be read or is not a valid model.
+        If the file cannot be read or does not contain a valid noise model.
     """
     try:
         return NoiseModel.from_toml(file_access.read_small_file(path).decode("utf-8"))
@@ -23,7 +23,7 @@ def read_model(path: Path) -> NoiseModel:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
     except ConfigError as error:
-        raise ConfigError(*(f"{path}: {line}" for line in error.lines)) from error
+        raise ConfigError(*(f"{path}: {line}" for line in error.mistake_lines)) from error
 
 
 def load_model(name_or_path: str, base_folder: Path) -> NoiseModel:
@@ -32,13 +32,13 @@ def load_model(name_or_path: str, base_folder: Path) -> NoiseModel:
     Parameters
     ----------
     name_or_path : str
-        Name of a model in the catalogue, or path of a model file.
+        Name of a noise model in the catalogue, or path of a model file.
     base_folder : Path
-        Folder for relative paths.
+        Folder to which relative paths refer.
 
     Raises
     ------
     ConfigError
-        If the model does not exist or is not valid.
+        If the noise model does not exist or is not valid.
     """
     return read_model(resolve_model_path(name_or_path, base_folder))

@@ -1,8 +1,8 @@
-"""Conversion of model files (TOML) to effects and back.
+"""Conversion between model files in TOML and the effects of a noise model.
 
-A model file contains ``sample_rate`` in Hz, an optional table ``[temperature]`` and one table for each effect of an
-axis. ``g*`` and ``a*`` stand for all gyroscopes and all accelerometers. A ConfigError has one line for each mistake in
-the file.
+A model file contains the key ``sample_rate`` in Hz, an optional table ``[temperature]``, and one table for each effect
+on an axis. The names ``g*`` and ``a*`` stand for all gyroscopes and all accelerometers. If a file is not valid, the
+message of the ConfigError has one line for each mistake.
 """
 
 import contextlib
@@ -22,21 +22,21 @@ from monitor.settings import toml_parser
 T = TypeVar("T", bound=ParameterTable)
 
 WILDCARDS: Final = {"g*": AXES[:3], "a*": AXES[3:]}
-"""Keys for all gyroscopes and for all accelerometers."""
+"""Names in model files that stand for all gyroscopes and for all accelerometers."""
 AXIS_KEYS: Final = (*AXES, *WILDCARDS)
 TOP_LEVEL_KEYS: Final = ("sample_rate", "temperature")
 
 AxisEffects = tuple[tuple[str, ...], tuple[Effect, ...]]
-"""Names of axes, and the effects that these axes have in common."""
+"""Names of axes, and the effects that apply to all of these axes."""
 
 
 def parse_model_toml(text: str) -> tuple[list[AxisEffects], float | None, Temperature | None]:
-    """Return the effects, the sample rate in Hz and the temperature from the text of a model file.
+    """Parse the text of a model file, and return the effects, the sample rate in Hz and the temperature.
 
     Raises
     ------
     ConfigError
-        If the text is not a valid model. The message has one line for each mistake.
+        If the text is not a valid noise model. The message has one line for each mistake.
     """
     tables = toml_parser.parse_toml(text)
     mistakes: list[str] = []
@@ -63,7 +63,7 @@ def parse_model_toml(text: str) -> tuple[list[AxisEffects], float | None, Temper
 def format_model_toml(
     axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
 ) -> str:
-    """Return the text of a model file.
+    """Format a noise model as the text of a model file.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def format_model_toml(
 def format_display_table(
     axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
 ) -> str:
-    """Return a table for display, with one line for each effect.
+    """Format a noise model as a table for display, with one line for each effect.
 
     The parameters are those of ``format_model_toml``.
     """
@@ -107,7 +107,7 @@ def format_display_table(
 
 @contextlib.contextmanager
 def prefix_config_errors(location: str) -> Iterator[None]:
-    """Prefix the message of a ConfigError with a location in the model file."""
+    """Add a location in the model file to the beginning of the message of a ConfigError."""
     try:
         yield
     except ConfigError as error:
@@ -116,11 +116,11 @@ def prefix_config_errors(location: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _collect_errors(mistakes: list[str]) -> Iterator[None]:
-    """Append the lines of a ConfigError in the context to ``mistakes``, and continue."""
+    """Suppress a ConfigError inside the context, and append the lines of its message to ``mistakes``."""
     try:
         yield
     except ConfigError as error:
-        mistakes += error.lines
+        mistakes += error.mistake_lines
 
 
 def _format_parameters(table: ParameterTable, axis: str = GYROS[0]) -> str:
@@ -128,12 +128,12 @@ def _format_parameters(table: ParameterTable, axis: str = GYROS[0]) -> str:
     for name, value in _set_fields(table):
         unit = gyro_and_accel_units(type(table))[name][axis not in GYROS]
         number = value if isinstance(value, str) else format(value, "g")
-        texts.append(f"{name} = {number}" + ("" if unit in ("1", "axis") else f" {unit}"))
+        texts.append(f"{name} = {number}" + ("" if unit in ("1", "axis", "text") else f" {unit}"))
     return ", ".join(texts)
 
 
 def _set_fields(table: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the name and the value of all fields that are not None."""
+    """Yield the names and values of all fields that are not None."""
     for f in fields(table):
         value = getattr(table, f.name)
         if value is not None:
@@ -172,7 +172,7 @@ def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
         for name in parameters
         if name not in known
     ]
-    # A misspelt parameter is not also reported as missing.
+    # Missing parameters are only reported if no parameter is misspelt.
     mistakes = mistakes or [
         f"{place}: {name} is missing" for name in required_parameters(kind) if name not in parameters
     ]
@@ -180,4 +180,4 @@ def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
         raise ConfigError(*mistakes)
     with prefix_config_errors(place):
         return kind(**parameters)
-    raise AssertionError  # not reached: the context manager does not suppress exceptions
+    raise AssertionError  # not reached, because the context manager does not suppress exceptions

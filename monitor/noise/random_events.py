@@ -1,7 +1,8 @@
-"""Random events of a simulation, such as outliers and steps.
+"""Random events in a simulation, such as outliers and steps.
 
-The gaps between events and the sizes of events are drawn in batches of constant length, so the events do not depend on
-the division into blocks. The times of the first events are stored for the truth file of a simulation.
+Gaps between events and sizes of events are drawn in batches of constant length. The events therefore do not depend on
+how the samples are divided into blocks. The times of the first events are stored, so that a simulation can report its
+true events.
 """
 
 from collections.abc import Callable
@@ -13,22 +14,23 @@ from drivers.data_types import Floats, Ints
 
 BATCH_SIZE: Final = 64
 MAX_LISTED_EVENTS: Final = 1000
-"""Maximum number of events with a stored time. Later events are only counted."""
+"""Maximum number of events whose time is stored. Later events are only counted."""
 
 
 class RandomEvents:
-    """Random events in the order of time.
+    """Random events in chronological order.
 
     Parameters
     ----------
     gaps : callable
-        Function that draws the gaps between events in samples. An infinite gap means no further event.
+        Function that draws the gaps between events in samples. An infinite gap means that no further event occurs.
     sizes : callable
         Function that draws the sizes of events.
     rate_hz : float
         Sample rate in Hz.
     before : float
-        Sample index at the start of the first gap. With -1, whole gaps of at least 1 allow an event at sample 0.
+        Sample index at which the first gap begins. The value -1 allows an event at sample 0 if gaps are whole numbers
+        of at least 1.
     """
 
     def __init__(
@@ -45,25 +47,25 @@ class RandomEvents:
         self._listed: list[tuple[float, float]] = []
 
     def take_block_events(self, first_index: int, n: int) -> tuple[Ints, Floats]:
-        """Return the next events, up to the end of a block.
+        """Return the events in the next block of samples.
 
         Parameters
         ----------
         first_index : int
-            Index of the first sample of the block.
+            Index of the first sample in the block.
         n : int
-            Number of samples of the block.
+            Number of samples in the block.
 
         Returns
         -------
         indices : ndarray, int64
-            Index of the sample of each event, relative to the block.
+            Index of the sample that each event affects, relative to the start of the block.
         sizes : ndarray, float64
             Size of each event.
         """
         if self._first_index is None:
             self._first_index = first_index
-        end = first_index - self._first_index + n - 1  # an event between two samples affects the later sample
+        end = first_index - self._first_index + n - 1  # an event between two samples affects the second one
         taken, sizes = [], []
         while True:
             k = int(np.searchsorted(self._next, end, "right"))
@@ -81,9 +83,9 @@ class RandomEvents:
         return np.ceil(when - (first_index - self._first_index)).astype(np.int64), size
 
     def drawn_random_values(self, size_key: str | None = None) -> dict[str, Any]:
-        """Return the number of events, and the times of the first events in seconds.
+        """Return the number of events so far, and the times of the first events in seconds.
 
-        If ``size_key`` is given, the dictionary also contains the sizes of the first events.
+        If ``size_key`` is given, the dictionary also contains the sizes of the first events under this key.
         """
         times: dict[str, Any] = {"count": self.count, "times": [time for time, _ in self._listed]}
         return times if size_key is None else times | {size_key: [height for _, height in self._listed]}

@@ -1,12 +1,12 @@
-"""Simulation of the samples of a noise model.
+"""Simulation of samples according to a noise model.
 
-Samples are simulated in blocks of any size, and the division into blocks does not affect the samples. The sources of
-each axis are added first. The leaks from other axes are then added, and the transforms are applied to the sums. All
+Samples can be simulated in blocks of any size, and the block sizes do not affect the samples. For each axis, the
+sources are added first. The leaks from other axes are then added, and the transforms are applied to the sum. All
 effects are simulated at the true sample rate.
 
-Each effect has a separate random generator. The seed is derived from the seed of the stream, the axis, the name of the
-effect and the number of earlier effects of the same name. Adding or removing an effect does not change the random
-numbers of other effects.
+Each effect has a separate random generator, so adding or removing an effect does not change the random numbers of other
+effects. The seed of a generator is derived from the seed of the simulation, the axis, the effect name, and the number
+of preceding effects of that name. Common vibrations with the same source number have the same seed on all axes.
 """
 
 import copy
@@ -26,35 +26,38 @@ from monitor.noise.effect import (
     Effect,
     NoiseSeries,
     RunningEffect,
+    RunningGain,
     RunningTransform,
     SampleBlockContext,
     Source,
     Transform,
-    first_sample_at_or_after,
+    WhiteNoiseGain,
 )
 from monitor.noise.effects import TRANSFORM_ORDER
-from monitor.noise.effects.disturbances.noise_step import NoiseStep
+from monitor.noise.effects.coupling.axis_permutation import AxisPermutation
+from monitor.noise.effects.disturbances.common_vibration import CommonVibration
+from monitor.noise.effects.disturbances.heavy_tails import HeavyTails, WhiteNoiseFactors
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
 from monitor.noise.model_toml import prefix_config_errors
 from monitor.noise.temperature import Temperature, recorded_temperature
 
 PIECE_SAMPLES: Final = 2048
-"""Number of samples simulated at once. The arrays of six axes then fit into the processor cache."""
+"""Number of samples that are simulated at a time. The arrays of six axes then fit into the processor cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedSamples:
     """Simulated samples and temperatures."""
 
-    values: Floats  # [n, 6] in AXES order, rad/s and m/s²
-    temperature_c: Floats  # [n] °C; NaN without a temperature
+    values: Floats  # [n, 6] samples in the order of AXES, rad/s and m/s²
+    temperature_c: Floats  # [n] temperature, °C; NaN if there is none
 
 
 def check_effects_can_be_simulated(
     axis_effects: Mapping[str, tuple[Effect, ...]], true_rate_hz: float, has_temperature: bool
 ) -> None:
-    """Check that the effects of a model can be simulated.
+    """Check that the effects of a noise model can be simulated.
 
     Parameters
     ----------
@@ -68,7 +71,8 @@ def check_effects_can_be_simulated(
     Raises
     ------
     ConfigError
-        If a frequency is too high for the sample rate, or if an effect requires a missing effect or temperature.
+        If a frequency is too high for the sample rate, or if an effect requires a temperature or another effect that is
+        missing.
     """
     for axis in AXES:
         effects = axis_effects.get(axis, ())
@@ -77,7 +81,9 @@ def check_effects_can_be_simulated(
                 effect.check_rate(true_rate_hz)
                 if isinstance(effect, AxisLeak) and not axis_effects.get(effect.source):
                     raise ConfigError(f"the model has no effect on its source {effect.source}")
-                if isinstance(effect, NoiseStep) and not any(isinstance(one, AngleRandomWalk) for one in effects):
+                if isinstance(effect, WhiteNoiseGain | HeavyTails) and not any(
+                    isinstance(one, AngleRandomWalk) for one in effects
+                ):
                     raise ConfigError(f"{axis} has no angle_random_walk to multiply")
                 if isinstance(effect, Source) and effect.uses_temperature and not has_temperature:
                     raise ConfigError(
@@ -86,7 +92,7 @@ def check_effects_can_be_simulated(
 
 
 class ModelStream:
-    """Endless simulation of six axes. Axes without effects are zero.
+    """Endless simulation of six axes, in which axes without effects are zero.
 
     Parameters
     ----------
@@ -101,7 +107,7 @@ class ModelStream:
     seed : int
         Seed of the random generators.
     temperature_c : ndarray, shape (n,), or None
-        Temperature of a recording in °C, used instead of the simulated temperature.
+        Temperature of a recording in °C, which replaces the simulated temperature.
 
     Raises
     ------
@@ -124,7 +130,7 @@ class ModelStream:
         self._effects = {axis: axis_effects.get(axis, ()) for axis in AXES}
         self._true_hz = rate_hz * true_to_stated_rate_ratio
         self._seed = seed
-        self._count = 0  # number of samples drawn so far
+        self._count = 0  # number of samples that have been simulated so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
         self._truths: list[tuple[str, Effect, RunningEffect]] = []
         self._temperature: NoiseSeries | None = None
@@ -132,17 +138,18 @@ class ModelStream:
             self._temperature = recorded_temperature(temperature_c)
         elif temperature is not None:
             self._temperature = temperature.start_series(self._true_hz, self._rng("temperature", "", 0))
+        self._columns = list(range(len(AXES)))  # for each axis of the output, the index of the measured axis
         self._axes = {axis: _AxisSimulator() for axis in AXES}
         for axis, effects in self._effects.items():
             for effect in effects:
                 self._begin(axis, effect)
 
-    def draw_samples(self, n: int) -> Floats:
-        """Return the next ``n`` samples [n, 6] in rad/s and m/s²."""
+    def draw_next_samples(self, n: int) -> Floats:
+        """Return the next n samples [n, 6] in rad/s and m/s²."""
         return self.draw_samples_with_temperature(n).values
 
     def draw_samples_with_temperature(self, n: int) -> SimulatedSamples:
-        """Return the next ``n`` samples and temperatures."""
+        """Return the next n samples and temperatures."""
         drawn = SimulatedSamples(np.empty((n, len(AXES))), np.full(n, np.nan))
         for begin in range(0, n, PIECE_SAMPLES):
             piece = slice(begin, min(begin + PIECE_SAMPLES, n))
@@ -150,10 +157,10 @@ class ModelStream:
         return drawn
 
     def add_effect(self, axis: str, effect: Effect) -> None:
-        """Add an effect that starts at the next sample.
+        """Add an effect that starts with the next sample.
 
-        A parameter ``time`` is relative to the first sample of the stream. Random walks, ramps and transients start at
-        the next sample.
+        Random walks, ramps and transients also start with the next sample. A parameter ``time`` counts from the first
+        sample of the simulation.
 
         Parameters
         ----------
@@ -165,7 +172,7 @@ class ModelStream:
         Raises
         ------
         ConfigError
-            If the effect is not possible on the axis, at the sample rate or in a running stream.
+            If the effect cannot be applied to the axis, at the sample rate, or during a simulation.
         """
         if axis not in AXES:
             raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
@@ -179,10 +186,10 @@ class ModelStream:
         self._begin(axis, effect)
 
     def drawn_random_values(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
-        """Return the random values drawn so far, by axis and name of the effect.
+        """Return the random values that have been drawn so far, by axis and name of the effect.
 
-        Each occurrence of an effect has a dictionary with phases, numbers of events and event times in seconds. The
-        values can be converted to JSON. Effects without such values are omitted.
+        For each occurrence of an effect, a dictionary contains phases, numbers of events and event times in seconds.
+        All values can be converted to JSON. Effects without random values are omitted.
         """
         truths: dict[str, dict[str, list[dict[str, Any]]]] = {}
         for axis, effect, running in self._truths:
@@ -195,11 +202,20 @@ class ModelStream:
         self._occurrences[axis, effect.name] += 1
         line = self._axes[axis]
         if isinstance(effect, Source):
-            series = effect.start_series(self._true_hz, self._rng(axis, effect.name, occurrence))
+            key = axis, occurrence
+            if isinstance(effect, CommonVibration):
+                key = "", int(effect.source_number)
+            series = effect.start_series(self._true_hz, self._rng(key[0], effect.name, key[1]))
             (line.white if isinstance(effect, AngleRandomWalk) else line.others).append(series)
             self._truths.append((axis, effect, series))
-        elif isinstance(effect, NoiseStep):
-            line.steps.append((first_sample_at_or_after(effect.time, self._true_hz), effect.ratio))
+        elif isinstance(effect, WhiteNoiseGain):
+            gain = effect.start_gain(self._true_hz, self._rng(axis, effect.name, occurrence))
+            line.gains.append(gain)
+            self._truths.append((axis, effect, gain))
+        elif isinstance(effect, AxisPermutation):
+            self._columns[AXES.index(axis)] = AXES.index(effect.source)
+        elif isinstance(effect, HeavyTails):
+            line.factors.append(effect.start_factors(self._rng(axis, effect.name, occurrence)))
         elif isinstance(effect, AxisLeak):
             line.add_leak(effect)
             self._axes[effect.source].leaks_out = True
@@ -209,14 +225,14 @@ class ModelStream:
             line.insert_transform(TRANSFORM_ORDER.index(type(effect)), running)
             self._truths.append((axis, effect, running))
         else:
-            raise TypeError(f"{effect.name} is not a source, leak, noise step or transform")
+            raise TypeError(f"{effect.name} is not a source, leak, transform, permutation or change of the white noise")
 
     def _rng(self, axis: str, effect: str, occurrence: int) -> np.random.Generator:
         key = (crc32(axis.encode()), crc32(effect.encode()), occurrence)
         return np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key))
 
     def _advance(self, values: Floats, temperature_c: Floats) -> None:
-        """Simulate the next samples into ``values`` [n, 6] and ``temperature_c`` [n]."""
+        """Simulate the next samples, and write them to ``values`` [n, 6] and ``temperature_c`` [n]."""
         n = temperature_c.size
         block = SampleBlockContext(self._count, temperature_c, np.empty(n))
         if self._temperature is not None:
@@ -230,33 +246,36 @@ class ModelStream:
         }
         for column, (axis, line) in enumerate(self._axes.items()):
             values[:, column] = line.add_leaks_and_transform(sums[axis], alone)
+        if self._columns != list(range(len(AXES))):
+            values[:] = values[:, self._columns]
         self._count += n
 
 
 class _AxisSimulator:
-    """Simulated effects of one axis."""
+    """Simulation of the effects on one axis."""
 
     def __init__(self) -> None:
         self.white: list[NoiseSeries] = []
         self.others: list[NoiseSeries] = []
-        self.steps: list[tuple[int, float]] = []  # (index of the first sample, ratio)
+        self.gains: list[RunningGain] = []  # gains of the white noise
+        self.factors: list[WhiteNoiseFactors] = []
         self.leaks: list[AxisLeak] = []
         self.leaks_out = False
-        # Transforms and their positions in TRANSFORM_ORDER, sorted by position.
+        # These are the transforms and their positions in TRANSFORM_ORDER, sorted by position.
         self._chain: list[tuple[int, RunningTransform]] = []
-        # Copies of the transforms for the measurement without leaks.
+        # Copies of the transforms are needed to compute the measurement without leaks.
         self._alone: list[tuple[int, RunningTransform]] = []
 
     @property
     def needs_leak_free_measurement(self) -> bool:
-        """True if the measurement without leaks is needed.
+        """True if the measurement without leaks must be computed.
 
-        Transforms with memory require the measurement without leaks for every block.
+        If a transform has memory, the measurement without leaks must be computed for every block.
         """
         return self.leaks_out or bool(self.leaks)
 
     def insert_transform(self, order: int, transform: RunningTransform) -> None:
-        """Insert a transform at the position ``order`` of TRANSFORM_ORDER."""
+        """Insert a transform that has the position ``order`` in TRANSFORM_ORDER."""
         if self.leaks:
             self._alone.append((order, copy.deepcopy(transform)))
             self._alone.sort(key=lambda one: one[0])
@@ -270,20 +289,23 @@ class _AxisSimulator:
         self.leaks.append(leak)
 
     def sum_own_sources(self, block: SampleBlockContext, n: int) -> Floats:
-        """Return the sum [n] of the sources of the axis. White noise is first, because noise steps multiply only white
-        noise.
+        """Return the sum [n] of the sources of the axis.
+
+        White noise is added first, because gains and heavy tails multiply only the white noise.
         """
         values = np.zeros(n)
         for series in self.white:
             series.add_next_samples(values, block)
-        for first, ratio in self.steps:
-            values[max(0, first - block.first) :] *= ratio
+        for gain in self.gains:
+            values *= gain.compute_gain(block.first, n)
+        for factors in self.factors:
+            factors.multiply_in_place(values)
         for series in self.others:
             series.add_next_samples(values, block)
         return values
 
     def transform_without_leaks(self, own_sum: Floats) -> Floats:
-        """Return the measurement without leaks. ``own_sum`` is modified in place if the axis has no leaks."""
+        """Return the measurement without leaks. If the axis has no leaks, ``own_sum`` is modified in place."""
         if not self.leaks:
             return _apply_transforms(self._chain, own_sum)
         return _apply_transforms(self._alone, own_sum.copy())
@@ -294,12 +316,12 @@ class _AxisSimulator:
             for leak in self.leaks:
                 own_sum += leak.coefficient * leak_free[leak.source]
         elif self.leaks_out:
-            return own_sum  # already transformed by ``transform_without_leaks``
+            return own_sum  # ``transform_without_leaks`` has already transformed the sum
         return _apply_transforms(self._chain, own_sum)
 
 
 def _apply_transforms(chain: list[tuple[int, RunningTransform]], values: Floats) -> Floats:
-    """Apply all transforms in place, and return the values."""
+    """Apply all transforms to the values in place, and return the values."""
     for _, running in chain:
         running.transform_in_place(values)
     return values

@@ -1,15 +1,16 @@
-"""Spectrum of the simulated samples of one axis, and the corresponding Allan variance.
+"""Power spectral density of the samples of one axis, and the Allan variance that results from it.
 
-Without a filter, the Allan variance is the sum of the closed forms of the sources. With a filter, the Allan variance is
-the integral
+Without filters, the Allan variance is the sum of the closed-form Allan variances of the sources. After a filter, the
+Allan variance is the integral
 
     σ²(τ) = 4 ∫ S(f) sin⁴(πfτ) / (m² sin²(πfτ0)) df   from 0 to 1/(2 τ0),
 
 where τ0 is the sample interval and m = τ/τ0. Spectral lines and slopes are added in closed form.
 
-For f < 0.1/τ, the trapezoidal rule is used on a logarithmic frequency grid. At higher frequencies, sin⁴(πfτ) is
-expanded to 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8. The products of the cosines and the piecewise linear density are integrated
-exactly. For all effects of noise models, the relative error is below 3·10⁻⁴.
+For f < 0.1/τ, the integral is computed by the trapezoidal rule on a logarithmic frequency grid. At higher frequencies,
+sin⁴(πfτ) is expanded to 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8. The density is interpolated linearly between grid points, and
+its products with the cosines are integrated exactly. For all effects of noise models, the relative error is below
+3·10⁻⁴.
 """
 
 from collections.abc import Callable
@@ -21,32 +22,35 @@ import numpy as np
 from drivers.data_types import Floats
 
 Curve = Callable[[Floats], Floats]
-"""Function of frequency in Hz or of averaging time in seconds."""
+"""Type of a function of frequency in Hz or of averaging time in seconds."""
 
 POINTS_PER_DECADE: Final = 400
 MIN_FREQUENCY_CYCLES: Final = 1e-5
-"""Lowest frequency of the integral, times the longest averaging time.
+"""Lower limit of the numerical integral, as the product of frequency and longest averaging time.
 
-For a random walk, a share of 3·10⁻⁵ of the Allan variance is below this frequency.
+Below this frequency, the density continues as a power of f.
+For a random walk, frequencies below the limit contribute a share of 3·10⁻⁵ to the Allan variance.
 """
+MIN_INTEGRAL_EXPONENT: Final = 0.05
+"""Smallest exponent of f in the integral below the lowest frequency. The exponent is 3 − α for a density f^(−α)."""
 MAX_SMOOTH_CYCLES: Final = 0.1
-"""Maximum f·τ for which the trapezoidal rule is sufficient."""
+"""Maximum f·τ for which the trapezoidal rule is sufficiently accurate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
     """Power spectral density and Allan variance of the samples of one axis."""
 
-    density: Curve  # two-sided density in unit²/Hz as a function of f in Hz, without lines and slope
+    density: Curve  # two-sided density in unit²/Hz as a function of f in Hz, excluding lines and slope
     closed_form_avar: Curve | None  # Allan variance in unit² as a function of τ in s; None after a filter
     tau0_s: float  # sample interval, s
-    lines: tuple[tuple[float, float], ...] = ()  # frequency in Hz and mean square in unit² of sinusoids
-    slope: float = 0.0  # root sum square of constant slopes, unit/s
+    lines: tuple[tuple[float, float], ...] = ()  # frequency in Hz and mean square in unit² of each spectral line
+    slope: float = 0.0  # root sum of squares of the constant slopes, unit/s
     level: float = 0.0  # sum of the constant biases, unit
-    peaks: tuple[tuple[float, float], ...] = ()  # centre and width in Hz of narrow peaks
+    peaks: tuple[tuple[float, float], ...] = ()  # centre and width in Hz of each narrow peak
 
     def __add__(self, other: "Spectrum") -> "Spectrum":
-        """Return the spectrum of the sum of two independent series."""
+        """Return the spectrum of the sum of two independent time series."""
         one, two = self.closed_form_avar, other.closed_form_avar
         return Spectrum(
             lambda f: self.density(f) + other.density(f),
@@ -59,7 +63,7 @@ class Spectrum:
         )
 
     def scaled_by_amplitude(self, factor: float) -> "Spectrum":
-        """Return the spectrum after multiplication of the samples by ``factor``."""
+        """Return the spectrum of the samples multiplied by ``factor``."""
         power, closed = factor**2, self.closed_form_avar
         return replace(
             self,
@@ -71,14 +75,14 @@ class Spectrum:
         )
 
     def filtered_by(self, power_gain: Curve, narrow_peaks: tuple[tuple[float, float], ...] = ()) -> "Spectrum":
-        """Return the spectrum after a filter with unit gain at zero frequency.
+        """Return the spectrum of the samples after a filter with unit gain at zero frequency.
 
         Parameters
         ----------
         power_gain : callable
-            Squared magnitude response as a function of frequency in Hz.
+            Squared magnitude of the frequency response as a function of frequency in Hz.
         narrow_peaks : tuple of (float, float)
-            Centres and widths in Hz of narrow peaks of the filter.
+            Centre and width in Hz of each narrow peak of the frequency response.
         """
         return replace(
             self,
@@ -103,14 +107,14 @@ class Spectrum:
         return total
 
     def mean_square(self, lowest_hz: float, weight: Curve | None = None) -> float:
-        """Return the mean square in unit² of all frequencies above ``lowest_hz``: 2 ∫ S w df plus the spectral lines.
+        """Return the mean square in unit² above ``lowest_hz``, which is 2 ∫ S w df plus the spectral lines.
 
         Parameters
         ----------
         lowest_hz : float
             Lower end of the integral, Hz.
         weight : callable or None
-            Weight w as a function of frequency in Hz. None means a weight of 1.
+            Weight w as a function of frequency in Hz. None means that w is 1.
         """
         f = frequency_grid(lowest_hz, self.tau0_s, self.peaks)
         weighted = self.density(f) if weight is None else self.density(f) * weight(f)
@@ -121,7 +125,7 @@ class Spectrum:
 def white_noise_spectrum(mean_square: float, tau0_s: float) -> Spectrum:
     """Return the spectrum of white noise.
 
-    The density is S = σ²τ0, and the Allan variance is σ²τ0/τ (IEEE Std 952 eq. C.18–C.19).
+    The two-sided density is S = σ²τ0, and the Allan variance is σ²τ0/τ (IEEE Std 952 eq. C.18–C.19).
 
     Parameters
     ----------
@@ -140,19 +144,19 @@ def zero_spectrum(tau0_s: float) -> Spectrum:
 
 
 def nan_spectrum(tau0_s: float) -> Spectrum:
-    """Return a spectrum of NaN, for series without a known stationary spectrum."""
+    """Return a spectrum of NaN, which represents a time series whose spectrum is unknown or not stationary."""
     return Spectrum(_nan, _nan, tau0_s)
 
 
 def allan_variance_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float) -> Floats:
     """Return the Allan variance of a sampled sinusoid.
 
-    The formula is A² sin⁴(πfτ)/(m² sin²(πfτ0)) with A² = 2·mean square (IEEE Std 952 annex C, sampled form).
+    The Allan variance is A² sin⁴(πfτ)/(m² sin²(πfτ0)) with A² = 2·mean square (IEEE Std 952 annex C, for sampled data).
 
     Parameters
     ----------
     f_hz : float
-        Frequency, Hz.
+        Frequency of the sinusoid, Hz.
     mean_square : float
         Mean square of the sinusoid, unit².
     tau_s : ndarray, float64
@@ -168,7 +172,7 @@ def allan_variance_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_
 def allan_variance_of_density(
     density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[tuple[float, float], ...]
 ) -> Floats:
-    """Return the Allan variance of a power spectral density by numerical integration.
+    """Compute the Allan variance from a power spectral density by numerical integration.
 
     Parameters
     ----------
@@ -179,7 +183,7 @@ def allan_variance_of_density(
     tau0_s : float
         Sample interval, s.
     peaks : tuple of (float, float)
-        Centres and widths of narrow peaks, Hz.
+        Centre and width of each narrow peak, Hz.
 
     Examples
     --------
@@ -196,7 +200,7 @@ def allan_variance_of_density(
 
 
 def frequency_grid(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
-    """Return a logarithmic frequency grid in Hz up to half the sample rate, with a finer grid around peaks.
+    """Return a logarithmic frequency grid in Hz up to half the sample rate, which is finer around peaks.
 
     Parameters
     ----------
@@ -205,10 +209,10 @@ def frequency_grid(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, fl
     tau0_s : float
         Sample interval, s.
     peaks : tuple of (float, float)
-        Centres and widths of narrow peaks, Hz.
+        Centre and width of each narrow peak, Hz.
     """
     nyquist = 0.5 / tau0_s
-    # Linear points resolve the kernel of short averaging times near half the sample rate.
+    # Near half the sample rate, linearly spaced points are needed to resolve the integrand at short averaging times.
     parts = [
         np.geomspace(lowest_hz, nyquist, max(2, round(POINTS_PER_DECADE * np.log10(nyquist / lowest_hz)))),
         np.linspace(0.1 * nyquist, nyquist, 2 * POINTS_PER_DECADE),
@@ -221,10 +225,11 @@ def frequency_grid(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, fl
 
 
 def _allan_variance_at(tau: float, f: Floats, rest: Floats, tau0_s: float) -> float:
-    """Return the Allan variance at one averaging time. ``rest`` is the density divided by sin²(πfτ0)."""
+    """Return the Allan variance at one averaging time, where ``rest`` is the density divided by sin²(πfτ0)."""
     split = int(np.clip(np.searchsorted(f, MAX_SMOOTH_CYCLES / tau), 1, f.size - 1))
     low = slice(0, split + 1)
-    total = _integrate_log_trapezoid(rest[low] * np.sin(np.pi * f[low] * tau) ** 4, f[low])
+    smooth = rest[low] * np.sin(np.pi * f[low] * tau) ** 4
+    total = _integrate_log_trapezoid(smooth, f[low]) + _integral_below(smooth, f[low])
     f, rest = f[split:], rest[split:]
     steps = np.diff(f)
     flat = float((0.5 * steps * (rest[1:] + rest[:-1])).sum())
@@ -235,13 +240,22 @@ def _allan_variance_at(tau: float, f: Floats, rest: Floats, tau0_s: float) -> fl
 
 
 def _integrate_cosine(omega: float, f: Floats, rest: Floats, slopes: Floats) -> float:
-    """Return the exact integral of a piecewise linear function times cos(ωf)."""
+    """Integrate the product of a piecewise linear function and cos(ωf) exactly."""
     ends = rest[-1] * np.sin(omega * f[-1]) - rest[0] * np.sin(omega * f[0])
     return float(ends / omega + (slopes * np.diff(np.cos(omega * f))).sum() / omega**2)
 
 
+def _integral_below(values: Floats, f: Floats) -> float:
+    """Return the integral from zero to the lowest frequency, for values that continue as a power of f."""
+    first, second = values[:2]
+    if not (first > 0.0 and second > 0.0):
+        return 0.0 * float(first)  # NaN remains NaN
+    slope = float(np.log(second / first) / np.log(f[1] / f[0]))
+    return float(first * f[0] / max(slope + 1.0, MIN_INTEGRAL_EXPONENT))
+
+
 def _integrate_log_trapezoid(values: Floats, f: Floats) -> float:
-    """Return ∫ values df by the trapezoidal rule in ln f."""
+    """Compute ∫ values df by the trapezoidal rule in ln f."""
     g = values * f
     return float((0.5 * np.diff(np.log(f)) * (g[1:] + g[:-1])).sum())
 

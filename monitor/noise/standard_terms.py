@@ -1,6 +1,6 @@
-"""Five noise terms of IEEE Std 952 and their Allan variances.
+"""The five noise terms of IEEE Std 952 and their Allan variances.
 
-The Allan variance is σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π) B² + K²τ/3 + R²τ²/2.
+The sum of the five Allan variances is σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π) B² + K²τ/3 + R²τ²/2.
 """
 
 from typing import Final
@@ -18,13 +18,13 @@ STANDARD_TERMS: Final[dict[str, type[Source]]] = {
     "K": RateRandomWalk,
     "R": RateRamp,
 }
-"""Effect of each noise coefficient. The parameter of the effect has the same symbol."""
+"""Effect that belongs to each noise coefficient, whose symbol is also the parameter name of the effect."""
 UNIT_SOURCES: Final = tuple(term(**{symbol: 1.0}) for symbol, term in STANDARD_TERMS.items())
-"""Noise terms with coefficients of 1."""
+"""The five noise terms with unit coefficients."""
 
 
 def unit_coefficient_allan_variances(tau_s: Floats, tau0_s: float) -> Floats:
-    """Return the Allan variances [m, 5] of the five noise terms with coefficients of 1.
+    """Return the Allan variances [m, 5] of the five noise terms with unit coefficients.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Temperature of a simulated sensor.
+"""Temperature of a sensor in a simulation.
 
-The temperature is T(t) = mean + swing sin(2πt/period) plus first-order Gauss–Markov noise. ``wander`` is the standard
-deviation of the noise, and ``wander_time`` the correlation time.
+The temperature is T(t) = mean + swing sin(2πt/period) plus first-order Gauss–Markov noise. The parameter ``wander`` is
+the standard deviation of the noise, and ``wander_time`` is its correlation time.
 """
 
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from monitor.noise.effects.ieee952.exponentially_correlated import Exponentially
 from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal
 
 PAIRS: Final = (("swing", "period"), ("wander", "wander_time"))
-"""Pairs of parameters that must be given together."""
+"""Pairs of parameters that are only allowed together."""
 
 
 @dataclass(frozen=True, slots=True)
 class Temperature(ParameterTable):
-    """Parameters of the table ``[temperature]`` in a model file.
+    """Table ``[temperature]`` of a model file, which describes a simulated temperature.
 
     Raises
     ------
     ConfigError
-        If a parameter is out of range, or if one parameter of a pair is missing.
+        If a parameter is out of range, or if only one parameter of a pair is given.
 
     Examples
     --------
@@ -39,12 +39,12 @@ class Temperature(ParameterTable):
     mean: float = parameter_field("°C", signed=True, number_range=TEMPERATURE_C)
     swing: float | None = parameter_field(
         "°C", optional=True, number_range=TEMPERATURE_C
-    )  # amplitude of the periodic part
+    )  # amplitude of the periodic component
     period: float | None = parameter_field("s", positive=True, optional=True, number_range=DURATION_S)
-    wander: float | None = parameter_field("°C", optional=True, number_range=TEMPERATURE_C)  # standard deviation
+    wander: float | None = parameter_field("°C", optional=True, number_range=TEMPERATURE_C)  # rms of the noise
     wander_time: float | None = parameter_field(
         "s", positive=True, optional=True, number_range=DURATION_S
-    )  # correlation time
+    )  # correlation time of the noise
 
     def __post_init__(self) -> None:
         ParameterTable.__post_init__(self)
@@ -54,14 +54,14 @@ class Temperature(ParameterTable):
                     raise ConfigError(f"temperature: {given} needs a {needed}")
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
-        """Start a simulated temperature series in °C.
+        """Start a simulated time series of the temperature in °C.
 
         Parameters
         ----------
         rate_hz : float
             Sample rate, Hz.
         rng : numpy.random.Generator
-            Random generator of the temperature.
+            Random generator of the temperature noise.
         """
         parts: list[NoiseSeries] = []
         if self.swing is not None and self.period is not None:
@@ -81,9 +81,9 @@ class Temperature(ParameterTable):
 
 
 def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
-    """Return the temperature of a recording as a series.
+    """Return the temperature of a recording as a time series.
 
-    Missing values are replaced by the previous value. The last value is repeated after the end of the recording.
+    Missing values are replaced by the preceding value. After the end of the recording, the last value is repeated.
 
     Parameters
     ----------

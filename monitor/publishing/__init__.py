@@ -1,1 +1,1 @@
-"""Output of results over zenoh, in Rerun and in the terminal, and as plots, reports and parameter files."""
+"""Publish results over zenoh, show them in Rerun and in the terminal, and write plots, reports and files."""

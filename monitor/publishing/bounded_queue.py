@@ -1,4 +1,4 @@
-"""Thread-safe queue of limited size that drops the oldest items instead of blocking the producer."""
+"""Thread-safe queue of limited size that drops its oldest items instead of blocking the thread that adds items."""
 
 import threading
 from collections import deque
@@ -8,7 +8,7 @@ T = TypeVar("T")
 
 
 class BoundedQueue(Generic[T]):
-    """Thread-safe queue that limits the total weight of the queued items, such as their size in bytes.
+    """Thread-safe queue that limits the total weight of its items, for example their size in bytes.
 
     >>> backlog = BoundedQueue[str](limit=2)
     >>> for word in ("a", "b", "c"):
@@ -22,7 +22,7 @@ class BoundedQueue(Generic[T]):
         self._limit = limit
         self._weight = 0
         self._ready = threading.Condition()
-        self.dropped = 0  # number of items dropped since creation
+        self.dropped = 0  # number of items dropped since the queue was created
 
     def push(self, item: T, weight: int) -> None:
         """Add an item, and drop the oldest items while the total weight exceeds the limit.
@@ -32,9 +32,9 @@ class BoundedQueue(Generic[T]):
         Parameters
         ----------
         item
-            The item.
+            Item to append.
         weight
-            Weight of the item, in the unit of the limit.
+            Weight of the item, in the same unit as the limit of the queue.
         """
         with self._ready:
             self._items.append((item, weight))
@@ -55,6 +55,6 @@ class BoundedQueue(Generic[T]):
             return items
 
     def wake(self) -> None:
-        """Wake a thread that waits in ``take``."""
+        """Wake a thread that waits for items in ``take``."""
         with self._ready:
             self._ready.notify_all()

@@ -1,11 +1,11 @@
-"""Text of noise coefficients in the units of data sheets, such as °/√h, for tables."""
+"""Noise coefficients as text for tables, in the units that data sheets use, such as °/√h."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
 from drivers.data_types import AXES
-from monitor.common.units import NO_VALUE, coefficient_unit, format_number
+from monitor.common.unit_formatting import NO_VALUE, coefficient_unit, format_number
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 
 TEMPERATURE_MARK: Final = "†"
@@ -22,12 +22,12 @@ class CoefficientText:
 
 
 def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digits: int = 3) -> CoefficientText:
-    """Format one noise coefficient in the unit of data sheets.
+    """Format one noise coefficient in the unit that data sheets use.
 
     Parameters
     ----------
     coefficients
-        Coefficients of all axes, SI.
+        Noise coefficients of all axes, in SI units.
     symbol
         Symbol of the coefficient: Q, N, B, K or R.
     axis
@@ -50,7 +50,7 @@ def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digit
 
 
 def mark_temperature_axis(axis: str, axes_of_temperature: Collection[str]) -> str:
-    """Append TEMPERATURE_MARK to the name of an axis if temperature explains most of the slow variance.
+    """Append TEMPERATURE_MARK to the name of an axis if temperature explains most of the axis's slow variance.
 
     >>> mark_temperature_axis("gy", ("gy", "gz")), mark_temperature_axis("gx", ("gy", "gz"))
     ('gy †', 'gx')

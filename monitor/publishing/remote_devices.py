@@ -1,7 +1,7 @@
 """State of all devices on the network, updated from zenoh messages.
 
-Malformed messages are counted. The memory for devices and texts is limited, because any program on the network may send
-messages.
+Malformed messages are counted and otherwise ignored. Any program on the network may send messages, so the number of
+devices and the length of texts are limited.
 """
 
 import copy
@@ -27,26 +27,26 @@ from monitor.publishing.messages.results import (
 )
 
 NORMAL_OUTPUT_STATES: Final = ("ok", "off")
-"""Output states that are not reported as problems."""
+"""States of an output, such as the viewer, that are not reported as problems."""
 GONE_TIMEOUT_S: Final = 1.5
-"""Largest age of the newest message [s] of a device without liveliness token before the device is gone."""
+"""Time since the newest message [s] after which a device without liveliness token counts as gone."""
 SILENCE_TIMEOUT_S: Final = 5.0
-"""Largest age of the newest message [s] before a device is silent."""
+"""Time since the newest message [s] after which a device counts as silent."""
 MAX_NAMED_LIMITS: Final = 6
 """Largest number of exceeded limits that a message lists by name."""
 MAX_DEVICES: Final = 20_000
-"""Largest number of devices. A new device replaces a device that has been silent for FORGET_AFTER_S."""
+"""Largest number of devices. Beyond this number, a new device replaces one that was silent for FORGET_AFTER_S."""
 FORGET_AFTER_S: Final = 600.0
 MAX_KEY_LENGTH: Final = 200
 MAX_EVENTS: Final = 5
-"""Number of newest events to keep."""
+"""Number of events of all devices to keep."""
 DECODERS: Final[dict[topics.Topic, Callable[[bytes], Message]]] = {
     topics.STATUS: StatusMessage.decode,
     topics.EVENT: EventMessage.decode,
     topics.COEFFICIENTS: partial(decode_message, CoefficientsMessage),
     topics.GAP: partial(decode_message, ModelGapMessage),
 }
-"""Decoder of each topic that device tables show."""
+"""Function that decodes the messages of each topic shown in device tables."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class DeviceCoefficients:
     coefficients: Coefficients
     axes: tuple[str, ...]  # measured axes
     k_or_r: frozenset[str]  # axes on which the data cannot distinguish K from R
-    filled_s: float | None = None  # filled part of the window [s]
+    filled_s: float | None = None  # duration of the samples in the window [s]
 
     @classmethod
     def from_estimate(cls, estimate: Estimate) -> "DeviceCoefficients":
@@ -81,9 +81,9 @@ class DeviceCoefficients:
 
 @dataclass(slots=True)
 class RemoteDevice:
-    """State of a remote device. All times refer to the monotonic clock of the receiver."""
+    """State of a device of another process. All times refer to the monotonic clock of the process that receives it."""
 
-    key: str  # key of the device, without the topic
+    key: str  # zenoh key of the device without the topic, such as imu/bench-1
     last_message_s: float  # time of the newest message of any topic
     status: StatusMessage | None = None
     coefficients: DeviceCoefficients | None = None
@@ -91,7 +91,7 @@ class RemoteDevice:
     token_exists: bool | None = None  # True if the liveliness token exists; None if unknown
 
     def state(self, now_s: float) -> str:
-        """Return the state that the daemon reports, or gone, silent or present without a current status."""
+        """Return the state that the daemon reports, or "gone", "silent" or "present" if there is no current status."""
         age_s = now_s - self.last_message_s
         ended = self.status is not None and self.status.state == "ended"
         if age_s > GONE_TIMEOUT_S and self.token_exists is False and not ended:
@@ -100,8 +100,8 @@ class RemoteDevice:
             return "silent"
         return "present" if self.status is None else self.status.state
 
-    def display_rank(self, now_s: float) -> int:
-        """Return the sort rank in device tables: 0 without data, 1 with a problem, 2 running, 3 ended."""
+    def problems_first_rank(self, now_s: float) -> int:
+        """Return the rank for sorting device tables: 0 without data, 1 with a problem, 2 running, 3 ended."""
         state, status = self.state(now_s), self.status
         if state in ("lost", "gone", "silent"):
             return 0
@@ -114,7 +114,7 @@ class RemoteDevice:
         return 2 if outputs_work and not troubled else 1
 
     def describe_problems(self) -> str:
-        """Describe all problems of the device. Return an empty string if there are none."""
+        """Describe all problems of the device, or return an empty string if the device has none."""
         if self.status is None:
             return ""
         found = [self.status.text] if self.status.text else []
@@ -146,19 +146,19 @@ class RemoteDevice:
                 self.disagreements = tuple(_describe_disagreements(message))
 
 
-class DeviceStates:
+class RemoteDeviceRegistry:
     """Thread-safe collection of the states of all remote devices.
 
     Parameters
     ----------
     clock
-        Clock for the age of messages [s]. Callers must pass times of the same clock.
+        Function that returns the time of a monotonic clock [s]. The methods expect times of this clock.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.note = ""  # note for the user, such as a list of unreachable endpoints
         self.malformed = 0  # number of messages that could not be decoded
-        self.ignored = 0  # number of messages of devices beyond MAX_DEVICES
+        self.ignored = 0  # number of messages that were ignored because there are MAX_DEVICES devices
         self._clock = clock
         self._devices: OrderedDict[str, RemoteDevice] = OrderedDict()  # by the time of the last message, oldest first
         self._events: deque[tuple[str, EventMessage]] = deque(maxlen=MAX_EVENTS)
@@ -167,12 +167,12 @@ class DeviceStates:
     def process_message(self, key: str, payload: bytes) -> Message | None:
         """Update the state of a device from a message, and return the decoded message.
 
-        Return None if the message is malformed or the topic is not used.
+        Return None if the message is malformed or device tables do not show its topic.
 
         Parameters
         ----------
         key
-            Key of the message.
+            zenoh key of the message.
         payload
             Encoded message.
         """
@@ -200,9 +200,9 @@ class DeviceStates:
         Parameters
         ----------
         key
-            Key of the token.
+            zenoh key of the liveliness token.
         exists
-            True if the token exists.
+            True if the token has appeared, False if it has disappeared.
         """
         device, topic = split_device_and_topic(key) or ("", None)
         if topic is not topics.ALIVE:
@@ -213,18 +213,18 @@ class DeviceStates:
                 known.token_exists = exists
 
     def remove_device(self, key: str) -> None:
-        """Remove the state and the events of the device that owns a key."""
+        """Remove the state and the events of the device to which a zenoh key belongs."""
         device, _ = split_device_and_topic(key) or ("", None)
         with self._lock:
             self._devices.pop(device, None)
             for one in [one for one in self._events if one[0] == device]:
                 self._events.remove(one)
 
-    def sorted_devices(self, now_s: float) -> list[RemoteDevice]:
-        """Return copies of all device states. Devices with problems at time ``now_s`` [s] precede the others."""
+    def devices_with_problems_first(self, now_s: float) -> list[RemoteDevice]:
+        """Return copies of all device states, and list devices with problems at the time ``now_s`` [s] first."""
         with self._lock:
             found = [copy.copy(one) for one in self._devices.values()]
-        return sorted(found, key=lambda one: (one.display_rank(now_s), one.key))
+        return sorted(found, key=lambda one: (one.problems_first_rank(now_s), one.key))
 
     def device_coefficients(self, device: str) -> DeviceCoefficients | None:
         """Return the newest noise coefficients of a device, or None if there are none."""
@@ -232,13 +232,13 @@ class DeviceStates:
             known = self._devices.get(device)
         return None if known is None else known.coefficients
 
-    def newest_events(self) -> list[tuple[str, EventMessage]]:
-        """Return the newest events with device keys, oldest event first."""
+    def recent_events_in_time_order(self) -> list[tuple[str, EventMessage]]:
+        """Return the newest events with the keys of their devices, in order of time."""
         with self._lock:
             return list(self._events)
 
     def _add(self, device: RemoteDevice) -> bool:
-        """Add a new device. Return False if the limit MAX_DEVICES is reached."""
+        """Add a new device. Return False if there are already MAX_DEVICES active devices."""
         if device.key in self._devices:
             return True
         full = len(self._devices) >= MAX_DEVICES
@@ -253,7 +253,7 @@ class DeviceStates:
 
 
 def split_device_and_topic(key: str) -> tuple[str, topics.Topic] | None:
-    """Split a zenoh key into device key and topic. Return None if the topic is unknown.
+    """Split a zenoh key into the device key and the topic, or return None if the topic is unknown.
 
     >>> split_device_and_topic("imu/bench-1/status")
     ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))

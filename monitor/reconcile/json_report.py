@@ -6,6 +6,10 @@ the recording. A number that is not finite is encoded as null.
 Each entry of ``steps`` describes one effect that was added or resized. ``found`` is the difference that led to the
 step. ``gap`` compares the same diagnostic before and after the step. ``scores`` lists the gaps of all diagnostics.
 
+``summary`` contains at most five sentences. ``findings`` lists the causes of the gap over all axes, in the order of
+``share``. ``remaining`` lists the differences that no effect explains, in the same order. Each share refers to
+``gap_nats``.
+
 ``recording_findings`` lists the faults of the recording with their evidence, the most serious fault first.
 """
 
@@ -24,6 +28,8 @@ from monitor.reconcile.result import (
     Reconciliation,
     RecordingFinding,
 )
+from monitor.reconcile.summary.ranked_findings import RankedGapCause, RankedRemainder, rank_findings
+from monitor.reconcile.summary.summary_sentences import summarize
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
 _JSON_ENCODER: Final = msgspec.json.Encoder()
@@ -31,9 +37,15 @@ _JSON_ENCODER: Final = msgspec.json.Encoder()
 
 def encode_report(result: Reconciliation) -> bytes:
     """Encode a reconciliation as JSON."""
+    ranking = rank_findings(result)
     return _JSON_ENCODER.encode({
         "schema": SCHEMA,
         "verdict": result.verdict,
+        "summary": summarize(result),
+        "gap_nats": finite_or_none(ranking.whole_nats),
+        "explained_share": finite_or_none(ranking.explained_share),
+        "findings": [_ranked_entry(finding) for finding in ranking.findings],
+        "remaining": [_remainder_entry(one) for one in ranking.remainders],
         "rate": finite_or_none(result.rate_hz),
         "samples": int(result.samples),
         "seconds": finite_or_none(result.duration_s),
@@ -56,6 +68,33 @@ def _finding_entry(finding: RecordingFinding) -> dict[str, Any]:
     }
 
 
+def _ranked_entry(finding: RankedGapCause) -> dict[str, Any]:
+    return {
+        "kind": finding.kind,
+        "effect": finding.effect,
+        "axes": finding.axes,
+        "parameters": {name: parameter_entry(bounds) for name, bounds in finding.parameters.items()},
+        "size_ratio": finite_or_none(finding.size_ratio),
+        "confidence": finite_or_none(finding.confidence),
+        "gain_nats": finite_or_none(finding.gain_nats),
+        "share": finite_or_none(finding.share),
+        "allan": {
+            axis: {"ratio": finite_or_none(one.ratio), "tau": finite_or_none(one.tau_s)}
+            for axis, one in finding.influences.items()
+        },
+    }
+
+
+def _remainder_entry(one: RankedRemainder) -> dict[str, Any]:
+    return {
+        "axis": one.axis,
+        "group": one.gap.group,
+        "gain_nats": finite_or_none(one.gap.gain_nats),
+        "share": finite_or_none(one.share),
+        "strongest": _gap_and_location_entry(one.gap.strongest),
+    }
+
+
 def _axis_entry(result: AxisResult) -> dict[str, Any]:
     return {
         "verdict": result.verdict,
@@ -73,6 +112,7 @@ def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
         "effect": step.effect,
         "parameters": {name: parameter_entry(bounds) for name, bounds in step.parameters.items()},
         "confidence": finite_or_none(step.confidence),
+        "gain_nats": finite_or_none(step.gain_nats),
         "runners_up": [{"effect": one.effect, "confidence": finite_or_none(one.confidence)} for one in step.runners_up],
         "gap": _gap_entry(step.before, step.after),
         "held_out_gap": held_out,
@@ -106,7 +146,7 @@ def _gap_and_location_entry(gap: DiagnosticGap) -> dict[str, Any]:
 def _where_entry(where: Location) -> dict[str, Any]:
     return {
         name: place if isinstance(place, str) else [finite_or_none(end) for end in place]
-        for name, place in where.resolved_dimensions().items()
+        for name, place in where.resolved_location_dimensions().items()
     }
 
 

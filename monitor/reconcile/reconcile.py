@@ -5,35 +5,39 @@ to the model until no diagnostic exceeds the threshold. The extended model is th
 recording.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from itertools import count
+from typing import Final
 
 import numpy as np
 from scipy.special import expit
 
 from drivers.data_types import AXES
-from monitor.noise.effect import AxisLeak
+from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
-    Bias,
+    BandwidthLimit,
+    ConstantBias,
     RateRamp,
     SampleRateError,
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.standard_terms import UNIT_SOURCES
-from monitor.reconcile.axis_result import build_axis_result
+from monitor.reconcile.axis_result_builder import build_axis_result
 from monitor.reconcile.diagnostics.null_distribution import (
+    SIMULATED_RECORDINGS,
     AxisNull,
     Findings,
+    all_simulations_have_improbable_gain,
     estimate_null_distributions,
     run_diagnostics,
 )
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
-from monitor.reconcile.likelihood.effect_roles import with_effect_size
-from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
+from monitor.reconcile.likelihood.effect_roles import is_stationary_gaussian, with_effect_size
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import whiten_axis
-from monitor.reconcile.preparation.reconcile_input import Recording, select_usable_axes
+from monitor.reconcile.preparation.reconcile_input import Recording, select_axes_and_smooth_temperature
 from monitor.reconcile.recording_checks.checks import check_recording, sort_findings
 from monitor.reconcile.recording_checks.sample_rate_from_features import (
     describe_sample_rate_error,
@@ -48,24 +52,22 @@ from monitor.reconcile.result import (
     Reconciliation,
     combine_decisions,
 )
-from monitor.reconcile.search.axis_repair import build_repaired_axes
-from monitor.reconcile.search.candidates import PENALTY_NATS
+from monitor.reconcile.search.backward_elimination import MapFunction, eliminate_unneeded_effects
+from monitor.reconcile.search.candidate_effects import PENALTY_NATS
+from monitor.reconcile.search.common_vibration_search import name_common_vibrations
+from monitor.reconcile.search.repaired_axes import build_repaired_axes
 from monitor.reconcile.search.sample_rate_from_spectrum import (
     SAMPLE_RATE_PENALTY_NATS,
     SampleRateErrorEstimate,
+    convert_effect_to_stated_time,
     detect_sample_rate_error,
-    rescale_effect_time,
 )
 from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
 
-SIMULATED_RECORDINGS: Final = 6
-"""Number of simulated recordings that determine a null distribution."""
 MIN_TERM_GAIN_NATS: Final = 3.0
 """Smallest log-likelihood gain, in nats, of a term that the fit of the five terms keeps."""
-ProgressCallback = Callable[[str], None]
-"""Function that receives the name of each stage."""
-MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-"""Function with the signature of ``map``, such as the ``map`` method of a thread pool."""
+ProgressCallback = Callable[[str, float | None], None]
+"""Function that receives the name of each stage, and the completed share of the stage from 0 to 1 or None."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,8 @@ class RecordingContext:
     recording: Recording
     seed: int
     regressors: RegressorCache
-    map_function: MapFunction  # distributes the work on axes and simulated recordings
+    map_function: MapFunction  # distributes the work on axes
+    report_stage: ProgressCallback = lambda _what, _share: None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +97,7 @@ def reconcile(
     model: NoiseModel | None,
     seed: int,
     map_function: MapFunction = map,
-    report_stage: ProgressCallback = lambda _what: None,
+    report_stage: ProgressCallback = lambda _what, _share: None,
 ) -> Reconciliation:
     """Compare a recording with a model and find the effects that the model lacks.
 
@@ -107,9 +110,10 @@ def reconcile(
     seed : int
         Seed of all simulations and random draws. The same seed gives the same result.
     map_function : callable, optional
-        Function with the signature of ``map`` that distributes the work on axes and simulated recordings.
+        Function with the signature of ``map`` that distributes the work on axes.
     report_stage : callable, optional
-        Function that is called with the name of each stage.
+        Function that is called with the name of each stage. During the search, the function is called with the
+        completed share after each axis, possibly from another thread.
 
     Returns
     -------
@@ -121,28 +125,33 @@ def reconcile(
     NotReady
         If the recording has too few samples or no axis that can be compared with the model.
     """
-    report_stage("checking the recording")
+    report_stage("checking the recording", None)
     checked = check_recording(recording, model, seed)
-    recording, notes = select_usable_axes(checked.recording, model)
+    recording, notes = select_axes_and_smooth_temperature(checked.recording, model)
     regressors = RegressorCache(recording.sample_count, recording.rate_hz, recording.temperature_c)
-    run = RecordingContext(recording, seed, regressors, map_function)
+    run = RecordingContext(recording, seed, regressors, map_function, report_stage)
     if model is None:
-        report_stage("fitting the five terms")
+        report_stage("fitting the five terms", None)
     tested = model or fit_five_terms(run)
-    report_stage("simulating the model")
+    report_stage("simulating the model", None)
     simulated = _diagnose_simulations(tested, run, seed, recording.values)
     null = estimate_null_distributions(simulated)
-    report_stage("searching for missing effects")
     found = _search_all_axes(run, tested, null)
+    report_stage("looking for common vibration", None)
+    found = replace(found, searches=name_common_vibrations(found.searches, null))
+    report_stage("looking for a simpler explanation", None)
+    found = replace(found, searches=eliminate_unneeded_effects(found.searches, null, model is None, map_function))
     extended = _add_found_effects(tested, found)
     final = null
     if found.searches_that_changed_model or found.sample_rate_error:
-        report_stage("simulating the extended model")
+        report_stage("simulating the extended model", None)
         changed = recording.values if found.sample_rate_error else found.searches_that_changed_model
         simulated |= _diagnose_simulations(extended, run, seed + SIMULATED_RECORDINGS, changed)
         final = estimate_null_distributions(simulated)
-    report_stage("describing the result")
-    axes = {name: build_axis_result(one, null[name], final[name]) for name, one in found.searches.items()}
+    report_stage("describing the result", None)
+    axes = {
+        name: build_axis_result(one, null[name], final[name], model is None) for name, one in found.searches.items()
+    }
     if found.sample_rate_error is not None:
         axes = _add_sample_rate_step(axes, found.sample_rate_error, null)
         rate_finding = describe_sample_rate_error(found.sample_rate_error, recording.rate_hz)
@@ -171,8 +180,8 @@ def fit_five_terms(run: RecordingContext) -> NoiseModel:
 
 
 def _fit_terms(axis: Axis) -> Effects:
-    best = axis.fit([with_effect_size(effect, axis.coefficient_rms) for effect in UNIT_SOURCES[:4]])
-    with_ramp = axis.fit((*best.effects, RateRamp(R=axis.coefficient_rms)))
+    best = axis.fit([with_effect_size(effect, axis.cosine_transform_rms) for effect in UNIT_SOURCES[:4]])
+    with_ramp = axis.fit((*best.effects, RateRamp(R=axis.cosine_transform_rms)))
     if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
         best = with_ramp
     for at in range(len(best.effects) - 1, -1, -1):
@@ -185,30 +194,66 @@ def _fit_terms(axis: Axis) -> Effects:
 
 
 def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
-    """Return the effects of each recorded axis without constant biases, because the mean is always fitted."""
+    """Return the effects of each recorded axis without constant biases, because the mean is always fitted.
+
+    The search may add a floor to a low-pass filter without floor, so such a filter has the floor 0.
+    """
     return {
-        axis: tuple(effect for effect in model.effects.get(axis, ()) if not isinstance(effect, Bias))
+        axis: tuple(
+            _with_floor(effect, 0.0) for effect in model.effects.get(axis, ()) if not isinstance(effect, ConstantBias)
+        )
         for axis in recording.values
     }
+
+
+def _with_floor(effect: Effect, floor: float | None) -> Effect:
+    """Replace a missing or zero floor of a low-pass filter."""
+    return replace(effect, floor=floor) if isinstance(effect, BandwidthLimit) and not effect.floor else effect
 
 
 def _diagnose_simulations(
     model: NoiseModel, run: RecordingContext, first_seed: int, names: Collection[str]
 ) -> dict[str, list[Findings]]:
-    """Run the diagnostics on simulated recordings of a model, and return the findings of each named axis."""
+    """Run the diagnostics on simulated recordings of a model, and return the findings of each named axis.
+
+    An axis with Gaussian noise is simulated until its gains are probable under a true model.
+    """
+    effects = _effects_by_axis(model, run.recording)
+    findings: dict[str, list[Findings]] = {name: [] for name in names}
+    remaining = tuple(names)
+    for seed in range(first_seed, first_seed + SIMULATED_RECORDINGS):
+        for name, found in _diagnose_simulation(model, run, effects, seed, remaining).items():
+            findings[name].append(found)
+        remaining = tuple(
+            name
+            for name in remaining
+            if not is_stationary_gaussian(effects[name]) or all_simulations_have_improbable_gain(findings[name])
+        )
+        if not remaining:
+            break
+    return findings
+
+
+def _diagnose_simulation(
+    model: NoiseModel, run: RecordingContext, effects: Mapping[str, Effects], seed: int, names: Collection[str]
+) -> dict[str, Findings]:
+    """Run the diagnostics on some axes of one simulated recording."""
+    axes = _simulate_axes(model, run, effects, seed)
+
+    def diagnose_axis(name: str) -> Findings:
+        return run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[name], effects[name]).fit))
+
+    return dict(zip(names, run.map_function(diagnose_axis, names), strict=True))
+
+
+def _simulate_axes(
+    model: NoiseModel, run: RecordingContext, effects: Mapping[str, Effects], seed: int
+) -> dict[str, Axis]:
     template = run.recording
-    effects = _effects_by_axis(model, template)
-
-    def diagnose_simulation(seed: int) -> dict[str, Findings]:
-        drawn = model.simulate(template.sample_count, template.rate_hz, seed, template.temperature_c)
-        simulated = replace(template, values={axis: drawn[:, AXES.index(axis)] for axis in template.values})
-        axes = build_repaired_axes(simulated, effects, run.regressors, np.random.default_rng(seed))
-        return {
-            name: run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[name], effects[name]).fit)) for name in names
-        }
-
-    findings = list(run.map_function(diagnose_simulation, range(first_seed, first_seed + SIMULATED_RECORDINGS)))
-    return {axis: [one[axis] for one in findings] for axis in names}
+    drawn = model.simulate(template.sample_count, template.rate_hz, seed, template.temperature_c)
+    values = {axis: np.ascontiguousarray(drawn[:, AXES.index(axis)]) for axis in template.values}
+    del drawn
+    return build_repaired_axes(replace(template, values=values), effects, run.regressors, np.random.default_rng(seed))
 
 
 def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str, AxisNull]) -> _AxesSearchResult:
@@ -216,6 +261,8 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
 
     If two axes appear to leak into each other, the search on one axis is repeated without this leak.
     """
+    stage, searched = "searching for missing effects", count(1)
+    run.report_stage(stage, 0.0)
     effects = _effects_by_axis(model, run.recording)
     axes = build_repaired_axes(run.recording, effects, run.regressors, np.random.default_rng(run.seed))
     error = estimate_sample_rate_error(
@@ -227,11 +274,15 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
     )
     if error is not None:
         ratio = float(error.ratio.value)
-        effects = {name: tuple(rescale_effect_time(effect, ratio) for effect in of) for name, of in effects.items()}
+        effects = {
+            name: tuple(convert_effect_to_stated_time(effect, ratio) for effect in of) for name, of in effects.items()
+        }
 
     def search_named_axis(name: str) -> AxisSearchResult:
         rng = np.random.default_rng([run.seed, AXES.index(name)])
-        return search_missing_effects(axes[name], effects[name], null[name], rng)
+        result = search_missing_effects(axes[name], effects[name], null[name], rng)
+        run.report_stage(stage, min(next(searched) / len(axes), 1.0))
+        return result
 
     found = dict(zip(axes, run.map_function(search_named_axis, axes), strict=True))
     for name, wrong in _reversed_leak_sources(found, null).items():
@@ -267,8 +318,11 @@ def _add_found_effects(model: NoiseModel, found: _AxesSearchResult) -> NoiseMode
     ratio = float(error.ratio.value) if error else 1.0
     effects = dict(model.effects)
     for name, search in found.searches_that_changed_model.items():
-        bias = tuple(effect for effect in model.effects.get(name, ()) if isinstance(effect, Bias))
-        effects[name] = bias + tuple(rescale_effect_time(effect, 1.0 / ratio) for effect in search.hypothesis.effects)
+        bias = tuple(effect for effect in model.effects.get(name, ()) if isinstance(effect, ConstantBias))
+        effects[name] = bias + tuple(
+            _with_floor(convert_effect_to_stated_time(effect, 1.0 / ratio), None)
+            for effect in search.hypothesis.effects
+        )
     if error is not None:
         effects[error.axis] = (*effects[error.axis], SampleRateError(ratio=ratio))
     return NoiseModel(effects, model.sample_rate_hz, model.temperature)
@@ -302,6 +356,7 @@ def _add_sample_rate_step(
             f"of true to stated sample rate agrees with all axes."
         ),
         snapshot_after=result.start,
+        gain_nats=error.gain,
     )
     verdict: Decision = "partly_explained" if result.left_over else "explained"
     return {**axes, error.axis: replace(result, steps=(step, *result.steps), verdict=verdict)}

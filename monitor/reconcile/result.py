@@ -9,8 +9,8 @@ from monitor.noise.model import NoiseModel
 
 Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]
 """Decision for an axis or a recording."""
-StepKind = Literal["added", "retuned"]
-"""Kind of change: an effect was added, or the size of an effect was changed."""
+StepKind = Literal["added", "retuned", "absent"]
+"""Kind of change: an effect was added, the size of an effect was changed, or an effect has the size zero."""
 FindingKind = Literal[
     "unit_error",
     "axes_permuted",
@@ -37,7 +37,7 @@ class Location:
     value: tuple[float, float] | None = None  # of the axis, SI
     source: str | None = None  # another axis
 
-    def resolved_dimensions(self) -> dict[str, tuple[float, float] | str]:
+    def resolved_location_dimensions(self) -> dict[str, tuple[float, float] | str]:
         """Return the dimensions that the diagnostic resolves, by name."""
         return {name: place for name, place in asdict(self).items() if place is not None}
 
@@ -80,7 +80,7 @@ class RecordingFinding:
 
 
 @dataclass(frozen=True, slots=True)
-class RunnerUp:
+class AlternativeEffect:
     """Less likely effect that explains the same difference."""
 
     effect: str
@@ -88,7 +88,7 @@ class RunnerUp:
 
 
 @dataclass(frozen=True, slots=True)
-class PlotData:
+class DiagnosticPlotData:
     """Data of one plot that compares a recorded axis with the expectation of a noise model."""
 
     lens: str  # name of the diagnostic
@@ -105,11 +105,19 @@ class PlotData:
 
 
 @dataclass(frozen=True, slots=True)
-class DiagnosticSnapshot:
+class AxisModelDiagnostics:
     """Differences and plots of all diagnostics, for one axis and one noise model."""
 
     gaps: tuple[DiagnosticGap, ...]  # one for each diagnostic
-    plots: tuple[PlotData, ...]  # one for each diagnostic that has a plot
+    plots: tuple[DiagnosticPlotData, ...]  # one for each diagnostic that has a plot
+
+
+@dataclass(frozen=True, slots=True)
+class AllanInfluence:
+    """Largest influence of an effect on the Allan deviation of an axis."""
+
+    ratio: float  # Allan deviation with the effect relative to the Allan deviation without the effect
+    tau_s: float  # averaging time with the largest influence
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,14 +128,25 @@ class AddedOrResizedEffect:
     effect: str
     parameters: Mapping[str, ParameterInterval]
     confidence: float
-    runners_up: tuple[RunnerUp, ...]
+    runners_up: tuple[AlternativeEffect, ...]
     before: DiagnosticGap  # difference that led to the change of the model
     after: DiagnosticGap  # the same diagnostic after the change
     held_out_before: DiagnosticGap | None
     held_out_after: DiagnosticGap | None
     held_out_reason: str  # reason for the missing held-out gap, or empty
     because: str  # justification in sentences
-    snapshot_after: DiagnosticSnapshot
+    snapshot_after: AxisModelDiagnostics
+    gain_nats: float = 0.0  # part of the gap that the effect closes
+    allan: AllanInfluence | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RemainingGap:
+    """Part of the gap of an axis that no effect explains."""
+
+    group: str  # group of diagnostics that see the same difference
+    strongest: DiagnosticGap  # strongest diagnostic of the group
+    gain_nats: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +155,11 @@ class AxisResult:
 
     axis: str
     verdict: Decision
-    start: DiagnosticSnapshot  # comparison with the model under test
+    start: AxisModelDiagnostics  # comparison with the model under test
     steps: tuple[AddedOrResizedEffect, ...]
     left_over: tuple[DiagnosticGap, ...]  # significant differences that remain
-    end: DiagnosticSnapshot  # comparison with the extended model
+    end: AxisModelDiagnostics  # comparison with the extended model
+    remaining: tuple[RemainingGap, ...] = ()  # the differences of ``left_over`` in groups, the largest gap first
 
 
 @dataclass(frozen=True, slots=True)

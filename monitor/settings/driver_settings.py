@@ -59,7 +59,7 @@ class FaultsTable(SettingsModel):
         1.0, description="true sample rate divided by the rate that the sensor states"
     )
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict if the fractions of faulty samples add up to more than 1."""
         if self.lost + self.repeated + self.flipped + self.cut > 1.0:
             text = "lost, repeated, flipped and cut are shares of all samples: their sum is at most 1"
@@ -96,7 +96,7 @@ class VirtualTable(LinkSettings):
 
 
 @dataclass(frozen=True, slots=True)
-class Driver:
+class BuiltLinkAndDecoder:
     """Link and decoder of a device, built from a configuration. The link is not open."""
 
     link: Link | VirtualTable
@@ -132,7 +132,7 @@ def default_decoder(link: str) -> str:
     return str(module_lookup.import_module(drivers.links, link, "_link").DEFAULT_DECODER)
 
 
-def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
+def build_link_and_decoder(table: Mapping[str, Any], folder: Path | None) -> BuiltLinkAndDecoder:
     """Build the link and the decoder from a configuration table ``[device.driver]``.
 
     Parameters
@@ -172,7 +172,7 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
         raise TableError(problems, link if isinstance(link, VirtualTable) else None)
     if isinstance(link, AddressFilteringLink) and isinstance(decoder, AddressFilteringDecoder):
         link.set_address_filter(decoder.addresses)
-    return Driver(link, decoder, silence_s)
+    return BuiltLinkAndDecoder(link, decoder, silence_s)
 
 
 def _read_decoder(
@@ -212,7 +212,7 @@ def _build(module: ModuleType | None, checked: TableCheckResult[Any]) -> Any:
     try:
         built = module.build(checked.value)
     except ConfigError as error:
-        for line in error.lines:
+        for line in error.mistake_lines:
             place, _, text = line.partition(": ")
             if re.split(r"[.\[]", place)[0] in keys:
                 checked.add_problem(place, text)

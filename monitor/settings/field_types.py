@@ -24,7 +24,7 @@ VIEWER_MODES: Final = ("auto", "native", "web", "none")
 SIZE_TEXT: Final = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,20})?)\s*(?:([kMGT]?)(i?)B|%)")
 
 
-class Metrics(NamedTuple):
+class MetricsAddress(NamedTuple):
     """Host and port on which the service answers requests of Prometheus."""
 
     host: str
@@ -62,7 +62,7 @@ def parse_rate_as_period(value: str, always_text: str) -> float:
     return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
 
 
-def rate_as_period_annotation(always_text: str) -> ConvertedFrom:
+def period_stated_as_rate_annotation(always_text: str) -> ConvertedFrom:
     """Return the type annotation of a period that a configuration states as a rate or as ``always_text``."""
     return ConvertedFrom(str, lambda value, folder: parse_rate_as_period(value, always_text))
 
@@ -123,12 +123,12 @@ def _check_zenoh_key(key: str) -> None:
         raise ConfigError(f"expected {example}, got {format_value(key)}")
 
 
-def _address(text: str, _: Path | None) -> Metrics:
+def _address(text: str, _: Path | None) -> MetricsAddress:
     """Parse an address such as "127.0.0.1:9464"."""
     match = ADDRESS_TEXT.fullmatch(text)
     if match is None or int(match[2]) == 0 or not PORT.supports(int(match[2])):
         raise ConfigError(f'{format_value(text)} is not a host and port; write "127.0.0.1:9464"')
-    return Metrics(match[1].strip("[]"), int(match[2]))
+    return MetricsAddress(match[1].strip("[]"), int(match[2]))
 
 
 DURATION_FROM_TEXT: Final = BeforeValidator(_parse_duration_text)
@@ -138,4 +138,4 @@ RelativePath = Annotated[Path, ConvertedFrom(str, _path)]
 """Path type. Relative paths refer to the folder of the configuration file."""
 Endpoint = Annotated[str, checked_by(_check_endpoint)]
 ZenohKey = Annotated[str, checked_by(_check_zenoh_key)]
-Address = Annotated[Metrics, ConvertedFrom(str, _address)]
+Address = Annotated[MetricsAddress, ConvertedFrom(str, _address)]

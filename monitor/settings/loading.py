@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers import file_access
-from drivers.errors import ConfigError, sanitize_error_text
+from drivers.errors import ConfigError, make_printable_and_shorten
 from drivers.settings_model import Problem, TableCheckResult, check_table
 from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_parser
-from monitor.settings.driver_settings import Driver, FaultsTable, VirtualTable
-from monitor.settings.field_types import Metrics, check_viewer_mode, parse_duration_s, parse_rate_as_period
+from monitor.settings.driver_settings import BuiltLinkAndDecoder, FaultsTable, VirtualTable
+from monitor.settings.field_types import MetricsAddress, check_viewer_mode, parse_duration_s, parse_rate_as_period
 from monitor.settings.schema import (
     DEVICE_NAME,
     WINDOW_SAMPLES,
@@ -31,14 +31,14 @@ from monitor.settings.schema import (
 __all__ = [
     "DEVICE_NAME",
     "WINDOW_SAMPLES",
+    "BuiltLinkAndDecoder",
     "Config",
     "Device",
-    "Driver",
     "FaultsTable",
     "Hook",
     "Limit",
     "LogTable",
-    "Metrics",
+    "MetricsAddress",
     "Storage",
     "ViewerTable",
     "VirtualTable",
@@ -63,7 +63,7 @@ class Config:
     log: LogTable
     storage: Storage | None = None  # None if nothing is kept
     hooks: tuple[Hook, ...] = ()
-    metrics: Metrics | None = None
+    metrics: MetricsAddress | None = None
     path: Path | None = None  # of the file
     table: Mapping[str, Any] = dataclasses.field(
         default_factory=dict
@@ -103,7 +103,7 @@ def load_config(path: Path, *, allow_pipe: bool = False) -> Config:
     Raises
     ------
     ConfigError
-        If the file has mistakes. The message describes the first mistake and counts the other mistakes.
+        If the file is not a valid configuration. The message describes the first mistake and counts the other mistakes.
     """
     reading = examine_config_file(path, allow_pipe=allow_pipe)
     if reading.config is None:
@@ -141,7 +141,7 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
         warnings.insert(0, line)
     models = _model_dependent_settings(checked, table)
     if wrong or checked.value is None:
-        return ConfigReading(None, [sanitize_error_text(f"{path}: {line}") for line in wrong], models)
+        return ConfigReading(None, [make_printable_and_shorten(f"{path}: {line}") for line in wrong], models)
     config = _configuration(checked.value)
     lines = tuple(f"{path}: {line}" for line in warnings)
     return ConfigReading(dataclasses.replace(config, path=path, table=table, warnings=lines), [], models)

@@ -22,7 +22,7 @@ from drivers.number_ranges import DAY_S, NumberRange
 from drivers.settings_model import Conflict, ConvertedFrom, KeywordOrType, ListOf, SettingsModel, checked_by, one_of
 from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.common.topics import ENDPOINT
-from monitor.settings.driver_settings import Driver, VirtualTable, read_driver
+from monitor.settings.driver_settings import BuiltLinkAndDecoder, VirtualTable, build_link_and_decoder
 from monitor.settings.field_types import (
     DURATION_FROM_TEXT,
     Address,
@@ -32,7 +32,7 @@ from monitor.settings.field_types import (
     ZenohKey,
     check_memory_limit,
     check_viewer_mode,
-    rate_as_period_annotation,
+    period_stated_as_rate_annotation,
 )
 
 WINDOW_SAMPLES: Final = (100, 10_000_000)
@@ -83,7 +83,7 @@ class Limit(SettingsModel):
         description="time for which the coefficient must be beyond the bound, or within the bounds again",
     )
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict if the limit has no bound, or if the bounds contradict each other."""
         bounds = ("above", "below", "times_model")
         if self.above is None and self.below is None and self.times_model is None:
@@ -109,7 +109,7 @@ class Device(SettingsModel):
     name: Annotated[str, checked_by(_check_name)] = Field(
         examples=["bench-1"], description="letters, digits, - and _; unique, since it is part of every zenoh key"
     )
-    driver: Annotated[Driver, ConvertedFrom(dict[str, Any], read_driver)] = Field(
+    driver: Annotated[BuiltLinkAndDecoder, ConvertedFrom(dict[str, Any], build_link_and_decoder)] = Field(
         examples=[{"link": "virtual"}], description="link and decoder"
     )
     rate_hz: Annotated[float, number_ranges.RATE_HZ] | None = Field(
@@ -122,13 +122,13 @@ class Device(SettingsModel):
             {"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, number_ranges.AVERAGING_TIME_S]]
         ),
     ] = Field("octave", description="averaging times: a grid, or a list of seconds")
-    refit_s: Annotated[float, rate_as_period_annotation("every sample")] = Field(
+    refit_s: Annotated[float, period_stated_as_rate_annotation("every sample")] = Field(
         0.1,
         alias="refit",
         examples=["10 Hz"],
         description='rate at which the coefficients are fitted, or "every sample"',
     )
-    publish_s: Annotated[float, rate_as_period_annotation("every block")] = Field(
+    publish_s: Annotated[float, period_stated_as_rate_annotation("every block")] = Field(
         0.1, alias="publish", examples=["10 Hz"], description='rate at which results are published, or "every block"'
     )
     motion: Literal["tell", "leave out"] = Field(
@@ -183,7 +183,7 @@ class Device(SettingsModel):
         """True if samples during motion are excluded from the noise analysis."""
         return self.motion == "leave out"
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict for each duration that does not match the sample rate, and for each relative limit without a
         noise model."""
         if text := self._window_problem():
@@ -243,7 +243,7 @@ class ZenohTable(SettingsModel):
             return table
         return {"mode": None, "listen": None, **table}
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict if a zenoh client has no router endpoint."""
         if self.mode == "client" and not self.connect and self.config is None:
             text = 'empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]'
@@ -296,7 +296,7 @@ class Storage(SettingsModel):
     )
     history: bool = Field(True, description="keep results, events and status for years, thinned with age")
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict if segments would be deleted before completion."""
         if self.keep_s < self.segment_s:
             text = f"{self.keep_s:g} s is shorter than a segment of {self.segment_s:g} s"
@@ -345,7 +345,7 @@ class Hook(SettingsModel):
         30.0, alias="timeout", examples=["30s"], description="time after which the command and its children are killed"
     )
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict if the hook has neither a command nor a zenoh key."""
         if not self.command and self.key is None:
             yield Conflict("", "nothing to do; add command or key", ("command", "key"))
@@ -379,7 +379,7 @@ class ConfigFile(SettingsModel):
     metrics: MetricsTable = Field(MetricsTable(), description="numbers for Prometheus")
     log: LogTable = Field(LogTable(), description="messages of the service")
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield the conflicts between tables of a configuration file."""
         names = [device.name for device in self.devices]
         places = tuple(f"device[{i}].name" for i in range(len(names)))

@@ -21,11 +21,14 @@ CLASSIC_BYTES: Final = 8
 
 
 class CanPort(Port):
-    """Port of a simulated sensor on a virtual CAN bus. The link is lost after ``silence_s`` seconds without frames."""
+    """Port of a simulated sensor on a virtual CAN bus.
 
-    def __init__(self, silence_s: float) -> None:
+    The link is lost after ``link_lost_after_s`` seconds without frames.
+    """
+
+    def __init__(self, link_lost_after_s: float) -> None:
         self._channel = f"imu-monitor-{secrets.token_hex(8)}"
-        settings = can_link.Settings(interface="virtual", channel=self._channel, silence=silence_s)
+        settings = can_link.Settings(interface="virtual", channel=self._channel, silence=link_lost_after_s)
         super().__init__(can_link.build(settings))
         self._bus: can.BusABC | None = None
 
@@ -44,7 +47,7 @@ class CanPort(Port):
             if bus is not None:
                 bus.shutdown()
 
-    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
+    def send_and_count_chunks(self, chunks: Sequence[Chunk]) -> int:
         """Send each chunk as one CAN frame, and return the number of sent chunks."""
         import can
 

@@ -45,20 +45,20 @@ def check_sensor_settings(table: VirtualTable) -> None:
         try:
             coming += [(text, axis, effect) for axis, effect in parse_effects(text)]
         except ConfigError as error:
-            wrong += error.lines
+            wrong += error.mistake_lines
     try:
         stream = None
         if table.model:
             model = read_model(Path(table.model))
             stream = model.start_stream(model.sample_rate_hz or DEFAULT_RATE_HZ, table.seed)
     except ConfigError as error:
-        wrong += error.lines
+        wrong += error.mistake_lines
     for text, axis, effect in coming:
         try:
             if stream is not None:
                 stream.add_effect(axis, effect)
         except ConfigError as error:
-            wrong += [f'effect "{text}": {line}' for line in error.lines]
+            wrong += [f'effect "{text}": {line}' for line in error.mistake_lines]
     if wrong:
         raise ConfigError(*wrong)
 
@@ -94,7 +94,7 @@ class SimulatedSensor:
         self._made = 0
         self._add_effects(self._create_stream(table.seed))  # reports errors of the effects before the sensor starts
 
-    def start_clock(self) -> None:
+    def compile_kernels_and_start_clock(self) -> None:
         """Compile the simulation kernels, and start the clock of the sensor."""
         trial = self._create_stream(0)
         self._add_effects(trial)

@@ -45,7 +45,7 @@ class FaultCounts:
     held_s: float = 0.0  # longest delay of a burst
 
     @property
-    def sample_count(self) -> int:
+    def total_simulated_samples(self) -> int:
         """Total number of simulated samples: sent + lost + flipped + cut + dropped."""
         return self.sent + self.lost + self.flipped + self.cut + self.dropped
 

@@ -39,7 +39,7 @@ class Port:
         """Disconnect the simulated sensor from the link, like pulling a cable."""
         raise NotImplementedError
 
-    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
+    def send_and_count_chunks(self, chunks: Sequence[Chunk]) -> int:
         """Send chunks without waiting for a reader, and return the number of completely sent chunks."""
         raise NotImplementedError
 
@@ -48,24 +48,24 @@ class Port:
         self.unplug()
 
 
-def create_port(carrier: str, silence_s: float) -> Port:
+def create_port(carrier: str, link_lost_after_s: float) -> Port:
     """Create the port of a simulated sensor for a carrier.
 
     Parameters
     ----------
     carrier : str
         Carrier of the wire format: "frames" for CAN, "messages" for zenoh, otherwise serial bytes.
-    silence_s : float
+    link_lost_after_s : float
         Time in seconds without data after which the link counts as lost.
     """
     if carrier == "frames":
         from monitor.simulator.can_port import CanPort
 
-        return CanPort(silence_s)
+        return CanPort(link_lost_after_s)
     if carrier == "messages":
         from monitor.simulator.zenoh_port import ZenohPort
 
-        return ZenohPort(silence_s)
+        return ZenohPort(link_lost_after_s)
     from monitor.simulator.pty_port import PtyPort
 
-    return PtyPort(silence_s)
+    return PtyPort(link_lost_after_s)

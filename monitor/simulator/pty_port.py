@@ -23,12 +23,15 @@ WAIT_S: Final = 0.01
 
 
 class PtyPort(Port):
-    """Port of a simulated sensor on a pseudo-terminal. The link is lost after ``silence_s`` seconds without data."""
+    """Port of a simulated sensor on a pseudo-terminal.
 
-    def __init__(self, silence_s: float) -> None:
+    The link is lost after ``link_lost_after_s`` seconds without data.
+    """
+
+    def __init__(self, link_lost_after_s: float) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="imu-monitor-"))
         self.path = self._folder / "tty"
-        settings = serial_link.Settings(port=str(self.path), baudrate=921600, silence=silence_s)
+        settings = serial_link.Settings(port=str(self.path), baudrate=921600, silence=link_lost_after_s)
         super().__init__(serial_link.build(settings))
         self._master: int | None = None
 
@@ -56,7 +59,7 @@ class PtyPort(Port):
             if master is not None:
                 os.close(master)
 
-    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
+    def send_and_count_chunks(self, chunks: Sequence[Chunk]) -> int:
         """Write chunks to the pseudo-terminal until the buffer is full. Return the number of completely written
         chunks."""
         data = b"".join(chunk.data for chunk in chunks)

@@ -78,7 +78,7 @@ class SimulatedDevice:
 
     def _run(self) -> None:
         """Send samples in bursts until the device is stopped."""
-        self._sensor.start_clock()
+        self._sensor.compile_kernels_and_start_clock()
         begun_s, made = self.now_s(), 0
         step_s = max(BURST_S, 0.5 / self._pace_hz)  # a sensor with a low rate needs two steps per sample
         while not self._stop.wait(step_s + self._burst_delay_s()):
@@ -116,7 +116,7 @@ class SimulatedDevice:
             (kind, self._faults.apply_fault(kind, position, chunks))
             for kind, position, chunks in zip(draws.kind_per_sample(), draws.position.tolist(), frames, strict=True)
         ]
-        sent = self.port.send_chunks([chunk for _, chunks in faulty for chunk in chunks])
+        sent = self.port.send_and_count_chunks([chunk for _, chunks in faulty for chunk in chunks])
         for kind, chunks in faulty:
             sent -= len(chunks)
             self.fault_counts.count_sample(kind, all_sent=sent >= 0)

@@ -18,12 +18,14 @@ KEY: Final = "imu-monitor/virtual/samples"
 
 
 class ZenohPort(Port):
-    """Port of a simulated sensor with a separate zenoh session. The link is lost after ``silence_s`` seconds without
-    messages."""
+    """Port of a simulated sensor with a separate zenoh session.
 
-    def __init__(self, silence_s: float) -> None:
+    The link is lost after ``link_lost_after_s`` seconds without messages.
+    """
+
+    def __init__(self, link_lost_after_s: float) -> None:
         self._endpoint = f"tcp/127.0.0.1:{_free_port()}"
-        settings = zenoh_link.Settings(key=KEY, connect=(self._endpoint,), silence=silence_s)
+        settings = zenoh_link.Settings(key=KEY, connect=(self._endpoint,), silence=link_lost_after_s)
         super().__init__(zenoh_link.build(settings))
         self._session: zenoh.Session | None = None
         self._publisher: Any = None
@@ -48,7 +50,7 @@ class ZenohPort(Port):
             if session is not None:
                 session.close()  # type: ignore[no-untyped-call]
 
-    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
+    def send_and_count_chunks(self, chunks: Sequence[Chunk]) -> int:
         """Publish each chunk as one zenoh message, and return the number of published chunks."""
         with self._plugging:
             if self._session is None:

@@ -299,7 +299,7 @@ def test_reset_forgets_half_a_frame(decoder: Decoder) -> None:
     first, rest = flat(parts[:4]), bytes_of(parts[4:])
     feed(decoder, [first])
     assert feed_bytes(decoder, rest[0][: len(rest[0]) // 2]) == []
-    decoder.reset()
+    decoder.forget_stream_state()
     got = seen(feed_bytes(decoder, b"".join(rest[1:])))
     assert len(got[0]) == N - 5
     assert got[3] == 0
@@ -377,5 +377,5 @@ def test_garbage_chunks_raise_nothing(decoder: Decoder) -> None:
     for n in rng.integers(0, 400, 2000).tolist():
         data = rng.integers(0, 256, n, np.uint8).tobytes()
         feed(decoder, [[Chunk(data, 1, address=addresses[n % len(addresses)])]])
-    decoder.reset()
+    decoder.forget_stream_state()
     assert len(seen(feed(decoder, [flat(chunks_of(decoder, made(decoder)))]))[0]) >= N - 1

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding
 from monitor.reconcile.diagnostics.null_distribution import estimate_null_distributions, run_diagnostics
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, inverse_cosine_transform
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, N, axes, correlated, seen, time_s, walk, warmth, white
@@ -184,7 +184,7 @@ def test_location_is_inside_the_recording(name):
         "time": (0.0, n / RATE_HZ),
         "temperature": (warmth(n).min() - 1e-9, warmth(n).max() + 1e-9),
     }
-    for kind, place in where.resolved_dimensions().items():
+    for kind, place in where.resolved_location_dimensions().items():
         if kind in limits:
             assert limits[kind][0] <= place[0] <= place[1] <= limits[kind][1]
     if name == "other_axes":

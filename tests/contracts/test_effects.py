@@ -16,8 +16,16 @@ from scipy.signal import welch
 import monitor.noise.effects as folder
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from monitor.noise.effect import AxisLeak, Effect, Source, Transform, gyro_and_accel_units, required_parameters
-from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER, NoiseStep
+from monitor.noise.effect import (
+    AxisLeak,
+    Effect,
+    Source,
+    Transform,
+    WhiteNoiseGain,
+    gyro_and_accel_units,
+    required_parameters,
+)
+from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER, AxisPermutation, HeavyTails
 from monitor.noise.model import NoiseModel
 from tests.contracts.effect_examples import AXIS, RATE_HZ, effect, example, model, without
 
@@ -74,7 +82,7 @@ def test_says_what_it_is(name):
     assert all(gyro and accelerometer for gyro, accelerometer in gyro_and_accel_units(kind).values())
     assert inspect.getdoc(inspect.getmodule(kind))
     assert ">>>" in inspect.getdoc(kind)
-    assert issubclass(kind, (Source, AxisLeak, Transform, NoiseStep))
+    assert issubclass(kind, (Source, AxisLeak, Transform, WhiteNoiseGain, AxisPermutation, HeavyTails))
     assert issubclass(kind, Transform) == (kind in TRANSFORM_ORDER)
 
 
@@ -147,15 +155,15 @@ def test_any_cut_into_blocks_gives_the_same_series(name, cuts):
 )
 def test_a_source_by_itself_gives_what_the_stream_adds(name):
     started = effect(name).start_series(RATE_HZ, np.random.default_rng(5))
-    pieces = [started.draw_samples(size, first) for size, first in ((1, 0), (0, 1), (900, 1), (99, 901))]
-    whole = effect(name).start_series(RATE_HZ, np.random.default_rng(5)).draw_samples(1000)
+    pieces = [started.draw_next_samples(size, first) for size, first in ((1, 0), (0, 1), (900, 1), (99, 901))]
+    whole = effect(name).start_series(RATE_HZ, np.random.default_rng(5)).draw_next_samples(1000)
     np.testing.assert_array_equal(np.concatenate(pieces), whole)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_same_seed_same_series_other_seed_another(name):
     np.testing.assert_array_equal(series(name, 1, 200), series(name, 1, 200))
-    certain = name in ("bias", "rate_ramp", "bias_step", "turn_on_transient")
+    certain = name in ("bias", "rate_ramp", "bias_step", "turn_on_transient", "bias_curve")
     assert np.array_equal(series(name, 1, 200), series(name, 2, 200)) == certain
 
 
@@ -173,7 +181,7 @@ def test_is_read_back_as_it_was_written(name):
     assert NoiseModel.from_toml(written).to_toml() == written
     assert name in str(model(name))
     for parameter, (unit, _) in gyro_and_accel_units(EFFECTS[name]).items():
-        if getattr(effect(name), parameter) is not None and unit not in ("1", "axis"):
+        if getattr(effect(name), parameter) is not None and unit not in ("1", "axis", "text"):
             assert f"{parameter} = " in str(model(name))
             assert unit in str(model(name))
 
@@ -189,7 +197,7 @@ def test_what_may_be_absent_stays_absent(name):
 def test_truth_is_ready_for_json_and_the_same_for_the_same_seed(name):
     def told() -> str:
         stream = model(name).start_stream(RATE_HZ, 4)
-        stream.draw_samples(500)
+        stream.draw_next_samples(500)
         return json.dumps(stream.drawn_random_values(), allow_nan=False)
 
     assert told() == told()
@@ -199,7 +207,15 @@ def parameters(name: str, **changed: object) -> dict[str, object]:
     return {**{key: example(name).parameters.get(key, 0.3) for key in gyro_and_accel_units(EFFECTS[name])}, **changed}
 
 
-NUMBERS = [(name, f.name) for name in NAMES for f in fields(EFFECTS[name]) if not f.metadata.get("axis")]
+NUMBERS = [(name, f.name) for name in NAMES for f in fields(EFFECTS[name]) if "quantity" in f.metadata]
+WORDS = [(name, f.name) for name in NAMES for f in fields(EFFECTS[name]) if "choices" in f.metadata]
+
+
+@pytest.mark.parametrize(("name", "parameter"), WORDS)
+@pytest.mark.parametrize("bad", [1.0, True, "unknown", ["iir"]])
+def test_refuses_what_is_no_choice(name, parameter, bad):
+    with pytest.raises(ConfigError, match=f"^{name}: {parameter} must be one of "):
+        EFFECTS[name](**parameters(name, **{parameter: bad}))
 
 
 @pytest.mark.parametrize(("name", "parameter"), NUMBERS)

@@ -162,7 +162,7 @@ def receive(rig: Rig) -> list[Chunk]:
     """Send until something comes: a zenoh session needs a moment to see its router."""
     for _ in range(100):
         rig.send()
-        chunks = rig.link.poll_chunks(0.05)
+        chunks = rig.link.wait_for_chunks_or_timeout(0.05)
         if chunks:
             return chunks
     raise AssertionError("nothing came")
@@ -170,7 +170,7 @@ def receive(rig: Rig) -> list[Chunk]:
 
 def read_on(link: Link) -> None:
     for _ in range(100):
-        link.poll_chunks(0.05)
+        link.wait_for_chunks_or_timeout(0.05)
 
 
 def test_every_link_has_a_rig() -> None:
@@ -216,10 +216,10 @@ def test_closing_before_opening_is_harmless(rig: Rig) -> None:
 def test_read_returns_none_on_timeout(rig: Rig) -> None:
     rig.link.open()
     receive(rig)
-    while rig.link.poll_chunks(0.05):
+    while rig.link.wait_for_chunks_or_timeout(0.05):
         pass
     start = time.monotonic()
-    assert rig.link.poll_chunks(rig.quiet_s) is None
+    assert rig.link.wait_for_chunks_or_timeout(rig.quiet_s) is None
     assert time.monotonic() - start >= rig.quiet_s * 0.9  # a lower bound holds on any machine
 
 
@@ -239,20 +239,20 @@ def test_read_after_close_raises_link_lost(rig: Rig) -> None:
     rig.link.open()
     rig.link.close()
     with pytest.raises(LinkLost):
-        rig.link.poll_chunks(0.1)
+        rig.link.wait_for_chunks_or_timeout(0.1)
 
 
 def test_closing_ends_a_waiting_read(rig: Rig) -> None:
     rig.link.open()
     receive(rig)
-    while rig.link.poll_chunks(0.05):
+    while rig.link.wait_for_chunks_or_timeout(0.05):
         pass
     began, ended = threading.Event(), threading.Event()
 
     def wait() -> None:
         began.set()
         with contextlib.suppress(LinkLost):
-            rig.link.poll_chunks(FOREVER_S)
+            rig.link.wait_for_chunks_or_timeout(FOREVER_S)
         ended.set()
 
     reader = threading.Thread(target=wait)

@@ -266,9 +266,9 @@ def test_loss_counts_once_beside_rejected_frames_in_one_read():
     frames = [c.data for c in rig.encoder.encode(samples(0, 60))]
     rig.link.open()
     rig.link.write(b"".join(frames[:20]))
-    rig.driver.run_once()
+    rig.driver.read_and_push_once()
     rig.link.write(damaged(frames, {20}, {30, 31, 32})[20 * len(frames[0]) :])
-    rig.driver.run_once()
+    rig.driver.read_and_push_once()
     counts = rig.driver.counts
     assert (counts.received, counts.bad, counts.lost) == (56, 1, 3)
 
@@ -304,8 +304,8 @@ def can_rig(late, n=500):
         delay_ns = i % 2 * (8_000_000 if i // 2 in late else 1_000_000)
         rig.link.write(replace(chunk, t_ns=chunk.t_ns + delay_ns))
         if i % 3 == 0:
-            rig.driver.run_once()
-    rig.driver.run_once()
+            rig.driver.read_and_push_once()
+    rig.driver.read_and_push_once()
     return rig
 
 
@@ -323,7 +323,7 @@ def test_late_and_missing_can_frames_add_up_with_the_samples():
         if i // 2 in missing and i % 2 == 1:
             continue
         rig.link.write(replace(chunk, t_ns=chunk.t_ns + i % 2 * (8_000_000 if i // 2 in late else 1_000_000)))
-        rig.driver.run_once()
+        rig.driver.read_and_push_once()
     counts = rig.driver.counts
     assert (counts.received, counts.bad, counts.lost, counts.late) == (94, 3, 3, 3)
 

@@ -3,7 +3,7 @@
 import pytest
 
 from drivers import errors
-from drivers.errors import ConfigError, DecodeError, LinkLost, RecordingError, sanitize_error_text
+from drivers.errors import ConfigError, DecodeError, LinkLost, RecordingError, make_printable_and_shorten
 
 
 @pytest.mark.parametrize("kind", [ConfigError, DecodeError, LinkLost, RecordingError])
@@ -12,7 +12,7 @@ def test_one_line_whatever_it_quotes(kind: type[Exception]) -> None:
 
 
 def test_not_endless() -> None:
-    text = sanitize_error_text("x" * 10**6)
+    text = make_printable_and_shorten("x" * 10**6)
     assert len(text) == errors.MAX_TEXT_CHARACTERS + 2
     assert text.endswith(" …")
-    assert sanitize_error_text("x" * errors.MAX_TEXT_CHARACTERS) == "x" * errors.MAX_TEXT_CHARACTERS
+    assert make_printable_and_shorten("x" * errors.MAX_TEXT_CHARACTERS) == "x" * errors.MAX_TEXT_CHARACTERS

@@ -126,7 +126,7 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     path = tmp_path / segment_file.format_segment_name(1, 1.7e9)
     os.mkfifo(path.with_name(path.name + ".part"))
-    segment_file.SingleSegmentWriter(path, segment_file.SegmentMetadata("a", "samples")).close()
+    segment_file.SegmentFileWriter(path, segment_file.SegmentMetadata("a", "samples")).close()
 
 
 @pytest.mark.parametrize(
@@ -198,11 +198,11 @@ def test_a_can_database(kind: str, suffix: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["fifo", "socket", "device", "directory", "loop"])
 def test_a_history(kind: str, end: str, tmp_path: Path) -> None:
     if end:
-        sqlite_store.HistoryStore(tmp_path / sqlite_store.FILE_NAME).close()
+        sqlite_store.HistoryFileWriter(tmp_path / sqlite_store.FILE_NAME).close()
     path = tmp_path / f"{sqlite_store.FILE_NAME}{end}"
     make(kind, path)
     for look in (
-        lambda: sqlite_store.HistoryStore(tmp_path / sqlite_store.FILE_NAME).close(),
+        lambda: sqlite_store.HistoryFileWriter(tmp_path / sqlite_store.FILE_NAME).close(),
         lambda: list(read_history(tmp_path)),
     ):
         with pytest.raises((RecordingError, OSError), match=KINDS[kind]):

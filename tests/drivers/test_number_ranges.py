@@ -59,7 +59,7 @@ def test_a_wrong_number_anywhere_in_settings_is_found(settings: dict[str, object
 def test_every_number_outside_its_range_is_found() -> None:
     with pytest.raises(ConfigError) as caught:
         read_settings(Outer, {"rate": 0.0, "tau": [1.0, -1.0], "seed": -1})
-    assert [line.partition(": ")[0] for line in caught.value.lines] == ["rate", "tau[1]", "seed"]
+    assert [line.partition(": ")[0] for line in caught.value.mistake_lines] == ["rate", "tau[1]", "seed"]
 
 
 def test_zero_has_a_meaning_of_its_own() -> None:

@@ -44,7 +44,7 @@ class Whole(SettingsModel):
     low: float = 0.0
     high: float = 1.0
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         if self.low >= self.high:
             yield Conflict("low", "must be less than high", ("high",))
 
@@ -104,7 +104,7 @@ def test_values_keep_their_types() -> None:
     assert settings.parts == (Part(name="x"),)
     with pytest.raises(ConfigError) as caught:
         read_settings(Whole, {"rate": -1, "count": "x"})
-    assert len(caught.value.lines) == 2
+    assert len(caught.value.mistake_lines) == 2
 
 
 def test_settings_of_python_code_are_checked_too() -> None:

@@ -34,12 +34,12 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.recordings import save_samples
-from monitor.commands.reconcile import ReconciliationRequest, run_reconciliation
+from monitor.commands.reconcile import ReconciliationRequest, reconcile_and_write_report
 from monitor.common import shipped_config_paths
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import MinuteAggregator
-from monitor.history.sqlite_store import FILE_NAME, HistoryStore
+from monitor.history.sqlite_store import FILE_NAME, HistoryFileWriter
 from monitor.history.stored_events import StoredEvent
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
@@ -47,7 +47,7 @@ from monitor.publishing.plots.reconcile_figures import diagnostic_comparison_svg
 from monitor.publishing.rerun import sinks
 from monitor.publishing.rerun.fleet import FleetView
 from monitor.publishing.rerun.queued_view import RerunView
-from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
@@ -286,7 +286,7 @@ def view(out: Path, folder: Path) -> Path:
             daemons.append(ending.enter_context(running(loading.load_config(file))))
         detail = [f"fleet/{name}" for name in MEMBERS[:2]]
         viewer = RerunView(
-            ViewerSettings("native", port), [DeviceInfo(key, "over zenoh") for key in detail], fleet=True
+            ViewerSettings("native", port), [ViewerDeviceDescription(key, "over zenoh") for key in detail], fleet=True
         )
         arriving = ending.enter_context(contextlib.closing(ZenohSubscriber("fleet/**", places, None, detail)))
         ending.enter_context(contextlib.closing(viewer))
@@ -344,9 +344,9 @@ def write_history(path: Path, device: str, now_s: float) -> None:
             scale = (1.0 + wander[i]) * (1.5 if i == 500 else 1.0)
             rows.append(minutes.add_estimate(now_s - 86_400.0 + 60.0 * i, scale_estimate(scale, rng)))
             rows.append(
-                minutes.generate_temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)]))
+                minutes.add_temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)]))
             )
-    store = HistoryStore(path)
+    store = HistoryFileWriter(path)
     times = [now_s - 86_400.0 + 60.0 * i for i in (500, 800, 860)]
     told = [("noise_changed", "gz angle random walk rose by 50 %"), ("link_lost", "/dev/ttyUSB0: gone"),
             ("link_back", "/dev/ttyUSB0: back after 1 h 00 min")]  # fmt: skip
@@ -442,7 +442,7 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
         assert rate_hz is not None
         n = round(HOUR_S * rate_hz)
         save_samples(source, np.arange(n) / rate_hz, model.simulate(n, rate_hz, 1), None)
-    return run_reconciliation(ReconciliationRequest(source, read_model(MODEL), folder / "result")).axes["gz"]
+    return reconcile_and_write_report(ReconciliationRequest(source, read_model(MODEL), folder / "result")).axes["gz"]
 
 
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:
@@ -508,7 +508,7 @@ def recording(folder: Path, seconds: float, changed: bool = False) -> Path:
         rate_hz = model.sample_rate_hz
         assert rate_hz is not None
         since_s = np.arange(round(seconds * rate_hz)) / rate_hz
-        values = model.start_stream(rate_hz, 1).draw_samples(since_s.size)
+        values = model.start_stream(rate_hz, 1).draw_next_samples(since_s.size)
         if changed:
             after = since_s >= CHANGED_S
             values[after, 2] += MORE_N * rate_hz**0.5 * np.random.default_rng(1).standard_normal(after.sum())

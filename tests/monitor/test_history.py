@@ -13,8 +13,8 @@ import pytest
 from drivers.data_types import Event, SampleBlock
 from drivers.recordings import save_samples
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
-from monitor.common.units import format_utc
-from monitor.daemon.output_interface import Output
+from monitor.common.unit_formatting import format_utc
+from monitor.daemon.outputs.output import Output
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history import history_table as past

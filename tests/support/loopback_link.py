@@ -59,7 +59,7 @@ class LoopbackLink:
             self._open = True
             self._dropped = False
 
-    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
+    def wait_for_chunks_or_timeout(self, timeout_s: float) -> list[Chunk] | None:
         """Return all chunks written since the last call, after waiting up to ``timeout_s`` seconds for the first."""
         with self._changed:
             self._changed.wait_for(self._can_return, timeout_s)

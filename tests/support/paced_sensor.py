@@ -71,7 +71,7 @@ def follow_reader(imu: SimulatedDevice, driver: Driver, allowed: Callable[[], fl
                 - driver.counts.received
                 - driver.clock.dropped_repeated_rows
             )
-            limit = max(limit, min(imu.fault_counts.sample_count + AHEAD - waiting, allowed()))
+            limit = max(limit, min(imu.fault_counts.total_simulated_samples + AHEAD - waiting, allowed()))
         return min(host_s - begun_s, (limit + 0.5) / imu._pace_hz)
 
     imu.now_s = now_s

@@ -12,7 +12,7 @@ def test_what_was_written_before_opening_waits() -> None:
     chunk = Chunk(b"frame", 7, 0x123)
     link.write(chunk)
     link.open()
-    assert link.poll_chunks(0.0) == [chunk]
+    assert link.wait_for_chunks_or_timeout(0.0) == [chunk]
     assert (link.carrier, link.epoch) == ("frames", "unix")
 
 
@@ -22,10 +22,10 @@ def test_drop_loses_what_was_unread_and_opening_heals() -> None:
     link.write(b"lost")
     link.drop()
     with pytest.raises(LinkLost, match="gone"):
-        link.poll_chunks(1.0)
+        link.wait_for_chunks_or_timeout(1.0)
     link.open()
     link.write(b"new")
-    assert [c.data for c in link.poll_chunks(1.0) or ()] == [b"new"]
+    assert [c.data for c in link.wait_for_chunks_or_timeout(1.0) or ()] == [b"new"]
 
 
 def test_end_comes_behind_what_was_written() -> None:
@@ -33,9 +33,9 @@ def test_end_comes_behind_what_was_written() -> None:
     link.open()
     link.write(b"last")
     link.end()
-    assert link.poll_chunks(1.0)
+    assert link.wait_for_chunks_or_timeout(1.0)
     with pytest.raises(LinkEnded):
-        link.poll_chunks(1.0)
+        link.wait_for_chunks_or_timeout(1.0)
 
 
 def test_absent() -> None:
@@ -45,4 +45,4 @@ def test_absent() -> None:
         link.open()
     link.absent = False
     link.open()
-    assert link.poll_chunks(0.0) is None
+    assert link.wait_for_chunks_or_timeout(0.0) is None

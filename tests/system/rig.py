@@ -14,11 +14,11 @@ import numpy as np
 from drivers.data_types import Event, SampleBlock, concatenate_blocks
 from monitor.common.device_health import Health
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.output_interface import Output
+from monitor.daemon.outputs.output import Output
 from monitor.daemon.service import Service
-from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.compensation.live_compensation import MeasuredAndSubtractedDrift
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.estimation.detection.model_comparison import ModelComparison
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings import loading
@@ -35,7 +35,7 @@ class Caught(Output):
         self.gaps: dict[str, ModelComparison] = {}
         self.thermals: dict[str, list[ThermalIntervalResult]] = {}
         self.rates: dict[str, list[SampleBlock]] = {}
-        self.drifts: dict[str, list[DriftUpdate]] = {}
+        self.drifts: dict[str, list[MeasuredAndSubtractedDrift]] = {}
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
 
@@ -50,12 +50,14 @@ class Caught(Output):
                 self.gaps[device] = result
             case ThermalIntervalResult():
                 self.thermals.setdefault(device, []).append(result)
-            case DriftUpdate():
+            case MeasuredAndSubtractedDrift():
                 self.drifts.setdefault(device, []).append(result)
             case TotalAndHadamardCurves():
                 self.totals[device] = result
 
-    def publish_compensated_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def publish_drift_compensated_samples(
+        self, device: str, received: int, samples: SampleBlock, offset_ns: int
+    ) -> None:
         self.rates.setdefault(device, []).append(samples)
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:

@@ -122,13 +122,13 @@ def stamp_as_recorded(link: Link, messages: list[can.Message]) -> None:
     recorded = [message.timestamp for message in imu_frames(messages)]
     begun_ns = time.monotonic_ns() - round((recorded[-1] - recorded[0]) * 1e9)
     times_ns = iter([begun_ns + round((t_s - recorded[0]) * 1e9) for t_s in recorded])
-    read = link.poll_chunks
+    read = link.wait_for_chunks_or_timeout
 
     def stamped(timeout_s: float) -> list[Chunk] | None:
         chunks = read(timeout_s)
         return None if chunks is None else [replace(chunk, t_ns=next(times_ns)) for chunk in chunks]
 
-    link.poll_chunks = stamped  # type: ignore[method-assign]
+    link.wait_for_chunks_or_timeout = stamped  # type: ignore[method-assign]
 
 
 @pytest.mark.data

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES
-from monitor.estimation.estimate import Estimate, PerSampleCoefficients
+from monitor.estimation.estimate import CoefficientsAfterEachSample, Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -45,7 +45,7 @@ class Kept(Caught):
 
     def __init__(self) -> None:
         super().__init__()
-        self.course: list[PerSampleCoefficients] = []
+        self.course: list[CoefficientsAfterEachSample] = []
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         super().publish_result(device, unix_s, received, result)

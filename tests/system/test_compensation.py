@@ -7,7 +7,7 @@ import zenoh
 
 from drivers.data_types import concatenate_blocks
 from drivers.recordings import load_samples, save_samples
-from drivers.zenoh.sample_message import SampleMessage, decode_samples
+from drivers.zenoh.sample_message import DecodedSampleMessage, decode_samples
 from monitor.commands.compensate import CompensationRequest, run_compensation
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
@@ -50,7 +50,7 @@ def test_rates_come_out_without_drift_live_as_offline(tmp_path: Path) -> None:
             wait_for(lambda: service.service.zenoh.state == "ok", "zenoh")
             made.replace(recording)
             wait_for(lambda: sum(map(len, caught.rates.get("bench-1", []))) == n, "all samples")
-        batches: list[SampleMessage] = []
+        batches: list[DecodedSampleMessage] = []
 
         def last_batch() -> bool:
             batches.extend(decode_samples(bytes(one.payload)) for one in iter(heard.try_recv, None))

@@ -17,7 +17,7 @@ from monitor.common import topics
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.service import Service
-from monitor.estimation.detection.model_comparison import ModelComparison
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.settings.loading import Config, VirtualTable, ZenohTable
 from monitor.simulator.demo_config import build_demo_config
 from tests.support.paced_sensor import follow_reader

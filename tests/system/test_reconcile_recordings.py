@@ -6,6 +6,8 @@ import pytest
 from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.result import AddedOrResizedEffect, Reconciliation
+from monitor.reconcile.summary.ranked_findings import rank_findings
+from monitor.reconcile.summary.summary_sentences import summarize
 from tests.support.recordings import recordings
 
 pytestmark = pytest.mark.data
@@ -72,6 +74,14 @@ def test_mpu6050_resonance() -> None:
     found = added(compared("mpu6050-hosttime/static-11min", "gz"))
     assert size(found["narrowband"], "frequency") == pytest.approx(31.38, abs=0.1)
     assert "sinusoidal" not in found
+
+
+def test_mpu6050_summary_begins_with_the_resonance() -> None:
+    result = compared("mpu6050-hosttime/static-11min", "gz")
+    first = rank_findings(result).findings[0]
+    assert (first.effect, first.parameters["frequency"].value) == ("narrowband", pytest.approx(31.38, abs=0.1))
+    assert first.share > 0.9
+    assert any(sentence.startswith("Resonance at 31.") for sentence in summarize(result))
 
 
 def test_xsens_tails() -> None:

@@ -37,7 +37,7 @@ def stamp_by_sentence(link: Link) -> None:
     The sentences carry no counter, so samples count as lost where a loaded machine stops for a while.
     """
     begun_ns, sentences = time.monotonic_ns(), 0
-    read = link.poll_chunks
+    read = link.wait_for_chunks_or_timeout
 
     def stamped(timeout_s: float) -> list[Chunk] | None:
         nonlocal sentences
@@ -47,7 +47,7 @@ def stamp_by_sentence(link: Link) -> None:
             found.append(replace(chunk, t_ns=begun_ns + round(sentences / RATE_HZ * 1e9)))
         return found or None
 
-    link.poll_chunks = stamped  # type: ignore[method-assign]
+    link.wait_for_chunks_or_timeout = stamped  # type: ignore[method-assign]
 
 
 @pytest.mark.data

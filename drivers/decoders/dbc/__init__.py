@@ -1,16 +1,16 @@
-"""Decoder for CAN sensors that are described by a DBC file. The settings map axes to signals.
+"""Decoder for CAN sensors that a DBC file describes. The settings assign a CAN signal to each axis.
 
-A sample may consist of several CAN messages, which ``drivers.decoders.dbc.sample_assembly`` joins. A sample is bad if a
-frame is missing or too short, or if the signal ``valid`` is not 1. With ``partial = true``, only the axes of a missing
-frame are marked as not measured. A sample with late frames is counted in ``dropped_late_samples`` and not in ``bad``. A
-message that contains only the temperature may have a lower rate than the samples. Each sample then contains the newest
-temperature.
+A sample may consist of several CAN messages, which ``drivers.decoders.dbc.sample_assembly`` joins. A sample is rejected
+if a frame is missing or too short, or if the signal ``valid`` is not 1. With ``partial = true``, a sample with a
+missing frame is kept, and the axes of the missing frame are marked as not measured. A sample with late frames is
+counted in ``dropped_late_samples`` and not in ``bad``. A message that contains only the temperature may arrive at a
+lower rate than the samples. Each sample then contains the newest temperature.
 
-J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by the parameter group, without the priority
-and the source address. The decoder accepts the first source address that it receives, unless the key ``source`` is set.
-A J1939 value in the top 2/256 of the range means "error" or "not available" (SAE J1939-71: 0xFE00 to 0xFFFF of 16
-bits), and the axis is marked as not measured. With ``not_available = true``, other messages are treated in the same
-way.
+J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by the parameter group. The priority and the
+source address are not part of the parameter group. The decoder accepts the first source address that it receives,
+unless the key ``source`` is set. A J1939 value in the top 2/256 of the range means "error" or "not available" (SAE
+J1939-71: 0xFE00 to 0xFFFF of 16 bits), and the axis is marked as not measured. With ``not_available = true``, other
+messages are treated in the same way.
 """
 
 from collections.abc import Sequence
@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 
 from drivers.data_types import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock, Timing
 from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder
-from drivers.decoders.dbc.database import Database
-from drivers.decoders.dbc.sample_assembly import CanMessage, SampleAssembler, SampleFrames
+from drivers.decoders.dbc.database import ConfiguredDbcMessages
+from drivers.decoders.dbc.sample_assembly import CanMessage, ReceivedSampleFrames, SampleAssembler
 from drivers.decoders.dbc.settings import COLUMNS, Settings, SignalSettings
 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
 
 MAX_CACHED_IDS: Final = 4096
-"""Maximum number of 29-bit identifiers in the cache, so that noise on the bus does not fill the memory."""
+"""Maximum number of cached 29-bit identifiers. The limit prevents corrupted identifiers from filling the memory."""
 
 
 class DbcDecoder:
@@ -57,8 +57,8 @@ class DbcDecoder:
         self.late_frames_hint = ""
         self._dropped = 0  # number of bad and late samples
         self.recent_problem = ""
-        self._two_senders_hint = ""  # hint that two senders are on the bus
-        self._samples_since_reject = 0  # number of good samples since the last rejected sample
+        self._two_senders_hint = ""  # message if two senders use the same parameter groups
+        self._samples_since_reject = 0  # number of valid samples since the last rejected sample
         self._builder = BlockBuilder()
         self._assembler = SampleAssembler(self._messages, settings)
         self._known = {m.address: i for i, m in self._numbered_messages() if not m.j1939}
@@ -68,20 +68,23 @@ class DbcDecoder:
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """Addresses to receive from the bus. The flag ``ANY_SOURCE`` marks J1939 parameter groups."""
+        """Addresses to receive from the CAN bus. The bit ``ANY_SOURCE`` marks J1939 parameter groups."""
         return tuple(m.address | (ANY_SOURCE if m.j1939 else 0) for _, m in self._numbered_messages())
 
-    def reset(self) -> None:
+    def forget_stream_state(self) -> None:
         """Discard an incomplete sample, the newest temperature and the accepted J1939 source address."""
-        self._assembler.reset()
-        self._builder.forget_rejected_frames()
+        self._assembler.forget_stream_state()
+        self._builder.forget_missing_samples()
         self._source = self._settings.source
         self._two_senders_hint = ""
         self._cache.clear()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the completed samples. ``t_ns`` is the arrival time of the last frame of a sample."""
-        done: list[SampleFrames] = []
+        """Return the samples that are complete after the given frames.
+
+        ``t_ns`` is the arrival time of the last frame of a sample.
+        """
+        done: list[ReceivedSampleFrames] = []
         for chunk in chunks:
             which = self._message_index(chunk.address)
             if which is None:
@@ -99,7 +102,7 @@ class DbcDecoder:
         self._samples_since_reject = 0 if rejected else self._samples_since_reject + len(done)
         if self._samples_since_reject >= HINT_FRAMES:
             self.recent_problem = self.late_frames_hint = ""
-        if delay_ns := self._assembler.take_late_frame_delay_ns():
+        if delay_ns := self._assembler.take_newest_late_frame_delay_ns():
             self._samples_since_reject = 0
             self.recent_problem = self.late_frames_hint = (
                 f"frames of one sample arrive {delay_ns * 1e-6:.3g} ms apart, more than "
@@ -115,7 +118,7 @@ class DbcDecoder:
         n = len(samples)
         table = np.column_stack((samples.values, samples.temperature_c))
         sent: list[tuple[CanMessage, Bytes]] = []
-        # the temperature is sent first, since the decoder applies it to the following samples
+        # The temperature is sent first, because the decoder assigns a temperature to the samples that follow.
         for _, message in sorted(self._numbered_messages()):
             frames = np.full((n, message.length), 0xFF if message.j1939 else 0, np.uint8)
             for column in message.columns:
@@ -133,7 +136,7 @@ class DbcDecoder:
         ]
 
     def _numbered_messages(self) -> list[tuple[int, CanMessage]]:
-        """Return the CAN messages and indices. A message that contains only the temperature has the index -1."""
+        """Return each CAN message with its index. A message that contains only the temperature has the index -1."""
         slow = [(-1, self._slow)] if self._slow is not None else []
         return [*slow, *enumerate(self._messages)]
 
@@ -169,7 +172,7 @@ class DbcDecoder:
         if len(data) >= self._slow.size:
             self._assembler.temperature = data[: self._slow.size]
 
-    def _decode_samples(self, done: Sequence[SampleFrames]) -> list[SampleBlock]:
+    def _decode_samples(self, done: Sequence[ReceivedSampleFrames]) -> list[SampleBlock]:
         n = len(done)
         table = np.full((n, len(COLUMNS)), np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
@@ -184,7 +187,7 @@ class DbcDecoder:
             if message.counter is not None:
                 raw: Ints = message.counter.extract_raw(frames).astype(np.int64)
                 ticks[there] = raw[there]
-        # ``BlockBuilder`` rejects a sample without any value, and counts the sample as missing
+        # ``BlockBuilder`` rejects a sample without any value and counts the sample as missing.
         table[~valid] = np.nan
         if not valid.all():
             self.recent_problem = f"{self._settings.valid} is not 1: the sensor reports that its values are invalid"
@@ -198,7 +201,7 @@ class DbcDecoder:
         )
 
 
-def _stack_frames(done: Sequence[SampleFrames], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
+def _stack_frames(done: Sequence[ReceivedSampleFrames], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
     frames = [s.temperature if which < 0 else s.frames[which] for s in done]
     empty = bytes(size)
     data = np.frombuffer(b"".join(f or empty for f in frames), np.uint8)
@@ -219,5 +222,5 @@ def build(settings: Settings) -> Decoder:
     ConfigError
         If the settings contain mistakes. The error has one line for each mistake.
     """
-    database = Database(settings)
+    database = ConfiguredDbcMessages(settings)
     return DbcDecoder(database.messages, settings, database.timing)

@@ -14,7 +14,7 @@ from drivers import file_access, units
 from drivers.data_types import ArrivalTimedFormat, CounterTimedFormat, Timing
 from drivers.decoders.dbc.sample_assembly import CanMessage, MeasuredSignal
 from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, SignalSettings
-from drivers.decoders.dbc.signal_bits import SignalBits
+from drivers.decoders.dbc.signal_bits import SignalCodec
 from drivers.errors import ConfigError
 from drivers.extras import require_extra
 from drivers.module_lookup import format_suggestion
@@ -22,10 +22,10 @@ from drivers.module_lookup import format_suggestion
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
 SHIPPED_PREFIX: Final = "shipped:"
 MAX_COUNTER_BITS: Final = 62
-"""Maximum length of a counter in bits, since ticks are int64."""
+"""Maximum length of a counter in bits. A longer counter would overflow the int64 array of ticks."""
 
 
-class Database:
+class ConfiguredDbcMessages:
     """Messages and signals that the settings select from a DBC file.
 
     Parameters
@@ -63,7 +63,7 @@ class Database:
         try:
             yield
         except ConfigError as error:
-            self._errors += error.lines
+            self._errors += error.mistake_lines
 
     def _find_configured_signals(self) -> None:
         s = self._settings
@@ -94,7 +94,7 @@ class Database:
         name = self._settings.counter
         if "." in name or self._settings.join == "time":
             return [self._find_signal("counter", name)]
-        # a message with only the temperature needs no counter
+        # Only messages with inertial measurements need a counter.
         inertial = [m.name for m in self._used.values() if not m.contains_only_temperature]
         return [self._find_signal("counter", f"{message}.{name}") for message in inertial]
 
@@ -139,8 +139,8 @@ class Database:
             raise ConfigError(f"{key}: {name} is multiplexed; such signals are not supported")
         return message, signal
 
-    def _register_message(self, message: Any, bits: SignalBits) -> CanMessage:
-        """Add a CAN message to the used messages, and increase ``size`` if the message is too short for the signal."""
+    def _register_message(self, message: Any, bits: SignalCodec) -> CanMessage:
+        """Return the entry of a CAN message, and create it if necessary. Extend ``size`` to the end of the signal."""
         extended, j1939 = bool(message.is_extended_frame), self._is_j1939(message)
         new = CanMessage(message.name, message.frame_id, extended, j1939, size=0, length=message.length, columns=[])
         entry = self._used.setdefault(message.name, new)
@@ -151,10 +151,10 @@ class Database:
         s = self._settings
         return bool(message.protocol == "j1939" if s.j1939 is None else s.j1939)
 
-    def _signal_bits(self, message: Any, signal: Any) -> SignalBits:
+    def _signal_bits(self, message: Any, signal: Any) -> SignalCodec:
         s = self._settings
         big_endian = signal.byte_order == "big_endian"
-        # a DBC file states the most significant bit of a Motorola signal and numbers the bits of a byte from 7 to 0
+        # For a Motorola signal, a DBC file states the most significant bit and numbers the bits of a byte from 7 to 0.
         first = 8 * (signal.start // 8) + 7 - signal.start % 8 if big_endian else signal.start
         if first < 0 or first + signal.length > 8 * message.length or not 0 < signal.length <= 64:
             raise ConfigError(f"{self._path.name}: {signal.name} does not fit in {message.name}")
@@ -168,7 +168,7 @@ class Database:
                 f"be finite, and the factor must not be 0"
             )
         not_available = self._is_j1939(message) if s.not_available is None else s.not_available
-        return SignalBits(
+        return SignalCodec(
             first,
             signal.length,
             big_endian,
@@ -181,7 +181,7 @@ class Database:
 
 
 def _locate(file: str) -> Path:
-    """Return the path of a DBC file. A name without a folder may refer to a shipped DBC file."""
+    """Return the path of a DBC file. A name without a folder may refer to a DBC file that is part of the project."""
     path = file_access.expand_user(file)
     name = file.removeprefix(SHIPPED_PREFIX)
     if name == file and (file_access.is_file(path) or len(path.parts) != 1):

@@ -2,15 +2,16 @@
 
 A sample is complete when one frame of every message has arrived. A frame starts the next sample if the current sample
 already contains a frame of the same message, or if the message contains only the counter. With ``join = "counter"``, a
-frame with a new counter value also starts the next sample. An incomplete sample is bad, unless ``partial`` is True.
-Frames before the first complete sample are ignored, since the link may have been opened in the middle of a sample.
+frame with a new counter value also starts the next sample. An incomplete sample is rejected, unless ``partial`` is
+True. Frames before the first complete sample are ignored, since the link may have been opened in the middle of a
+sample.
 
-A frame that arrives more than ``window`` after the first frame of the current sample is either late or starts the next
-sample. A frame with the counter value of the current sample is late. Without counter values, the order of the messages
-decides. The first message of a sample is the message with the longest median pause before the frame. A frame of the
-first message starts the next sample. A frame of any other message is late, unless a complete sample period has passed.
-A frame is kept in a queue while the order of the messages is unknown. If all frames of a sample have arrived but some
-were late, the sample is dropped and counted as missing, but not as bad.
+A frame that arrives more than the time ``window`` after the first frame of the current sample is either late or starts
+the next sample. A frame with the counter value of the current sample is late. Without counter values, the order of the
+messages decides whether the frame is late. The first message of a sample is the message with the longest median pause
+before the frame. A frame of the first message starts the next sample. A frame of any other message is late, unless a
+complete sample period has passed. A frame waits in a queue while the order of the messages is unknown. If all frames of
+a sample have arrived but some were late, the sample is dropped and counted as late, but not as bad.
 """
 
 from collections import deque
@@ -23,22 +24,25 @@ import numpy as np
 
 from drivers.data_types import AXES, EXTENDED_ID, NO_TICK
 from drivers.decoders.dbc.settings import Settings
-from drivers.decoders.dbc.signal_bits import SignalBits
+from drivers.decoders.dbc.signal_bits import SignalCodec
 
 PAUSE_HISTORY: Final = 15
-"""Number of pauses per message over which the median is computed."""
+"""Number of recent pauses per message from which the median pause is computed."""
 MIN_PAUSES: Final = 3
-"""Number of pauses per message that determine the order of the messages."""
+"""Minimum number of pauses per message from which the order of the messages is determined."""
 MAX_UNDECIDED_PER_MESSAGE: Final = 8
-"""Maximum number of waiting frames per message. Above this number, the order is estimated from the pauses so far."""
+"""Maximum number of queued frames per message.
+
+If more frames wait, the message order is estimated from the pauses so far.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredSignal:
     """Signal of one axis or of the temperature, with the conversion to SI units."""
 
-    index: int  # in COLUMNS
-    bits: SignalBits
+    index: int  # index of the column in COLUMNS
+    bits: SignalCodec
     factor: float
     offset: float
 
@@ -54,8 +58,8 @@ class CanMessage:
     size: int  # number of bytes from the start of the message to the end of the last used signal
     length: int  # number of bytes of the complete message
     columns: list[MeasuredSignal]
-    valid: SignalBits | None = None
-    counter: SignalBits | None = None
+    valid: SignalCodec | None = None
+    counter: SignalCodec | None = None
 
     @property
     def address(self) -> int:
@@ -75,7 +79,7 @@ class CanMessage:
 
 
 @dataclass(slots=True)
-class SampleFrames:
+class ReceivedSampleFrames:
     """CAN frames of one sample, in the order of the messages. A missing frame is None, and a short frame is b""."""
 
     frames: list[bytes | None]
@@ -83,22 +87,22 @@ class SampleFrames:
     start_ns: int  # arrival time of the first frame
     count: int  # value of the counter; NO_TICK = no counter value has arrived
     missing_before: int = 0  # number of bad and late samples since the last good sample
-    late: set[int] = field(default_factory=set)  # indices of the messages that arrived after the window
+    late: set[int] = field(default_factory=set)  # indices of the messages whose frames were late
     temperature: bytes | None = None  # newest frame of the message that contains only the temperature
 
     @property
     def complete(self) -> bool:
-        """True if every message has arrived."""
+        """True if a frame of every message has arrived."""
         return None not in self.frames
 
 
 class SampleAssembler:
-    """Assembler that joins CAN frames to samples, in order of arrival.
+    """Assembler that combines CAN frames into samples, in order of arrival.
 
     Parameters
     ----------
     messages
-        Messages of a sample.
+        CAN messages that make up one sample.
     settings
         Settings of the decoder.
     """
@@ -111,13 +115,13 @@ class SampleAssembler:
         self._window_ns = round(settings.window * 1e9) or (1 << 62)
         self._partial = settings.partial
         self.dropped_late_samples = 0
-        """Number of samples dropped because some of their frames arrived after the window."""
+        """Number of samples that were dropped because some of their frames were late."""
         self._delay_ns = 0  # time from the first frame of a sample to a late frame; 0 = no frame has been late
-        self.reset()
+        self.forget_stream_state()
 
-    def reset(self) -> None:
-        """Discard the current sample and the known order of the messages."""
-        self._current: SampleFrames | None = None
+    def forget_stream_state(self) -> None:
+        """Discard the current sample and the order of the messages."""
+        self._current: ReceivedSampleFrames | None = None
         self._synchronized = False
         self._missing = 0
         self._count_before = NO_TICK  # counter value of the previous sample
@@ -131,14 +135,12 @@ class SampleAssembler:
         missing, self._missing = self._missing, 0
         return missing
 
-    def take_late_frame_delay_ns(self) -> int:
-        """Return the delay of the newest late frame relative to the first frame of the sample in ns, and reset the
-        delay.
-        """
+    def take_newest_late_frame_delay_ns(self) -> int:
+        """Return and reset the delay in ns from the first frame of a sample to the newest late frame."""
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
 
-    def add_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[SampleFrames]) -> None:
+    def add_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[ReceivedSampleFrames]) -> None:
         """Add one CAN frame to the current or the next sample.
 
         Parameters
@@ -161,8 +163,11 @@ class SampleAssembler:
         while self._undecided and self._assign_frame(*self._undecided[0], finished):
             self._undecided.popleft()
 
-    def _assign_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[SampleFrames]) -> bool:
-        """Add a frame to the current or the next sample. Return False if the order of the messages is unknown."""
+    def _assign_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[ReceivedSampleFrames]) -> bool:
+        """Add a frame to the current or the next sample.
+
+        Return False if the order of the messages must be known first.
+        """
         count = self._read_count(message_index, data)
         sample = self._current
         if sample is not None:
@@ -180,7 +185,7 @@ class SampleAssembler:
                 self._add_late_frame(sample, message_index, data, finished)
                 return True
         if sample is None:
-            sample = self._current = SampleFrames([None] * self._n, t_ns, t_ns, NO_TICK)
+            sample = self._current = ReceivedSampleFrames([None] * self._n, t_ns, t_ns, NO_TICK)
         sample.frames[message_index] = data
         sample.t_ns = t_ns
         if count != NO_TICK:
@@ -191,7 +196,7 @@ class SampleAssembler:
         return True
 
     def _add_late_frame(
-        self, sample: SampleFrames, message_index: int, data: bytes, finished: list[SampleFrames]
+        self, sample: ReceivedSampleFrames, message_index: int, data: bytes, finished: list[ReceivedSampleFrames]
     ) -> None:
         if data:
             sample.late.add(message_index)
@@ -207,7 +212,7 @@ class SampleAssembler:
             return NO_TICK
         return int(bits.extract_raw(np.frombuffer(data, np.uint8)[None, :])[0])
 
-    def _begins_next(self, sample: SampleFrames, message_index: int, count: int, delay_ns: int) -> bool | None:
+    def _begins_next(self, sample: ReceivedSampleFrames, message_index: int, count: int, delay_ns: int) -> bool | None:
         """Return True if a frame starts the next sample; None if the order of the messages must be known first."""
         if (
             sample.frames[message_index] is not None
@@ -224,10 +229,10 @@ class SampleAssembler:
             return None
         pauses = [median(newest) if newest else 0 for newest in self._pauses]
         first = pauses.index(max(pauses)) if self._counter_message is None else self._counter_message
-        # the sum of the pauses before all messages is the sample period
+        # The pauses before all messages add up to the sample period.
         return message_index == first or delay_ns >= sum(pauses)
 
-    def _finish(self, sample: SampleFrames, finished: list[SampleFrames]) -> None:
+    def _finish(self, sample: ReceivedSampleFrames, finished: list[ReceivedSampleFrames]) -> None:
         """Append a good sample to ``finished``, or increase the number of late or bad samples."""
         self._count_before = sample.count
         whole = sample.complete and b"" not in sample.frames

@@ -15,7 +15,7 @@ COLUMNS: Final = (*AXES, TEMPERATURE)
 
 
 class SignalSettings(SettingsModel):
-    """Settings of the signal of one axis: name, unit and an additional factor."""
+    """CAN signal of one axis: name, unit and additional factor."""
 
     signal: str = Field(examples=["RateOfTurn.RateX"], description='"Message.Signal"')
     unit: str = Field("", examples=["rad/s"], description="unit of the signal; absent: as the DBC says")
@@ -25,7 +25,7 @@ class SignalSettings(SettingsModel):
 
 
 def _signal(value: Any) -> Any:
-    """Convert the short form "Message.Signal" or "-Message.Signal" to the table of a signal."""
+    """Convert the short form "Message.Signal" or "-Message.Signal" to a table of settings."""
     if isinstance(value, str):
         return {"signal": value.removeprefix("-"), "factor": -1.0 if value.startswith("-") else 1.0}
     if not isinstance(value, dict | SignalSettings):
@@ -34,7 +34,7 @@ def _signal(value: Any) -> Any:
 
 
 class Settings(SettingsModel):
-    """Keys of ``[device.driver.decoder_options]`` for a CAN database."""
+    """Keys of ``[device.driver.decoder_options]`` for a sensor that is described by a DBC file."""
 
     file: FileOrName = Field(
         examples=["xsens_mti"],
@@ -74,7 +74,7 @@ class Settings(SettingsModel):
         description="values in the top 2/256 of their range are not measured; absent: true for J1939 messages only",
     )
 
-    def find_conflicts(self) -> Iterator[Conflict]:
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict if no axis is configured, or if ``join = "counter"`` has no counter."""
         if not self.signals:
             yield Conflict("signals", 'empty; it maps axes to signals: gz = "Message.Signal"')

@@ -14,14 +14,14 @@ from drivers.data_types import Floats
 from drivers.decoders.base import Bytes
 
 FIRST_INDICATOR: Final = 0xFE
-"""Smallest top byte of a value that is an indicator and not a measurement (SAE J1939-71)."""
+"""Smallest top byte of a raw value that means "error" or "not available" (SAE J1939-71)."""
 ALL_ONES: Final = np.uint64((1 << 64) - 1)
 
 RawNumbers = NDArray[np.uint64]
 
 
 @dataclass(frozen=True, slots=True)
-class SignalBits:
+class SignalCodec:
     """Position of a signal in a CAN frame, and the conversion from the raw number to a physical value."""
 
     first: int  # number of the first bit
@@ -54,7 +54,7 @@ class SignalBits:
         raw = self.extract_raw(frames)
         values = self._to_float(raw) * self.scale + self.offset
         if self.indicators:
-            # compare the top byte; fields shorter than one byte have no indicators
+            # Compare the top byte. Signals shorter than one byte have no raw values for "error" or "not available".
             values = np.where(raw >> np.uint64(self.length - 8) >= FIRST_INDICATOR, np.nan, values)
         return values
 
@@ -66,7 +66,7 @@ class SignalBits:
         frames
             [n, size] uint8, changed in place.
         values
-            [n] float64 in the unit of the DBC. NaN is written as "not available" if ``indicators`` is True.
+            [n] float64 in the unit of the DBC file. If ``indicators`` is True, NaN is written as "not available".
         """
         with np.errstate(over="ignore"):
             raw = self._from_float((values - self.offset) / self.scale)
@@ -92,7 +92,7 @@ class SignalBits:
     def _to_float(self, raw: RawNumbers) -> Floats:
         if self.is_float:
             bits = raw.astype(f"<u{self.length // 8}")
-            with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
+            with np.errstate(invalid="ignore"):  # converting a signalling NaN causes a warning
                 return bits.view(f"<f{self.length // 8}").astype(np.float64)
         if self.signed:
             unused = np.uint64(64 - self.length)
@@ -109,7 +109,7 @@ class SignalBits:
         high = low + (1 << self.length) - 1
         if self.indicators:
             high = (FIRST_INDICATOR << self.length - 8) - 1
-        # the largest float64 within the range, since 2⁶³ - 1 is not a float64
+        # Use the largest float64 within the range, because float64 cannot represent 2⁶³ - 1.
         top = float(high) if int(float(high)) <= high else np.nextafter(float(high), 0.0)
         whole = np.rint(np.clip(np.nan_to_num(numbers), low, top))
         return whole.astype(np.int64).view(np.uint64) if self.signed else whole.astype(np.uint64)

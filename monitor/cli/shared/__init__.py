@@ -1,1 +1,1 @@
-"""Options, output and error messages that the commands share."""
+"""Options, output functions and error messages that the commands share."""

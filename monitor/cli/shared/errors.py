@@ -10,23 +10,23 @@ from typing import Any, Final
 import typer
 from typer.exceptions import TyperException
 
-from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, sanitize_error_text
+from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, make_printable_and_shorten
 
 FAILED: Final = 1
-"""Exit status of a failure at run time."""
+"""Exit status after a failure at run time."""
 WRONG: Final = 2
-"""Exit status of a wrong argument or input file."""
+"""Exit status if an argument or an input file is invalid."""
 NO_ANSWER: Final = 3
 """Exit status if the data do not support an answer."""
 INTERRUPTED: Final = 128 + signal.SIGINT
 DEBUG: Final = "--debug"
 MAX_CAUSE_CHARACTERS: Final = 300
-"""Maximum length of the text of an unexpected error, because libraries may produce very long texts."""
+"""Maximum length in characters of an unexpected error text, because libraries may produce very long texts."""
 
 
 @contextlib.contextmanager
 def name_option_in_config_errors(option: str) -> Iterator[None]:
-    """Add the name of an option at the beginning of the message of a ConfigError."""
+    """Prepend the name of an option to the message of a ConfigError."""
     try:
         yield
     except ConfigError as error:
@@ -34,10 +34,10 @@ def name_option_in_config_errors(option: str) -> Iterator[None]:
 
 
 def error_message_and_exit_status(error: Exception) -> tuple[str, int]:
-    """Return the error message and the exit status for an error that ended a command."""
+    """Return the error message and the exit status after an error has ended a command."""
     match error:
         case TyperException():
-            return sanitize_error_text(_usage(error)), WRONG
+            return make_printable_and_shorten(_usage(error)), WRONG
         case ConfigError() | RecordingError():
             return str(error), WRONG
         case NotReady():
@@ -47,7 +47,7 @@ def error_message_and_exit_status(error: Exception) -> tuple[str, int]:
         case typer.Abort():
             return "interrupted", INTERRUPTED
         case OSError():
-            return sanitize_error_text(_system_error(error)), FAILED
+            return make_printable_and_shorten(_system_error(error)), FAILED
         case MemoryError():
             why = f" ({cause})" if (cause := _cause(error)) else ""
             return f"not enough memory{why}; read less data, e.g. the end of a recording with --last 1h", FAILED
@@ -59,12 +59,12 @@ def error_message_and_exit_status(error: Exception) -> tuple[str, int]:
 
 
 def _cause(error: Exception) -> str:
-    text = " ".join(sanitize_error_text(str(error)).split())
+    text = " ".join(make_printable_and_shorten(str(error)).split())
     return text if len(text) <= MAX_CAUSE_CHARACTERS else f"{text[:MAX_CAUSE_CHARACTERS]} …"
 
 
 def _system_error(error: OSError) -> str:
-    """Return the text of a system error, with a special text if the working directory is missing."""
+    """Return the text of a system error. A missing working directory gives a special text."""
     if error.filename is None:
         try:
             os.getcwd()
@@ -74,7 +74,7 @@ def _system_error(error: OSError) -> str:
 
 
 def _usage(error: TyperException) -> str:
-    """Return an error message with the missing arguments, or with the possible values of a wrong argument."""
+    """Return an error message that lists the missing arguments, or the possible values of an invalid argument."""
     text, context = error.format_message(), getattr(error, "ctx", None)
     if isinstance(error, typer.BadParameter) and error.param is not None and not error.message:
         option: Any = error.param

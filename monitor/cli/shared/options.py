@@ -1,4 +1,4 @@
-"""Command-line options that several commands share, and functions that parse the values of options."""
+"""Command-line options that several commands share, and functions that parse option values."""
 
 import sys
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final, overload
 
 import typer
 
-from drivers.errors import ConfigError, sanitize_error_text
+from drivers.errors import ConfigError, make_printable_and_shorten
 from drivers.number_ranges import (
     AVERAGING_TIME_S,
     DURATION_S,
@@ -29,12 +29,12 @@ MAX_AVERAGING_TIMES: Final = 1000
 
 
 def make_range_callback(allowed_range: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
-    """Return a typer callback that checks whether the value of an option is within the allowed range.
+    """Return a typer callback that checks whether an option value is within the allowed range.
 
     Raises
     ------
     ConfigError
-        If the value of the option is outside the supported range.
+        If the option value is outside the allowed range.
     """
 
     def check_option_value(option: typer.CallbackParam, value: Number | None) -> Number | None:
@@ -109,7 +109,7 @@ Last = Annotated[
 
 
 def parse_averaging_times(text: str) -> "TauGrid":
-    """Parse the averaging times of the option ``--tau``: the name of a grid, or a list of times in seconds.
+    """Parse the option ``--tau``, which is the name of a grid or a list of averaging times in seconds.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def parse_averaging_times(text: str) -> "TauGrid":
         listed = tuple(float(part) for part in text.split(","))
     except ValueError:
         raise ConfigError(
-            f'--tau: "{sanitize_error_text(text)[:60]}"; possible are octave, decade10, or seconds with commas'
+            f'--tau: "{make_printable_and_shorten(text)[:60]}"; possible are octave, decade10, or seconds with commas'
         ) from None
     if len(listed) > MAX_AVERAGING_TIMES:
         raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
@@ -139,14 +139,14 @@ def parse_duration(option: str, text: None) -> None: ...
 @overload
 def parse_duration(option: str, text: str | None) -> float | None: ...
 def parse_duration(option: str, text: str | None) -> float | None:
-    """Parse a duration such as "90", "30min" or "1h", and return the duration in seconds.
+    """Convert a duration such as "90", "30min" or "1h" to seconds.
 
     Parameters
     ----------
     option : str
-        Name of the option, for the message.
+        Name of the option, used in error messages.
     text : str or None
-        Text of the duration. If None, the function returns None.
+        Duration as text. If the text is None, the result is None.
 
     Raises
     ------
@@ -163,12 +163,12 @@ def parse_duration(option: str, text: str | None) -> float | None:
 
 
 def parse_arma_order(text: str | None) -> "Order | None":
-    """Parse the orders p and q of an ARMA model, for example "2,1".
+    """Parse the orders p and q of an ARMA(p, q) model, for example "2,1".
 
     Raises
     ------
     ConfigError
-        If the text is not a supported order.
+        If the text is not a pair of supported orders.
     """
     from monitor.drift.compensation.arma import ORDERS
 

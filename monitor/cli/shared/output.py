@@ -1,4 +1,4 @@
-"""Output of the commands: results on standard output or in files, and a progress bar in the terminal."""
+"""Functions that write results to standard output or files, and show a progress bar in the terminal."""
 
 import contextlib
 import sys
@@ -19,16 +19,16 @@ def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
     Parameters
     ----------
     option : str
-        Name of the option, for the message.
+        Name of the option, used in error messages.
     path : Path or None
         File to write.
     *suffixes : str
-        Allowed suffixes. By default, all suffixes are allowed.
+        Allowed file suffixes. By default, all suffixes are allowed.
 
     Raises
     ------
     ConfigError
-        If the suffix is not allowed, or if the folder does not exist.
+        If the suffix is not allowed or the folder does not exist.
     """
     if path is None:
         return
@@ -39,16 +39,16 @@ def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
 
 
 def write_file_or_stdout(option: str, path: Path, data: bytes) -> None:
-    """Write data to a file, or to standard output if the path is ``-``.
+    """Write data to a file. The path ``-`` means standard output.
 
     Parameters
     ----------
     option : str
-        Name of the option, for the message.
+        Name of the option, used in error messages.
     path : Path
         File to write.
     data : bytes
-        Content.
+        Bytes to write.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def write_file_or_stdout(option: str, path: Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def show_progress_bar() -> Iterator[ProgressCallback]:
-    """Show a progress bar if the output is a terminal, and yield the callback that updates the progress bar."""
+    """Show a progress bar if the output is a terminal, and yield a callback that updates the progress bar."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -77,17 +77,18 @@ def show_progress_bar() -> Iterator[ProgressCallback]:
         return
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("", total=None)
-        yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
+        yield lambda what, share: bar.update(
+            task, description=what, total=None if share is None else 1.0, completed=share or 0.0
+        )
 
 
 def compile_analysis_kernels(report_progress: ProgressCallback) -> None:
-    """Compile the numerical kernels for the analysis of recordings, if the cache on disk does not contain the
-    kernels."""
+    """Compile the numerical kernels that analyze recordings, unless the disk cache already contains them."""
     from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
     for group in kernel_parts.GROUPS:
         if not kernel_compilation.is_warm(group):
-            with contextlib.suppress(OSError):  # without a cache, kernels are compiled at the first call
+            with contextlib.suppress(OSError):  # without a disk cache, kernels are compiled at the first call
                 for _ in kernel_compilation.prepare_kernels(
                     group, lambda progress: report_progress(str(progress), progress.compiled_share)
                 ):

@@ -1,6 +1,6 @@
-"""Run the service in a terminal, with a live table, log lines and signal handlers.
+"""Functions that run the service in a terminal, with a live table, log lines and signal handlers.
 
-A separate thread writes to the terminal, so that a blocked terminal or pipe does not delay the processing of samples.
+A separate thread writes to the terminal, so that a blocked terminal or pipe cannot delay the processing of samples.
 """
 
 import contextlib
@@ -35,11 +35,11 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     Parameters
     ----------
     config : Config
-        Configuration to run.
+        Configuration of the service.
     seconds : float or None
         Duration in seconds. If None, the service runs until a signal is received or all replays have ended.
     viewer_mode : str or None
-        Viewer mode that replaces the mode of the configuration.
+        Viewer mode that replaces the configured mode. None keeps the configured mode.
 
     Raises
     ------
@@ -54,15 +54,16 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     from rich.console import Console
 
     from monitor.daemon.operations.systemd import SystemdNotifier
-    from monitor.daemon.result_outputs import LogOutput, TableOutput
+    from monitor.daemon.outputs.log_output import EventAndStatusLogOutput
+    from monitor.daemon.outputs.table_output import TableOutput
     from monitor.daemon.service import STATUS_INTERVAL_S, Service
-    from monitor.publishing.remote_devices import DeviceStates
+    from monitor.publishing.remote_devices import RemoteDeviceRegistry
     from monitor.publishing.terminal.live_table import LiveTable
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
     unit = SystemdNotifier.from_environment(os.environ)
     config = _with_viewer(config, viewer_mode)
-    console, board, asked = Console(file=sys.stdout), DeviceStates(), threading.Event()
+    console, board, asked = Console(file=sys.stdout), RemoteDeviceRegistry(), threading.Event()
     table, terminal = LiveTable(console), console.is_terminal
     screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
     writers = {"terminal": screen} if terminal else {}
@@ -76,14 +77,18 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
         if not shared:
             screen.start()
         try:
-            outputs = [TableOutput(board, screen.request_redraw)] if terminal else [TableOutput(board), LogOutput()]
+            outputs = (
+                [TableOutput(board, screen.request_redraw)]
+                if terminal
+                else [TableOutput(board), EventAndStatusLogOutput()]
+            )
             service = Service(config, outputs, unit=unit, writers=writers)
 
             def stop() -> None:
                 asked.set()
                 service.request_stop()
 
-            # in a terminal, SIGHUP means that the terminal has been closed
+            # A service in a terminal receives SIGHUP when the terminal is closed.
             install_signal_handlers(stop, stop if terminal else service.request_reload)
             table.states = board
             service.run(seconds)
@@ -97,14 +102,14 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
 
 
 def _table_error(screen: "QueuedWriter", unread: bool) -> Exception | None:
-    """Return the error that prevented the output of the final table, or None."""
+    """Return the error that prevented the final table from being printed, or None."""
     from monitor.publishing.terminal.queued_writer import CLOSE_S
 
     if unread:
         return TimeoutError(f"{STDOUT}: the final table was not written, because nobody read it for {CLOSE_S:g} s")
     error = screen.error
     if isinstance(error, OSError) and error.errno == errno.EBADF:
-        return None  # standard output was already closed at the start, so no table is expected
+        return None  # standard output was closed from the start
     if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
         return OSError(f"{STDOUT}: the final table could not be written: {error.strerror}")
     return error
@@ -118,14 +123,14 @@ def run_fleet_viewer(
     viewer_mode: str,
     seconds: float | None,
 ) -> None:
-    """Show several daemons in the viewer until a signal is received.
+    """Show the devices of several daemons in one viewer until a signal is received.
 
     Parameters
     ----------
     keyexpr : str
-        Zenoh key expression of the daemons.
+        Zenoh key expression (topic pattern) that selects the daemons.
     connect : sequence of str
-        Zenoh endpoints to connect to.
+        Zenoh endpoints to which the viewer connects.
     zenoh_file : Path or None
         Zenoh configuration file.
     detailed_devices : sequence of str
@@ -144,7 +149,7 @@ def run_fleet_viewer(
 
     from monitor.publishing.rerun.fleet import FleetView, full_device_key
     from monitor.publishing.rerun.queued_view import RerunView
-    from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+    from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
     from monitor.publishing.terminal.queued_writer import QueuedWriter
     from monitor.publishing.zenoh.subscriber import ZenohSubscriber
     from monitor.settings import loading
@@ -153,7 +158,9 @@ def run_fleet_viewer(
         loading.check_viewer_mode(viewer_mode)
     keys = tuple(dict.fromkeys(full_device_key(device, keyexpr) for device in detailed_devices))
     arriving = ZenohSubscriber(keyexpr, connect, zenoh_file, keys)
-    rerun = RerunView(ViewerSettings(mode=viewer_mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
+    rerun = RerunView(
+        ViewerSettings(mode=viewer_mode), [ViewerDeviceDescription(key, "over zenoh") for key in keys], fleet=True
+    )
     stop = threading.Event()
     install_signal_handlers(stop.set)
 
@@ -168,7 +175,7 @@ def run_fleet_viewer(
 
 
 def with_viewer_history_length(config: "Config", history_s: float | None) -> "Config":
-    """Return a copy of the configuration with another length of the history in the viewer.
+    """Return a copy of the configuration with a different length of the history that the viewer shows.
 
     Parameters
     ----------
@@ -192,7 +199,7 @@ def with_viewer_history_length(config: "Config", history_s: float | None) -> "Co
 
 
 def _with_viewer(config: "Config", viewer: str | None) -> "Config":
-    """Return a copy of the configuration with another viewer mode. None keeps the configured mode."""
+    """Return a copy of the configuration with a different viewer mode. None keeps the configured mode."""
     import dataclasses
 
     from monitor.settings import loading
@@ -206,9 +213,9 @@ def _with_viewer(config: "Config", viewer: str | None) -> "Config":
 
 @contextlib.contextmanager
 def _stderr_through(writer: "QueuedWriter") -> Iterator[None]:
-    """Redirect standard error to a writer thread.
+    """Redirect standard error to a separate writer thread.
 
-    If the writer thread is still blocked at the end, standard error is redirected to the null device.
+    If the writer thread is still blocked when the context ends, standard error is redirected to the null device.
     """
     from monitor.publishing.terminal.queued_writer import (
         QueuedLines,
@@ -245,7 +252,7 @@ class _ErrorStream(io.TextIOBase):
     """Text stream that writes to the current standard error and ignores write errors."""
 
     def write(self, text: str) -> int:
-        """Write text to standard error. Errors such as a full disk are ignored."""
+        """Write text to standard error. Write errors, such as a full disk, are ignored."""
         with contextlib.suppress(OSError):
             sys.stderr.write(text)
         return len(text)
@@ -269,7 +276,7 @@ def _configure_logging(config: "Config") -> None:
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
         logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _ErrorStream())),
-        cache_logger_on_first_use=False,  # a reload may change the level
+        cache_logger_on_first_use=False,  # reloading the configuration may change the log level
     )
     set_log_level(config.log.level)
 
@@ -279,7 +286,7 @@ def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]
 
 
 def install_signal_handlers(stop: Callable[[], None], on_hangup: Callable[[], None] | None = None) -> None:
-    """Install the handlers of SIGINT, SIGTERM and SIGHUP.
+    """Install handlers for the signals SIGINT, SIGTERM and SIGHUP.
 
     The first SIGINT or SIGTERM calls ``stop``. A second SIGINT ends the process immediately. SIGHUP calls
     ``on_hangup``.
@@ -289,13 +296,13 @@ def install_signal_handlers(stop: Callable[[], None], on_hangup: Callable[[], No
     stop : callable
         Function that starts an orderly shutdown.
     on_hangup : callable, optional
-        Function that handles SIGHUP. By default, the handler of SIGHUP is not changed.
+        Function that handles SIGHUP. By default, the existing handler of SIGHUP is kept.
     """
     import threading
 
     def handle_first_signal(number: int, _frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # Another thread calls ``stop``, because the main thread may hold the lock of the event that ``stop`` sets.
+        # Call ``stop`` in another thread, because the main thread may hold the lock of the event that ``stop`` sets.
         threading.Thread(target=stop, name="stop", daemon=True).start()
 
     signal.signal(signal.SIGINT, handle_first_signal)
@@ -306,7 +313,7 @@ def install_signal_handlers(stop: Callable[[], None], on_hangup: Callable[[], No
 
 
 def exit_on_sigterm() -> None:
-    """Exit on SIGTERM in the same way as on Ctrl-C, so that incomplete files are removed."""
+    """Make SIGTERM end the program in the same way as Ctrl-C, so that incomplete files are removed."""
 
     def ended(_number: int, _frame: Any) -> NoReturn:
         sys.exit(128 + signal.SIGTERM)

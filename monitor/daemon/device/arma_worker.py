@@ -9,7 +9,7 @@ from drivers.data_types import Floats
 from drivers.errors import NotReady
 from monitor.drift.compensation.arma import ArmaModel, fit_arma
 from monitor.drift.compensation.compensator import Compensator
-from monitor.drift.compensation.live_compensation import LiveCompensation
+from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 
 
 class ArmaWorker:
@@ -28,7 +28,7 @@ class ArmaWorker:
         self._at_once = synchronous
         self._work: _Identification | None = None
 
-    def adopt_and_start_models(self, live: LiveCompensation) -> None:
+    def adopt_and_start_models(self, live: LiveDriftCompensation) -> None:
         """Adopt an identified model, and start the next identification that is due."""
         if self._work is not None:
             if self._work.thread.is_alive():

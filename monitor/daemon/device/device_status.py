@@ -60,7 +60,7 @@ class DeviceStatus:
             late=clock.dropped_late_rows + driver.counts.late,
             moving=signal_monitor is not None and signal_monitor.is_moving,
             moved=signal_monitor.samples_in_motion if signal_monitor is not None else 0,
-            crossed=self._publisher.limits.limits_crossed_now,
+            crossed=self._publisher.limits.coefficients_beyond_limits,
         )
 
     def _text(self) -> str:
@@ -70,9 +70,9 @@ class DeviceStatus:
             if self._restore.active and ready.all.is_set():
                 return "the window is being rebuilt from the recording; no sample is lost"
             if ready.progress:
-                lacking = "" if self._pipeline.fit_kernels_ready else "no coefficients yet, "
+                lacking = "" if self._pipeline.fit_kernels_can_run else "no coefficients yet, "
                 return f"{ready.progress}; {lacking}no sample is lost"
-            if not self._pipeline.fit_kernels_ready:
+            if not self._pipeline.fit_kernels_can_run:
                 return "compiling the estimator; no coefficients yet, no sample is lost"
         lacking = self._missing_estimate_text() if driver.state in ("running", "ended") else ""
         if driver.text or driver.state != "running":
@@ -88,6 +88,10 @@ class DeviceStatus:
                 f"measured rate {measured_hz:.4g} Hz differs from the configured "
                 f"{self._publisher.device.rate_hz:g} Hz; coefficients are withheld: correct `rate` or remove it"
             )
-        if self._pipeline.estimator is None and self._publisher.published and clock.rate_hz is None:
+        if (
+            self._pipeline.estimator is None
+            and self._publisher.published
+            and clock.configured_or_measured_rate_hz is None
+        ):
             return "no estimate: the times of the samples do not show a rate; set `rate`"
         return self._pipeline.refusal_reason

@@ -21,10 +21,10 @@ from monitor.daemon.device.ring_buffer import RingBuffer
 from monitor.daemon.device.window_restore import WindowRestore
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.coefficient_limits import LimitMonitor, read_model_in_force
-from monitor.daemon.output_interface import Output
+from monitor.daemon.outputs.output import Output
 from monitor.daemon.result_publisher import ResultPublisher
 from monitor.daemon.storage.recorder import Recorder
-from monitor.estimation.window_snapshot import WindowSnapshot
+from monitor.estimation.window_sample_snapshot import WindowSnapshot
 from monitor.settings.loading import Device, VirtualTable
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class DeviceWorker:
 
     # --- start and stop
 
-    def start(self) -> None:
+    def start_reader_and_resume_recording(self) -> None:
         """Start the reader thread, and continue a recording that ended less than one window ago."""
         if self.simulated is not None:
             self.simulated.start()
@@ -121,9 +121,9 @@ class DeviceWorker:
                 self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
         self._thread.start()
 
-    def rebuild_window(self) -> None:
+    def refill_window_from_recording(self) -> None:
         """Fill the window from the recording, while new samples wait in the ring buffer."""
-        self.restore.rebuild_window()
+        self.restore.refill_window_from_recording()
         self._wake.set()
 
     def stop(self) -> None:
@@ -143,10 +143,12 @@ class DeviceWorker:
         """True if a replay has ended and all samples have been processed."""
         if self.driver.state != "ended" or self._thread.is_alive() or not self.pipeline.ready.all.is_set():
             return False
-        return not self.pipeline.awaits_thermal_model and (self.ring.empty or self.clock.rate_hz is None)
+        return not self.pipeline.awaits_thermal_model and (
+            self.ring.is_empty or self.clock.configured_or_measured_rate_hz is None
+        )
 
     @property
-    def read_attempts(self) -> int | None:
+    def reader_progress_count(self) -> int | None:
         """Number of read attempts of the reader thread, or None if the thread may block.
 
         A reader that has ended makes no attempts, and a replayed recording blocks while the ring buffer is full.
@@ -166,7 +168,7 @@ class DeviceWorker:
             True to process all samples and publish all results, because the device stops.
         """
         self.publisher.schedule.begin_round(now_s, drain)
-        with self.pipeline.kernel_context(self.clock.rate_hz):
+        with self.pipeline.interpret_kernels_if_uncompiled(self.clock.configured_or_measured_rate_hz):
             self._process_new_samples(drain)
 
     def _process_new_samples(self, drain: bool) -> None:
@@ -176,12 +178,12 @@ class DeviceWorker:
             return
         blocks = self._take() if drain or self._can_take() else []
         events = self.timeline.take_events() + events  # the time of the first sample is known now
-        self.pipeline.process_blocks(blocks, self.clock.rate_hz, drain)
+        self.pipeline.process_blocks(blocks, self.clock.configured_or_measured_rate_hz, drain)
         if drain:
-            self.pipeline.process_held_samples()
+            self.pipeline.process_samples_held_by_motion_detector()
         if self.pipeline.thermal is not None and any(event.kind == "link_back" for event in events):
             self.pipeline.thermal.learn_new_offset()
-        published = self.publisher.publish_samples_if_due(blocks)
+        published = self.publisher.batch_samples_and_publish_if_due(blocks)
         self.publisher.publish_events(events + self.pipeline.take_events())
         self.publisher.publish_thermal_intervals()
         self._select_thermal_model()
@@ -198,12 +200,14 @@ class DeviceWorker:
             return False
         if pipeline.estimator is not None or pipeline.refusal_reason:
             return True
-        if self.clock.rate_hz is None:  # samples are also published if the sample rate stays unknown
+        if (
+            self.clock.configured_or_measured_rate_hz is None
+        ):  # samples are also published if the sample rate stays unknown
             return self.ring.free_capacity < self.ring.capacity // 2
-        return pipeline.required_kernels_ready(self.clock.rate_hz)
+        return pipeline.required_kernels_ready(self.clock.configured_or_measured_rate_hz)
 
     def _take(self) -> list[SampleBlock]:
-        self.status.latency.note_samples_taken()
+        self.status.latency.note_ring_buffer_emptied()
         blocks = self.ring.take_samples()
         if blocks:
             self.timeline.set_newest_sample_time(int(blocks[-1].t_ns[-1]))
@@ -215,7 +219,7 @@ class DeviceWorker:
             return
         begun_s = time.perf_counter()
         until_s = begun_s + (MODEL_SELECTION_REPLAY_S if self._replayed else MODEL_SELECTION_S)
-        while thermal.run_selection_step() and time.perf_counter() < until_s:
+        while thermal.run_selection_step_if_active() and time.perf_counter() < until_s:
             pass
         if self._replayed:
             self._wake.set()  # samples of the recording may wait
@@ -234,7 +238,7 @@ class DeviceWorker:
             self.pipeline.advanced = True  # the estimate must be computed again
 
     def _update_rate(self) -> None:
-        rate_hz = self.clock.rate_hz
+        rate_hz = self.clock.configured_or_measured_rate_hz
         if rate_hz is not None and not self.restore.active:
             self.pipeline.refine_rate(rate_hz)
 

@@ -20,7 +20,7 @@ class LatencyMeter:
         """Record the time at which samples arrive in the ring buffer."""
         self._arrived_ns = self._arrived_ns or time.monotonic_ns()
 
-    def note_samples_taken(self) -> None:
+    def note_ring_buffer_emptied(self) -> None:
         """Record that all samples have been taken from the ring buffer."""
         arrived_ns, self._arrived_ns = self._arrived_ns, 0
         self._taken_ns = self._taken_ns or arrived_ns

@@ -17,12 +17,12 @@ from drivers.errors import ConfigError
 from monitor.common.compiled import interpret_uncompiled_kernels
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
-from monitor.drift.compensation.live_compensation import LiveCompensation
+from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.drift.thermal.live_thermal import LiveThermalModels, ThermalIntervalResult
-from monitor.estimation.detection.model_comparison import PreparedModel
+from monitor.estimation.detection.comparison_with_noise_model import ModelAllanVariances
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.window_snapshot import TemperatureRing, WindowSnapshot
+from monitor.estimation.window_sample_snapshot import TemperatureRing, WindowSnapshot
 from monitor.noise.model import NoiseModel
 from monitor.settings.loading import Device
 
@@ -61,8 +61,8 @@ class DevicePipeline:
         self.estimator: Estimator | None = None
         self.signal_monitor: SignalMonitor | None = None
         self.thermal: LiveThermalModels | None = None
-        self.compensation: LiveCompensation | None = None
-        self.model_in_force: PreparedModel | None = None
+        self.compensation: LiveDriftCompensation | None = None
+        self.model_in_force: ModelAllanVariances | None = None
         self.refusal_reason = ""
         """Reason why an estimate is not possible, or ""."""
         self.advanced = False
@@ -92,7 +92,7 @@ class DevicePipeline:
         return self._interprets or self._needs.is_set()
 
     @property
-    def fit_kernels_ready(self) -> bool:
+    def fit_kernels_can_run(self) -> bool:
         """True if the kernels of the fit are compiled or can be interpreted."""
         return self._interprets or self.ready.fit.is_set()
 
@@ -106,7 +106,7 @@ class DevicePipeline:
         """True if the kernels of motion and change detection are compiled or can be interpreted."""
         return self._interprets or self.ready.all.is_set()
 
-    def kernel_context(self, rate_hz: float | None) -> AbstractContextManager[None]:
+    def interpret_kernels_if_uncompiled(self, rate_hz: float | None) -> AbstractContextManager[None]:
         """Return a context manager in which kernels that are not compiled are interpreted."""
         if rate_hz is not None and self.estimator is None:
             self.required_kernels_ready(rate_hz)
@@ -150,13 +150,13 @@ class DevicePipeline:
             self._restart_changed_axes()
             self._update_thermal()
 
-    def process_held_samples(self) -> None:
+    def process_samples_held_by_motion_detector(self) -> None:
         """Process the samples that the motion detector holds back, after the last sample."""
         self._update_estimator(self.signal_monitor.flush_delayed_samples() if self.signal_monitor is not None else [])
         self._restart_changed_axes()
         self._update_thermal()
 
-    def update_drift_models(self) -> None:
+    def adopt_and_identify_drift_models(self) -> None:
         """Adopt identified drift models at the end of an interval, and start identifications that are due."""
         live = self.compensation
         if live is None or not self.ready.all.is_set():  # otherwise, the identification would compile kernels
@@ -234,7 +234,7 @@ class DevicePipeline:
             self.estimator = Estimator(rate_hz, device.window_s, device.tau, every_sample=device.refit_s == 0.0)
             self._temperatures = TemperatureRing(self.estimator.window_length_samples)
             if self._model is not None:
-                self.model_in_force = PreparedModel(self._model, self.estimator.window_length_samples)
+                self.model_in_force = ModelAllanVariances(self._model, self.estimator.window_length_samples)
         except ConfigError as error:  # the averaging times do not fit the measured rate
             self.refusal_reason = f"no estimate: {error}"
             return False
@@ -249,7 +249,7 @@ class DevicePipeline:
             rate_hz, device.leave_out_motion, device.alarms_per_day, keep_samples_at_rest=wanted
         )
         self.thermal = None if device.thermal_s is None else LiveThermalModels(rate_hz, device.thermal_s)
-        self.compensation = LiveCompensation(rate_hz) if device.compensate else None
+        self.compensation = LiveDriftCompensation(rate_hz) if device.compensate else None
 
     def _update_estimator(self, blocks: Sequence[SampleBlock]) -> None:
         if self.estimator is None or self._temperatures is None:
@@ -274,5 +274,5 @@ class DevicePipeline:
         if self.signal_monitor.orientation_changes != self._handled:
             self._handled = self.signal_monitor.orientation_changes
             self.thermal.learn_new_offset()
-        for samples in self.signal_monitor.take_samples_at_rest():
+        for samples in self.signal_monitor.take_samples_with_motion_masked():
             self._thermal_intervals += self.thermal.process_block(samples)

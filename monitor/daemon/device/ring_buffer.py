@@ -34,7 +34,7 @@ class RingBuffer:
         self._lock = threading.Lock()
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """True if the buffer contains no samples."""
         return self._read == self._written
 

@@ -14,8 +14,8 @@ from drivers.data_types import AXES, Event, Ints, SampleBlock, make_block
 from drivers.errors import ImuError
 from drivers.recordings.segment_file import DaemonState
 from drivers.timing.sample_clock import LastSample, SampleClock
-from monitor.daemon.device.device_timeline import DeviceTimeline
 from monitor.daemon.device.pipeline import DevicePipeline
+from monitor.daemon.device.unix_timeline import DeviceTimeline
 from monitor.daemon.storage.recording_tail import RecordingTail
 from monitor.settings.loading import Device
 
@@ -31,7 +31,7 @@ class WindowRestore:
     device : Device
         Settings of the device.
     pipeline : DevicePipeline
-        Pipeline of the device. While ``active`` is True, only ``rebuild_window`` may use the pipeline.
+        Pipeline of the device. While ``active`` is True, only ``refill_window_from_recording`` may use the pipeline.
     clock : SampleClock
         Sample clock of the device.
     timeline : DeviceTimeline
@@ -68,7 +68,7 @@ class WindowRestore:
         self._clock.resume_after_restart(LastSample(t_ns, int(newest.ticks[-1]), rate_hz, state.tick_step))
         self._tail, self._state_before = tail, state
 
-    def rebuild_window(self) -> None:
+    def refill_window_from_recording(self) -> None:
         """Fill the window from the recording, while new samples wait in the ring buffer."""
         tail = self._tail
         if tail is None:
@@ -91,7 +91,9 @@ class WindowRestore:
             return before
         tick_step = self._clock.ticks_per_sample or before.tick_step
         if estimator is None:
-            return msgspec.structs.replace(before, rate=self._clock.rate_hz or before.rate, tick_step=tick_step)
+            return msgspec.structs.replace(
+                before, rate=self._clock.configured_or_measured_rate_hz or before.rate, tick_step=tick_step
+            )
         offset_ns = self._timeline.unix_offset_ns(self._pipeline.newest_ns)
         entered, theta = estimator.fit_state()
         since = tuple(None if t_ns is None else (t_ns + offset_ns) / 1e9 for t_ns in self._pipeline.since_ns)
@@ -100,7 +102,7 @@ class WindowRestore:
 
     def _replay(self, tail: RecordingTail, offset_ns: int) -> str:
         pipeline, state = self._pipeline, tail.newest.state
-        rate_hz = self._clock.rate_hz or state.rate or 0.0
+        rate_hz = self._clock.configured_or_measured_rate_hz or state.rate or 0.0
         counted = np.zeros(len(AXES), np.int64)
         for piece in tail.read_pieces(max(self._device.window_s, MIN_REPLAY_S)):
             samples = piece.samples

@@ -11,7 +11,7 @@ from drivers.extras import find_missing_packages
 from monitor.drift.compensation.arma import fit_arma
 from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.thermal import thermal_response
-from monitor.estimation.detection.change_detection import ChangeDetector
+from monitor.estimation.detection.change_detection import NoiseAndBiasChangeDetector
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
 
@@ -52,7 +52,7 @@ def _call_motion_detection() -> None:
 
 def _call_change_detection() -> None:
     SignalMonitor(100.0).process_samples(_samples(100))
-    ChangeDetector(100.0).restart_references()
+    NoiseAndBiasChangeDetector(100.0).restart_references()
 
 
 def _call_compensation() -> None:

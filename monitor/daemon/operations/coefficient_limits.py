@@ -16,7 +16,7 @@ from typing import Final
 from drivers.data_types import AXES, Event
 from drivers.errors import ConfigError
 from monitor.common.distributions import Z95
-from monitor.common.units import COEFFICIENT_NAMES, coefficient_unit, sensor_kind
+from monitor.common.unit_formatting import COEFFICIENT_NAMES, coefficient_unit, sensor_kind
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
@@ -55,11 +55,11 @@ class _Measured:
     lo: float
     hi: float
 
-    def is_beyond_limit(self, bound: AxisLimit) -> bool:
+    def interval_is_beyond_limit(self, bound: AxisLimit) -> bool:
         """Return True if the confidence interval is beyond the limit."""
         return self.lo > bound.limit if bound.upper else self.hi < bound.limit
 
-    def is_within_limit(self, bound: AxisLimit) -> bool:
+    def is_value_within_limit(self, bound: AxisLimit) -> bool:
         """Return True if the value is within the limit."""
         if not bound.upper:
             return self.value >= bound.limit
@@ -92,7 +92,7 @@ class LimitMonitor:
         self.states = {bound: _State() for bound in make_axis_limits(limits, model)}
 
     @property
-    def limits_crossed_now(self) -> tuple[str, ...]:
+    def coefficients_beyond_limits(self) -> tuple[str, ...]:
         """Axis and letter of each coefficient that has crossed a limit, for example ``gz N``."""
         return tuple(bound.axis_and_letter for bound, state in self.states.items() if state.crossed)
 
@@ -108,7 +108,7 @@ class LimitMonitor:
 
     def _test_bound(self, bound: AxisLimit, state: _State, estimate: Estimate) -> Event | None:
         seen = _measured(bound, estimate)
-        if not (seen.is_within_limit(bound) if state.crossed else seen.is_beyond_limit(bound)):
+        if not (seen.is_value_within_limit(bound) if state.crossed else seen.interval_is_beyond_limit(bound)):
             state.since = None
             return None
         if state.since is None:
@@ -132,7 +132,7 @@ def read_model_in_force(device: Device) -> NoiseModel | None:
     try:
         make_axis_limits(device.limits, model)
     except ConfigError as error:
-        raise ConfigError(*(f"device {device.name}: {line}" for line in error.lines)) from None
+        raise ConfigError(*(f"device {device.name}: {line}" for line in error.mistake_lines)) from None
     return model
 
 

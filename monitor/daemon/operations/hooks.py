@@ -23,7 +23,7 @@ from typing import Final
 import structlog
 
 from drivers.data_types import Event
-from monitor.daemon.output_interface import Output
+from monitor.daemon.outputs.output import Output
 from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Hook
 

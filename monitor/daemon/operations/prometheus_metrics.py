@@ -19,12 +19,12 @@ import numpy as np
 
 from drivers.data_types import AXES, Event
 from monitor.common.device_health import Health
-from monitor.daemon.output_interface import Output
+from monitor.daemon.outputs.output import Output
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.standard_terms import STANDARD_TERMS
-from monitor.settings.loading import Metrics
+from monitor.settings.loading import MetricsAddress
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry, MetricsHandler
@@ -78,11 +78,11 @@ class MetricsOutput(Output):
 
     Parameters
     ----------
-    settings : Metrics
+    settings : MetricsAddress
         Address of the server. Port 0 selects a free port.
     """
 
-    def __init__(self, settings: Metrics) -> None:
+    def __init__(self, settings: MetricsAddress) -> None:
         self._settings = settings
         self.state = "starting"
         self.port = 0

@@ -27,7 +27,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from monitor.common.program import PROGRAM
-from monitor.estimation.window_snapshot import WindowSnapshot
+from monitor.estimation.window_sample_snapshot import WindowSnapshot
 from monitor.publishing.messages.results import ReconcileReply
 from monitor.publishing.zenoh.publisher import Command
 
@@ -49,7 +49,7 @@ JOIN_TIMEOUT_S: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class ReconcileJob:
+class WindowCopyForReconcile:
     """Copy of the window of a device, for a reconciliation."""
 
     device: str
@@ -62,7 +62,7 @@ class ReconcileJob:
 
 
 @dataclass(frozen=True, slots=True)
-class FinishedReconciliation:
+class ReconciliationOutcomeText:
     """Result of a finished reconciliation in one sentence."""
 
     device: str
@@ -85,15 +85,15 @@ class Reconciler:
         self._limit_s = limit_s
         self._running: dict[str, threading.Thread] = {}
         self._children: dict[str, subprocess.Popen[bytes]] = {}
-        self._finished: queue.SimpleQueue[FinishedReconciliation] = queue.SimpleQueue()
+        self._finished: queue.SimpleQueue[ReconciliationOutcomeText] = queue.SimpleQueue()
         self._closing = threading.Event()
 
-    def start_reconciliation(self, job: ReconcileJob, command: Command) -> None:
+    def start_reconciliation(self, job: WindowCopyForReconcile, command: Command) -> None:
         """Start a reconciliation in a thread, or refuse a second query for the same device.
 
         Parameters
         ----------
-        job : ReconcileJob
+        job : WindowCopyForReconcile
             Window to reconcile.
         command : Command
             Query that receives the answer.
@@ -107,7 +107,7 @@ class Reconciler:
         self._running[job.device] = thread
         thread.start()
 
-    def take_finished_reconciliations(self) -> list[FinishedReconciliation]:
+    def take_finished_reconciliations(self) -> list[ReconciliationOutcomeText]:
         """Return the reconciliations that have finished since the last call."""
         found = []
         with contextlib.suppress(queue.Empty):
@@ -125,18 +125,18 @@ class Reconciler:
 
     # --- thread of one query
 
-    def _run(self, job: ReconcileJob, command: Command) -> None:
+    def _run(self, job: WindowCopyForReconcile, command: Command) -> None:
         try:
             result, status, folder = self._reconcile(job)
         except (OSError, RuntimeError) as error:
             command.reply_refusal(str(error))
-            self._finished.put(FinishedReconciliation(job.device, f"reconcile failed: {error}"))
+            self._finished.put(ReconciliationOutcomeText(job.device, f"reconcile failed: {error}"))
             return
         head = ReconcileReply(device=job.device, t=job.unix_s, samples=job.samples)
         command.reply_result(head.encode_report(result, status, folder))
-        self._finished.put(FinishedReconciliation(job.device, format_reconcile_result(result, status)))
+        self._finished.put(ReconciliationOutcomeText(job.device, describe_reconcile_result(result, status)))
 
-    def _reconcile(self, job: ReconcileJob) -> tuple[dict[str, Any], int, str | None]:
+    def _reconcile(self, job: WindowCopyForReconcile) -> tuple[dict[str, Any], int, str | None]:
         """Return the JSON result, the exit status, and the folder of the report or None."""
         with tempfile.TemporaryDirectory(prefix="imu-monitor-") as temporary:
             path, folder = Path(temporary) / f"{job.device}.npz", Path(temporary) / "report"
@@ -180,7 +180,7 @@ class Reconciler:
         return child.returncode, output, errors
 
 
-def _write_window(path: Path, job: ReconcileJob) -> None:
+def _write_window(path: Path, job: WindowCopyForReconcile) -> None:
     values = job.window.restore_samples()
     columns = {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
     if not np.isnan(job.temperature_c).all():
@@ -188,7 +188,7 @@ def _write_window(path: Path, job: ReconcileJob) -> None:
     np.savez(path, fs=np.float64(job.window.rate_hz), **columns)  # type: ignore[arg-type]
 
 
-def format_reconcile_result(result: dict[str, Any], status: int = DONE) -> str:
+def describe_reconcile_result(result: dict[str, Any], status: int = DONE) -> str:
     """Return the verdict of a reconciliation and the changes of the model in one sentence.
 
     Parameters
@@ -200,7 +200,7 @@ def format_reconcile_result(result: dict[str, Any], status: int = DONE) -> str:
 
     Examples
     --------
-    >>> format_reconcile_result({"verdict": "explained", "axes": {"gz": {"steps": [
+    >>> describe_reconcile_result({"verdict": "explained", "axes": {"gz": {"steps": [
     ...     {"kind": "added", "effect": "sinusoidal", "confidence": 0.998}]}}})
     'reconcile: explained: gz sinusoidal added (0.998)'
     """

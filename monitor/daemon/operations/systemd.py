@@ -80,12 +80,12 @@ class SystemdNotifier:
         """Send the message that the service is stopping."""
         self._send("STOPPING=1")
 
-    def send_watchdog(self, read_attempts: Mapping[str, int], now_s: float) -> list[str]:
+    def send_watchdog(self, reader_progress_count: Mapping[str, int], now_s: float) -> list[str]:
         """Send a watchdog message if a message is due and no reader is stuck.
 
         Parameters
         ----------
-        read_attempts : mapping of str to int
+        reader_progress_count : mapping of str to int
             Number of read attempts of each reader.
         now_s : float
             Present time on the monotonic clock, in seconds.
@@ -97,7 +97,7 @@ class SystemdNotifier:
         """
         self._turns = {
             name: self._turns[name] if self._turns.get(name, (-1, 0.0))[0] == count else (count, now_s)
-            for name, count in read_attempts.items()
+            for name, count in reader_progress_count.items()
         }
         stuck = [name for name, (_, since_s) in self._turns.items() if now_s - since_s > self._stuck_s]
         if self.watchdog_s is not None and not stuck and now_s >= self._next_beat_s:

@@ -19,7 +19,7 @@ from drivers.data_types import NO_TICK, Chunk, SampleBlock
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import check_folder_or_absent
 from drivers.recordings import segment_file
-from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
+from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from drivers.recordings.table import PARTIAL_SUFFIX
 from monitor.settings.loading import Storage
 
@@ -38,7 +38,7 @@ CHUNK_OVERHEAD_BYTES: Final = 100
 RAW_FOLDER: Final = "raw"
 """Name of the subfolder for raw bytes."""
 
-Opening = Callable[[Path, SegmentMetadata], SingleSegmentWriter]
+Opening = Callable[[Path, SegmentMetadata], SegmentFileWriter]
 """Function that opens a new segment."""
 
 
@@ -101,7 +101,7 @@ class RecordingTrack:
         self._queue_bytes = 0
         self._dropped = 0  # rows that are missing before the oldest row in the queue
         self._taken: list[SampleBlock | Chunk] = []  # taken from the queue and being written
-        self._writer: SingleSegmentWriter | None = None
+        self._writer: SegmentFileWriter | None = None
         self._begin_s = 0.0  # Unix time of the first row in the open segment
         self._number: int | None = None  # number of the newest segment, or None if it is unknown
         self._rows = 0  # rows or chunks in the open segment
@@ -136,7 +136,7 @@ class RecordingTrack:
                     self._dropped += rows + lost
                     self.missed += rows
 
-    def drop_rows_recorded_elsewhere(self) -> None:
+    def drop_rows_already_recorded_elsewhere(self) -> None:
         """Drop queued rows that another process has already recorded."""
         newest = self._find_newest_row()
         with self._lock:
@@ -178,19 +178,19 @@ class RecordingTrack:
 
     # --- segment file
 
-    def write_queued_rows(self, state: DaemonState, disk_full: str) -> None:
+    def write_queued_rows(self, state: DaemonState, disk_problem: str) -> None:
         """Write the queued rows to the segment, or keep the rows for the next attempt after an error.
 
         Parameters
         ----------
         state : DaemonState
             State of the estimate that is recorded with the rows.
-        disk_full : str
+        disk_problem : str
             Message if the disk is too full, otherwise "".
         """
-        if disk_full:
-            self._report_failure(disk_full)
-        if self.trouble and (disk_full or time.monotonic() - self._stopped_s < RETRY_S):
+        if disk_problem:
+            self._report_failure(disk_problem)
+        if self.trouble and (disk_problem or time.monotonic() - self._stopped_s < RETRY_S):
             return
         if not self._taken:
             self._take_queue()
@@ -207,7 +207,7 @@ class RecordingTrack:
             self._taken = []
             if self.trouble:
                 self.trouble = ""
-                self.report_continuation()
+                self.queue_continuation_event()
 
     def sync_segment_to_disk(self) -> None:
         """Flush the open segment to the disk."""
@@ -251,8 +251,8 @@ class RecordingTrack:
         known = segment_file.list_segments(self.folder)  # not compressed, because another program may use them
         self._number = max(self._number or 0, segment_file.parse_segment_number(known[-1]) if known else 0)
         note = f"{writer.path} {change} during recording, with {self._rows} rows in it; a new file is begun"
-        self.queue_event("recording_stopped", note)
-        self.queue_event("recording_back", "recording continues in a new file")
+        self.queue_recorder_event("recording_stopped", note)
+        self.queue_recorder_event("recording_back", "recording continues in a new file")
         return note
 
     def _append(self, state: DaemonState) -> None:
@@ -270,7 +270,7 @@ class RecordingTrack:
             self._rows += len(self._taken)
         self._unsynced = True
 
-    def _begin(self, begin_s: float) -> SingleSegmentWriter:
+    def _begin(self, begin_s: float) -> SegmentFileWriter:
         check_folder_or_absent(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         if self._number is None:
@@ -287,7 +287,7 @@ class RecordingTrack:
 
     # --- events
 
-    def queue_event(self, kind: str, text: str) -> None:
+    def queue_recorder_event(self, kind: str, text: str) -> None:
         """Queue an event of the device.
 
         Parameters
@@ -299,13 +299,13 @@ class RecordingTrack:
         """
         self._events.append(RecorderEvent(self.origin.device, kind, text))
 
-    def report_continuation(self) -> None:
+    def queue_continuation_event(self) -> None:
         """Queue an event that the recording continues."""
-        self.queue_event("recording_back", f"recording continues; {self.missed} rows are missing in it")
+        self.queue_recorder_event("recording_back", f"recording continues; {self.missed} rows are missing in it")
 
     def _report_failure(self, reason: str) -> None:
         if not self.trouble:
-            self.queue_event("recording_stopped", reason)
+            self.queue_recorder_event("recording_stopped", reason)
         self.trouble = reason
         self._stopped_s = time.monotonic()
 

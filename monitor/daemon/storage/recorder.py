@@ -23,7 +23,7 @@ from drivers.data_types import AXES, Chunk, Ints, SampleBlock, make_block
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import segment_file
-from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
+from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
 from monitor.daemon.storage.device_recording import (
@@ -62,7 +62,7 @@ class Recorder:
     """
 
     def __init__(
-        self, storage: Storage, origins: Sequence[SegmentMetadata], opening: Opening = SingleSegmentWriter
+        self, storage: Storage, origins: Sequence[SegmentMetadata], opening: Opening = SegmentFileWriter
     ) -> None:
         self._storage = storage
         self._opening = opening
@@ -254,14 +254,14 @@ class Recorder:
         for track in self._tracks.values():
             track.suspend_recording()
             if not self._lock_failure:
-                track.queue_event("recording_stopped", reason)
+                track.queue_recorder_event("recording_stopped", reason)
         self._lock_failure, self._lock_failed_s = reason, time.monotonic()
 
     def _resume(self) -> None:
         for track in self._tracks.values():
             if self._other_process:
-                track.drop_rows_recorded_elsewhere()
-            track.report_continuation()
+                track.drop_rows_already_recorded_elsewhere()
+            track.queue_continuation_event()
         self._lock_failure, self._other_process = "", False
 
     def _sync(self) -> None:
@@ -275,7 +275,7 @@ class Recorder:
         while time.monotonic() < until_s and (self._packing is not None or self._finished):
             try:
                 if self._packing is None:
-                    self._packing = segment_file.compress_segment(self._finished.popleft())
+                    self._packing = segment_file.compress_segment_stepwise(self._finished.popleft())
                 next(self._packing)
             except StopIteration:
                 self._packing = None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import segment_file
-from drivers.recordings.segment_file import SegmentMetadata, SegmentPiece
+from drivers.recordings.segment_file import GapFreeSegmentPart, SegmentMetadata
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,9 +16,9 @@ class RecordingTail:
 
     origin: SegmentMetadata
     paths: tuple[Path, ...]  # oldest first
-    newest: SegmentPiece
+    newest: GapFreeSegmentPart
 
-    def read_pieces(self, span_s: float) -> Iterator[SegmentPiece]:
+    def read_pieces(self, span_s: float) -> Iterator[GapFreeSegmentPart]:
         """Yield the recorded pieces of the last ``span_s`` seconds with the same axis mounting, oldest first."""
         begin_ns = int(self.newest.samples.t_ns[-1]) - round(span_s * 1e9)
         for path in self._segments_since(begin_ns):

@@ -1,1 +1,1 @@
-"""Compensation of the gyro drift while the carrier may move."""
+"""Compensation of the gyro drift of a vehicle that may be in motion."""

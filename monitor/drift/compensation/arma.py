@@ -1,17 +1,17 @@
 """Identification of ARMA(p, q) models for the gyro drift at rest, with p ≤ 2 and q ≤ 1.
 
-The model of the process x and of the interval means z is
+The bias is averaged over successive intervals. The drift x in interval k and the interval mean z are modelled as
 
     x_k = φ1 x_{k−1} + φ2 x_{k−2} + a_k + θ1 a_{k−1},    z_k = μ + x_k + v_k
 
 where a is the innovation and v is the white noise of an interval mean. The variance of v is estimated from the scatter
-within the intervals. If the variance of v is zero, the model equals the model of Yuan et al. (2010). The state-space
-form of the ARMA model uses Green's function (Pandit & Wu 1983):
+within the intervals. If the variance of v is zero, the model is that of Yuan et al. (2010). The state-space form of the
+ARMA model uses Green's function (Pandit & Wu 1983):
 
     X_k = [x_k, x̂_{k+1|k}],  X_k = A X_{k−1} + B a_k,  A = [[0, 1], [φ2, φ1]],  B = [G0, G1]ᵀ,  G0 = 1, G1 = φ1 + θ1
 
-A Kalman filter computes the exact likelihood, even if interval means are missing. The coefficients are functions of
-partial autocorrelations, which keeps the ARMA model stable and invertible (Monahan 1984).
+A Kalman filter computes the exact likelihood, even if interval means are missing. The coefficients are expressed by
+partial autocorrelations, so that the ARMA model is always stable and invertible (Monahan 1984).
 """
 
 from collections.abc import Sequence
@@ -32,14 +32,14 @@ Order = tuple[int, int]
 _Triple = tuple[float, float, float]
 
 ORDERS: Final[tuple[Order, ...]] = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1))
-"""Orders (p, q) to choose from. Yuan et al. (2010) use (2, 1). The order (0, 0) is white noise."""
+"""Orders (p, q) among which the fit selects. Yuan et al. (2010) use (2, 1). The order (0, 0) means white noise."""
 MIN_VALUES: Final = 30
-"""Smallest number of interval means for the identification of an ARMA model."""
+"""Minimum number of interval means from which an ARMA model is identified."""
 MAX_PARTIAL_AUTOCORRELATION: Final = 0.99999
 MAX_COEFFICIENTS: Final = 3
-"""Number of coefficients of the highest order, which is the only order with several likelihood maxima."""
+"""Number of coefficients of the highest order. Only for this order can the likelihood have several maxima."""
 MIN_MAXIMA_DISTANCE: Final = 0.1
-"""Smallest difference of the partial autocorrelations of two distinct likelihood maxima."""
+"""Minimum difference between the partial autocorrelations at which two likelihood maxima count as distinct."""
 BISECTION_STEPS: Final = 6
 """Number of bisection steps in the search for the end of a confidence interval."""
 START_PARTIAL_AUTOCORRELATIONS: Final = {
@@ -47,37 +47,37 @@ START_PARTIAL_AUTOCORRELATIONS: Final = {
     1: ((0.3,), (0.9,), (0.99,)),
     2: ((0.5, 0.0), (0.9, 0.0), (0.99, 0.0), (0.9, -0.5), (0.3, 0.4)),
 }
-"""Start values of the partial autocorrelations, by p."""
+"""Start values of the partial autocorrelations for each autoregressive order p."""
 START_THETAS: Final = (-0.9, -0.5, 0.0, 0.5)
-"""Start values of the partial autocorrelation of the moving-average part."""
+"""Start values of the moving-average coefficient."""
 START_VARIANCE_SHARES: Final = (1e-3, 0.03, 0.5)
-"""Start values of the innovation variance, relative to the variance of z."""
+"""Start values of the innovation variance, relative to the variance of the interval means."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArmaModel:
-    """Parameters of an identified ARMA model.
+    """Identified ARMA model.
 
     >>> ArmaModel((0.5, 0.3), -0.2, 1.0).green_function_values
     (1.0, 0.3)
     """
 
-    phi: tuple[float, float]  # φ1 and φ2; 0 for coefficients that the order does not have
+    phi: tuple[float, float]  # φ1 and φ2; 0 for coefficients that are not part of the model
     theta: float
-    variance: float  # variance of a, (rad/s)²
+    variance: float  # variance of the innovation a, (rad/s)²
     mean: float = 0.0  # μ, rad/s
-    white_variance: float = 0.0  # variance of v, (rad/s)²
+    white_variance: float = 0.0  # variance of the white noise v, (rad/s)²
     order: Order = (2, 1)
-    # limits of the 95 % intervals of φ1, φ2, θ1; NaN = not computed
+    # limits of the 95 % confidence intervals of φ1, φ2 and θ1; NaN if they are not computed
     lo: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     hi: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    log_likelihood: float = np.nan  # logarithm of the likelihood
+    log_likelihood: float = np.nan  # logarithm of the maximum likelihood
     bic: float = np.nan
-    count: int = 0  # number of values used for the identification
+    count: int = 0  # number of interval means from which the model was identified
 
     @property
     def green_function_values(self) -> tuple[float, float]:
-        """Return the first two values G0 and G1 of Green's function."""
+        """Return the first two values G0 and G1 of Green's function of the ARMA model."""
         return 1.0, self.phi[0] + self.theta
 
     @property
@@ -92,23 +92,23 @@ def fit_arma(
     orders: Sequence[Order] = ORDERS,
     with_confidence_intervals: bool = False,
 ) -> ArmaModel:
-    """Fit ARMA models of all given orders, and return the model with the least BIC (Schwarz 1978).
+    """Fit an ARMA model of each given order, and return the model with the smallest BIC (Schwarz 1978).
 
     Parameters
     ----------
     interval_means : ndarray, shape (n,)
-        Interval means in rad/s; NaN = missing.
+        Interval means in rad/s; NaN means missing.
     white_variance : float
-        Variance of the white noise v of a mean, (rad/s)².
+        Variance of the white noise v of an interval mean, (rad/s)².
     orders : sequence of (p, q)
-        Orders to choose from.
+        Orders among which the fit selects.
     with_confidence_intervals : bool
-        True to compute the confidence intervals of the coefficients, which takes ten times as long.
+        True to compute the confidence intervals of the coefficients. The fit then takes ten times as long.
 
     Raises
     ------
     NotReady
-        If fewer than MIN_VALUES interval means are known, or if all interval means are equal.
+        If fewer than MIN_VALUES interval means are known, or if they are all equal.
     """
     known = interval_means[np.isfinite(interval_means)]
     if known.size < MIN_VALUES:
@@ -130,7 +130,7 @@ def fit_arma(
 def _propagate_covariance(
     p11: float, p12: float, p22: float, phi1: float, phi2: float, g1: float, variance: float
 ) -> _Triple:
-    """Return the elements p11, p12 and p22 of the predicted covariance A P Aᵀ + variance · B Bᵀ."""
+    """Return the elements p11, p12 and p22 of the predicted covariance matrix A P Aᵀ + variance · B Bᵀ."""
     return (
         p22 + variance,
         phi2 * p12 + phi1 * p22 + g1 * variance,
@@ -140,7 +140,7 @@ def _propagate_covariance(
 
 @compiled
 def stationary_covariance(phi1: float, phi2: float, theta: float) -> _Triple:
-    """Return the elements p11, p12 and p22 of the stationary state covariance for innovations of unit variance.
+    """Return the elements p11, p12 and p22 of the stationary covariance matrix for innovations of unit variance.
 
     Parameters
     ----------
@@ -159,34 +159,34 @@ def stationary_covariance(phi1: float, phi2: float, theta: float) -> _Triple:
 def compute_likelihood_sums(
     values: Floats, phi1: float, phi2: float, theta: float, innovation_variance: float, white_variance: float
 ) -> tuple[int, float, float, float]:
-    """Compute the sums of the log-likelihood of an ARMA model with an exact Kalman filter.
+    """Compute the sums that determine the exact log-likelihood of an ARMA model, with a Kalman filter.
 
     Parameters
     ----------
     values : ndarray, shape (n,)
-        Values; NaN = missing.
+        Interval means; NaN means missing.
     phi1, phi2, theta : float
         Coefficients φ1, φ2 and θ1.
     innovation_variance : float
-        Variance of a, in the squared unit of z.
+        Variance of the innovation a, in squared units of the interval means.
     white_variance : float
-        Variance of v, in the squared unit of z.
+        Variance of the white noise v, in squared units of the interval means.
 
     Returns
     -------
     count : int
-        Number of known values.
+        Number of values that are not missing.
     log_determinant : float
-        Σ log S over the innovation variances S.
+        Σ log S, where S is the variance of the Kalman filter innovation ε.
     square : float
-        Σ ε²/S of z about its mean.
+        Σ ε²/S after subtraction of the estimated mean.
     mean : float
-        Generalised least-squares estimate of the mean.
+        Generalised least-squares estimate of the mean μ.
     """
     g1 = phi1 + theta
     p11, p12, p22 = stationary_covariance(phi1, phi2, theta)
     p11, p12, p22 = p11 * innovation_variance, p12 * innovation_variance, p22 * innovation_variance
-    x1 = x2 = o1 = o2 = 0.0  # The filter also processes a series of ones, from which the mean is estimated.
+    x1 = x2 = o1 = o2 = 0.0  # The filter also processes a series of ones, from whose innovations the mean is estimated.
     count, logs, zz, zo, oo = 0, 0.0, 0.0, 0.0, 0.0
     for k in range(values.size):
         if values[k] == values[k]:
@@ -205,14 +205,14 @@ def compute_likelihood_sums(
     return count, logs, zz - mean * zo, mean
 
 
-_OrderFit = tuple[float, Order, Floats]  # BIC, order, search parameters
+_OrderFit = tuple[float, Order, Floats]  # BIC, order and search parameters
 
 
 def _fit_order(z: Floats, white: float, order: Order) -> _OrderFit:
-    """Return the maximum-likelihood estimate of an ARMA model of the given order.
+    """Fit an ARMA model of the given order by maximum likelihood.
 
-    The search parameters are atanh of the partial autocorrelations and of θ. If the white noise v has a positive
-    variance, the logarithm of the innovation variance is another search parameter.
+    The search parameters are the inverse hyperbolic tangents of the partial autocorrelations and of θ1. If the white
+    noise v has a positive variance, the logarithm of the innovation variance is an additional search parameter.
     """
     count = int(np.isfinite(z).sum())
     free = sum(order) + (white > 0.0 and order != (0, 0))
@@ -241,7 +241,10 @@ def _start_parameters(white: float, order: Order) -> list[Floats]:
 
 
 def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
-    """Return the log-likelihood, maximised over the mean, and without white noise also over the innovation variance."""
+    """Return the log-likelihood, maximised over the mean.
+
+    Without white noise, the innovation variance is maximised too.
+    """
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     count, logs, square, _ = compute_likelihood_sums(z, phi1, phi2, theta, variance, white)
     if white > 0.0 and order != (0, 0):
@@ -251,7 +254,7 @@ def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
 
 
 def _model_coefficients(order: Order, u: Floats, white: float) -> tuple[float, float, float, float]:
-    """Return φ1, φ2, θ1 and the innovation variance for a vector of search parameters."""
+    """Convert search parameters to φ1, φ2, θ1 and the innovation variance."""
     partial = [
         max(min(tanh(one), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION)
         for one in u[: order[0] + order[1]].tolist()
@@ -288,10 +291,11 @@ def _to_model(z: Floats, white: float, origin: float, scale: float, best: _Order
 
 
 def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> tuple[_Triple, _Triple]:
-    """Return the 95 % confidence intervals of φ1, φ2 and θ1 by the profile likelihood.
+    """Compute the 95 % confidence intervals of φ1, φ2 and θ1 from the profile likelihood.
 
-    If a root of φ nearly cancels θ, the likelihood has a long ridge or two maxima. The curvature of the likelihood then
-    underestimates the uncertainty. The confidence intervals therefore cover all maxima within the 95 % limit.
+    If a root of the autoregressive polynomial nearly cancels θ1, the likelihood has a long ridge or two maxima. The
+    curvature at the maximum would then underestimate the uncertainty. The confidence intervals therefore include all
+    maxima within the 95 % limit.
     """
     there = (order[0] > 0, order[0] > 1, order[1] > 0)
     tops = _likelihood_maxima(z, white, order, u)
@@ -303,7 +307,7 @@ def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> t
 
 
 def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list[Floats]:
-    """Return the search parameters of all likelihood maxima within the 95 % limit, starting with the fitted maximum."""
+    """Return the search parameters at all likelihood maxima within the 95 % limit. The global maximum comes first."""
     found = [u]
     if sum(order) == MAX_COEFFICIENTS:
         for start in _start_parameters(white, order):
@@ -318,7 +322,7 @@ def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list
 
 
 def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: float) -> tuple[float, float]:
-    """Return the ends of the confidence interval of a coefficient around a likelihood maximum."""
+    """Return the ends of the confidence interval of one coefficient around a likelihood maximum."""
     value = _model_coefficients(order, u, white)[which]
     limits = (
         (-MAX_PARTIAL_AUTOCORRELATION, MAX_PARTIAL_AUTOCORRELATION)
@@ -329,7 +333,7 @@ def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int,
     for limit in limits:
         inside, outside, near = value, limit, _free_parameters(order, u, which)
         step = max(abs(limit - value) / 64.0, 1e-9)
-        while abs(inside - limit) > 1e-9:  # The search moves outwards with growing steps.
+        while abs(inside - limit) > 1e-9:  # The search for the end moves outwards in growing steps.
             further = inside + np.sign(limit - value) * min(step, abs(limit - inside))
             fallen, moved = _profile_likelihood(z, white, order, which, float(further), near)
             if top - fallen > HALF_CHI2_95:
@@ -351,7 +355,7 @@ def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int,
 
 
 def _free_parameters(order: Order, u: Floats, which: int) -> Floats:
-    """Return the search parameters without the parameter that corresponds to a fixed coefficient."""
+    """Return the search parameters except the parameter that corresponds to a fixed coefficient."""
     held = order[0] if which == 2 else which
     return np.delete(u, held)
 
@@ -359,8 +363,7 @@ def _free_parameters(order: Order, u: Floats, which: int) -> Floats:
 def _profile_likelihood(
     z: Floats, white: float, order: Order, which: int, value: float, near: Floats
 ) -> tuple[float, Floats]:
-    """Return the log-likelihood for a fixed coefficient, maximised over the other parameters, and the position of
-    the maximum."""
+    """Maximise the log-likelihood for a fixed coefficient, and return the maximum and its position."""
 
     def insert_fixed_coefficient(free: Floats) -> Floats:
         u = np.insert(free, order[0] if which == 2 else which, 0.0)
@@ -368,7 +371,7 @@ def _profile_likelihood(
             u[order[0]] = atanh(value)
         elif order[0] == 1 or which == 1:
             u[which] = atanh(value)
-        else:  # φ1 = r1 (1 − φ2), so |φ1| < 1 − φ2
+        else:  # the relation φ1 = r1 (1 − φ2) implies |φ1| < 1 − φ2
             highest = 1.0 - abs(value)
             phi2 = (
                 -MAX_PARTIAL_AUTOCORRELATION

@@ -1,23 +1,23 @@
-"""Results of the compensation of a recording."""
+"""Results of the drift compensation of a recording."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.compensation_score import RestScore
-from monitor.drift.compensation.compensator import DriftInterval
+from monitor.drift.compensation.compensation_score import RateQualityAtRest
+from monitor.drift.compensation.compensator import MeasuredAndPredictedDrift
 
 
 @dataclass(frozen=True, slots=True)
 class AxisCompensation:
-    """Quality of the drift compensation of a gyro axis at rest."""
+    """Quality of the drift compensation of one gyro axis, measured at rest."""
 
-    model: ArmaModel | None  # last identified model of the drift; None if there was too little rest
-    uncompensated: RestScore  # without compensation, minus the mean of the first third
-    compensated: RestScore  # with compensation
+    model: ArmaModel | None  # last identified drift model; None if the sensor was not at rest for long enough
+    uncompensated: RateQualityAtRest  # score without compensation, after subtraction of the mean of the first third
+    compensated: RateQualityAtRest  # score with compensation
     rejected_intervals: int  # number of intervals that were rejected as outliers
-    steps: int  # number of steps of the bias
+    steps: int  # number of bias steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,13 +25,13 @@ class DriftCompensationResult:
     """Result of the drift compensation of a recording."""
 
     recording: str
-    out: Path  # compensated recording
+    out: Path  # path of the compensated recording
     method: str
     rate_hz: float
     samples: int
     interval_s: float
-    learning_rest_s: float  # time at rest in the first third, s
-    evaluated_rest_s: float  # time at rest after the first third, s
-    intervals: tuple[DriftInterval, ...]
+    learning_rest_s: float  # time at rest in the first third of the recording, s
+    evaluated_rest_s: float  # time at rest in the rest of the recording, s
+    intervals: tuple[MeasuredAndPredictedDrift, ...]
     axes: Mapping[str, AxisCompensation]
     notes: tuple[str, ...]

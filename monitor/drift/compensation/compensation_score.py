@@ -1,7 +1,7 @@
-"""Quality of a compensated gyro rate at rest.
+"""Score that measures the quality of a compensated gyro rate at rest.
 
-Samples that were used for learning are not evaluated. The mean of the learning samples is subtracted from the
-uncompensated rate, so that the removal of a constant bias does not count as an improvement.
+Samples from which the drift model was learned are not evaluated. Their mean is subtracted from the uncompensated rate,
+so that removing a constant bias does not count as an improvement.
 """
 
 from dataclasses import dataclass
@@ -14,37 +14,37 @@ from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 
 MINUTE_S: Final = 60.0
 SPANS_S: Final = (60.0, 600.0, 3600.0)
-"""Averaging periods of the mean rate in seconds."""
+"""Periods in seconds over which the rate is averaged to measure the remaining drift."""
 
 
 @dataclass(frozen=True, slots=True)
-class RestScore:
-    """Quality of the rate of a gyro axis at rest, in rad/s.
+class RateQualityAtRest:
+    """Quality measures of the rate of a gyro axis at rest, in rad/s.
 
-    A value is NaN if the recording is too short.
+    A measure is NaN if the recording is too short.
     """
 
-    rms: float  # rms about zero
-    worst_minute: float  # largest rms of a minute
-    drift: tuple[float, ...]  # rms of the means over each of SPANS_S
+    rms: float  # rms of the rate about zero
+    worst_minute: float  # largest rms of the rate within one minute
+    drift: tuple[float, ...]  # rms of the mean rate over each period of SPANS_S
     tau_s: Floats  # [k] averaging times
-    allan: Floats  # [k] overlapping Allan deviation
+    allan: Floats  # [k] overlapping Allan deviation of the rate
 
 
-def score_at_rest(angular_rate: Floats, rate_hz: float) -> RestScore:
-    """Return the quality of an angular rate whose true value is zero.
+def score_at_rest(angular_rate: Floats, rate_hz: float) -> RateQualityAtRest:
+    """Compute the quality measures of an angular rate whose true value is zero.
 
     Parameters
     ----------
     angular_rate : ndarray, shape (n,)
-        Rate in rad/s; NaN = missing, or not at rest.
+        Rate in rad/s; NaN means missing or not at rest.
     rate_hz : float
         Sample rate in Hz.
     """
     sizes: Ints = cluster_sizes(angular_rate.size, rate_hz)
     allan, _ = overlapping_avar_axis(angular_rate, sizes)
     minutes = _span_means(angular_rate**2, round(MINUTE_S * rate_hz))
-    return RestScore(
+    return RateQualityAtRest(
         rms=_rms(angular_rate),
         worst_minute=float(np.sqrt(minutes.max())) if minutes.size else np.nan,
         drift=tuple(_rms(_span_means(angular_rate, round(span * rate_hz))) for span in SPANS_S),
@@ -54,7 +54,7 @@ def score_at_rest(angular_rate: Floats, rate_hz: float) -> RestScore:
 
 
 def _span_means(x: Floats, samples: int) -> Floats:
-    """Return the means of successive periods in which at least half of the samples are known."""
+    """Return the means over successive periods, except periods in which more than half of the samples are missing."""
     count = x.size // samples if samples else 0
     if not count:
         return np.zeros(0)

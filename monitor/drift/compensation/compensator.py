@@ -1,12 +1,12 @@
-"""Compensation of the gyro drift of a carrier that may move, sample by sample.
+"""Sample-by-sample compensation of the gyro drift of a vehicle that may be in motion.
 
-The measured rate is z = ω + drift + noise. At rest, the rate ω is zero, and the drift is estimated from interval means
-with the Kalman filter of ``sage_husa``. In motion, the drift is predicted, and the filters of
-``carrier_rate_filter_bank`` smooth the remaining rate.
+The measured rate is z = ω + drift + noise. At rest, the true rate ω is zero, and the Kalman filter in ``sage_husa``
+estimates the drift from interval means. In motion, the drift is predicted, and the filters in
+``vehicle_rate_filter_bank`` smooth the remaining rate.
 
-The motion detector decides some blocks later whether a block was at rest. At most sample rates, the bias estimate is
-therefore delayed by 0.5 s. The compensated rate is not delayed. The results do not depend on the sizes of the input
-blocks.
+The motion detector decides with a delay whether the sensor was at rest. At most sample rates, the bias estimate is
+therefore delayed by 0.5 s. The compensated rate is not delayed. The results do not depend on how the samples are
+divided into calls.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from drivers.errors import NotReady
 from monitor.common.compiled import compiled
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import ORDERS, ArmaModel, Order, fit_arma
-from monitor.drift.compensation.carrier_rate_filter_bank import (
+from monitor.drift.compensation.vehicle_rate_filter_bank import (
     MIN_REST_INTERVALS,
-    apply_bias_change,
     choose_memory_lengths,
-    compute_gain_table,
+    compute_gains_by_filter_age,
+    correct_rates_for_bias_change,
     filter_rate_sample,
     predict_over_gap,
     update_rest_noise,
@@ -33,79 +33,82 @@ from monitor.estimation.detection import motion_kernel
 from monitor.estimation.detection.motion_detection import samples_per_block
 
 GYROS: Final = 3
-"""Number of gyro axes. They are the first columns of the samples."""
+"""Number of gyro axes, which are the first columns of the samples."""
 BLOCKS_PER_INTERVAL: Final = 4
-"""Number of blocks per interval. An interval lasts 1 s, or longer at sample rates below 32 Hz."""
+"""Number of motion detector blocks in an interval. An interval lasts 1 s, or longer at sample rates below 32 Hz."""
 MIN_REST_BLOCKS: Final = 2
-"""Smallest number of blocks at rest in an interval that counts as at rest."""
+"""Minimum number of blocks at rest for which an interval counts as an interval at rest."""
 MAX_PENDING_BLOCKS: Final = 4
-"""Largest number of blocks that wait for a decision of the motion detector."""
+"""Maximum number of blocks that wait for a decision of the motion detector."""
 HISTORY_INTERVALS: Final = 2048
-"""Number of intervals that are stored for the identification of a drift model."""
+"""Number of intervals that are stored to identify a drift model."""
 MIN_IDENTIFICATION_INTERVALS: Final = 60
-"""Number of intervals at rest before the first identification.
+"""Number of intervals at rest before a drift model is identified for the first time.
 
-The identification is repeated each time the number of intervals has grown by half.
+The identification is repeated whenever the number of intervals has grown by half.
 """
 MAX_REST_RMS: Final = (0.02,) * 3 + (0.3,) * 3
-"""Largest standard deviation of the samples of a block at rest, in rad/s and m/s².
+"""Maximum standard deviation of the samples in a block at rest, in rad/s and m/s².
 
 The limit is needed because the motion detector can adapt to permanent motion, for example in a car.
 """
 MAX_BIAS_RAD_S: Final = 0.35
-"""Largest mean rate of a gyro at rest: 0.35 rad/s is 20 °/s."""
+"""Maximum mean rate of a gyro at rest, 0.35 rad/s or 20 °/s."""
 MAX_GAP_INTERVALS: Final = 100_000
-"""Largest number of missing intervals over which the drift is predicted."""
+"""Maximum number of missing intervals over which the drift is predicted."""
 
 BLOCK_NUMBER, COUNT, ORIGIN, SUM, SQUARES = range(5)
-"""Columns of ``CompensatorState.waiting``: number of the block, number of samples, origin of the sums, sum, and sum of
-squares."""
-MEAN, EXPECTED, INNOVATION_STD, OUTCOME, EXPECTED_ERROR, SCATTER = range(6)
-"""Columns of the result of an interval.
+"""Columns of ``CompensatorArrays.waiting``.
 
-MEAN is the measured mean, NaN if the interval was not at rest. EXPECTED is the predicted drift and INNOVATION_STD the
-predicted standard deviation of their difference. OUTCOME is one of the outcomes of ``sage_husa``. EXPECTED_ERROR is the
-standard error of the prediction. SCATTER is the variance of the mean, estimated from the scatter within the interval.
+The columns are the block number, the number of samples, the origin, the sum and the sum of squares. Both sums are
+relative to the origin.
+"""
+MEAN, EXPECTED, INNOVATION_STD, OUTCOME, EXPECTED_ERROR, SCATTER = range(6)
+"""Columns of the results for an interval.
+
+MEAN is the measured mean, or NaN if the sensor was not at rest. EXPECTED is the predicted drift, and INNOVATION_STD is
+the predicted standard deviation of MEAN − EXPECTED. OUTCOME is an outcome that ``sage_husa`` defines, for example
+REJECTED. EXPECTED_ERROR is the standard error of the prediction. SCATTER is the variance of MEAN, estimated from the
+scatter within the interval.
 """
 
 
-class CompensatorState(NamedTuple):
-    """State of the compensator in arrays for compiled code."""
+class CompensatorArrays(NamedTuple):
+    """State of the compensator, stored in arrays for compiled code."""
 
     rest: motion_kernel.MotionState
-    current: Ints  # [1] number of the current interval; -1 = none yet
-    learned: Ints  # [3] intervals at rest from which the filters learned their noise
-    drift: np.ndarray  # [3] of sage_husa.DRIFT_FILTER
-    bias: Floats  # [3] rad/s, bias that is subtracted now; NaN = not known yet
-    bank: Floats  # [3, filters + 1, 5] columns as in ``carrier_rate_filter_bank``
-    ages: Ints  # [3, filters, 2] columns as in ``carrier_rate_filter_bank``
-    feedback: Floats  # [3, 1] difference of input and output that is still to be fed back
-    waiting: Floats  # [MAX_PENDING_BLOCKS, 6, 5] sums of the blocks that wait for a rest decision
-    sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] sums of ``filter_rate_sample`` for each of these blocks
-    means: Floats  # [3, BLOCKS_PER_INTERVAL] rad/s, means of the blocks of the interval; NaN = not at rest
-    followed: Floats  # [3, filters + 1, 2] sums of ``filter_rate_sample`` over the blocks at rest
-    samples: Floats  # [3] number of samples in these blocks
+    current: Ints  # [1] number of the current interval; -1 before the first interval
+    learned: Ints  # [3] number of intervals at rest from which the filters have learned their noise
+    drift: np.ndarray  # [3] records of type sage_husa.DRIFT_FILTER
+    bias: Floats  # [3] bias that is currently subtracted, rad/s; NaN if not known yet
+    bank: Floats  # [3, filters + 1, 5] columns are defined in ``vehicle_rate_filter_bank``
+    ages: Ints  # [3, filters, 2] columns are defined in ``vehicle_rate_filter_bank``
+    feedback: Floats  # [3, 1] difference between input and output that must still be fed back
+    waiting: Floats  # [MAX_PENDING_BLOCKS, 6, 5] sums over the blocks that wait for a decision
+    sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] ``square_sums`` of each waiting block
+    means: Floats  # [3, BLOCKS_PER_INTERVAL] block means in the interval, rad/s; NaN if not at rest
+    followed: Floats  # [3, filters + 1, 2] ``square_sums`` over the blocks at rest in the interval
+    samples: Floats  # [3] number of samples in the blocks at rest in the interval
     table: Floats  # [rows, 2] gains of all filters
-    first: Ints  # [filters + 1] first row of each filter in the table
-    decisions: Ints  # [2, MAX_PENDING_BLOCKS] scratch: block numbers, and 1 if the block is in motion
-    episodes: Floats  # [MAX_PENDING_BLOCKS, 5] scratch, not used
+    first: Ints  # [filters + 1] first row of each filter in ``table``
+    decisions: Ints  # [2, MAX_PENDING_BLOCKS] scratch memory: block numbers, and 1 for blocks in motion
+    episodes: Floats  # [MAX_PENDING_BLOCKS, 5] scratch memory that the motion detector requires
 
 
 @dataclass(frozen=True, slots=True)
-class DriftInterval:
+class MeasuredAndPredictedDrift:
     """Measured and predicted drift of three gyro axes in one interval, in rad/s."""
 
-    end: int  # index of the first sample after the interval; missing samples count
-    mean: Floats  # [3] measured at rest; NaN = in motion
-    expected: Floats  # [3] predicted drift; NaN = not known yet
+    end: int  # index of the first sample after the interval, counting missing samples
+    mean: Floats  # [3] measured drift at rest; NaN if in motion
+    expected: Floats  # [3] predicted drift; NaN if not known yet
     error: Floats  # [3] predicted standard deviation of ``mean - expected``
-    outcome: Ints  # [3] NOT_AT_REST, USED, REJECTED or STEPPED of ``sage_husa``
+    outcome: Ints  # [3] NOT_AT_REST, USED, REJECTED or STEPPED, see ``sage_husa``
     known: Floats  # [3] standard error of ``expected``
 
     @property
     def innovation(self) -> Floats:
-        """Return the normalised innovations [3], which are ``mean - expected`` divided by the predicted standard
-        deviations."""
+        """Return the normalised innovations [3], which are ``(mean - expected) / error``."""
         return (self.mean - self.expected) / self.error
 
 
@@ -117,9 +120,9 @@ class Compensator:
     rate_hz : float
         Sample rate in Hz.
     adapts : bool
-        True to estimate the noise of the drift continuously. False to keep the identified noise.
+        True to adapt the noise variances of the drift model continuously, False to keep the identified variances.
     orders : sequence of (p, q)
-        ARMA orders to choose from.
+        ARMA orders among which the identification selects.
 
     Examples
     --------
@@ -136,13 +139,13 @@ class Compensator:
         self.models: list[ArmaModel | None] = [None] * GYROS
         self._orders = tuple(orders)
         self._state = _initial_state(rate_hz, adapts)
-        self.sample_count = 0  # samples received, including missing ones
+        self.sample_count = 0  # number of received samples, including missing samples
         self._means = np.full((GYROS, HISTORY_INTERVALS), np.nan)  # ring buffer of interval means
         self._scatter = np.full((GYROS, HISTORY_INTERVALS), np.nan)
         self._interval_count = 0
         self._at_rest = np.zeros(GYROS, np.int64)
         self._next_identification = np.full(GYROS, MIN_IDENTIFICATION_INTERVALS)
-        self._finished_intervals: list[DriftInterval] = []
+        self._finished_intervals: list[MeasuredAndPredictedDrift] = []
 
     @property
     def interval_samples(self) -> int:
@@ -156,41 +159,43 @@ class Compensator:
 
     @property
     def bias(self) -> Floats:
-        """Return the subtracted bias [3] in rad/s. The value NaN means that the bias is not known yet."""
+        """Return the bias [3] that is currently subtracted in rad/s, or NaN if it is not known yet."""
         return self._state.bias.copy()
 
     @property
     def bias_standard_error(self) -> Floats:
-        """Return the standard errors [3] of the bias in rad/s. The value NaN means that the bias is not known yet."""
+        """Return the standard error [3] of the bias in rad/s, or NaN if the bias is not known yet."""
         known = [sage_husa.expected_bias_and_variance(drift)[1] ** 0.5 for drift in self._state.drift]
         return np.where(np.isnan(self._state.bias), np.nan, known)
 
     def compensate(self, values: Floats, lost: int = 0) -> Floats:
-        """Return the samples with the gyro drift removed.
+        """Remove the gyro drift from samples.
 
-        The rate of a gyro axis is returned unchanged until the bias of the axis is known.
+        Until the bias of a gyro axis is known, the rate of the axis is returned unchanged.
 
         Parameters
         ----------
         values : ndarray, shape (n, 6), float64
-            Samples in rad/s and m/s², in the order of AXES; NaN = missing.
+            Samples in rad/s and m/s², in the order of AXES; NaN means missing.
         lost : int
-            Number of samples that are missing before the first row.
+            Number of samples that are missing before ``values``.
 
         Returns
         -------
         ndarray, shape (n, 6), float64
-            The samples in the same units, with unchanged accelerometer values.
+            Compensated samples in rad/s and m/s². The accelerometer values are unchanged.
         """
         if lost:
             for axis in range(GYROS):
                 predict_over_gap(self._state.bank[axis], self._state.ages[axis], lost)
             self.sample_count += lost
         out = np.array(values, dtype=np.float64, order="C")
-        # Numba compiles one version per memory layout and access flag, so the array is always contiguous and read-only.
+        # Numba compiles a version for each memory layout and access flag, so the array is always contiguous and
+        # read-only.
         values = np.ascontiguousarray(values, np.float64).view()
         values.flags.writeable = False
-        # After missing samples, the motion detector decides about all waiting blocks at once. Each may end an interval.
+        # After missing samples, the motion detector decides on all waiting blocks at once. Each block may end an
+        # interval.
         outcomes = np.empty((len(values) // self.interval_samples + 2 + MAX_PENDING_BLOCKS, 1 + 6 * GYROS))
         filled = _advance(values, self.sample_count, self.block_samples, self._state, out, outcomes)
         self.sample_count += len(values)
@@ -198,7 +203,7 @@ class Compensator:
             self._record_interval(outcomes[k])
         return out
 
-    def take_finished_intervals(self) -> list[DriftInterval]:
+    def take_finished_intervals(self) -> list[MeasuredAndPredictedDrift]:
         """Return the results of the intervals that have ended since the last call."""
         outcomes, self._finished_intervals = self._finished_intervals, []
         return outcomes
@@ -207,19 +212,20 @@ class Compensator:
 
     @property
     def samples_to_interval_end(self) -> int:
-        """Return the number of samples until the end of the interval.
+        """Return the number of samples until the end of the current interval.
 
-        Results do not depend on the sizes of the input blocks if models are changed only at the end of an interval.
+        If drift models are only changed at the end of an interval, results do not depend on the sizes of the input
+        blocks.
         """
         return self.interval_samples - self.sample_count % self.interval_samples
 
     @property
     def axes_due_for_identification(self) -> tuple[int, ...]:
-        """Return the indices of the axes whose drift models are due for identification."""
+        """Return the indices of the axes whose drift model should now be identified."""
         return tuple(np.flatnonzero(self._at_rest >= self._next_identification).tolist())
 
     def means_and_noise_variance_for_identification(self, axis: int) -> tuple[Floats, float]:
-        """Return the interval means and the noise variance for the identification of a drift model.
+        """Return the interval means and the noise variance from which a drift model is identified.
 
         Parameters
         ----------
@@ -229,23 +235,23 @@ class Compensator:
         Returns
         -------
         means : ndarray, shape (n,)
-            Interval means in rad/s, oldest first; NaN = not at rest.
+            Interval means in rad/s, oldest first; NaN means not at rest.
         white : float
-            Variance of the white noise of a mean, (rad/s)².
+            Variance of the white noise of an interval mean, (rad/s)².
         """
         z, scatter = self._history(axis)
         white = float(np.nanmean(scatter)) if np.isfinite(scatter).any() else 0.0
         return z, white
 
     def apply_identification_result(self, axis: int, identified_model: ArmaModel | None) -> None:
-        """Replace the drift model of an axis, and process all stored intervals again with the new model.
+        """Replace the drift model of an axis, and filter all stored intervals again with the new model.
 
         Parameters
         ----------
         axis : int
             Index of the gyro axis, 0 to 2.
         identified_model : ArmaModel or None
-            The identified model. None means that the identification failed and is repeated later.
+            Identified drift model. None means that the identification has failed and is repeated later.
         """
         self._next_identification[axis] = self._at_rest[axis] + min(
             max(self._at_rest[axis], MIN_IDENTIFICATION_INTERVALS) // 2, HISTORY_INTERVALS
@@ -257,23 +263,23 @@ class Compensator:
         count = drift["rest_count"]
         sage_husa.restart_with_model(drift, identified_model)
         sage_husa.refilter_history(drift, *self._history(axis), _min_variance(self._state.rest.open, axis))
-        drift["rest_count"] = count  # The stored intervals must not be counted twice.
+        drift["rest_count"] = count  # Filtering the stored intervals again must not count them twice.
         _update_bias(axis, self._state.drift, self._state.bias, self._state.bank)
 
     def identify_due_models(self) -> None:
-        """Identify the drift models of all axes that are due."""
+        """Identify the drift models of all axes for which an identification is due."""
         for axis in self.axes_due_for_identification:
             try:
                 self.apply_identification_result(
                     axis, fit_arma(*self.means_and_noise_variance_for_identification(axis), self._orders)
                 )
-            except NotReady:  # too few means, or all means are equal
+            except NotReady:  # too few interval means, or all means are equal
                 self.apply_identification_result(axis, None)
 
     # --- results of intervals
 
     def _history(self, axis: int) -> tuple[Floats, Floats]:
-        """Return the stored interval means and their variances, oldest first."""
+        """Return the stored means of an axis and their variances, oldest first."""
         count = min(self._interval_count, HISTORY_INTERVALS)
         order = np.arange(self._interval_count - count, self._interval_count) % HISTORY_INTERVALS
         return self._means[axis][order], self._scatter[axis][order]
@@ -282,7 +288,7 @@ class Compensator:
         columns = outcomes[1:].reshape(GYROS, 6).T.copy()
         at = self._interval_count % HISTORY_INTERVALS
         became = columns[OUTCOME].astype(np.int64)
-        self._means[became == sage_husa.STEPPED] = np.nan  # The older means belong to the bias before the step.
+        self._means[became == sage_husa.STEPPED] = np.nan  # Older means belong to the bias before the step.
         used = (became == sage_husa.USED) | (became == sage_husa.STEPPED)
         self._means[:, at] = np.where(used, columns[MEAN], np.nan)
         self._scatter[:, at] = np.where(used, columns[SCATTER], np.nan)
@@ -290,16 +296,18 @@ class Compensator:
         self._at_rest += used
         end = int(outcomes[0] + 1) * self.interval_samples
         mean, expected, innovation_std, _, expected_error, _ = columns
-        self._finished_intervals.append(DriftInterval(end, mean, expected, innovation_std, became, expected_error))
+        self._finished_intervals.append(
+            MeasuredAndPredictedDrift(end, mean, expected, innovation_std, became, expected_error)
+        )
 
 
-def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
+def _initial_state(rate_hz: float, adapts: bool) -> CompensatorArrays:
     each = choose_memory_lengths(rate_hz)
-    table, first = compute_gain_table(each)
+    table, first = compute_gains_by_filter_age(each)
     filters = each.size
     drift = np.zeros(GYROS, sage_husa.DRIFT_FILTER)
     drift["adaptive"] = adapts
-    return CompensatorState(
+    return CompensatorArrays(
         rest=motion_kernel.make_motion_state(),
         current=np.full(1, -1, np.int64),
         learned=np.zeros(GYROS, np.int64),
@@ -321,9 +329,8 @@ def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
 
 
 @compiled
-def _advance(values: Floats, index: int, size: int, s: CompensatorState, out: Floats, outcomes: Floats) -> int:
-    """Process successive samples, write the results of finished intervals, and return the number of finished
-    intervals."""
+def _advance(values: Floats, index: int, size: int, s: CompensatorArrays, out: Floats, outcomes: Floats) -> int:
+    """Process samples, write the results of completed intervals, and return the number of these intervals."""
     keep = 0.5 / (2 << (s.ages.shape[1] - 1))
     filled, i, n = 0, 0, values.shape[0]
     while i < n:
@@ -357,7 +364,7 @@ def _begin_block(number: int, waiting: Floats, sums: Floats) -> None:
 
 
 @compiled
-def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorState, keep: float, out: Floats) -> None:
+def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorArrays, keep: float, out: Floats) -> None:
     bank, ages, feedback = s.bank[axis], s.ages[axis], s.feedback[axis]
     bias = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
     trusted = s.learned[axis] >= MIN_REST_INTERVALS
@@ -374,7 +381,7 @@ def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorState, kee
 
 @compiled
 def _accumulate(values: Floats, sums: Floats) -> None:
-    """Add values to the sums of a block, except NaN."""
+    """Add the values that are not NaN to the sums of a block."""
     for k in range(values.size):
         if values[k] != values[k]:
             continue
@@ -387,8 +394,8 @@ def _accumulate(values: Floats, sums: Floats) -> None:
 
 
 @compiled
-def _apply_rest_decision(number: int, moves: bool, s: CompensatorState, outcomes: Floats) -> bool:
-    """Process the decision of the motion detector about a block, and return True if the previous interval has ended."""
+def _apply_rest_decision(number: int, moves: bool, s: CompensatorArrays, outcomes: Floats) -> bool:
+    """Process the decision of the motion detector on a block, and return True if the previous interval has ended."""
     interval = number // BLOCKS_PER_INTERVAL
     over = bool(s.current[0] >= 0 and interval > s.current[0])
     if over:
@@ -413,7 +420,7 @@ def _apply_rest_decision(number: int, moves: bool, s: CompensatorState, outcomes
 
 @compiled
 def _exceeds_rest_limits(waiting: Floats) -> bool:
-    """Return True if the rms or the mean rate of a block exceeds the limits for a sensor at rest."""
+    """Return True if the scatter or the mean rate in a block exceeds the limits for a sensor at rest."""
     for a in range(len(AXES)):
         n = waiting[a, COUNT]
         if n == 0.0:
@@ -427,8 +434,8 @@ def _exceeds_rest_limits(waiting: Floats) -> bool:
 
 
 @compiled
-def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
-    """Finish the interval, update the drift filters, and predict the drift of the next interval."""
+def _finish_interval(s: CompensatorArrays, outcomes: Floats) -> None:
+    """Complete the current interval, update the drift filters, and predict the drift in the next interval."""
     outcomes[0] = s.current[0]
     for a in range(GYROS):
         outcome = outcomes[1 + 6 * a : 7 + 6 * a]
@@ -451,7 +458,7 @@ def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
                 s.learned[a] += 1
                 update_rest_noise(s.bank[a], s.followed[a], s.samples[a], s.learned[a])
         else:
-            sage_husa.process_interval_in_motion(s.drift[a])
+            sage_husa.discard_unconfirmed_level_in_motion(s.drift[a])
         _predict_next_interval(a, s)
         for b in range(BLOCKS_PER_INTERVAL):
             s.means[a, b] = np.nan
@@ -462,9 +469,9 @@ def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
 
 @compiled
 def _interval_mean(means: Floats) -> tuple[int, float, float]:
-    """Return the number of blocks at rest in an interval, the mean of the blocks, and the variance of the mean.
+    """Return the number of blocks at rest in an interval, their mean, and the variance of the mean.
 
-    The variance is estimated from the differences of neighbouring blocks.
+    The variance is estimated from the differences between the means of neighbouring blocks.
     """
     count, total, apart, pairs = 0, 0.0, 0.0, 0
     for b in range(BLOCKS_PER_INTERVAL):
@@ -477,12 +484,12 @@ def _interval_mean(means: Floats) -> tuple[int, float, float]:
 
 @compiled
 def _min_variance(blocks: Floats, axis: int) -> float:
-    """Return the smallest variance of an interval mean, which follows from the quantization step."""
+    """Return the minimum variance of an interval mean, which follows from the quantization step."""
     return float(blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.MIN_VARIANCE)
 
 
 @compiled
-def _predict_next_interval(axis: int, s: CompensatorState) -> None:
+def _predict_next_interval(axis: int, s: CompensatorArrays) -> None:
     if s.drift[axis]["rest_count"] >= sage_husa.MIN_CONFIRMED_INTERVALS:
         sage_husa.predict_next_interval(s.drift[axis])
         _update_bias(axis, s.drift, s.bias, s.bank)
@@ -492,5 +499,5 @@ def _predict_next_interval(axis: int, s: CompensatorState) -> None:
 def _update_bias(axis: int, drifts: np.ndarray, biases: Floats, banks: Floats) -> None:
     now = sage_husa.expected_bias_and_variance(drifts[axis])[0]
     before = biases[axis] if biases[axis] == biases[axis] else 0.0
-    apply_bias_change(banks[axis], now - before)
+    correct_rates_for_bias_change(banks[axis], now - before)
     biases[axis] = now

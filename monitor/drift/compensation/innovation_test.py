@@ -1,25 +1,25 @@
-"""Test of the innovations of a drift model, which detects a model that no longer fits.
+"""Detection of drift models that no longer fit, based on the innovations.
 
-If the drift model fits, the mean of ε²/S over the last intervals follows a χ² distribution divided by the degrees of
-freedom. A mean above LIMIT is reported once. The next report is possible after the mean has fallen below RESET_LIMIT.
+If the drift model fits, the mean of the squared normalised innovations ε²/S over n intervals has the distribution
+χ²_n/n. When the mean exceeds LIMIT, a misfit is reported. The next misfit is reported only after the mean has fallen
+below RESET_LIMIT.
 """
 
 from collections import deque
 from typing import Final
 
 INTERVALS: Final = 64
-"""Number of intervals over which the squared innovations are averaged."""
+"""Number of intervals over which the squared normalised innovations are averaged."""
 FALSE_ALARM_PROBABILITY: Final = 1e-8
-"""Probability that the mean square innovation of a correct model exceeds LIMIT in one evaluation."""
+"""Probability that a correct model exceeds LIMIT at a single test."""
 LIMIT: Final = 2.327393746165351
-"""Quantile of χ² with INTERVALS degrees of freedom, divided by INTERVALS, for the probability 1 −
-FALSE_ALARM_PROBABILITY."""
+"""Quantile of χ²/n with n = INTERVALS degrees of freedom, for the probability 1 − FALSE_ALARM_PROBABILITY."""
 RESET_LIMIT: Final = 1.3
-"""Mean square innovation below which a drift model is considered to fit again."""
+"""Mean squared normalised innovation below which a drift model counts as fitting again."""
 
 
 class InnovationTest:
-    """Innovation test for the drift model of an axis."""
+    """Test of the innovations of a drift model for one axis."""
 
     def __init__(self) -> None:
         self._squares: deque[float] = deque(maxlen=INTERVALS)
@@ -31,9 +31,9 @@ class InnovationTest:
         return sum(self._squares) / INTERVALS if len(self._squares) == INTERVALS else float("nan")
 
     def detect_new_misfit(self, innovation: float) -> bool:
-        """Add a normalised innovation ε/√S, and return True if the drift model no longer fits.
+        """Add a normalised innovation ε/√S, and return True if the drift model has ceased to fit.
 
-        Each misfit is reported only once.
+        The function returns True only once for each misfit.
         """
         self._squares.append(innovation**2)
         now = self.mean_square_innovation
@@ -45,6 +45,6 @@ class InnovationTest:
         return True
 
     def forget_innovations(self) -> None:
-        """Discard all innovations after the drift model or the bias level has changed."""
+        """Discard all innovations, for example after a change of the drift model or a bias step."""
         self._squares.clear()
         self._exceeded = False

@@ -1,7 +1,7 @@
-"""Live compensation of the gyro drift of a device.
+"""Live compensation of the gyro drift of one device.
 
-The identification of a drift model takes about 50 ms, so the caller runs the identification in another thread. Events
-report steps of the bias and drift models that no longer fit.
+Identifying a drift model takes about 50 ms, so the caller should do it in another thread. Bias steps and drift models
+that no longer fit are reported as events.
 """
 
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Event, Floats, SampleBlock, make_block
-from monitor.common.units import format_axis_value
+from monitor.common.unit_formatting import format_axis_value
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.compensator import GYROS, Compensator, DriftInterval
+from monitor.drift.compensation.compensator import GYROS, Compensator, MeasuredAndPredictedDrift
 from monitor.drift.compensation.innovation_test import INTERVALS, InnovationTest
 from monitor.drift.compensation.sage_husa import STEPPED, USED
 from monitor.estimation.detection.signal_monitor import MAX_RATE_CHANGE
@@ -21,20 +21,20 @@ EVENT_KIND: Final = "drift_unexplained"
 
 
 @dataclass(frozen=True, slots=True)
-class DriftUpdate:
+class MeasuredAndSubtractedDrift:
     """Measured and subtracted drift of three gyro axes in one interval, in rad/s."""
 
-    t_ns: int  # time of the last sample
+    t_ns: int  # time of the last sample in the interval
     interval_s: float
-    mean: Floats  # [3] measured at rest; NaN = in motion, or rejected
-    expected: Floats  # [3] drift that was subtracted; NaN = not known yet
+    mean: Floats  # [3] measured drift at rest; NaN if in motion or rejected
+    expected: Floats  # [3] drift that was subtracted; NaN if not known yet
     error: Floats  # [3] standard error of ``expected``
-    innovation: Floats  # [3] normalised innovation ε/√S; NaN = not used
-    models: tuple[ArmaModel | None, ...]  # one model per axis; None = not identified yet
+    innovation: Floats  # [3] normalised innovation ε/√S; NaN if not used
+    models: tuple[ArmaModel | None, ...]  # drift model of each axis; None if not identified yet
 
 
-class LiveCompensation:
-    """Drift compensation for the gyro axes of a device.
+class LiveDriftCompensation:
+    """Drift compensation for the gyro axes of one device.
 
     Parameters
     ----------
@@ -45,11 +45,11 @@ class LiveCompensation:
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self._events: list[Event] = []
-        self._updates: list[DriftUpdate] = []
+        self._updates: list[MeasuredAndSubtractedDrift] = []
         self._reset()
 
     def compensate_block(self, samples: SampleBlock) -> SampleBlock:
-        """Return a block of samples with the gyro drift removed."""
+        """Remove the gyro drift from a block of samples."""
         values = self.compensator.compensate(samples.values, samples.lost)
         newest_ns = int(samples.t_ns[-1])
         for interval in self.compensator.take_finished_intervals():
@@ -57,13 +57,13 @@ class LiveCompensation:
             self._publish(interval, t_ns)
         return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
-    def take_drift_updates(self) -> list[DriftUpdate]:
+    def take_drift_updates(self) -> list[MeasuredAndSubtractedDrift]:
         """Return the results of the intervals that have ended since the last call."""
         updates, self._updates = self._updates, []
         return updates
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call: steps of the bias, and drift models that no longer fit."""
+        """Return the events since the last call, which report bias steps and drift models that no longer fit."""
         events, self._events = self._events, []
         return events
 
@@ -75,16 +75,16 @@ class LiveCompensation:
         axis : int
             Index of the gyro axis, 0 to 2.
         identified_model : ArmaModel or None
-            The identified model. None means that the identification failed.
+            Identified drift model. None means that the identification has failed.
         """
         self.compensator.apply_identification_result(axis, identified_model)
         if identified_model is not None:
             self._innovations[axis].forget_innovations()
 
     def set_rate(self, rate_hz: float) -> None:
-        """Set a better estimate of the sample rate in Hz.
+        """Set a more accurate value of the sample rate in Hz.
 
-        If the sample rate changes by more than MAX_RATE_CHANGE, the compensation is restarted.
+        The compensation is restarted if the relative change of the rate exceeds MAX_RATE_CHANGE.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz
@@ -94,10 +94,10 @@ class LiveCompensation:
         self.compensator = Compensator(self._rate_hz)
         self._innovations = [InnovationTest() for _ in range(GYROS)]
 
-    def _publish(self, interval: DriftInterval, t_ns: int) -> None:
+    def _publish(self, interval: MeasuredAndPredictedDrift, t_ns: int) -> None:
         used = interval.outcome == USED
         self._updates.append(
-            DriftUpdate(
+            MeasuredAndSubtractedDrift(
                 t_ns,
                 self.compensator.interval_s,
                 np.where(used, interval.mean, np.nan),

@@ -1,7 +1,7 @@
-"""Published methods that remove drift and noise from a finished recording, for comparison.
+"""Published methods that remove drift and noise from a complete recording, used for comparison.
 
-All methods use samples at rest for learning and do not detect motion. The methods ``emd`` and ``wavelet`` need future
-samples. The method ``ar`` assumes that the recording has the spectrum of the noise at rest.
+All methods learn from given samples at rest and do not detect motion. The methods ``emd`` and ``wavelet`` need future
+samples. The method ``ar`` assumes that the whole recording has the spectrum of the noise at rest.
 """
 
 from collections.abc import Callable
@@ -15,35 +15,35 @@ from monitor.common.compiled import compiled
 from monitor.common.distributions import NORMAL_QUARTILE
 
 MAX_ORDER: Final = 8
-"""Highest order of an autoregression."""
+"""Highest order of an autoregressive model."""
 MIN_REST_SAMPLES: Final = 100
 PIECE, OVERLAP = 16_384, 4_096
-"""Number of samples in a piece, and in the overlap of two pieces.
+"""Number of samples in a segment, and in the overlap of two segments.
 
-An empirical mode decomposition of a long signal would need too much memory.
+The empirical mode decomposition of a long signal would need too much memory.
 """
 MAX_NOISE_LAG: Final = 2
-"""Lag in samples by which the autocorrelation of a noise mode has fallen below 1/e."""
+"""Maximum lag in samples at which the autocorrelation of a noise mode falls below 1/e."""
 WAVELET: Final = "db4"
 MAX_DOUBLINGS: Final = 60
 MAX_LEVELS: Final = 8
 MISSING_PACKAGES: Final = 'EMD-signal and PyWavelets are not installed: pip install "imu-monitor[denoise]"'
 
 ReferenceMethod = Callable[[Floats, Floats], Floats]
-"""Function that returns a filtered rate [n] for a rate [n] and samples at rest [m], minus the mean at rest."""
+"""Function that filters a rate [n], given samples at rest [m]. The mean at rest has been subtracted from both."""
 
 
 def apply_reference_method(rate: Floats, rest_samples: Floats, method: ReferenceMethod) -> Floats:
-    """Return the rate of a gyro axis with drift and noise removed by a reference method.
+    """Remove drift and noise from the rate of a gyro axis with a reference method.
 
     Parameters
     ----------
     rate : ndarray, shape (n,)
-        Rate in rad/s; NaN = missing. Missing samples stay missing.
+        Rate in rad/s. NaN means missing and remains NaN in the result.
     rest_samples : ndarray, shape (m,)
-        Rate at rest in rad/s, in the order of time.
+        Rate at rest in rad/s, in chronological order.
     method : callable
-        One of the REFERENCE_METHODS.
+        One of the methods in REFERENCE_METHODS.
 
     Returns
     -------
@@ -53,7 +53,7 @@ def apply_reference_method(rate: Floats, rest_samples: Floats, method: Reference
     Raises
     ------
     NotReady
-        If there are too few samples at rest.
+        If there are too few samples at rest to learn from.
     """
     rest = rest_samples[np.isfinite(rest_samples)]
     if rest.size < MIN_REST_SAMPLES:
@@ -66,17 +66,17 @@ def apply_reference_method(rate: Floats, rest_samples: Floats, method: Reference
 
 
 def _autoregressive_filter(x: Floats, learned: Floats) -> Floats:
-    """Apply a Kalman filter with an autoregressive model, whose order is selected by the BIC."""
+    """Apply a Kalman filter with an autoregressive model whose order minimises the BIC."""
     return _kalman_filtered(x, *_autoregression(learned), float(learned.var()))
 
 
 def _filter_emd_modes(x: Floats, _learned: Floats) -> Floats:
-    """Filter the noise modes of an empirical mode decomposition (Huang et al. 1998)."""
+    """Decompose a signal into empirical modes (Huang et al. 1998), and filter the modes that consist of noise."""
     return _process_pieces(x, _filter_noise_modes)
 
 
 def _shrink_wavelets(x: Floats, learned: Floats) -> Floats:
-    """Apply soft thresholding to the wavelet coefficients with the universal threshold (Donoho & Johnstone 1994)."""
+    """Apply soft thresholding with the universal threshold to the wavelet coefficients (Donoho & Johnstone 1994)."""
     try:
         import pywt
     except ImportError as error:
@@ -91,7 +91,7 @@ def _shrink_wavelets(x: Floats, learned: Floats) -> Floats:
 
 
 def _autoregression(x: Floats) -> tuple[Floats, float]:
-    """Return the coefficients of an autoregressive model and the variance of the innovations."""
+    """Fit an autoregressive model, and return its coefficients and innovation variance."""
     n = x.size
     most = min(MAX_ORDER, n // 10)
     covariance = np.array([float(x[: n - k] @ x[k:]) / n for k in range(most + 1)])
@@ -105,7 +105,7 @@ def _autoregression(x: Floats) -> tuple[Floats, float]:
 
 
 def _kalman_filtered(x: Floats, phi: Floats, new: float, measuring: float) -> Floats:
-    """Return the steady-state Kalman estimate of an autoregressive process with white measurement noise."""
+    """Estimate an autoregressive process with white measurement noise by a steady-state Kalman filter."""
     p = phi.size
     step = np.zeros((p, p))
     step[0], step[1:, :-1] = phi, np.eye(p - 1)
@@ -115,11 +115,11 @@ def _kalman_filtered(x: Floats, phi: Floats, new: float, measuring: float) -> Fl
 
 
 def _steady_covariance(step: Floats, new: float) -> Floats:
-    """Return the steady-state covariance of a Kalman prediction.
+    """Return the steady-state covariance matrix of a Kalman prediction.
 
-    The structure-preserving doubling algorithm converges quadratically (Chu, Fan, Lin & Wang, Int. J. Control 77,
-    2004). The transition matrix ``step`` has the shape [p, p]. The variance ``new`` is added to the first state in each
-    step. The first state is measured with unit variance.
+    The function uses the structure-preserving doubling algorithm, which converges quadratically (Chu, Fan, Lin & Wang,
+    Int. J. Control 77, 2004). The transition matrix ``step`` has the shape (p, p). In each time step, the variance
+    ``new`` is added to the first state, and the first state is measured with unit variance.
     """
     p = step.shape[0]
     a, g, h = step.T.copy(), np.zeros((p, p)), np.zeros((p, p))
@@ -155,7 +155,7 @@ def _run_filter(x: Floats, phi: Floats, gain: Floats) -> Floats:
 
 
 def _filter_noise_modes(x: Floats) -> Floats:
-    """Return the sum of the modes of x [n] after filtering the noise modes."""
+    """Return the sum of the empirical modes of x [n], in which the noise modes are filtered."""
     try:
         from PyEMD import EMD
     except ImportError as error:
@@ -170,7 +170,7 @@ def _filter_noise_modes(x: Floats) -> Floats:
 
 
 def _is_noise(mode: Floats) -> bool:
-    """Return True if the autocorrelation of a mode falls below 1/e within MAX_NOISE_LAG samples."""
+    """Return True if the autocorrelation of an empirical mode falls below 1/e within MAX_NOISE_LAG samples."""
     centred = mode - mode.mean()
     power = float(centred @ centred)
     if not power > 0.0:
@@ -180,7 +180,7 @@ def _is_noise(mode: Floats) -> bool:
 
 
 def _process_pieces(x: Floats, work: Callable[[Floats], Floats]) -> Floats:
-    """Process overlapping pieces of x [n], and cross-fade the results."""
+    """Process overlapping segments of x [n], and cross-fade the results."""
     out = np.zeros(x.size)
     rise = (np.arange(OVERLAP) + 0.5) / OVERLAP
     start, end = 0, 0

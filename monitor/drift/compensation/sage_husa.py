@@ -1,19 +1,19 @@
-"""Adaptive Kalman filter for the bias of a gyro axis. The time step is one interval.
+"""Adaptive Kalman filter that estimates the bias of a gyro axis, with one update per interval.
 
-The state is [x, x̂, level], where x is an ARMA process and x̂ is the one-step prediction of x. The level is a slow
-random walk. The measured interval mean is z = x + level + v, where v is white noise. The noise variances Q̂ and R̂ are
-estimated after Sage and Husa (1969), in a form that keeps Q̂ and R̂ positive. With the innovation ε, the variance S of
-ε, and the weight d_k = (1 − b)/(1 − b^{k+1}) of interval k:
+The state is [x, x̂, level]. Here x is an ARMA process, x̂ is its one-step prediction, and the level is a slow random
+walk. The measured interval mean is z = x + level + v, where v is white noise. The noise variances Q̂ and R̂ are
+estimated by the method of Sage and Husa (1969), modified so that they stay positive. Let ε be the innovation, S its
+variance, and d_k = (1 − b)/(1 − b^{k+1}) the weight of interval k. The variances are updated by
 
     Q̂ ← Q̂ + d Q̂ D (ε² − S) Dᵀ Q̂,  D = Hᵀ/S        R̂ ← (1 − d) R̂ + d [(1 − H K)² ε² + H P Hᵀ]
 
-The matrix Q̂ equals s B Bᵀ, so only the factor s is updated: s ← s + d s² (ε² − S)/S². Lower limits prevent s and R̂
-from becoming zero. The means of the noise are not estimated, because estimated means increased the error up to three
-times on recordings at rest.
+Because Q̂ = s B Bᵀ, only the factor s is updated: s ← s + d s² (ε² − S)/S². Lower limits prevent s and R̂ from becoming
+zero. In contrast to the original method, the means of the noise are not estimated. On recordings at rest, estimated
+means increased the error by a factor of up to three.
 
-An interval is rejected as an outlier if the innovation exceeds OUTLIER_SIGMAS standard deviations, or if the scatter
-within the interval is unusually large. After an outlier, GUARD_INTERVALS successive intervals must agree before the
-filter uses intervals again. If the bias persists at a new value, the filter assumes a step of the bias.
+An interval is rejected as an outlier if its innovation exceeds OUTLIER_SIGMAS standard deviations, or if the scatter
+within the interval is unusually large. After an outlier, the filter ignores all intervals until GUARD_INTERVALS
+successive intervals agree with each other. If the bias persists at a new value, the filter assumes a bias step.
 """
 
 from typing import Final
@@ -25,28 +25,28 @@ from monitor.common.compiled import compiled
 from monitor.drift.compensation.arma import ArmaModel, stationary_covariance
 
 FORGETTING_FACTOR: Final = 0.995
-"""Forgetting factor b of the noise estimate. It corresponds to 200 intervals."""
+"""Forgetting factor b of the noise estimation, which corresponds to a memory of 200 intervals."""
 MIN_VARIANCE_SHARE: Final = 0.05
-"""Lower limit of s, relative to the identified innovation variance."""
+"""Lower limit of the estimated innovation variance, relative to the identified innovation variance."""
 OUTLIER_SIGMAS: Final = 6.0
-"""Largest innovation of an accepted interval, in predicted standard deviations."""
+"""Maximum innovation of an accepted interval, in predicted standard deviations."""
 MAX_SCATTER_RATIO: Final = (16.0, 10.0)
-"""Largest ratio of the scatter of an interval to the average scatter, and smallest number of averaged intervals.
+"""Maximum ratio of the variance within an interval to the average, and minimum number of averaged intervals.
 
-White noise exceeds the limit with a probability of 1e-6 or less.
+White noise exceeds the maximum ratio with a probability of at most 1e-6.
 """
 GUARD_INTERVALS: Final = 5.0
-"""Number of successive intervals that must agree after a rejected interval."""
+"""Number of successive intervals that must agree with each other after a rejected interval."""
 AGREEMENT_SIGMAS: Final = 4.0
-"""Largest difference of two intervals at rest that agree, in standard deviations of the difference."""
+"""Maximum difference at which the means of two intervals agree, in standard deviations of the difference."""
 STEP_INTERVALS: Final = (10.0, 300.0)
-"""Smallest and largest number of intervals after which a persistent change counts as a step."""
+"""Minimum and maximum number of intervals after which a persistent change counts as a bias step."""
 MIN_CONFIRMED_INTERVALS: Final = 5
-"""Number of successive intervals at rest that confirm the first bias level."""
+"""Number of successive intervals at rest that confirm the initial bias level."""
 SCATTER_WEIGHT: Final = 0.02
-"""Weight of an interval in the average scatter."""
+"""Weight of a new interval in the running average of the scatter."""
 MIN_LEVEL_MEMORY, MAX_LEVEL_MEMORY = 40, 1000
-"""Smallest and largest memory of the bias level in intervals."""
+"""Minimum and maximum memory of the bias level in intervals."""
 
 DRIFT_FILTER: Final = np.dtype(
     [
@@ -55,37 +55,37 @@ DRIFT_FILTER: Final = np.dtype(
         ("phi1", "f8"),
         ("phi2", "f8"),
         ("g1", "f8"),
-        ("identified_variance", "f8"),  # variance of a as identified, (rad/s)²
-        ("level_variance", "f8"),  # variance of the steps of the level, (rad/s)²
-        ("variance", "f8"),  # s, estimated variance of a, (rad/s)²
-        ("white_variance", "f8"),  # R̂, (rad/s)²
-        ("scatter", "f8"),  # average variance of a mean from the scatter within the intervals, (rad/s)²
-        ("scatter_count", "f8"),  # number of intervals with a scatter
+        ("identified_variance", "f8"),  # identified variance of the innovation a, (rad/s)²
+        ("level_variance", "f8"),  # variance of the random walk steps of the level, (rad/s)²
+        ("variance", "f8"),  # s, adapted variance of the innovation a, (rad/s)²
+        ("white_variance", "f8"),  # R̂, adapted variance of v, (rad/s)²
+        ("scatter", "f8"),  # average variance of an interval mean, from the scatter within intervals, (rad/s)²
+        ("scatter_count", "f8"),  # number of intervals in ``scatter``
         ("rest_count", "f8"),  # number of intervals at rest
-        ("outlier_run", "f8"),  # number of successive outliers
-        ("last_outlier", "f8"),  # mean of the last outlier, rad/s
-        ("guard_left", "f8"),  # number of remaining guard intervals
-        ("adaptive", "?"),  # True if the noise is estimated
-        ("identified", "?"),  # True if a model has been identified
+        ("outlier_run", "f8"),  # number of successive outliers that agree with each other
+        ("last_outlier", "f8"),  # interval mean of the last outlier, rad/s
+        ("guard_left", "f8"),  # number of intervals that must still agree after an outlier
+        ("adaptive", "?"),  # True to adapt the noise variances
+        ("identified", "?"),  # True if an ARMA model has been identified
     ],
     align=True,
 )
-"""Fields of the filter of a gyro axis."""
+"""Data type of the filter state of a gyro axis."""
 NOT_AT_REST, USED, REJECTED, STEPPED = range(4)
-"""Possible outcomes of an interval: not at rest, used, rejected, or used as a step of the bias."""
+"""Possible outcomes of an interval: not at rest, used, rejected as an outlier, or used as the end of a bias step."""
 
 
 def restart_with_model(drift_filter: np.void, model: ArmaModel) -> None:
     """Restart the filter with a new ARMA model.
 
-    The state becomes unknown, and the noise variances are those of the new model.
+    The state becomes unknown, and the noise variances are taken from the new model.
 
     Parameters
     ----------
     drift_filter : record of DRIFT_FILTER
-        Filter of a gyro axis, updated in place.
+        Filter state of a gyro axis, updated in place.
     model : ArmaModel
-        Identified model, in rad/s.
+        Identified ARMA model in rad/s.
     """
     phi1, phi2 = model.phi
     p11, p12, p22 = stationary_covariance(phi1, phi2, model.theta)
@@ -94,7 +94,7 @@ def restart_with_model(drift_filter: np.void, model: ArmaModel) -> None:
     drift_filter["phi1"], drift_filter["phi2"], drift_filter["g1"] = phi1, phi2, phi1 + model.theta
     drift_filter["identified_variance"] = drift_filter["variance"] = model.variance
     drift_filter["white_variance"] = model.white_variance
-    # Spectral density of x + v at zero frequency.
+    # This is the spectral density of x + v at zero frequency.
     slow = model.white_variance + model.variance * ((1.0 + model.theta) / (1.0 - phi1 - phi2)) ** 2
     drift_filter["level_variance"] = slow / min(max(model.count / 3.0, MIN_LEVEL_MEMORY), MAX_LEVEL_MEMORY) ** 2
     drift_filter["covariance"][2, 2] = slow / model.count
@@ -118,8 +118,8 @@ def predict_next_interval(drift_filter: np.void) -> None:
 
 
 @compiled
-def process_interval_in_motion(drift_filter: np.void) -> None:
-    """Process an interval in motion, which discards a bias level that is not confirmed yet."""
+def discard_unconfirmed_level_in_motion(drift_filter: np.void) -> None:
+    """Process an interval in motion. A bias level that has not been confirmed yet is discarded."""
     if drift_filter["rest_count"] < MIN_CONFIRMED_INTERVALS:
         drift_filter["rest_count"] = 0.0
 
@@ -140,20 +140,20 @@ def update_with_interval(
     Parameters
     ----------
     drift_filter : record of DRIFT_FILTER
-        Filter of a gyro axis, updated in place.
+        Filter state of a gyro axis, updated in place.
     interval_mean : float
         Mean of the interval, rad/s.
     scatter_variance : float
-        Variance of the mean from the scatter within the interval, (rad/s)²; NaN = not known.
+        Variance of the mean, estimated from the scatter within the interval, (rad/s)²; NaN means unknown.
     min_variance : float
-        Smallest variance of the mean, (rad/s)².
+        Minimum variance of the mean, (rad/s)².
 
     Returns
     -------
     variance : float
         Variance S of the innovation, (rad/s)².
     outcome : int
-        USED, REJECTED or STEPPED.
+        Outcome USED, REJECTED or STEPPED.
     """
     loud = _update_scatter(drift_filter, scatter_variance, min_variance)
     if not drift_filter["identified"]:
@@ -181,7 +181,7 @@ def update_with_interval(
 
 @compiled
 def _update_scatter(drift: np.void, scatter: float, least: float) -> bool:
-    """Update the average scatter within intervals, and return True if the new scatter is unusually large."""
+    """Update the average scatter within intervals, and return True if the new value is unusually large."""
     usual = max(drift["scatter"], least)
     loud = drift["scatter_count"] >= MAX_SCATTER_RATIO[1] and scatter > MAX_SCATTER_RATIO[0] * usual
     if scatter == scatter and not loud:
@@ -192,8 +192,7 @@ def _update_scatter(drift: np.void, scatter: float, least: float) -> bool:
 
 @compiled
 def _model_level_only(drift: np.void, z: float, least: float) -> None:
-    """Set the noise variances before the first identification, when the model is a slowly varying level with white
-    noise."""
+    """Set the noise variances of a slowly varying level with white noise, before a model is identified."""
     drift["white_variance"] = max(drift["scatter"], least)
     drift["level_variance"] = drift["white_variance"] / MIN_LEVEL_MEMORY**2
     if drift["rest_count"] == 0.0:
@@ -202,7 +201,7 @@ def _model_level_only(drift: np.void, z: float, least: float) -> None:
 
 @compiled
 def _process_outlier(drift: np.void, z: float, e: float) -> int:
-    """Process an outlier with the innovation ``e``, and return REJECTED or STEPPED."""
+    """Process an outlier with the innovation ``e``, and decide whether it is REJECTED or STEPPED."""
     if drift["rest_count"] < MIN_CONFIRMED_INTERVALS:
         drift["state"][2], drift["covariance"][2, 2], drift["rest_count"] = z, drift["white_variance"], 1.0
         return REJECTED
@@ -213,7 +212,7 @@ def _process_outlier(drift: np.void, z: float, e: float) -> int:
         return REJECTED
     drift["guard_left"] = 0.0
     drift["covariance"][2, 2] += e * e
-    drift["scatter_count"] = 0.0  # The noise may have changed with the level.
+    drift["scatter_count"] = 0.0  # The noise may have changed together with the level.
     return STEPPED
 
 
@@ -225,7 +224,7 @@ def _agree(drift: np.void, z: float, sigmas: float) -> bool:
 
 @compiled
 def _adapt_noise(drift: np.void, e: float, total: float, least: float) -> None:
-    """Update the noise variances with an innovation ``e`` of variance ``total``."""
+    """Adapt the noise variances to an innovation ``e`` of variance ``total``."""
     d = (1.0 - FORGETTING_FACTOR) / (1.0 - FORGETTING_FACTOR ** (drift["rest_count"] + 1.0))
     r = drift["white_variance"]
     left = r / total  # 1 − H K
@@ -238,7 +237,7 @@ def _adapt_noise(drift: np.void, e: float, total: float, least: float) -> None:
 
 @compiled
 def _correct(drift: np.void, e: float) -> None:
-    """Correct the state and the covariance with the innovation ``e``."""
+    """Correct the state and its covariance with the innovation ``e``."""
     x, p = drift["state"], drift["covariance"]
     h = p[0, 0] + p[2, 0], p[0, 1] + p[2, 1], p[0, 2] + p[2, 2]  # H P
     total = h[0] + h[2] + drift["white_variance"]
@@ -253,18 +252,18 @@ def _correct(drift: np.void, e: float) -> None:
 def refilter_history(
     drift_filter: np.void, interval_means: Floats, scatter_variances: Floats, min_variance: float
 ) -> None:
-    """Run the filter over all stored intervals, after ``restart_with_model``.
+    """Run the filter over all stored intervals, for example after ``restart_with_model``.
 
     Parameters
     ----------
     drift_filter : record of DRIFT_FILTER
-        Filter of a gyro axis, updated in place.
+        Filter state of a gyro axis, updated in place.
     interval_means : ndarray, shape (n,)
-        Interval means in rad/s, oldest first; NaN = not at rest.
+        Interval means in rad/s, oldest first; NaN means not at rest.
     scatter_variances : ndarray, shape (n,)
-        Variances of the means from the scatter within the intervals, (rad/s)².
+        Variances of the means, estimated from the scatter within the intervals, (rad/s)².
     min_variance : float
-        Smallest variance of a mean, (rad/s)².
+        Minimum variance of a mean, (rad/s)².
     """
     for k in range(interval_means.size):
         if interval_means[k] == interval_means[k]:

@@ -1,1 +1,1 @@
-"""Models of the bias against temperature: fit, online update and prediction."""
+"""Fit, online update and prediction of thermal models, which describe the bias as a function of temperature."""

@@ -1,19 +1,20 @@
-"""Significance tests for the dependence of a bias on temperature, and for hysteresis between heating and cooling.
+"""Tests of whether a bias depends on temperature, and whether it differs between heating and cooling (hysteresis).
 
-A random walk can correlate with temperature by chance. The tests are therefore F tests of generalised least squares, in
-which the noise is the sum of white noise and a random walk with correlated increments. The noise parameters are
-unknown, so an F test is made for each pair of parameters on a grid. A pair is plausible if its log restricted
-likelihood (Harville, J. Am. Stat. Assoc. 72, 1977) is within MAX_LIKELIHOOD_LOSS of the best. The p-value is the
-largest p-value of all plausible pairs. The measured false positive rates are in docs/thermal-measurements.md.
+A random walk of the bias can correlate with temperature by chance. The tests are therefore F tests in a generalised
+least-squares regression. The noise model is the sum of white noise and a random walk with correlated increments. The
+two parameters of the noise model are unknown, so the F test is repeated for each pair of parameters on a grid. A pair
+is plausible if its restricted log-likelihood (Harville, J. Am. Stat. Assoc. 72, 1977) is within MAX_LIKELIHOOD_LOSS of
+the maximum. The largest p-value among all plausible pairs is used. Measured false positive rates are listed in
+docs/thermal-measurements.md.
 
-Hysteresis is described in three ways:
+Hysteresis is described by three kinds of regressors:
 
-- differences between heating and cooling that vanish at the ends of the temperature range;
-- first-order lags, for heat that reaches the sensor with a delay;
+- differences between heating and cooling, which vanish at the ends of the temperature range;
+- first-order lags, which represent heat that reaches the sensor with a delay;
 - play operators of the Prandtl-Ishlinskii model (Visintin, Differential Models of Hysteresis, 1994, chapter III).
 
-If the temperature rose and fell, a constant drift with time is part of the null hypothesis. If the temperature only
-rose or only fell, a drift with time cannot be distinguished from a dependence on temperature.
+If the temperature rose and fell, the null hypothesis includes a linear drift with time. If the temperature only rose or
+only fell, a drift with time cannot be distinguished from a dependence on temperature.
 """
 
 from collections.abc import Mapping
@@ -30,52 +31,52 @@ from monitor.drift.thermal.thermal_model import interpolate_missing_temperatures
 from monitor.drift.thermal.thermal_response import apply_first_order_lag
 
 SIGNIFICANCE: Final = 0.01
-"""Largest p-value of a dependence or a hysteresis that is reported, after Bonferroni's correction."""
+"""Maximum p-value at which a dependence or hysteresis is reported, after Bonferroni correction."""
 MAIN_SHARE: Final = 0.5
-"""Share of the variance of the interval means from which temperature explains most of the variance."""
+"""Minimum explained share of the variance at which temperature is said to explain most of the variance."""
 MAX_MEANS: Final = 150
-"""Largest number of interval means, because the computing time grows with the cube of the number."""
+"""Maximum number of interval means in a test. The computing time grows with the third power of this number."""
 MIN_FREE: Final = 4
-"""Smallest number of degrees of freedom that a regression must leave."""
+"""Minimum number of residual degrees of freedom of a regression."""
 MAX_LIKELIHOOD_LOSS: Final = 2.0
-"""Largest difference of the log restricted likelihood between the best and a plausible noise model."""
+"""Maximum difference of the restricted log-likelihood between the best and a plausible noise model."""
 WALK_RATIOS: Final = (0.0, *np.geomspace(1e-3, 1e3, 9).tolist())
-"""Variance of the random walk increments, divided by the variance of the white noise."""
+"""Grid of the variance of the random walk increments, divided by the variance of the white noise."""
 INCREMENT_CORRELATIONS: Final = (0.0, 0.5, 0.8, 0.95)
-"""Correlations of successive increments of the random walk."""
+"""Grid of the correlation between successive increments of the random walk."""
 MIN_REVERSAL_SHARE: Final = 0.05
-"""Smallest change of temperature for a reversal, as a share of the temperature range."""
+"""Minimum temperature change that counts as a reversal, as a fraction of the temperature range."""
 MIN_REVERSAL_SIGMAS: Final = 3.0
-"""Smallest change of temperature for a reversal, in standard errors of a mean temperature."""
+"""Minimum temperature change that counts as a reversal, in standard errors of a mean temperature."""
 LAG_INTERVALS: Final = (1.0, 2.5, 6.0, 15.0)
-"""Time constants of the lags, in intervals."""
+"""Time constants of the first-order lags, in intervals."""
 PLAY_WIDTHS: Final = (0.05, 0.1, 0.2, 0.35)
-"""Half widths of the play operators, as shares of the temperature range."""
+"""Half-widths of the play operators, as fractions of the temperature range."""
 LOOP_POWERS: Final = 4
-"""Number of terms of the difference between heating and cooling."""
+"""Number of polynomial terms that describe the difference between heating and cooling."""
 FOLDS: Final = 6
-"""Number of parts for the cross-validation. Successive interval means belong to different parts."""
+"""Number of folds of the cross-validation. Successive interval means belong to different folds."""
 MIN_NEW_SHARE: Final = 1e-4
-"""Smallest part of a regressor that must be linearly independent of the previous regressors."""
+"""Minimum fraction of a regressor that must be linearly independent of the preceding regressors."""
 CURVE_ORDER: Final = 3
-"""Order of the polynomial in temperature for the test of dependence."""
+"""Order of the polynomial in temperature that is tested for a dependence."""
 HYSTERESIS_CURVE_ORDER: Final = 5
-"""Order of the polynomial in temperature for the test of hysteresis."""
+"""Order of the polynomial in temperature to which regressors for hysteresis are added."""
 
 
 @dataclass(frozen=True, slots=True)
 class TemperatureDependence:
     """Significant dependence of a bias on temperature."""
 
-    share: float  # explained share of the variance of the interval means, cross-validated
-    p_value: float  # p-value of the hypothesis of no dependence
+    share: float  # cross-validated share of the variance of the interval means that temperature explains
+    p_value: float  # p-value of the null hypothesis that the bias does not depend on temperature
     form: str  # "cubic", or "cubic with hysteresis"
     one_way: bool  # True if the temperature only rose or only fell
     interval_s: float
 
     @property
     def explains_most_variance(self) -> bool:
-        """Return True if temperature explains at least half of the variance of the interval means."""
+        """Return True if temperature explains at least half of the bias variance."""
         return self.share >= MAIN_SHARE
 
 
@@ -83,8 +84,8 @@ class TemperatureDependence:
 class Hysteresis:
     """Difference of a bias between heating and cooling."""
 
-    size: float  # largest difference of the bias at one temperature, including a drift in between; rad/s or m/s²
-    p_value: float  # p-value of the hypothesis of no difference
+    size: float  # largest bias difference at one temperature, including a drift in between; rad/s or m/s²
+    p_value: float  # p-value of the null hypothesis that there is no difference
 
     @property
     def hysteresis_is_significant(self) -> bool:
@@ -94,12 +95,12 @@ class Hysteresis:
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    """Result of the F test of additional regressors."""
+    """Result of an F test of additional regressors."""
 
     p_value: float  # largest p-value among the plausible noise models
-    likelihood: float  # logarithm, for the most likely noise model; comparable between regressions of the same means
-    smooth: Floats  # [m] known means minus their estimated white noise
-    noise: tuple[float, float]  # ratio and correlation of the most likely noise model
+    likelihood: float  # largest restricted log-likelihood; comparable between regressions of the same means
+    smooth: Floats  # [m] interval means after subtraction of the estimated white noise
+    noise: tuple[float, float]  # variance ratio and correlation of the most likely noise model
 
 
 def temperature_noise_c(temperature_c: Floats) -> float:
@@ -109,11 +110,10 @@ def temperature_noise_c(temperature_c: Floats) -> float:
 
 
 def heating_direction(temperature_c: Floats) -> Floats:
-    """Return +1 for each temperature after a rise and -1 for each temperature after a fall. A constant temperature
-    gives zeros.
+    """Return +1 where the temperature rises and -1 where it falls, or zeros if it is constant.
 
-    A change of direction counts if the change exceeds MIN_REVERSAL_SHARE of the temperature range and
-    MIN_REVERSAL_SIGMAS standard errors.
+    The direction changes only if the temperature reverses by more than MIN_REVERSAL_SHARE of the temperature range and
+    by more than MIN_REVERSAL_SIGMAS standard errors.
 
     Parameters
     ----------
@@ -154,12 +154,12 @@ def find_temperature_dependence(means: IntervalMeans) -> TemperatureDependence |
     Parameters
     ----------
     means : IntervalMeans
-        Interval means of bias (rad/s or m/s²) and temperature (°C). The temperature must vary.
+        Interval means of the bias (rad/s or m/s²) and of the temperature (°C), which must vary.
 
     Returns
     -------
     TemperatureDependence or None
-        The significant dependence with the largest explained share, or None if no dependence is significant.
+        Significant dependence that explains the largest share of the variance, or None if no dependence is significant.
     """
     pooled = _pooled(means)
     known, y = pooled.both_known, pooled.bias
@@ -178,7 +178,7 @@ def find_temperature_dependence(means: IntervalMeans) -> TemperatureDependence |
         if tested is None or (p_value := len(candidates) * tested.p_value) >= SIGNIFICANCE:
             continue
         share = _validated_share(y, nuisance, columns, known, tested.noise)
-        if found is None or share > found.share + 0.01:  # a simpler form has precedence
+        if found is None or share > found.share + 0.01:  # prefer a simpler form
             found = TemperatureDependence(share, p_value, form, one_way, means.interval_s)
     return found
 
@@ -189,19 +189,20 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
     Parameters
     ----------
     means : IntervalMeans
-        Interval means of bias (rad/s or m/s²) and temperature (°C). The temperature must vary.
+        Interval means of the bias (rad/s or m/s²) and of the temperature (°C), which must vary.
 
     Returns
     -------
     Hysteresis or None
-        The hysteresis and its p-value. None if the temperature only rose or only fell, or if there are too few means.
+        Hysteresis and its p-value, or None if the temperature did not both rise and fall, or if there are too few
+        means.
     """
     pooled = _pooled(means)
     x, direction = _scaled(pooled)
     if not _rose_and_fell(direction):
         return None
     curve, loops = _polynomial(x, HYSTERESIS_CURVE_ORDER), _hysteresis_regressors(x, direction)
-    # A single lag or play operator leaves more degrees of freedom than all four together.
+    # Single lags and play operators are also tested, because they leave more degrees of freedom than all four together.
     candidates = [*loops.values(), *loops["lag"].T[:, :, None], *loops["play"].T[:, :, None]]
 
     def test_candidates(nuisance: Floats) -> list[_Regression]:
@@ -209,7 +210,7 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
         return [one for one in tested if one is not None]
 
     tests = test_candidates(np.hstack([_linear_drift(x.size), curve]))
-    # Within one temperature cycle, drift and hysteresis are nearly collinear, so the size is fitted without drift.
+    # In a single temperature cycle, drift and hysteresis are nearly collinear, so the size is fitted without drift.
     fits = test_candidates(curve)
     if not tests or not fits:
         return None
@@ -219,7 +220,7 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
 
 
 def _pooled(means: IntervalMeans) -> IntervalMeans:
-    """Return the interval means, averaged in groups if there are more than MAX_MEANS."""
+    """Return the interval means, averaged in groups if there are more than MAX_MEANS of them."""
     group = -(-means.bias.size // MAX_MEANS)
     if group == 1:
         return means
@@ -241,29 +242,29 @@ def _pooled(means: IntervalMeans) -> IntervalMeans:
 
 
 def _scaled(means: IntervalMeans) -> tuple[Floats, Floats]:
-    """Return the temperature scaled to the range -1 to 1, and the heating direction."""
+    """Return the temperature, scaled to the range from -1 to 1, and the heating direction."""
     temperature_c = interpolate_missing_temperatures(means.temperature_c)
     lowest, swing = float(temperature_c.min()), float(np.ptp(temperature_c))
     return 2.0 * (temperature_c - lowest) / swing - 1.0, heating_direction(temperature_c)
 
 
 def _rose_and_fell(direction: Floats) -> bool:
-    """Return True if the temperature rose in at least three intervals and fell in at least three intervals."""
+    """Return True if the temperature rose and fell in at least three intervals each."""
     return min(int((direction > 0.0).sum()), int((direction < 0.0).sum())) >= 3
 
 
 def _polynomial(x: Floats, order: int) -> Floats:
-    """Return the powers 1, 2, …, ``order`` of x as columns [n, order]."""
+    """Return the powers x, x², … up to ``order`` as columns [n, order]."""
     return np.stack([x**power for power in range(1, order + 1)], axis=1)
 
 
 def _linear_drift(n: int) -> Floats:
-    """Return a linear drift with time as a column [n, 1], from -1 to 1."""
+    """Return a linear drift from -1 to 1 as a column [n, 1]."""
     return np.linspace(-1.0, 1.0, n)[:, None]
 
 
 def _hysteresis_regressors(x: Floats, direction: Floats) -> Mapping[str, Floats]:
-    """Return the regressors [n, k] for each description of hysteresis."""
+    """Return the regressors [n, k] of each kind of hysteresis."""
     return {
         "direction": np.stack([direction * (1.0 - x**2) * x**power for power in range(LOOP_POWERS)], axis=1),
         "lag": np.stack(
@@ -274,7 +275,7 @@ def _hysteresis_regressors(x: Floats, direction: Floats) -> Mapping[str, Floats]
 
 
 def _play(x: Floats, half_width: float) -> Floats:
-    """Return the output of a play operator, which follows x at a distance of at most ``half_width``.
+    """Return the output of a play operator, which follows its input x at a distance of at most ``half_width``.
 
     >>> _play(np.array([0.0, 1.0, 0.0, -1.0]), 0.25).tolist()
     [0.0, 0.75, 0.25, -0.75]
@@ -288,7 +289,7 @@ def _play(x: Floats, half_width: float) -> Floats:
 
 
 def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) -> _Regression | None:
-    """Return the F test of additional regressors, or None if there are too few interval means."""
+    """Perform the F test of additional regressors, or return None if there are too few interval means."""
     if int(known.sum()) <= MIN_FREE + 1:
         return None
     whiteners, log_determinants = _whiteners(known.tobytes())
@@ -312,7 +313,7 @@ def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) 
     diagonal = np.abs(triangles[:, np.arange(terms), np.arange(terms)])
     likelihood = -0.5 * (free * np.log(left) + log_determinants) - np.log(np.maximum(diagonal, 1e-300)).sum(axis=1)
     unexplained = left / (left + gained)
-    # p-value of F = gained / (terms - at) / (left / free)
+    # These are the p-values of F = gained / (terms - at) / (left / free).
     p_values = incomplete_beta(0.5 * free, 0.5 * (terms - at), unexplained)
     best = int(likelihood.argmax())
     plausible = likelihood >= likelihood[best] - MAX_LIKELIHOOD_LOSS
@@ -325,7 +326,7 @@ def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) 
 def _validated_share(
     y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray, noise: tuple[float, float]
 ) -> float:
-    """Return the cross-validated share of the variance of the interval means that the regressors explain."""
+    """Return the cross-validated share of the bias variance that the regressors explain."""
     columns = np.hstack([nuisance, tested])[known]
     columns = columns - columns.mean(axis=0)
     columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -345,24 +346,24 @@ def _validated_share(
 
 
 def _noise_models() -> list[tuple[float, float]]:
-    """Return the ratio and the correlation of each noise model on the grid."""
+    """Return the variance ratio and the correlation of each noise model on the grid."""
     return [(ratio, one) for ratio in WALK_RATIOS for one in (INCREMENT_CORRELATIONS if ratio else (0.0,))]
 
 
 @lru_cache(maxsize=4)
 def _whiteners(known: bytes) -> tuple[Floats, Floats]:
-    """Return the whitening matrices [g, m - 1, m] and the log determinants [g] of all noise models."""
+    """Return the whitening matrices [g, m - 1, m] and the log determinants [g] of all g noise models."""
     there = np.frombuffer(known, np.bool_)
     made = [_whitener(there, *one) for one in _noise_models()]
     return np.stack([each for each, _ in made]), np.array([each for _, each in made])
 
 
 def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floats, float]:
-    """Return the matrix [m - 1, m] that whitens the differences of m interval means, and the log determinant.
+    """Return the matrix [m - 1, m] that whitens the differences between m interval means, and its log determinant.
 
-    The covariance matrix is the sum of the covariances of white noise and of the random walk. White noise gives a
-    tridiagonal matrix (-1, 2, -1). The increments of an averaged random walk have the variance 2/3 and the covariance
-    1/6.
+    The covariance matrix of the differences is the sum of a matrix for white noise and a matrix for the random walk.
+    The matrix for white noise is tridiagonal with the elements (-1, 2, -1). The increments of an averaged random walk
+    have the variance 2/3, and neighbouring increments have the covariance 1/6.
     """
     n, at = known.size, np.flatnonzero(known)
     if correlation:
@@ -382,7 +383,7 @@ def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floa
 
 
 def _toeplitz(row: Floats) -> Floats:
-    """Return the symmetric Toeplitz matrix [n, n] with the first row ``row``."""
+    """Return the symmetric Toeplitz matrix [n, n] whose first row is ``row``."""
     at = np.arange(row.size)
     return np.asarray(row[np.abs(at[:, None] - at)])
 
@@ -402,8 +403,7 @@ def _loop_width(bias: Floats, x: Floats, direction: Floats) -> float:
 
 
 def _mean_of_legs(legs: list[Floats], n: int) -> Floats:
-    """Return the mean bias of all temperature sweeps on the temperature grid. The value is NaN outside of all
-    sweeps."""
+    """Average the bias of all temperature sweeps on a temperature grid, with NaN outside all sweeps."""
     rows = np.array(legs).reshape(len(legs), n)
     there = np.isfinite(rows)
     with np.errstate(invalid="ignore"):

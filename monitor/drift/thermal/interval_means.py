@@ -1,4 +1,4 @@
-"""Interval means of the bias and the temperature, with standard errors."""
+"""Means of the bias and the temperature over successive intervals, with standard errors."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,39 +8,39 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 
 PARTS_PER_INTERVAL: Final = 8
-"""Number of parts of an interval. The scatter of the parts determines the standard error of the mean."""
+"""Number of parts into which an interval is divided to estimate the standard error of the mean."""
 MIN_KNOWN_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class IntervalMeans:
-    """Means of the bias of an axis and of the temperature over successive intervals."""
+    """Means of the bias of one axis and of the temperature over successive intervals."""
 
     interval_s: float
-    bias: Floats  # [n] rad/s or m/s²; NaN if too few samples are known
-    error: Floats  # [n] standard error of each mean
-    temperature_c: Floats  # [n] °C; NaN if too few samples are known
+    bias: Floats  # [n] mean bias, rad/s or m/s²; NaN if too few samples are known
+    error: Floats  # [n] standard error of each mean bias
+    temperature_c: Floats  # [n] mean temperature, °C; NaN if too few samples are known
 
     @property
     def both_known(self) -> np.ndarray:
-        """Return a mask [n] that is True for intervals with a known bias and a known temperature."""
+        """Return a mask [n] that is True for intervals in which both bias and temperature are known."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
 
 
 def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> IntervalMeans:
-    """Return the means of the bias and the temperature over successive intervals.
+    """Compute the means of the bias and the temperature over successive intervals.
 
-    An interval is divided into PARTS_PER_INTERVAL parts. The variance of a part is half the mean square difference
-    between the means of neighbouring parts. The standard error is the square root of the variance divided by the number
-    of parts. A drift within the interval has little effect on the standard error. Samples after the last complete
-    interval are not used.
+    To estimate the standard error, an interval is divided into PARTS_PER_INTERVAL parts. The variance of a part mean is
+    half the mean square difference between neighbouring part means. The standard error is the square root of this
+    variance divided by the number of parts. A drift within the interval has little effect on it. Samples after the last
+    complete interval are ignored.
 
     Parameters
     ----------
     values : ndarray, shape (samples,)
-        Samples of one axis, rad/s or m/s²; NaN = missing.
+        Samples of one axis, rad/s or m/s²; NaN means missing.
     temperature_c : ndarray, shape (samples,)
-        Temperature, °C; NaN = missing.
+        Temperature, °C; NaN means missing.
     rate_hz : float
         Sample rate, Hz.
     interval_s : float
@@ -60,11 +60,11 @@ def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float
 
 
 def _row_means(rows: Floats) -> tuple[Floats, Floats]:
-    """Return the mean and the standard error of each row [n, length]. NaN means that too few values are known."""
+    """Return the mean and the standard error of each row [n, length], or NaN if too few values are known."""
     known_samples = np.isfinite(rows)
     count = known_samples.sum(axis=1)
     too_few = count < max(MIN_KNOWN_SHARE * rows.shape[1], 1.0)
-    # Subtracting the origin reduces rounding errors, for example if gravity is 9.81 m/s² and the noise 1e-4 m/s².
+    # Subtracting the origin reduces rounding errors, for example with noise of 1e-4 m/s² on gravity of 9.81 m/s².
     origin = np.nanmedian(rows) if known_samples.any() else 0.0
     mean = origin + np.where(known_samples, rows - origin, 0.0).sum(axis=1) / np.maximum(count, 1)
     size = rows.shape[1] // PARTS_PER_INTERVAL
@@ -79,14 +79,14 @@ def _row_means(rows: Floats) -> tuple[Floats, Floats]:
 
 
 def standard_error_from_parts(part_sums: Floats, part_counts: Ints) -> Floats:
-    """Return the standard errors [n] of interval means from the sums over parts of the intervals.
+    """Return the standard errors [n] of interval means, computed from sums over parts of the intervals.
 
     Parameters
     ----------
     part_sums : ndarray, shape (PARTS_PER_INTERVAL, n)
-        Sum of the known samples of each part.
+        Sum of the known samples in each part.
     part_counts : ndarray, shape (PARTS_PER_INTERVAL, n)
-        Number of known samples of each part.
+        Number of known samples in each part.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         differences = np.diff(part_sums / part_counts, axis=0)

@@ -1,15 +1,16 @@
-"""Online model of the bias against temperature for one axis.
+"""Online model of the bias of one axis as a function of temperature.
 
-The model predicts each interval before the interval is used for the fit. A multi-step prediction uses only the
-temperature. A one-step prediction also uses the previous bias. After the prediction, ``RecursiveThermalFit`` updates
-the coefficients. The model is selected again when the number of intervals has grown by the factor REFIT_GROWTH. A model
-selection takes up to a second, so ``run_selection_step`` runs one short step at a time.
+The mean bias of each interval is predicted before the interval is used to fit the model. A multi-step prediction uses
+only the temperature. A one-step prediction also uses the bias of the previous interval. After the prediction,
+``RecursiveThermalFit`` updates the coefficients. A new model is selected when the number of intervals has grown by the
+factor REFIT_GROWTH. Because a model selection takes up to a second, ``run_selection_step_if_active`` runs one short
+step at a time.
 
-If several intervals lie outside of the prediction intervals, ``residual_alarm`` suspects a change of the bias.
-Intervals far outside of the prediction are not used for the fit. Two fits test the suspicion, one with a step of the
-bias and one without a step. If the fit with a step is clearly better, the change is reported, and the earlier intervals
-are shifted to the new offset. Otherwise, the fit without a step becomes the new model. After the sensor has been moved
-or restarted, the new offset is learned but not reported.
+If the bias lies outside the prediction interval several times, ``residual_alarm`` suspects a change of the bias. A
+measured bias far outside the prediction interval is not used to fit the model. To test the suspicion, a model with a
+bias step and a model without a step are fitted. If the model with a step is clearly better, the change is reported, and
+the earlier intervals are shifted to the new offset. Otherwise, the model without a step replaces the previous model.
+After the sensor has been moved or restarted, the new offset is learned but not reported.
 """
 
 from collections import deque
@@ -23,36 +24,36 @@ import numpy as np
 from drivers.errors import NotReady
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval, RecursiveThermalFit
-from monitor.drift.thermal.residual_alarm import ResidualAlarm, UnexplainedChange
+from monitor.drift.thermal.residual_alarm import UnexplainedBiasChangeDetector, UnexplainedChange
 from monitor.drift.thermal.thermal_fit import StepwiseWork, fit_thermal_model_stepwise
 from monitor.drift.thermal.thermal_model import ThermalModel
 
 MAX_INTERVALS: Final = 1000
-"""Largest number of stored intervals. A thousand intervals of ten minutes correspond to a week."""
+"""Maximum number of stored intervals. A thousand intervals of ten minutes cover a week."""
 REFIT_GROWTH: Final = 1.25
-"""Growth of the number of known intervals after which the model is selected again."""
+"""Growth factor of the number of known intervals after which a new model is selected."""
 OFFSET_INTERVALS: Final = 3
-"""Number of intervals from which a new offset is determined."""
+"""Number of intervals from which a new bias offset is determined."""
 STEP_AICC_MARGIN: Final = 10.0
-"""Improvement of the AICc above which a step of the bias is accepted.
+"""Improvement of the AICc above which a bias step is accepted.
 
 A margin is needed because the same intervals determine the position of the step.
 """
 NEW_OFFSET: Final = "the sensor was moved or restarted: the new offset is being learned"
-"""Reason for a missing prediction after a change of the offset."""
+"""Message that explains why there is no prediction after a change of the offset."""
 
 
 @dataclass(frozen=True, slots=True)
-class PredictedAxisInterval:
-    """Measured and predicted mean of an axis in one interval."""
+class MeasuredAndPredictedMean:
+    """Measured and predicted mean bias of one axis in an interval."""
 
-    bias: float  # rad/s or m/s²; NaN if too few samples are known
+    bias: float  # measured mean bias, rad/s or m/s²; NaN if too few samples are known
     error: float  # standard error of ``bias``
-    multi_step: PredictionInterval | None  # prediction from temperature only; None if there is no model yet
-    one_step: PredictionInterval | None  # prediction from temperature and previous bias
-    model: str  # name of the form of the model
-    slope: float  # bias per °C after all lags have settled; NaN without a model
-    text: str  # reason why there is no prediction
+    multi_step: PredictionInterval | None  # prediction from the temperature alone; None if there is no model yet
+    one_step: PredictionInterval | None  # prediction from the temperature and the previous bias
+    model: str  # name of the model form
+    slope: float  # change of the bias per °C after all lags have settled; NaN without a model
+    text: str  # reason why there is no prediction, or empty
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +64,12 @@ class _Row:
 
     @property
     def has_bias_and_temperature(self) -> bool:
-        """Return True if the bias and the temperature are both known."""
+        """Return True if both the bias and the temperature are known."""
         return bool(np.isfinite(self.bias) and np.isfinite(self.temperature_c))
 
 
 class OnlineThermalModel:
-    """Online thermal model of an axis, with the intervals of the fit.
+    """Online thermal model of one axis, with the intervals to which it is fitted.
 
     Parameters
     ----------
@@ -80,29 +81,29 @@ class OnlineThermalModel:
         self._interval_s = interval_s
         self._rows: deque[_Row] = deque(maxlen=MAX_INTERVALS)
         self._recursion: RecursiveThermalFit | None = None
-        self._suspicion = ResidualAlarm()
+        self._suspicion = UnexplainedBiasChangeDetector()
         self._work: StepwiseWork[None] | None = None
-        self._interval_count = 0  # intervals since the start
-        self._known_count = 0  # intervals with a known bias and temperature
-        self._next_choice = 0  # number of known intervals at the next choice
-        self._offset_differences: list[float] | None = None  # residuals since a change of the offset, or None
-        self._new_offset_at = 0  # number of intervals at the change of the offset
+        self._interval_count = 0  # number of intervals since the start
+        self._known_count = 0  # number of intervals with known bias and temperature
+        self._next_choice = 0  # number of known intervals at which the next model is selected
+        self._offset_differences: list[float] | None = None  # residuals since the offset changed; None otherwise
+        self._new_offset_at = 0  # value of ``_interval_count`` when the offset changed
         self._settled: list[UnexplainedChange] = []
         self._missing_reason = ""  # reason why there is no model
 
     def predict_and_add_interval(
         self, bias: float, standard_error: float, temperature_c: float
-    ) -> PredictedAxisInterval:
-        """Predict the bias of a new interval, and then update the model with the interval.
+    ) -> MeasuredAndPredictedMean:
+        """Predict the bias in a new interval, and then update the model with the measured bias.
 
         Parameters
         ----------
         bias : float
-            Mean of the interval in rad/s or m/s²; NaN = not measured.
+            Mean bias in the interval, in rad/s or m/s²; NaN means not measured.
         standard_error : float
             Standard error of ``bias``.
         temperature_c : float
-            Mean temperature of the interval in °C; NaN = not measured.
+            Mean temperature in the interval, in °C; NaN means not measured.
         """
         row = _Row(bias, standard_error, temperature_c)
         self._interval_count += 1
@@ -111,14 +112,14 @@ class OnlineThermalModel:
         if self._recursion is None:
             if self._work is None:
                 self._start_work(self._choose_model())
-            return PredictedAxisInterval(bias, standard_error, None, None, "", np.nan, self._missing_reason)
+            return MeasuredAndPredictedMean(bias, standard_error, None, None, "", np.nan, self._missing_reason)
         multi_step, one_step = self._recursion.predict_multi_and_one_step(temperature_c)
         model = self._recursion.model
         if self._offset_differences is not None:
             self._recursion.add_interval(temperature_c, np.nan)
             if row.has_bias_and_temperature:
                 self._add_offset_difference(self._offset_differences, bias - multi_step.bias)
-            return PredictedAxisInterval(
+            return MeasuredAndPredictedMean(
                 bias, standard_error, None, None, model.shape.name, model.mean_bias_slope, NEW_OFFSET
             )
         found = self._suspicion.check_interval(bias if row.has_bias_and_temperature else np.nan, multi_step, one_step)
@@ -134,17 +135,17 @@ class OnlineThermalModel:
             and self._suspicion.recent_intervals_fit_prediction
         ):
             self._start_work(self._choose_model())
-        return PredictedAxisInterval(
+        return MeasuredAndPredictedMean(
             bias, standard_error, multi_step, one_step, model.shape.name, model.mean_bias_slope, ""
         )
 
     @property
     def is_selecting_model(self) -> bool:
-        """Return True if a model selection is active."""
+        """Return True if a model selection is in progress."""
         return self._work is not None
 
-    def run_selection_step(self) -> bool:
-        """Run one step of an active model selection, which takes about 1 ms. Return False if no selection is active."""
+    def run_selection_step_if_active(self) -> bool:
+        """Run one step of a model selection, which takes about 1 ms. Return False if no selection is in progress."""
         if self._work is None:
             return False
         try:
@@ -154,26 +155,26 @@ class OnlineThermalModel:
         return True
 
     def take_unexplained_changes(self) -> list[UnexplainedChange]:
-        """Return the bias changes that were confirmed since the last call and that temperature does not explain."""
+        """Return the confirmed bias changes since the last call that temperature does not explain."""
         told, self._settled = self._settled, []
         return told
 
     def learn_new_offset(self) -> None:
-        """Learn a new offset of the bias, for example after the sensor has been moved."""
+        """Learn a new bias offset, for example after the sensor has been moved."""
         self._work = None
         self._suspicion.forget_residuals()
         if self._recursion is None:
-            self._rows.clear()  # Without a model, the new offset cannot be determined.
+            self._rows.clear()  # Without a model, the offset cannot be separated from the effect of temperature.
         else:
             self._offset_differences, self._new_offset_at = [], self._interval_count
 
     def _start_work(self, work: StepwiseWork[None]) -> None:
-        """Start a model selection, and discard any unfinished model selection."""
+        """Start a model selection, and discard a selection that is still in progress."""
         self._work = work
-        self.run_selection_step()
+        self.run_selection_step_if_active()
 
     def _choose_model(self) -> StepwiseWork[None]:
-        """Select a new model, or keep the present model if there are too few intervals."""
+        """Select a new model, or keep the current model if there are too few intervals."""
         self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         self._missing_reason = "the model is being selected"
         try:
@@ -184,7 +185,7 @@ class OnlineThermalModel:
             self._recursion = RecursiveThermalFit(chosen.model, self._means())
 
     def _test_for_step(self, doubt: UnexplainedChange) -> StepwiseWork[None]:
-        """Decide whether a suspected change is explained by another thermal model or by a step of the bias."""
+        """Decide whether a suspected change is explained by a different thermal model or by a bias step."""
         means, came, since = self._means(), self._interval_count, len(self._rows) - doubt.since
         self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         size, model = doubt.size, None
@@ -192,7 +193,7 @@ class OnlineThermalModel:
             without = yield from fit_thermal_model_stepwise(means, always_try_lags=True)
             stepped = yield from fit_thermal_model_stepwise(means, since, always_try_lags=True)
         except NotReady:
-            pass  # With too few intervals, the present model is kept.
+            pass  # keep the current model if there are too few intervals
         else:
             if without.aicc - stepped.aicc < STEP_AICC_MARGIN:
                 self._recursion = RecursiveThermalFit(without.model, self._means())
@@ -203,28 +204,27 @@ class OnlineThermalModel:
         self._settled.append(replace(doubt, size=size, since=since))
 
     def _add_offset_difference(self, apart: list[float], by: float) -> None:
-        """Add a residual, and determine the new offset after OFFSET_INTERVALS residuals."""
+        """Store a residual, and determine the new offset after OFFSET_INTERVALS residuals."""
         apart.append(by)
         if len(apart) == OFFSET_INTERVALS:
             self._start_work(self._settle_offset(float(np.mean(apart))))
 
     def _settle_offset(self, size: float) -> StepwiseWork[None]:
-        """Determine the new offset from a fit to all intervals, or from the mean residual if the fit is not
-        possible."""
+        """Determine the new offset by a fit to all intervals, or from the mean residual if no fit is possible."""
         model = None
         try:
             stepped = yield from fit_thermal_model_stepwise(
                 self._means(), len(self._rows) - (self._interval_count - self._new_offset_at)
             )
         except NotReady:
-            pass  # The mean residual is used.
+            pass  # use the mean residual
         else:
             size, model = stepped.step, stepped.model
         self._offset_differences = None
         self._shift_history(size, self._interval_count - self._new_offset_at, model)
 
     def _shift_history(self, by: float, last: int, model: ThermalModel | None) -> None:
-        """Add a step to the bias of all intervals except the last ``last`` intervals, and fit the model again."""
+        """Add a bias step to all intervals except the last ``last`` intervals, and restart the recursive fit."""
         before = max(len(self._rows) - last, 0)
         moved = [_Row(row.bias + by, row.error, row.temperature_c) for row in islice(self._rows, before)]
         self._rows = deque([*moved, *islice(self._rows, before, None)], maxlen=MAX_INTERVALS)

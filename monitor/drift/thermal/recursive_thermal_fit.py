@@ -1,10 +1,10 @@
-"""Recursive least squares, which updates the coefficients of a thermal model with each interval.
+"""Recursive least-squares fit, which updates the coefficients of a thermal model with each interval.
 
-The regressors and values of all intervals are stored as the triangular factor R of a QR decomposition, which is updated
-with each interval (Golub & Van Loan, Matrix Computations, 6.5). The coefficients equal those of a least-squares fit to
-all intervals, except for rounding errors. Additional columns of R contain the derivatives with respect to the time
-constants. The derivatives add the uncertainty of the time constants to the prediction intervals. The time constants and
-φ are not updated.
+The triangular factor R of a QR decomposition represents the regressors and values of all intervals and is updated with
+each interval (Golub & Van Loan, Matrix Computations, 6.5). Except for rounding errors, the coefficients equal those of
+a least-squares fit to all intervals. Additional columns of R contain the derivatives of the bias with respect to the
+time constants. The prediction intervals therefore include the uncertainty of the time constants. The time constants and
+the residual correlation φ are not updated.
 """
 
 from dataclasses import dataclass, replace
@@ -22,33 +22,33 @@ from monitor.drift.thermal.thermal_model import (
     combine_regressor_derivatives,
     interpolate_missing_temperatures,
     predict_bias_and_variance,
-    regressor_derivatives,
+    regressor_derivatives_by_log_time_constant,
 )
 from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors
 
 
 @dataclass(frozen=True, slots=True)
 class PredictionInterval:
-    """Predicted mean of one interval, with a 95 % prediction interval, in rad/s or m/s²."""
+    """Predicted mean bias in one interval, with a 95 % prediction interval, in rad/s or m/s²."""
 
     bias: float
     lo: float
     hi: float
 
     def side_of_interval(self, bias: float) -> int:
-        """Return 1 if the bias lies above the prediction interval, -1 if the bias lies below, and 0 otherwise."""
+        """Return 1 if a bias lies above the prediction interval, -1 if it lies below, and 0 otherwise."""
         return int(bias > self.hi) - int(bias < self.lo)
 
 
 class RecursiveThermalFit:
-    """Thermal model with recursively updated coefficients.
+    """Thermal model whose coefficients are updated recursively.
 
     Parameters
     ----------
     model : ThermalModel
-        Thermal model whose terms, time constants, φ and reference temperature are used.
+        Thermal model that provides the terms, time constants, φ and reference temperature.
     means : IntervalMeans
-        Interval means so far.
+        Interval means to which the coefficients are fitted initially.
     """
 
     def __init__(self, model: ThermalModel, means: IntervalMeans) -> None:
@@ -58,17 +58,17 @@ class RecursiveThermalFit:
         self._terms = 1 + shape.powers + k
         excess = interpolate_missing_temperatures(means.temperature_c) - model.reference_c
         columns = build_regressors(shape, excess, model.interval_s, with_initial_state=True)
-        rows = np.hstack([columns, regressor_derivatives(shape, excess, model.interval_s)])
+        rows = np.hstack([columns, regressor_derivatives_by_log_time_constant(shape, excess, model.interval_s)])
         near = np.multiply.outer(
             np.exp([-LOG_TIME_CONSTANT_STEP, 0.0, LOG_TIME_CONSTANT_STEP]), np.asarray(shape.constants_s)
         )
-        # [3, k] for slightly shorter, exact and slightly longer time constants
+        # The rows [3, k] are for slightly shorter, exact and slightly longer time constants.
         self._decays = np.exp(-model.interval_s / near)
         moved = [
             build_regressors(ThermalModelForm(0, tuple(one)), excess, model.interval_s, with_initial_state=True)[-1, 1:]
             for one in near
         ]
-        # each [3, k], after the last interval
+        # Both arrays [3, k] hold the state after the last interval.
         self._lags, self._initial_responses = np.hsplit(np.array(moved).reshape(3, 2 * k), 2)
         self._excess = float(excess[-1])
         self._row, self._bias = rows[-1], float(means.bias[-1]) if means.both_known[-1] else np.nan
@@ -81,14 +81,14 @@ class RecursiveThermalFit:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Return the number of degrees of freedom of the residuals."""
+        """Return the residual degrees of freedom."""
         taken = self._terms + 2 * self._k + (self._model.phi > 0.0)
         return max(self._count - taken, 1)
 
     def predict_multi_and_one_step(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
-        """Return the multi-step and the one-step prediction of the next interval for a temperature in °C.
+        """Return the multi-step and the one-step prediction for the next interval at a temperature in °C.
 
-        The prediction intervals use Student's t distribution, because few intervals may be known.
+        Because the number of intervals may be small, the prediction intervals are based on Student's t distribution.
         """
         model = self.model
         excess = np.array([self._excess, temperature_c - model.reference_c if np.isfinite(temperature_c) else np.nan])
@@ -107,14 +107,14 @@ class RecursiveThermalFit:
         return both[0], both[1]
 
     def add_interval(self, temperature_c: float, bias: float) -> None:
-        """Update the coefficients with the temperature and the bias of an interval.
+        """Update the coefficients with the mean temperature and the mean bias of an interval.
 
         Parameters
         ----------
         temperature_c : float
-            Mean temperature in °C; NaN = not measured.
+            Mean temperature in °C; NaN means not measured.
         bias : float
-            Mean bias in rad/s or m/s²; NaN = not measured.
+            Mean bias in rad/s or m/s²; NaN means not measured.
         """
         model = self.model
         known = bool(np.isfinite(temperature_c) and np.isfinite(bias))
@@ -134,7 +134,7 @@ class RecursiveThermalFit:
             self.model = self._with_current_coefficients(lowest, highest)
 
     def _next_row(self, excess: float, ends: tuple[float, float] | None) -> tuple[Floats, Floats, Floats]:
-        """Return the regressors of the next interval, the updated lags, and the updated initial-state responses."""
+        """Return the regressors for the next interval, the updated lags, and the updated initial-state responses."""
         lags = self._decays * self._lags + (1.0 - self._decays) * excess
         left = self._initial_responses * self._decays
         shape = replace(self._model.shape, constants_s=())
@@ -143,7 +143,7 @@ class RecursiveThermalFit:
         return np.concatenate([first, lags[1], left[1], *by]), lags, left
 
     def _with_current_coefficients(self, lowest_c: float, highest_c: float) -> ThermalModel:
-        """Return the thermal model with coefficients from all intervals so far."""
+        """Return the thermal model with coefficients that are fitted to all intervals so far."""
         own = self._terms + self._k
         x, z = self._triangle[:, :own], self._triangle[:, -1]
         scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)

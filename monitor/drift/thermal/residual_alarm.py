@@ -1,8 +1,8 @@
-"""Alarm for a bias that lies outside of the prediction from temperature more often than by chance.
+"""Alarm for a bias that lies outside the prediction from temperature more often than by chance.
 
-For a correct model, one in forty intervals lies above the 95 % prediction interval, and one in forty lies below. A
-change is suspected if MIN_OUTSIDE of the last WINDOW_INTERVALS known intervals lie on the same side. The measured rate
-of false alarms is in docs/thermal-measurements.md.
+If the model is correct, the bias lies above the 95 % prediction interval in 2.5 % of the intervals, and below it in
+another 2.5 %. A change is suspected if the bias lies outside on the same side in MIN_OUTSIDE of the last
+WINDOW_INTERVALS intervals. The measured false alarm rate is given in docs/thermal-measurements.md.
 """
 
 from collections import deque
@@ -16,63 +16,62 @@ from monitor.common.distributions import Z95
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 
 MIN_OUTSIDE: Final = 4
-"""Number of intervals on the same side of the prediction intervals that raises a suspicion."""
+"""Number of intervals with a bias outside the prediction interval, on the same side, that raises a suspicion."""
 WINDOW_INTERVALS: Final = 6
-"""Number of recent intervals with a known bias in which outliers are counted."""
+"""Number of recent intervals with a known bias that are considered."""
 FAR_HALF_WIDTHS: Final = 2.0
-"""Largest distance from the prediction for an update of the fit, in half widths of the prediction interval."""
+"""Maximum deviation from the prediction at which a bias is used for the fit, in half-widths of the interval."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnexplainedChange:
     """Change of a bias that temperature does not explain."""
 
-    size: float  # mean of measured minus predicted since the change began; rad/s or m/s²
-    outside: int  # number of intervals outside their prediction, on one side
-    of: int  # number of intervals considered
-    since: int  # intervals since the first one outside, including missing ones
+    size: float  # mean difference between measured and predicted bias since the change began; rad/s or m/s²
+    outside: int  # number of intervals with a bias outside the prediction interval, on one side
+    of: int  # number of intervals that were considered
+    since: int  # number of intervals since the first bias outside, including missing intervals
     sigma: float  # combined deviation of these intervals, in standard deviations
 
 
 @dataclass(frozen=True, slots=True)
 class _Residual:
-    """Residual of one interval."""
+    """Residuals of one interval."""
 
-    at: int  # number of the interval
-    side: int  # 1 above the prediction interval, -1 below, 0 inside
+    at: int  # index of the interval
+    side: int  # 1 if the bias is above the prediction interval, -1 if below, 0 if inside
     apart: float  # residual of the multi-step prediction
     z: float  # normalised residual of the one-step prediction
 
 
-class ResidualAlarm:
+class UnexplainedBiasChangeDetector:
     """Detector of bias changes that temperature does not explain, for one axis."""
 
     def __init__(self) -> None:
-        self._recent: deque[_Residual] = deque(maxlen=WINDOW_INTERVALS)  # only intervals with a known bias
+        self._recent: deque[_Residual] = deque(maxlen=WINDOW_INTERVALS)  # intervals with a known bias
         self._interval_count = 0
 
     @property
     def recent_intervals_fit_prediction(self) -> bool:
-        """Return True if the last interval agrees with the prediction, and at most one recent interval lies on each
-        side."""
+        """Return True if the last bias agrees with its prediction, and few recent biases lie outside."""
         return not (self._recent and self._recent[-1].side) and all(self._count_outside(side) < 2 for side in (-1, 1))
 
     @property
     def last_interval_is_far_outside(self) -> bool:
-        """Return True if the last interval is too far outside of the prediction interval to be used for the fit."""
+        """Return True if the last bias is too far outside the prediction interval to be used for the fit."""
         return bool(self._recent) and abs(self._recent[-1].z) > FAR_HALF_WIDTHS * Z95
 
     def check_interval(
         self, bias: float, multi_step: PredictionInterval, one_step: PredictionInterval
     ) -> UnexplainedChange | None:
-        """Add an interval with its predictions, and return a suspected change of the bias or None.
+        """Compare the bias in an interval with its predictions, and return a suspected change or None.
 
         Parameters
         ----------
         bias : float
-            Measured interval mean in rad/s or m/s²; NaN = not measured.
+            Measured mean bias in rad/s or m/s²; NaN means not measured.
         multi_step, one_step : PredictionInterval
-            Predictions of the interval.
+            Predictions for the interval.
         """
         self._interval_count += 1
         if not np.isfinite(bias):
@@ -92,9 +91,9 @@ class ResidualAlarm:
         return found
 
     def forget_residuals(self) -> None:
-        """Discard all stored residuals."""
+        """Discard the residuals of all recent intervals."""
         self._recent.clear()
 
     def _count_outside(self, side: int) -> int:
-        """Return the number of recent intervals above (1) or below (-1) the prediction intervals."""
+        """Return the number of recent intervals with a bias above (1) or below (-1) the prediction interval."""
         return sum(one.side == side for one in self._recent)

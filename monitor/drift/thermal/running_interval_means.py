@@ -1,6 +1,6 @@
-"""Interval means of a stream of samples. The means equal the means of ``compute_interval_means``.
+"""Interval means of a stream of samples, which equal the results of ``compute_interval_means``.
 
-The means do not depend on how the stream is divided into blocks.
+The results do not depend on how the stream is divided into blocks.
 """
 
 from dataclasses import dataclass
@@ -17,23 +17,23 @@ TEMPERATURE_COLUMN: Final = len(AXES)
 
 @dataclass(frozen=True, slots=True)
 class IntervalMean:
-    """Means of one interval, with standard errors."""
+    """Means of the biases and of the temperature in one interval."""
 
-    bias: Floats  # [6] rad/s and m/s²; NaN if too few samples are known
-    error: Floats  # [6] standard error of each mean
-    temperature_c: float  # °C; NaN if too few samples are known
-    end: int  # index of the first sample after the interval; missing samples count
+    bias: Floats  # [6] mean biases, rad/s and m/s²; NaN if too few samples are known
+    error: Floats  # [6] standard error of each mean bias
+    temperature_c: float  # mean temperature, °C; NaN if too few samples are known
+    end: int  # index of the first sample after the interval, counting missing samples
 
 
 class RunningIntervalMeans:
-    """Interval means of a stream of samples.
+    """Computation of interval means from a stream of samples.
 
     Parameters
     ----------
     length : int
         Number of samples in an interval, at least PARTS_PER_INTERVAL.
     longest : int
-        Largest number of empty intervals that are returned for a series of missing samples.
+        Maximum number of empty intervals that are returned for a gap in the samples.
 
     Examples
     --------
@@ -47,13 +47,13 @@ class RunningIntervalMeans:
         size = length // PARTS_PER_INTERVAL
         self._length = length
         self._max_empty = longest
-        # Samples after the last part contribute to the mean, but not to the standard error.
+        # Samples after the last of the equal parts contribute to the mean, but not to the standard error.
         self._edges = [*(size * k for k in range(1, PARTS_PER_INTERVAL)), size * PARTS_PER_INTERVAL, length]
         self._rows = np.empty((BUFFER_ROWS, TEMPERATURE_COLUMN + 1))
         self._buffered = 0
-        # Subtracting the origin reduces rounding errors, for example if gravity is 9.81 m/s² and the noise 1e-4 m/s².
+        # Subtracting the origin reduces rounding errors, for example with noise of 1e-4 m/s² on gravity of 9.81 m/s².
         self._origin = np.full(TEMPERATURE_COLUMN + 1, np.nan)
-        self._end = 0  # end of the last finished interval, in samples
+        self._end = 0  # end of the last complete interval, in samples
         self._begin()
 
     def add_samples(self, values: Floats, temperature_c: Floats, lost: int) -> list[IntervalMean]:
@@ -62,11 +62,11 @@ class RunningIntervalMeans:
         Parameters
         ----------
         values : ndarray, shape (n, 6)
-            Samples in rad/s and m/s²; NaN = missing.
+            Samples in rad/s and m/s²; NaN means missing.
         temperature_c : ndarray, shape (n,)
-            Temperature in °C; NaN = missing.
+            Temperature in °C; NaN means missing.
         lost : int
-            Number of samples that are missing before the first row.
+            Number of samples that are missing before ``values``.
         """
         finished = self._skip_missing(lost) if lost else []
         at = 0
@@ -80,8 +80,8 @@ class RunningIntervalMeans:
             finished += self._advance(count)
         return finished
 
-    def forget_current_sensor_values(self) -> None:
-        """Discard the sensor values of the current interval. The temperatures are kept."""
+    def forget_interval_samples_except_temperature(self) -> None:
+        """Discard the samples of the current interval, but keep the temperatures."""
         self._rows[: self._buffered, :TEMPERATURE_COLUMN] = np.nan
         self._sum[:, :TEMPERATURE_COLUMN], self._count[:, :TEMPERATURE_COLUMN] = 0.0, 0
 
@@ -91,7 +91,7 @@ class RunningIntervalMeans:
         self._count = np.zeros((PARTS_PER_INTERVAL + 1, TEMPERATURE_COLUMN + 1), np.int64)
 
     def _advance(self, count: int) -> list[IntervalMean]:
-        """Advance by ``count`` samples, and return the means of the interval if the interval has ended."""
+        """Advance by ``count`` samples, and return the means if the interval has ended."""
         self._position += count
         if self._buffered == BUFFER_ROWS or self._position == self._edges[self._part]:
             self._sum_buffer()

@@ -1,8 +1,8 @@
-"""Noise coefficients of a recording after the temperature dependence of the bias has been removed.
+"""Noise coefficients of a recording after removal of the temperature dependence of the bias.
 
 The bias of each axis is tested for a dependence on temperature. A significant dependence is modelled and subtracted
-from the samples, and the noise coefficients are computed again. A model can follow a part of a random walk by chance,
-so a change of K or R by a few percent is not significant.
+from the samples, and the noise coefficients are computed again. A thermal model can follow part of a random walk by
+chance. A change of K or R by a few percent is therefore not significant.
 """
 
 from collections.abc import Mapping
@@ -26,36 +26,36 @@ SLOW_LETTERS: Final = ("K", "R")
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureRemoval:
-    """Temperature dependence of each axis, and the noise coefficients before and after removing the dependence."""
+class TemperatureRemovalComparison:
+    """Temperature dependence of each axis, and noise coefficients before and after its removal."""
 
-    models: Mapping[str, str]  # axis -> form of its model, for the axes with a fitted model
+    models: Mapping[str, str]  # form of the thermal model by axis, for axes with a fitted model
     before: Coefficients
     coefficients: Coefficients
-    k_or_r: tuple[bool, ...]  # [6] per axis, as in ``Estimate``
+    k_or_r: tuple[bool, ...]  # [6] True if K and R cannot be distinguished, as in ``Estimate``
     dependences: Mapping[str, TemperatureDependence] = field(default_factory=dict)  # significant dependences by axis
 
     @property
     def axes_explained_by_temperature(self) -> tuple[str, ...]:
-        """Return the axes on which temperature explains most of the bias variation."""
+        """Return the axes on which temperature explains at least half of the bias variance."""
         return tuple(axis for axis, one in self.dependences.items() if one.explains_most_variance)
 
     def variance_share_of_temperature(self, letter: str, axis: str) -> float | None:
-        """Return the share of the variance of a noise coefficient that temperature explains, 1 − after²/before².
+        """Return the share 1 − after²/before² of a squared noise coefficient that temperature explains.
 
-        If only an upper bound of the coefficient is known after the removal, the result is a lower bound.
+        If only an upper bound of the coefficient is known after the removal, the share is a lower bound.
 
         Parameters
         ----------
         letter : str
-            Letter of the coefficient, one of SYMBOLS.
+            Symbol of the coefficient, one of SYMBOLS.
         axis : str
             Name of the axis.
 
         Returns
         -------
         float or None
-            The share, at least 0. None if the coefficient is not known before or after the removal.
+            Share of at least 0, or None if the coefficient is not known both before and after the removal.
         """
         at = SYMBOLS.index(letter), AXES.index(axis)
         if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
@@ -65,15 +65,14 @@ class TemperatureRemoval:
         return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
 
     def coefficient_decreased_significantly(self, letter: str, axis: str) -> bool:
-        """Return True if the removal of the temperature dependence has reduced a noise coefficient significantly.
+        """Return True if removing the temperature dependence has reduced a noise coefficient significantly.
 
-        The reduction is significant if the confidence intervals of the coefficient before and after the removal do not
-        overlap.
+        The reduction is significant if the confidence intervals before and after the removal do not overlap.
 
         Parameters
         ----------
         letter : str
-            Letter of the coefficient, one of SYMBOLS.
+            Symbol of the coefficient, one of SYMBOLS.
         axis : str
             Name of the axis.
         """
@@ -84,7 +83,7 @@ class TemperatureRemoval:
 
 
 def temperature_varied(temperatures_c: Floats) -> bool:
-    """Return True if the temperature [n] in °C is known and has a range of more than MIN_SWING_C."""
+    """Return True if the temperatures [n] in °C are known and vary by more than MIN_SWING_C."""
     return (
         bool(np.isfinite(temperatures_c).any())
         and float(np.ptp(temperatures_c[np.isfinite(temperatures_c)])) > MIN_SWING_C
@@ -93,8 +92,8 @@ def temperature_varied(temperatures_c: Floats) -> bool:
 
 def remove_temperature_effect(
     analysis: RecordingAnalysis, temperature_c: Floats, parallel_map: EachAxis = map
-) -> TemperatureRemoval | None:
-    """Return the noise coefficients of an analysis after removing the temperature dependence of the bias.
+) -> TemperatureRemovalComparison | None:
+    """Compute the noise coefficients of a recording after removal of the temperature dependence of the bias.
 
     Parameters
     ----------
@@ -103,12 +102,12 @@ def remove_temperature_effect(
     temperature_c : ndarray, shape (n,)
         Temperature of each sample, °C.
     parallel_map : callable
-        Replacement for ``map``, which may run in parallel.
+        Function that applies a computation to each axis, like ``map``, possibly in parallel.
 
     Returns
     -------
-    TemperatureRemoval or None
-        The new coefficients, or None if no axis depends on temperature.
+    TemperatureRemovalComparison or None
+        Noise coefficients before and after the removal, or None if no axis depends on temperature.
     """
     rate_hz = analysis.estimate.rate_hz
     interval_s = choose_interval_s(len(analysis.values) / rate_hz, rate_hz)
@@ -136,20 +135,21 @@ def remove_temperature_effect(
     if models:
         fit = fit_other_samples(analysis, values, parallel_map)
         after, k_or_r = fit.coefficients, fit.k_or_r
-    return TemperatureRemoval(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
+    return TemperatureRemovalComparison(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
 
 
 def interpolate_with_zero_mean(interval_values: Floats, interval_samples: int, n_samples: int) -> Floats:
     """Interpolate interval values to samples with a natural cubic spline, and subtract the mean.
 
-    The spline passes through the middles of the intervals, and continues linearly beyond the first and the last middle.
+    The spline takes the interval values at the centres of the intervals. It continues linearly before the first and
+    after the last centre.
 
     Parameters
     ----------
     interval_values : ndarray, shape (intervals,)
-        Value of each interval, at least two.
+        Values of at least two intervals.
     interval_samples : int
-        Samples per interval.
+        Number of samples per interval.
     n_samples : int
         Number of samples.
 
@@ -159,7 +159,7 @@ def interpolate_with_zero_mean(interval_values: Floats, interval_samples: int, n
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     """
     bend = _natural_spline(interval_values)
-    at = (np.arange(n_samples) + 0.5) / interval_samples - 0.5  # in intervals, 0 = middle of the first interval
+    at = (np.arange(n_samples) + 0.5) / interval_samples - 0.5  # in intervals from the centre of the first one
     left = np.clip(at.astype(np.int64), 0, interval_values.size - 2)
     right = left + 1
     t = np.clip(at, 0.0, interval_values.size - 1.0) - left
@@ -172,9 +172,10 @@ def interpolate_with_zero_mean(interval_values: Floats, interval_samples: int, n
 
 
 def _natural_spline(y: Floats) -> Floats:
-    """Return the second derivatives of the natural cubic spline through the values y [n ≥ 2] at unit steps.
+    """Return the second derivatives of the natural cubic spline through equidistant values y [n ≥ 2].
 
-    The tridiagonal system (1, 4, 1) / 6 is described by de Boor, A Practical Guide to Splines, 1978, chapter IV.
+    The derivatives solve the tridiagonal system (1, 4, 1) / 6 (de Boor, A Practical Guide to Splines, 1978, chapter
+    IV).
 
     >>> _natural_spline(np.array([0.0, 1.0, 0.0])).tolist()
     [0.0, -3.0, 0.0]

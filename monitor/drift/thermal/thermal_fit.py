@@ -1,16 +1,16 @@
-"""Selection and fit of a model of the bias as a function of temperature.
+"""Selection and fit of a thermal model, which describes the bias as a function of temperature.
 
-Polynomials and difference equations are fitted to interval means by least squares. A difference equation is evaluated
-with predicted values, because noise in the measured values would bias the roots towards zero. The residuals may be
-correlated: r_n = φ r_{n−1} + e_n.
+Polynomials and difference equations are fitted to interval means of bias and temperature by least squares. Difference
+equations are evaluated with predicted values, because noise in measured values would bias the roots towards zero.
+Successive residuals may be correlated: r_n = φ r_{n−1} + e_n.
 
-The model with the least AICc is selected (Hurvich & Tsai, Biometrika 76, 1989). The AICc asymptotically agrees with
+The model with the smallest AICc is selected (Hurvich & Tsai, Biometrika 76, 1989). Asymptotically, the AICc agrees with
 cross-validation (Stone, J. R. Stat. Soc. B, 1977). Lags and powers above the third must improve the AICc by a margin. A
-model is rejected if the cross-validated error exceeds the error of a constant, because slow heating leaves one end of a
+model is rejected if its cross-validated error exceeds that of a constant, because slow heating leaves one end of a
 polynomial unconstrained. The selection takes 50 ms to 1 s.
 
-The method follows Wang et al., who modelled the bias of MEMS gyroscopes with 72 hourly means under small temperature
-changes. The constant term and the use of predicted values are additions to the method.
+The method follows Wang et al., who modelled the bias of MEMS gyroscopes with 72 hourly means and small temperature
+changes. The constant term and the use of predicted values extend that method.
 """
 
 from collections.abc import Generator, Iterator
@@ -28,7 +28,7 @@ from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, temper
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import (
     ThermalModel,
-    bias_derivatives_by_time_constant,
+    bias_derivatives_by_log_time_constant,
     coefficient_covariance,
     interpolate_missing_temperatures,
 )
@@ -37,67 +37,67 @@ from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regre
 MIN_INTERVALS: Final = 12
 MAX_POWER: Final = 5
 CUBIC: Final = 3
-"""Highest order of a polynomial that requires no margin in the AICc."""
+"""Highest order of a polynomial that is accepted without a margin in the AICc."""
 MAX_LAGS: Final = 3
 INTERVALS_PER_SQUARED_LAGS: Final = 8
-"""Number of intervals that a model with k lags needs, divided by k².
+"""Minimum number of intervals for a model with k lags, divided by k².
 
 With fewer intervals, the lags would follow a random walk of the bias.
 """
 MAX_TIME_CONSTANT_SHARE: Final = 0.25
-"""Longest time constant as a share of the record, because longer time constants resemble a drift."""
+"""Maximum time constant as a fraction of the recording. Longer time constants would resemble a drift."""
 MIN_TIME_CONSTANT_INTERVALS: Final = 0.5
-"""Shortest time constant in intervals, because shorter time constants have no effect."""
+"""Minimum time constant in intervals. Shorter time constants would have no effect."""
 MIN_TIME_CONSTANT_RATIO: Final = 2.0
-"""Smallest ratio of two time constants, because closer time constants have large coefficients that cancel."""
+"""Minimum ratio of two time constants. Closer time constants would get large coefficients that cancel each other."""
 GRID_POINTS: Final = 20
 PHI_VALUES: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
 FOLDS: Final = 6
-"""Number of parts of the record for the cross-validation."""
+"""Number of parts into which the recording is divided for cross-validation."""
 MAX_ERROR_RATIO: Final = 1.05
-"""Largest cross-validated error of an accepted model, relative to the error of a constant."""
+"""Maximum cross-validated error of an accepted model, relative to the error of a constant."""
 LAG_AICC_MARGIN: Final = 6.0
-"""Smallest AICc improvement of a model with lags, because noise can resemble a lag if there are few intervals."""
+"""Minimum AICc improvement of a model with lags. With few intervals, noise can resemble a lag."""
 CURVE_AICC_MARGIN: Final = 10.0
-"""Smallest AICc improvement of a power above the third, because noise can resemble a higher power."""
+"""Minimum AICc improvement of a power above the third, because noise can resemble a higher power."""
 MIN_SWING_C: Final = 0.1
-"""Smallest range of temperature for a fit, °C."""
+"""Minimum temperature range for a fit, °C."""
 MIN_SWING_SIGMAS: Final = 5.0
-"""Smallest range of temperature, in standard errors of a mean of temperature."""
+"""Minimum temperature range for a fit, in standard errors of a mean temperature."""
 MIN_REVERSE_SHARE: Final = 0.1
-"""Smallest share of the rise or fall in the total temperature change, if the temperature rose and fell."""
+"""The temperature counts as having risen and fallen if rises and falls each exceed this share of the total change."""
 GOLDEN_STEPS: Final = 10
 GOLDEN_RATIO: Final = 0.6180339887498949
 
 
 @dataclass(frozen=True, slots=True)
 class CandidateModel:
-    """Fitted thermal model that was considered in the model selection."""
+    """Fitted thermal model that was considered in a model selection."""
 
     shape: ThermalModelForm
-    aicc: float  # difference to the chosen form; negative if a margin was not reached
-    rms: float  # rms of the multi-step residuals, rad/s or m/s²
-    validated: float  # cross-validated rms, rad/s or m/s²
+    aicc: float  # AICc minus that of the selected form; negative if a margin was not reached
+    rms: float  # rms residual of the multi-step prediction, rad/s or m/s²
+    validated: float  # cross-validated rms error, rad/s or m/s²
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalFit:
-    """Selected thermal model of an axis, and all candidate models."""
+    """Selected thermal model of an axis, with all candidate models."""
 
     model: ThermalModel
-    candidates: tuple[CandidateModel, ...]  # the chosen form first, then the others by AICc
+    candidates: tuple[CandidateModel, ...]  # the selected form, followed by the others in the order of their AICc
     temperature_rose_and_fell: bool
-    explained: float  # explained share of the variance of the means
-    aicc: float  # only differences between fits of the same means are meaningful
-    step: float = 0.0  # step of the offset (after minus before), if one was fitted; rad/s or m/s²
+    explained: float  # share of the variance of the interval means that the model explains
+    aicc: float  # AICc, only comparable between fits to the same interval means
+    step: float = 0.0  # fitted bias step (after minus before), rad/s or m/s²
     hysteresis: float | None = None  # largest difference between heating and cooling at one temperature, rad/s or m/s²;
-    # 0 if noise explains the difference; None if temperature moved in one direction only, or if there was no test
-    hysteresis_p: float | None = None  # p-value of the hypothesis of no difference between heating and cooling
+    # 0 if noise explains the difference; None if temperature did not both rise and fall, or if there was no test
+    hysteresis_p: float | None = None  # p-value of the null hypothesis that heating and cooling do not differ
 
 
 T = TypeVar("T")
 StepwiseWork = Generator[None, None, T]
-"""Generator that runs one computation step at each ``next``, and returns the result at the end."""
+"""Generator that runs one step of a computation at each call of ``next``, and finally returns the result."""
 
 
 def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
@@ -129,16 +129,16 @@ def fit_thermal_model_stepwise(
 ) -> StepwiseWork[ThermalFit]:
     """Select and fit a thermal model in steps of less than a millisecond.
 
-    Each ``next`` of the generator runs one least-squares fit.
+    Each call of ``next`` on the generator runs one least-squares fit.
 
     Parameters
     ----------
     means : IntervalMeans
-        Interval means of bias (rad/s or m/s²) and temperature (°C).
+        Interval means of the bias (rad/s or m/s²) and of the temperature (°C).
     first_after_step : int or None
-        Index of the first interval after a possible step of the bias. The step is one more coefficient.
+        Index of the first interval after a possible bias step, which is fitted as an additional coefficient.
     always_try_lags : bool
-        True to fit lags even if the temperature only rose or only fell.
+        True to fit models with lags even if the temperature only rose or only fell.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def fit_thermal_model_stepwise(
 
 @dataclass(frozen=True, slots=True)
 class _ShapeFit:
-    """Least-squares fit of a model form."""
+    """Least-squares fit of one model form."""
 
     shape: ThermalModelForm
     columns: Floats  # [n, terms + k] regressors
@@ -185,7 +185,7 @@ class _ShapeFit:
 
 
 def check_means_suffice_for_fit(means: IntervalMeans) -> None:
-    """Check that the interval means suffice to fit a thermal model.
+    """Check whether the interval means suffice to fit a thermal model.
 
     Raises
     ------
@@ -211,21 +211,21 @@ def check_means_suffice_for_fit(means: IntervalMeans) -> None:
 
 
 def _aicc_margin(shape: ThermalModelForm) -> float:
-    """Return the AICc improvement that a model form requires."""
+    """Return the AICc improvement that is required to select a model form."""
     if shape.difference_equation_order:
         return LAG_AICC_MARGIN
     return CURVE_AICC_MARGIN if shape.powers > CUBIC else 0.0
 
 
 def _temperature_difference(means: IntervalMeans) -> tuple[Floats, float]:
-    """Return the temperature minus the reference temperature [n], and the reference temperature, in °C."""
+    """Return the temperatures [n] relative to the reference temperature, and the reference temperature, in °C."""
     known = interpolate_missing_temperatures(means.temperature_c)
     reference_c = round(float(known.mean()), 2)
     return known - reference_c, reference_c
 
 
 def _both_ways(temperature_c: Floats) -> bool:
-    """Return True if the temperature rose and fell by more than MIN_REVERSE_SHARE of the total change."""
+    """Return True if the temperature both rose and fell by more than MIN_REVERSE_SHARE of the total change."""
     smooth = np.convolve(
         np.pad(interpolate_missing_temperatures(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid"
     )
@@ -235,7 +235,7 @@ def _both_ways(temperature_c: Floats) -> bool:
 
 
 def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
-    """Yield the model forms that the number of intervals allows."""
+    """Yield the model forms for which there are enough intervals."""
     count = int(means.both_known.sum())
     for powers in range(MAX_POWER + 1):
         if powers + 3 < count / 2:
@@ -249,7 +249,7 @@ def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
 def _fit_shape(
     means: IntervalMeans, excess: Floats, shape: ThermalModelForm, since: int | None
 ) -> StepwiseWork[_ShapeFit]:
-    """Fit a model form with the best time constants and the best residual correlation φ."""
+    """Find the best time constants and the best residual correlation φ of a model form."""
     best = yield from _TimeConstantSearch(means, excess, shape, PHI_VALUES[0], since).find_best_time_constants()
     for phi in PHI_VALUES[1:]:
         other = yield from _TimeConstantSearch(means, excess, shape, phi, since).find_best_time_constants()
@@ -258,7 +258,7 @@ def _fit_shape(
 
 
 class _TimeConstantSearch:
-    """Search for the time constants of a model form with a given φ.
+    """Search for the best time constants of a model form at a given residual correlation φ.
 
     The time constants are selected one by one from a grid, and then refined by golden-section search.
     """
@@ -273,7 +273,7 @@ class _TimeConstantSearch:
         self._constants: tuple[float, ...] = ()
 
     def find_best_time_constants(self) -> StepwiseWork[_ShapeFit]:
-        """Return the fit with the best time constants."""
+        """Find the best time constants, and return the fit."""
         k = self._shape.difference_equation_order
         for _ in range(k):
             yield from self._add_from_grid()
@@ -288,8 +288,7 @@ class _TimeConstantSearch:
         return _fit_sizes(self._means, self._excess, shape, self._phi, self._since)
 
     def _add_from_grid(self) -> StepwiseWork[None]:
-        """Add the best time constant of the grid. The ratio to the other time constants is at least
-        MIN_TIME_CONSTANT_RATIO."""
+        """Add the best time constant on the grid that differs from the others by MIN_TIME_CONSTANT_RATIO or more."""
         free = [
             one
             for one in self._grid.tolist()
@@ -313,7 +312,7 @@ class _TimeConstantSearch:
         return (*self._constants[:at], constant, *self._constants[at + 1 :])
 
     def _bounds(self, at: int) -> tuple[float, float]:
-        """Return the limits for the refinement of a time constant, which are at most one grid step away."""
+        """Return the limits within which a time constant is refined, at most one grid step away."""
         one, others = self._constants[at], (*self._constants[:at], *self._constants[at + 1 :])
         ratio = float(self._grid[1] / self._grid[0])
         below = max((MIN_TIME_CONSTANT_RATIO * other for other in others if other < one), default=self._fastest)
@@ -324,7 +323,7 @@ class _TimeConstantSearch:
 def _fit_sizes(
     means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None = None
 ) -> _ShapeFit:
-    """Fit the coefficients of a model form by least squares on whitened regressors."""
+    """Fit the coefficients of a model form by least squares with whitened regressors."""
     known = means.both_known
     columns = build_regressors(shape, excess, means.interval_s, with_initial_state=True)
     own = columns.shape[1]
@@ -351,30 +350,30 @@ def _without_step(means: IntervalMeans, since: int | None, step: float) -> Inter
 
 
 def whiten_regression(regressors: Floats, values: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
-    """Remove the residual correlation φ from regressors and values.
+    """Whiten regressors and values whose residuals have the correlation φ.
 
-    Each row is reduced by φ times the previous row, if the previous row is known. Otherwise, the row is scaled to the
-    same variance.
+    From each row, φ times the previous row is subtracted. If the previous row is unknown, the row is scaled instead, so
+    that its residual has the same variance.
 
     Parameters
     ----------
     regressors : ndarray, shape (n, m)
-        Regressors.
+        Regressors of the model form.
     values : ndarray, shape (n,)
-        Values in rad/s or m/s².
+        Values to which the regressors are fitted, in rad/s or m/s².
     known : ndarray, shape (n,), bool
         True where the value is known.
     phi : float
-        Correlation of successive residuals.
+        Correlation between successive residuals.
 
     Returns
     -------
     regressors : ndarray, shape (known, m)
-        Whitened regressors of the known rows.
+        Whitened regressors of the rows with known values.
     values : ndarray, shape (known,)
         Whitened values.
     fresh : int
-        Number of known rows without a known previous row.
+        Number of known rows whose previous row is unknown.
     """
     follows = known[1:] & known[:-1]
     x, z = regressors.copy(), values.copy()
@@ -387,10 +386,10 @@ def whiten_regression(regressors: Floats, values: Floats, known: np.ndarray, phi
 
 
 def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit) -> float:
-    """Return the rms error of a cross-validation in which each part of the record is predicted from the other parts.
+    """Return the rms error with which each part of the recording is predicted by a fit to the other parts.
 
-    If the first part is predicted, the temperature before the record is assumed to be constant, because the initial
-    state of the lags is unknown.
+    For the first part, the temperature before the recording is assumed to be constant, because the initial state of the
+    lags is unknown.
     """
     edges = np.linspace(0, excess.size, FOLDS + 1).astype(np.int64)
     square = 0.0
@@ -405,7 +404,7 @@ def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit)
 
 
 def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
-    """Return the thermal model of a fit, with the covariance of the coefficients."""
+    """Convert a fit to a thermal model with the covariance of the coefficients."""
     k = one.shape.difference_equation_order
     terms = one.sizes.size - k
     model = ThermalModel(
@@ -420,6 +419,6 @@ def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _Sh
         lowest_c=float(np.nanmin(means.temperature_c)),
         highest_c=float(np.nanmax(means.temperature_c)),
     )
-    rows = np.hstack([one.columns, bias_derivatives_by_time_constant(model, excess, one.sizes)])
+    rows = np.hstack([one.columns, bias_derivatives_by_log_time_constant(model, excess, one.sizes)])
     x, _, _ = whiten_regression(rows, np.zeros(excess.size), means.both_known, one.phi)
     return replace(model, covariance=coefficient_covariance(x, one.sigma))

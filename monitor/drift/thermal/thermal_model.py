@@ -1,8 +1,8 @@
-"""Model of the bias against temperature, with coefficients, uncertainty and predictions of interval means.
+"""Thermal model of a bias with coefficients and uncertainties, which predicts interval means from the temperature.
 
 A multi-step prediction uses only the temperature. A one-step prediction also uses the bias of the previous interval.
-The prediction intervals include the scatter of the interval means, and the uncertainty of coefficients and time
-constants.
+The prediction intervals take into account the scatter of the interval means and the uncertainty of the coefficients and
+time constants.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from monitor.drift.thermal.thermal_response import (
 )
 
 LOG_TIME_CONSTANT_STEP: Final = 1e-3
-"""Step of the logarithm of a time constant for its numerical derivative."""
+"""Step of the logarithm of a time constant that is used to compute numerical derivatives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +29,14 @@ class ThermalModel:
 
     shape: ThermalModelForm
     interval_s: float
-    reference_c: float  # °C, reference temperature, at which the constant applies
-    coefficients: Floats  # [terms] coefficients of constant, powers and lags: rad/s (m/s²) per power of °C
-    initial_state: Floats  # [k] initial state of each lag at the start of the fit, rad/s (m/s²)
-    phi: float  # correlation of the residuals of successive intervals
-    sigma: float  # rad/s (m/s²), standard deviation of the one-step residuals
-    covariance: Floats  # covariance of coefficients, initial state and logarithms of the time constants
-    lowest_c: float  # °C, lowest temperature of the fit
-    highest_c: float  # °C, highest temperature of the fit
+    reference_c: float  # reference temperature at which the constant applies, °C
+    coefficients: Floats  # [terms] coefficients of the constant, powers and lags, in rad/s or m/s² per power of °C
+    initial_state: Floats  # [k] initial state of each lag at the start of the fit, rad/s or m/s²
+    phi: float  # correlation between the residuals of successive intervals
+    sigma: float  # standard deviation of the one-step residuals, rad/s or m/s²
+    covariance: Floats  # covariance matrix of coefficients, initial state and log time constants
+    lowest_c: float  # lowest temperature in the fit, °C
+    highest_c: float  # highest temperature in the fit, °C
 
     @property
     def residual_std(self) -> float:
@@ -54,8 +54,7 @@ class ThermalModel:
 
     @property
     def equation(self) -> dict[str, list[float] | float] | None:
-        """Return the coefficients a, b and c of the difference equation, or None for a polynomial of order 2 or
-        more."""
+        """Return the coefficients a, b and c of the difference equation, or None for polynomials above order 1."""
         if self.shape.powers > 1:
             return None
         a, b, c = difference_equation_coefficients(self.shape, self.coefficients, self.interval_s)
@@ -63,7 +62,7 @@ class ThermalModel:
 
     @property
     def temperature_range_from_reference_c(self) -> tuple[float, float]:
-        """Return the lowest and the highest temperature of the fit, minus the reference temperature, in °C."""
+        """Return the lowest and the highest temperature in the fit, relative to the reference temperature, in °C."""
         return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
 
 
@@ -71,29 +70,30 @@ class ThermalModel:
 class ThermalPrediction:
     """Predicted interval means, with 95 % prediction intervals."""
 
-    bias: Floats  # [n] rad/s or m/s²
-    lo: Floats  # [n] 95 % prediction interval of the measured mean
+    bias: Floats  # [n] predicted mean bias, rad/s or m/s²
+    lo: Floats  # [n] lower end of the 95 % prediction interval for the measured mean
     hi: Floats  # [n]
 
 
 def predict_interval_means(
     model: ThermalModel, temperature_c: Floats, measured_bias: Floats | None = None, starts_with_fit: bool = False
 ) -> ThermalPrediction:
-    """Predict interval means of the bias, either multi-step or one-step.
+    """Predict interval means of the bias by multi-step or one-step prediction.
 
-    Outside the temperature range of the fit, each power continues as a straight line, and the extrapolated change is
-    added to the uncertainty.
+    Outside the temperature range of the fit, each power of the temperature is continued as a straight line. The
+    extrapolated change is added to the uncertainty.
 
     Parameters
     ----------
     model : ThermalModel
-        Fitted model.
+        Fitted thermal model.
     temperature_c : ndarray, shape (n,)
-        Mean temperature of each interval, °C; NaN = missing.
+        Mean temperature of each interval, °C; NaN means missing.
     measured_bias : ndarray, shape (n,), or None
-        Measured bias of each interval in rad/s or m/s², for one-step predictions. None selects multi-step predictions.
+        Measured bias in each interval in rad/s or m/s², which one-step predictions require. None selects multi-step
+        predictions.
     starts_with_fit : bool
-        True if the first interval is also the first interval of the fit, so that the initial state is known. If False,
+        True if the first interval is also the first interval of the fit, so that the initial state is known. Otherwise,
         the temperature before the first interval is assumed to be constant, which increases the uncertainty.
     """
     excess = interpolate_missing_temperatures(temperature_c) - model.reference_c
@@ -105,7 +105,7 @@ def predict_interval_means(
         columns[:, columns.shape[1] - k :] = 0.0
     sizes = np.concatenate([model.coefficients, model.initial_state if starts_with_fit else np.zeros(k)])
     bias, variance = predict_bias_and_variance(
-        model, excess, columns, sizes, bias_derivatives_by_time_constant(model, excess, sizes), measured_bias
+        model, excess, columns, sizes, bias_derivatives_by_log_time_constant(model, excess, sizes), measured_bias
     )
     if not starts_with_fit and k:
         swing = (model.highest_c - model.lowest_c) / 12.0**0.5
@@ -124,29 +124,29 @@ def predict_bias_and_variance(
     derivatives: Floats,
     measured_bias: Floats | None,
 ) -> tuple[Floats, Floats]:
-    """Return the predicted bias of successive intervals, and the variance of the prediction errors.
+    """Predict the bias in successive intervals, and return the prediction and the variance of its errors.
 
     Parameters
     ----------
     model : ThermalModel
-        Fitted model.
+        Fitted thermal model.
     excess_c : ndarray, shape (n,)
-        T − reference, °C.
+        Temperature relative to the reference temperature, °C.
     regressors : ndarray, shape (n, terms + k)
-        Regressors of ``build_regressors``.
+        Result of ``build_regressors``.
     coefficients : ndarray, shape (terms + k,)
-        Coefficients of the columns.
+        Coefficients of the regressors.
     derivatives : ndarray, shape (n, k)
-        Derivatives of ``bias_derivatives_by_time_constant``.
+        Result of ``bias_derivatives_by_log_time_constant``.
     measured_bias : ndarray, shape (n,), or None
-        Measured bias in rad/s or m/s², for one-step predictions. None selects multi-step predictions.
+        Measured bias in rad/s or m/s², which one-step predictions require. None selects multi-step predictions.
 
     Returns
     -------
     bias : ndarray, shape (n,)
         Predicted bias in rad/s or m/s².
     variance : ndarray, shape (n,)
-        Variance of the prediction errors, in the squared unit.
+        Variance of the prediction errors, in the squared unit of the bias.
     """
     bias = regressors @ coefficients
     rows = np.hstack([regressors, derivatives])
@@ -165,7 +165,7 @@ def predict_bias_and_variance(
 
 
 def interpolate_missing_temperatures(temperature_c: Floats) -> Floats:
-    """Return the temperatures [n] with interpolated values for missing temperatures."""
+    """Replace missing temperatures [n] by interpolated values."""
     there = np.flatnonzero(np.isfinite(temperature_c))
     return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
 
@@ -176,7 +176,7 @@ def coefficient_covariance(whitened_regressors: Floats, residual_std: float) -> 
     Parameters
     ----------
     whitened_regressors : ndarray, shape (n, m)
-        Whitened regressors.
+        Whitened regressors, as returned by ``whiten_regression``.
     residual_std : float
         Standard deviation of the whitened residuals.
     """
@@ -185,32 +185,32 @@ def coefficient_covariance(whitened_regressors: Floats, residual_std: float) -> 
     return np.asarray(residual_std**2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-10) / np.outer(scale, scale))
 
 
-def bias_derivatives_by_time_constant(model: ThermalModel, excess_c: Floats, coefficients: Floats) -> Floats:
+def bias_derivatives_by_log_time_constant(model: ThermalModel, excess_c: Floats, coefficients: Floats) -> Floats:
     """Return the derivatives [n, k] of the bias with respect to the logarithms of the time constants.
 
     Parameters
     ----------
     model : ThermalModel
-        Fitted model.
+        Fitted thermal model.
     excess_c : ndarray, shape (n,)
-        T − reference, °C.
+        Temperature relative to the reference temperature, °C.
     coefficients : ndarray, shape (terms + k,)
-        Coefficients of the columns.
+        Coefficients of the regressors.
     """
     return combine_regressor_derivatives(
-        model.shape, regressor_derivatives(model.shape, excess_c, model.interval_s), coefficients
+        model.shape, regressor_derivatives_by_log_time_constant(model.shape, excess_c, model.interval_s), coefficients
     )
 
 
-def regressor_derivatives(shape: ThermalModelForm, excess_c: Floats, interval_s: float) -> Floats:
-    """Return the derivatives of lags and initial-state responses with respect to the logarithms of the time constants.
+def regressor_derivatives_by_log_time_constant(shape: ThermalModelForm, excess_c: Floats, interval_s: float) -> Floats:
+    """Return the derivatives of lags and initial-state responses with respect to log time constants.
 
     Parameters
     ----------
     shape : ThermalModelForm
-        Form of the model.
+        Form of the thermal model.
     excess_c : ndarray, shape (n,)
-        T − reference, °C.
+        Temperature relative to the reference temperature, °C.
     interval_s : float
         Length of an interval, s.
     """
@@ -227,16 +227,16 @@ def regressor_derivatives(shape: ThermalModelForm, excess_c: Floats, interval_s:
 
 
 def combine_regressor_derivatives(shape: ThermalModelForm, derivatives: Floats, coefficients: Floats) -> Floats:
-    """Return the derivatives of the bias by combining the derivatives of the regressors with the coefficients.
+    """Combine the derivatives of the regressors with the coefficients to obtain the derivatives of the bias.
 
     Parameters
     ----------
     shape : ThermalModelForm
-        Form of the model.
+        Form of the thermal model.
     derivatives : ndarray, shape (n, 2 k)
-        Derivatives of the columns, from ``regressor_derivatives``.
+        Result of ``regressor_derivatives_by_log_time_constant``.
     coefficients : ndarray, shape (terms + k,)
-        Coefficients of the columns.
+        Coefficients of the regressors.
     """
     k, first = shape.difference_equation_order, 1 + shape.powers
     return np.asarray(

@@ -1,16 +1,17 @@
-"""Response of a bias to temperature, as a sum of terms with linear coefficients.
+"""Response of a bias to temperature, expressed as a linear combination of regressors.
 
-A lag describes heat that reaches the sensor with a delay: L_n = p L_{n−1} + (1 − p) T_n, with p = exp(−Δt/τ). Networks
-of thermal resistances and capacitances have only real, positive time constants. A difference equation
+A first-order lag describes heat that reaches the sensor with a delay: L_n = p L_{n−1} + (1 − p) T_n, with p =
+exp(−Δt/τ). Networks of thermal resistances and capacitances have only real, positive time constants. A difference
+equation
 
     Y_n + a_1 Y_{n−1} + … + a_k Y_{n−k} = b_0 T_n + … + b_m T_{n−m} + c
 
-with the roots p_1 … p_k is therefore a stable sum of k lags. The order m is k − 1, or k if a part of the bias follows
-the temperature without delay. Each root also has an initial-state response p^n, which describes the effect of
-temperatures before the first interval.
+with the roots p_1 … p_k is therefore a stable sum of k lags. The order m is k − 1, or k if part of the bias follows the
+temperature without delay. Each root also has an initial-state response p^n, which represents the effect of temperatures
+before the first interval.
 
 A polynomial describes a bias that follows the temperature without delay. Outside the temperature range of the fit, each
-power continues as a straight line.
+power of the temperature is continued as a straight line.
 """
 
 from dataclasses import dataclass
@@ -23,9 +24,9 @@ from monitor.common.compiled import compiled
 
 @dataclass(frozen=True, slots=True)
 class ThermalModelForm:
-    """Form of a thermal model: the order of the polynomial, and the time constants of the lags."""
+    """Form of a thermal model, given by the order of the polynomial and the time constants of the lags."""
 
-    powers: int  # order of the polynomial in T − reference, which acts without delay
+    powers: int  # order of the polynomial in the temperature, which acts without delay
     constants_s: tuple[float, ...]  # time constants of the lags, s
 
     @property
@@ -48,12 +49,12 @@ class ThermalModelForm:
 
 
 def compute_lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
-    """Return the root p of each lag.
+    """Return the root p = exp(−Δt/τ) of each lag.
 
     Parameters
     ----------
     shape : ThermalModelForm
-        Form of the model.
+        Form of the thermal model.
     interval_s : float
         Length of an interval, s.
     """
@@ -67,21 +68,22 @@ def build_regressors(
     with_initial_state: bool = False,
     range_c: tuple[float, float] | None = None,
 ) -> Floats:
-    """Return the regressors [n, terms]: a constant, powers of T − reference, lags, and initial-state responses.
+    """Return the regressors [n, terms]: constant, powers of the relative temperature, lags, initial-state responses.
 
     Parameters
     ----------
     shape : ThermalModelForm
-        Form of the model.
+        Form of the thermal model.
     excess_c : ndarray, shape (n,)
-        T − reference, °C, without gaps.
+        Temperature relative to the reference temperature, °C, without missing values.
     interval_s : float
         Length of an interval, s.
     with_initial_state : bool
-        True to add the initial-state response of each lag. False to assume a constant temperature before the first
+        True to add the initial-state response of each lag, False to assume a constant temperature before the first
         interval.
     range_c : (float, float) or None
-        Lowest and highest T − reference of the fit, °C. Outside of the range, powers continue as straight lines.
+        Temperature range of the fit, relative to the reference temperature, °C. Outside the range, powers are continued
+        as straight lines.
 
     Examples
     --------
@@ -99,21 +101,20 @@ def build_regressors(
 
 
 def temperature_beyond_range(excess_c: Floats, range_c: tuple[float, float]) -> Floats:
-    """Return the signed distance of each temperature from the temperature range of the fit in °C. Inside, the distance
-    is 0.
+    """Return the signed distance of each temperature from the temperature range of the fit in °C, or 0 inside.
 
     Parameters
     ----------
     excess_c : ndarray, shape (n,)
-        T − reference, °C.
+        Temperature relative to the reference temperature, °C.
     range_c : (float, float)
-        Lowest and highest T − reference of the fit, °C.
+        Temperature range of the fit, relative to the reference temperature, °C.
     """
     return excess_c - np.clip(excess_c, *range_c)
 
 
 def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
-    """Return a power of x, which continues outside the range as a straight line through the end points."""
+    """Return a power of x, continued outside the range ``ends`` as a straight line with the mean slope inside."""
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])
@@ -122,12 +123,12 @@ def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
 
 @compiled
 def apply_first_order_lag(values: Floats, root: float) -> Floats:
-    """Apply a first-order lag, L_n = p L_{n−1} + (1 − p) x_n, which starts at the first value.
+    """Apply a first-order lag L_n = p L_{n−1} + (1 − p) x_n, whose initial state is the first value.
 
     Parameters
     ----------
     values : ndarray, shape (n,)
-        Input.
+        Input of the lag.
     root : float
         Root of the lag, 0 < p < 1.
     """
@@ -140,14 +141,14 @@ def apply_first_order_lag(values: Floats, root: float) -> Floats:
 
 
 def solve_least_squares(regressors: Floats, values: Floats) -> Floats:
-    """Return the least-squares coefficients [terms], computed with scaled columns.
+    """Return the least-squares coefficients [terms]. The regressors are scaled internally for numerical stability.
 
     Parameters
     ----------
     regressors : ndarray, shape (n, terms)
-        Regressors.
+        Regressors in the columns.
     values : ndarray, shape (n,)
-        Values.
+        Values to which the regressors are fitted.
     """
     scale = np.maximum(np.linalg.norm(regressors, axis=0), 1e-300)
     found = np.linalg.lstsq(regressors / scale, values, rcond=1e-10)[0]
@@ -157,14 +158,14 @@ def solve_least_squares(regressors: Floats, values: Floats) -> Floats:
 def difference_equation_coefficients(
     shape: ThermalModelForm, coefficients: Floats, interval_s: float
 ) -> tuple[Floats, Floats, float]:
-    """Return the coefficients a [k], b [m + 1] and c of the difference equation in T − reference.
+    """Return the coefficients a [k], b [m + 1] and c of the difference equation in the relative temperature.
 
     Parameters
     ----------
     shape : ThermalModelForm
-        Form of the model.
+        Form of the thermal model.
     coefficients : ndarray, shape (terms,)
-        Coefficients of constant, powers and lags.
+        Coefficients of the constant, the powers and the lags.
     interval_s : float
         Length of an interval, s.
 
@@ -176,7 +177,7 @@ def difference_equation_coefficients(
     ([-0.5], [5.0], 1.5)
     """
     p = compute_lag_roots(shape, interval_s)
-    whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] 1, followed by a
+    whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] the value 1, followed by the coefficients a
     b = np.zeros(whole.size)
     if shape.powers:
         b += coefficients[1] * whole

@@ -1,4 +1,4 @@
-"""Reports of thermal fits to a recording, and of thermal predictions for another recording."""
+"""Reports on thermal models that are fitted to a recording or predict the bias in another recording."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from monitor.drift.thermal.thermal_fit import ThermalFit
 from monitor.drift.thermal.thermal_model import ThermalModel, ThermalPrediction, predict_interval_means
 
 DEFAULT_INTERVALS: Final = 72
-"""Default number of intervals in a recording. Wang et al. use 72 intervals of 1 h."""
+"""Default number of intervals into which a recording is divided. Wang et al. use 72 intervals of 1 h."""
 ROUND_INTERVALS_S: Final = (
     0.1,
     0.2,
@@ -45,37 +45,37 @@ class ThermalFitReport:
     interval_s: float
     means: Mapping[str, IntervalMeans]
     fits: Mapping[str, ThermalFit]
-    refused: Mapping[str, str]  # axis -> reason why no model was fitted
+    refused: Mapping[str, str]  # reason why no model was fitted, by axis
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class ThermalModelComparison:
-    """Prediction errors of a thermal model for the interval means of a recording."""
+class ThermalPredictionErrors:
+    """Prediction errors of a thermal model for interval means of the bias."""
 
     multi_step: ThermalPrediction
     one_step: ThermalPrediction
-    offset: float  # mean difference of measured and multi-step bias, because the bias differs after each start
-    rms: float  # rms of measured minus multi-step, rad/s or m/s²
-    rms_without_offset: float  # rms of measured minus multi-step minus offset
-    rms_one_step: float  # rms of measured minus one-step
-    rms_about_mean: float  # rms of measured about its mean
-    coverage: float  # share of means inside the multi-step prediction interval
+    offset: float  # mean of measured minus multi-step bias, which differs after each start of the sensor
+    rms: float  # rms of measured minus multi-step bias, rad/s or m/s²
+    rms_without_offset: float  # rms of measured minus multi-step bias minus ``offset``
+    rms_one_step: float  # rms of measured minus one-step bias
+    rms_about_mean: float  # rms of the measured bias about its mean
+    coverage: float  # share of interval means inside the multi-step prediction interval
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalPredictionReport:
-    """Prediction errors of the thermal models of all axes for a recording."""
+    """Prediction errors of the thermal models of all axes in a recording."""
 
     recording: str
     interval_s: float
     means: Mapping[str, IntervalMeans]
-    judged: Mapping[str, ThermalModelComparison]
+    judged: Mapping[str, ThermalPredictionErrors]
     refused: Mapping[str, str]
     notes: tuple[str, ...] = ()
 
 
-def compare_model_with_means(model: ThermalModel, means: IntervalMeans) -> ThermalModelComparison:
+def compare_model_with_means(model: ThermalModel, means: IntervalMeans) -> ThermalPredictionErrors:
     """Compare the predictions of a thermal model with interval means that were not used for the fit.
 
     Parameters
@@ -83,14 +83,14 @@ def compare_model_with_means(model: ThermalModel, means: IntervalMeans) -> Therm
     model : ThermalModel
         Fitted model.
     means : IntervalMeans
-        Interval means of bias (rad/s or m/s²) and temperature (°C).
+        Interval means of the bias (rad/s or m/s²) and of the temperature (°C).
     """
     multi, known = predict_interval_means(model, means.temperature_c), means.both_known
     residual = means.bias - multi.bias
     offset = float(residual[known].mean())
     one = predict_interval_means(model, means.temperature_c, means.bias - offset)
     inside = (means.bias >= multi.lo) & (means.bias <= multi.hi)
-    return ThermalModelComparison(
+    return ThermalPredictionErrors(
         multi,
         ThermalPrediction(one.bias + offset, one.lo + offset, one.hi + offset),
         offset,
@@ -103,7 +103,7 @@ def compare_model_with_means(model: ThermalModel, means: IntervalMeans) -> Therm
 
 
 def choose_interval_s(recording_s: float, rate_hz: float) -> float:
-    """Return a round interval length in seconds that divides a recording into about DEFAULT_INTERVALS intervals.
+    """Choose a round interval length in seconds that divides a recording into about DEFAULT_INTERVALS intervals.
 
     Parameters
     ----------

@@ -1,20 +1,20 @@
-"""Overlapping Allan variance of a whole recording in floating point, the reference for the sliding window.
+"""Overlapping Allan variance of a whole recording, computed in floating point.
 
-The functions in this module share no arithmetic with ``window``, which uses integers. The following measures keep the
-precision for 10⁷ samples and more, even for noise of 1e-4 m/s² on a mean of 9.81 m/s².
+The results serve as a reference for ``AllanWindow``, which uses integer arithmetic. Three measures keep the precision
+for 10⁷ samples and more, even for noise of 1e-4 m/s² on a mean of 9.81 m/s².
 
-- Each run of samples without a missing sample is treated as a separate recording, and the mean of the run is
-  subtracted. The subtraction is exact if the noise is small compared with the mean (Sterbenz).
-- Phase is the running sum of the mean-free rates. The rounding errors of the running sum are summed separately and
-  added back (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005).
-- The squared differences are added in ``LANES`` separate sums, and NumPy adds these sums pairwise.
+- Missing samples divide the recording into runs of consecutive samples. The mean of a run is subtracted from its
+  samples. The subtraction is exact if the noise is small compared with the mean (Sterbenz).
+- Phase is the running sum of the rates after subtraction of the mean. The rounding errors of the running sum are summed
+  separately and added back (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005).
+- The squared differences are accumulated in ``LANES`` separate sums, which NumPy then adds pairwise.
 
 Compared with exact integer arithmetic, the relative error of the Allan variance is 1e-15 for stationary noise and 1e-12
-for random walk. For a ramp that rises by 20 000 times the noise, the relative error is 1e-10.
+for random walk. For a linear drift over 20 000 times the noise, the relative error is 1e-10.
 
-The kernel releases the GIL and computes one axis per call. The axes can therefore be computed in parallel with
-``overlapping_avar(values, factors, map_axes=pool.map)``. A run is processed in blocks, and all τ of a block are
-computed together, because a loop over one τ at a time would be limited by the memory bandwidth.
+The compiled code releases the GIL, so ``overlapping_avar(values, factors, map_axes=pool.map)`` computes the axes in
+parallel. The samples are processed in blocks that fit the processor cache. Each block is read once for all τ, because
+separate passes over the recording would be limited by the memory bandwidth.
 """
 
 from collections.abc import Callable, Iterable
@@ -27,44 +27,44 @@ from drivers.errors import ConfigError
 from monitor.common.compiled import compiled
 
 TauGrid = Literal["octave", "decade10"] | tuple[float, ...]
-"""Name of a grid of averaging times, or the averaging times in seconds."""
+"""Averaging times: the name of a predefined grid, or a tuple of times in seconds."""
 
 Column = tuple[Floats, Ints]
-"""Allan variance [m] of one axis and the number of its terms [m]."""
+"""Allan variance [m] of one axis, and the number of averaged second differences [m]."""
 
 EachAxis = Callable[[Callable[[Floats], Column], Iterable[Floats]], Iterable[Column]]
-"""Signature of ``map`` or of the ``map`` of a thread pool."""
+"""Type of the built-in function ``map`` and of the method ``map`` of a thread pool."""
 
 MIN_PRESENT_SHARE: Final = 0.98
-"""Minimum share of samples that must be present for a slope."""
+"""Minimum share of samples that must be present to compute a slope."""
 BLOCK: Final = 16_384
-"""Number of phase points in a block. Three blocks need 0.4 MB, which fits a second-level cache."""
+"""Number of phase points in a block. Three blocks of 0.4 MB in total fit a second-level cache."""
 LANES: Final = 512
-"""Number of separate sums of squares per τ. The sums fit the first-level cache."""
+"""Number of partial sums of squares per τ. The partial sums fit the first-level cache."""
 
 
 def overlapping_avar(values: Floats, factors: Ints, map_axes: EachAxis = map) -> tuple[Floats, Ints]:
-    """Return the overlapping Allan variance of rates and the number of second differences.
+    """Return the overlapping Allan variance of rates, and the number of averaged second differences.
 
-    NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C). Here x is phase, and C is the
-    number of second differences (terms). The unit of time is the sample interval. Second differences that contain a
-    missing sample are left out.
+    According to NIST SP 1065 eq. 11, σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C). Here x is phase, and C is the
+    number of second differences. The unit of time is the sample interval. Second differences that contain a missing
+    sample are left out.
 
     Parameters
     ----------
     values : ndarray of float, shape (n, k)
-        Rates of k axes; values that are not finite are missing.
+        Rates of k axes; non-finite values mean missing samples.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples, at least 1.
     map_axes : EachAxis
-        Function that maps over the axes, for example the ``map`` method of a thread pool.
+        Function that applies a computation to each axis, for example the method ``map`` of a thread pool.
 
     Returns
     -------
     avar : ndarray of float64, shape (m, k)
         Allan variance in squared units of the axis; NaN if every second difference contains a missing sample.
     terms : ndarray of int64, shape (m, k)
-        Number of second differences.
+        Number of averaged second differences.
 
     >>> overlapping_avar(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
@@ -74,12 +74,12 @@ def overlapping_avar(values: Floats, factors: Ints, map_axes: EachAxis = map) ->
 
 
 def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
-    """Return the overlapping Allan variance of one axis and the number of second differences.
+    """Return the overlapping Allan variance of one axis, and the number of averaged second differences.
 
     Parameters
     ----------
     rate : ndarray of float, shape (n,)
-        Rates of the axis; values that are not finite are missing.
+        Rates of the axis; non-finite values mean missing samples.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
 
@@ -88,24 +88,25 @@ def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
     avar : ndarray of float64, shape (m,)
         Allan variance.
     terms : ndarray of int64, shape (m,)
-        Number of second differences.
+        Number of averaged second differences.
     """
     phase = np.empty(len(rate) + 1)
     phase[0] = 0.0
-    phase[1:] = rate  # a copy in float64, because sums in float32 are too inaccurate
+    phase[1:] = rate  # copied to float64, because sums in float32 would be too inaccurate
     m = np.ascontiguousarray(factors, np.int64)
     lanes, terms = np.zeros((m.size, LANES)), np.zeros(m.size, np.int64)
     _add_runs(phase, m, lanes, terms)
-    with np.errstate(invalid="ignore"):  # 0/0 if every second difference contains a missing sample
+    with np.errstate(invalid="ignore"):  # 0/0 if no second difference is complete
         return lanes.sum(axis=1) / (2.0 * m * m * terms), terms
 
 
 def rate_slope_from_thirds(values: Floats) -> Floats:
-    """Return the slope of the rates of a recording, computed from the means of the first and the last third.
+    """Return the slope of the rates of a recording, computed from the means of its first and last third.
 
     The difference between the two means is divided by two thirds of the duration T. For white noise, the variance of
-    this slope is 13.5 N²/T³, and the variance of a linear regression is 12 N²/T³. The slope [k] of the rates [n, k] is
-    in units per sample. The slope is NaN if more than 2 % of the samples are missing.
+    this slope is 13.5 N²/T³. A slope from linear regression would have a variance of 12 N²/T³. The rates have the shape
+    (n, k), and the slope has the shape (k,) in units per sample. The slope is NaN if more than 2 % of the samples are
+    missing.
 
     >>> rate_slope_from_thirds(0.5 * np.arange(9.0)[:, None]).tolist()
     [0.5]
@@ -123,15 +124,15 @@ def rate_slope_from_thirds(values: Floats) -> Floats:
 
 
 def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
-    """Return the slope of the rates at each averaging time, from the mean second difference of phase.
+    """Return the slope of the rates at each averaging time, computed from the mean second difference of phase.
 
-    The mean second difference is divided by m². A linear drift with this slope contributes slope² τ²/2 to the Allan
-    variance. Missing samples are replaced by the mean.
+    The slope is the mean second difference of phase, divided by m². A linear drift with this slope contributes slope²
+    τ²/2 to the Allan variance. Missing samples are replaced by the mean of the axis.
 
     Parameters
     ----------
     rates : ndarray of float, shape (n, k)
-        Rates of k axes; values that are not finite are missing.
+        Rates of k axes; non-finite values mean missing samples.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
 
@@ -159,9 +160,9 @@ def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
 
 @compiled
 def _mean(values: Floats) -> tuple[Ints, Floats]:
-    """Return the number [k] and the mean [k] of the finite values of each column.
+    """Return the number [k] and the mean [k] of the finite values in each column.
 
-    Differences from the first value are summed, because the sums of the values would lose precision.
+    To keep precision, the differences from the first finite value are summed instead of the values.
     """
     n, k = values.shape
     first, total, count = np.zeros(k), np.zeros(k), np.zeros(k, np.int64)
@@ -177,7 +178,7 @@ def _mean(values: Floats) -> tuple[Ints, Floats]:
 
 @compiled
 def _sums_of_phase(values: Floats, mean: Floats, places: Ints) -> Floats:
-    """Return the running sum of phase before each point of ``places``, which must be in ascending order."""
+    """Return the running sum of phase before each index in ``places``, which must be in ascending order."""
     n, k = values.shape
     phase, total, result = np.zeros(k), np.zeros(k), np.zeros((places.size, k))
     at = 0
@@ -200,10 +201,11 @@ def octave_cluster_sizes(largest: int) -> Ints:
 
 
 def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints:
-    """Return the cluster sizes m = τ · rate of a grid of averaging times.
+    """Return the cluster sizes m = τ · rate for a set of averaging times.
 
-    The grid ``octave`` contains powers of two, and ``decade10`` contains ten sizes per decade. Both grids end at a
-    quarter of the window. Averaging times in seconds may reach half the window.
+    The grid ``octave`` contains powers of two, and the grid ``decade10`` contains ten sizes per decade. The cluster
+    sizes of a grid are at most a quarter of the window length. Averaging times in seconds may reach half the window
+    length.
 
     Parameters
     ----------
@@ -212,7 +214,7 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
     rate_hz : float
         Sample rate in Hz.
     tau : TauGrid
-        Name of a grid, or a tuple of averaging times in seconds, each rounded to the nearest m.
+        Name of a grid, or a tuple of averaging times in seconds, which are rounded to whole samples.
 
     Returns
     -------
@@ -242,7 +244,7 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
 
 @compiled
 def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
-    """Add the squared second differences of all runs; on input, ``phase[1:]`` contains rates."""
+    """Convert the rates in ``phase[1:]`` to phase, and add the squared second differences to ``lanes``."""
     before = 0
     while before + 1 < phase.size:
         last = _integrate(phase, before)
@@ -258,7 +260,7 @@ def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
 
 @compiled
 def _integrate(phase: Floats, before: int) -> int:
-    """Replace the finite rates after index ``before`` by phase, and return the index of the last finite rate."""
+    """Convert the finite rates that follow index ``before`` to phase, and return the index of the last one."""
     total, last = 0.0, before
     while last + 1 < phase.size and np.isfinite(phase[last + 1]):
         last += 1
@@ -278,9 +280,9 @@ def _integrate(phase: Floats, before: int) -> int:
 
 @compiled
 def _add_squares(phase: Floats, first: int, end: int, m: int, lanes: Floats) -> None:
-    """Add the squared second differences that end at the indices first ≤ i < end.
+    """Add the squared second differences whose last phase point has an index first ≤ i < end.
 
-    The indices are unsigned, because a signed index would prevent vectorization of the inner loop.
+    The indices are unsigned because a signed index would prevent vectorization of the inner loop.
     """
     for row in range(first, end, LANES):
         at0, at1, at2 = np.uintp(row), np.uintp(row - m), np.uintp(row - 2 * m)

@@ -12,8 +12,8 @@ class AllanCurve:
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
     avar: Floats  # [m, 6] Allan variance in squared units of the axis; NaN if the window is too short
-    terms: Ints  # [m, 6] number of second differences averaged
+    terms: Ints  # [m, 6] number of averaged second differences
     edf: Floats  # [m, 6] equivalent degrees of freedom; NaN where ``avar`` is NaN
-    lo: Floats  # [m, 6] lower end of the 95 % interval of the Allan deviation
-    hi: Floats  # [m, 6] upper end of the 95 % interval of the Allan deviation
-    n: int  # number of samples in the window, including missing ones
+    lo: Floats  # [m, 6] lower end of the 95 % confidence interval of the Allan deviation
+    hi: Floats  # [m, 6] upper end of the 95 % confidence interval of the Allan deviation
+    n: int  # number of samples in the window, including missing samples

@@ -1,12 +1,11 @@
-"""Dynamic Allan variance of a recording: Allan deviation and noise coefficients as functions of time.
+"""Dynamic Allan variance, which gives the Allan deviation and noise coefficients of a recording as functions of time.
 
-A window slides along the recording. At each step, the overlapping Allan variance of the window is computed, and the
-coefficients Q N B K R are fitted. The method follows "Dynamic extraction of random drift error coefficients of MEMS
-gyroscopes". Terms are added to the fit and dropped from the fit with hysteresis, so each fit receives the terms of the
-previous fit.
+A window slides along the recording in steps. At each step, the overlapping Allan variance is computed, and the noise
+coefficients Q, N, B, K and R are fitted to it. The method follows "Dynamic extraction of random drift error
+coefficients of MEMS gyroscopes". Noise terms enter and leave the fit with hysteresis, so each fit starts from the terms
+of the previous fit.
 
-Results are computed only for full windows. A change of the noise is therefore fully visible one window length after the
-change.
+Results are computed only for full windows, so a change of the noise is fully visible one window length later.
 """
 
 from collections.abc import Callable
@@ -21,34 +20,35 @@ from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
+from monitor.estimation.fit.coefficient_fit import MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 
 STEPS_PER_WINDOW: Final = 20
-"""Default number of steps per window length."""
+"""Default number of steps in which the window moves by its own length."""
 MAX_STEPS: Final = 500
 
 Progress = Callable[[float], None]
-"""Function that receives the completed fraction, from 0 to 1."""
+"""Type of a function that receives the completed fraction of the computation, from 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class DynamicAllan:
     """Dynamic Allan variance of six axes at T times, in SI units.
 
-    The last index of each array is the axis, from gx to az. The coefficients are in the order Q N B K R.
+    The last dimension of each array is the axis, in the order gx, gy, gz, ax, ay, az. The coefficients are in the order
+    Q, N, B, K, R.
     """
 
     t_s: Floats  # [T] end of each window, in seconds since the first sample
-    window_s: float  # length of the window
+    window_s: float  # length of the sliding window
     rate_hz: float
     tau_s: Floats  # [m]
     deviation: Floats  # [T, m, 6] Allan deviation in units of the axis; NaN if too many samples are missing
-    lo: Floats  # [T, m, 6] lower end of the 95 % interval of the deviation
-    hi: Floats  # [T, m, 6] upper end of the 95 % interval of the deviation
+    lo: Floats  # [T, m, 6] lower end of the 95 % confidence interval of the Allan deviation
+    hi: Floats  # [T, m, 6] upper end of the 95 % confidence interval of the Allan deviation
 
     value: Floats  # [T, 5, 6] coefficients; NaN unless estimated
-    value_lo: Floats  # [T, 5, 6] lower end of the 95 % interval; 0 if only an upper bound is known
-    value_hi: Floats  # [T, 5, 6] upper end of the 95 % interval, or one-sided 95 % upper bound
+    value_lo: Floats  # [T, 5, 6] lower end of the 95 % confidence interval; 0 if only an upper bound is known
+    value_hi: Floats  # [T, 5, 6] upper end of the 95 % confidence interval, or the one-sided 95 % upper bound
     status: NDArray[np.int8]  # [T, 5, 6] values of ``Status``
 
 
@@ -60,7 +60,7 @@ def compute_dynamic_allan(
     step_s: float | None = None,
     progress: Progress | None = None,
 ) -> DynamicAllan:
-    """Compute the dynamic Allan variance and the coefficients of a recording on a regular grid.
+    """Compute the dynamic Allan variance and the noise coefficients of a recording with a constant sample rate.
 
     Parameters
     ----------
@@ -71,12 +71,12 @@ def compute_dynamic_allan(
     window_s : float
         Length of the sliding window in seconds.
     tau : TauGrid
-        Name of a grid, or a tuple of averaging times in seconds.
+        Name of a grid of averaging times, or a tuple of times in seconds.
     step_s : float or None
-        Time between two windows in seconds. None means a twentieth of the window. If the number of steps
-        would exceed ``MAX_STEPS``, a longer step is used.
+        Time step of the sliding window in seconds. None means a twentieth of the window length. The step is increased
+        if the number of steps would exceed ``MAX_STEPS``.
     progress : Progress or None
-        Function that is called with the completed fraction, from 0 to 1.
+        Function that is called with the completed fraction of the computation, from 0 to 1.
 
     Raises
     ------
@@ -105,8 +105,8 @@ def compute_dynamic_allan(
     for row, end in enumerate(ends.tolist()):
         window.append_samples(values[start:end])
         start = end
-        avar, (slope, slopes) = window.avar(), window.rate_slopes_per_axis_and_tau()
-        measured = MeasuredCurve(avar, window.term_counts(), slope * rate_hz, slopes * rate_hz, entered)
+        avar, (slope, slopes) = window.avar(), window.drift_slopes_by_axis_and_tau()
+        measured = MeasuredVariancesAndSlopes(avar, window.term_counts(), slope * rate_hz, slopes * rate_hz, entered)
         found = fit_coefficients(columns, covariances, measured)
         entered = found.entered
         deviation[row] = np.sqrt(avar)

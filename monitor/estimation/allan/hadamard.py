@@ -1,12 +1,12 @@
-"""Overlapping Hadamard variance: mean square of third phase differences, insensitive to a linear drift of the rate.
+"""Overlapping Hadamard variance, which is insensitive to a linear drift of the rate.
 
-The overlapping Hadamard variance (NIST SP 1065 eq. 20) of a rate is the mean of (x_{i+3m} − 3 x_{i+2m} + 3 x_{i+m} −
-x_i)² / 6m² over all i, where x is phase and m ≤ n/3. White noise has equal Hadamard and Allan variances. For m of more
-than a few samples, the Hadamard variance of other noise is the Allan variance times 10/9 for quantization noise, 0.811
-for flicker noise, and 0.5 for random walk.
+The Hadamard variance (NIST SP 1065 eq. 20) of a rate is the mean of (x_{i+3m} − 3 x_{i+2m} + 3 x_{i+m} − x_i)² / 6m²
+over all i, where x is phase and m ≤ n/3. For white noise, the Hadamard variance equals the Allan variance. For cluster
+sizes above a few samples, the ratio of the two variances is 10/9 for quantization noise, 0.811 for flicker noise and
+0.5 for random walk.
 
-The degrees of freedom are computed for the fitted mixture of noise terms, from the exact covariance of the third
-differences. The formula of Greenhall & Riley (PTTI 2003, d = 3) holds only for a single power law. Third differences
+The degrees of freedom are computed from the covariance of the third differences for the fitted mixture of noise terms.
+In contrast, the formula of Greenhall & Riley (PTTI 2003, d = 3) holds only for a single power law. Third differences
 that contain a missing sample are left out.
 """
 
@@ -25,18 +25,18 @@ from monitor.estimation.allan.squared_difference_moments import (
     PhaseRing,
     correct_bias_and_compute_intervals,
     phase_autocovariance,
-    quadrature_nodes,
+    summation_nodes,
     theta_in_sample_units,
     variance_from_squared_differences,
 )
 
 SQUARED_WEIGHTS: Final = 6.0
-"""Factor in the definition of the Hadamard variance, σ² = mean of d² / (6 m²)."""
+"""Divisor in the definition of the Hadamard variance, which is the mean of d² / (6 m²) for third differences d."""
 
 MAX_LAG_CLUSTERS: Final = 16
-"""Distance in clusters beyond which third differences are treated as uncorrelated.
+"""Lag in clusters beyond which third differences are treated as uncorrelated.
 
-For flicker noise, the squared correlation coefficient at this distance is 1e-9.
+At a lag of 16 clusters, the squared correlation coefficient of third differences of flicker noise is 1e-9.
 """
 
 
@@ -46,17 +46,17 @@ class HadamardCurve:
 
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
-    hvar: Floats  # [m, k] in squared units of the axis; NaN if too many samples are missing
-    terms: Ints  # [m, k] number of third differences averaged
+    hvar: Floats  # [m, k] Hadamard variance in squared units of the axis; NaN if too many samples are missing
+    terms: Ints  # [m, k] number of averaged third differences
     edf: Floats  # [m, k] equivalent degrees of freedom; NaN if the noise is unknown
-    lo: Floats  # [m, k] lower end of the 95 % interval of the deviation
-    hi: Floats  # [m, k] upper end of the 95 % interval of the deviation
+    lo: Floats  # [m, k] lower end of the 95 % confidence interval of the Hadamard deviation
+    hi: Floats  # [m, k] upper end of the 95 % confidence interval of the Hadamard deviation
 
 
 def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Return the overlapping Hadamard variance of rates and the number of third differences.
+    """Return the overlapping Hadamard variance of rates, and the number of averaged third differences.
 
-    The parameters and results are described at ``total.total_variance``. Cluster sizes may reach n/3.
+    The parameters and results are those of ``total.total_variance``, but cluster sizes must not exceed n/3.
 
     >>> ramp = np.arange(90.0)[:, None]
     >>> hadamard_variance(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
@@ -68,7 +68,7 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
 def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
     """Compute the Hadamard variance of a recording with confidence intervals.
 
-    The parameters are described at ``total.compute_total_curve``. Cluster sizes may reach n/3.
+    The parameters are those of ``total.compute_total_curve``, but cluster sizes must not exceed n/3.
     """
     n = len(values)
     factors = octave_cluster_sizes(n // 3) if factors is None else factors
@@ -81,9 +81,9 @@ def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factor
 def hadamard_curve_from_variance(
     moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
 ) -> HadamardCurve:
-    """Compute degrees of freedom and confidence intervals for given Hadamard variances.
+    """Compute the degrees of freedom and confidence intervals of given Hadamard variances.
 
-    The parameters are described at ``total.correct_total_variance``.
+    The parameters are those of ``total.correct_total_variance``.
     """
     _, edf, lo, hi = correct_bias_and_compute_intervals(
         moments, theta_in_sample_units(theta, rate_hz), raw_variance, terms
@@ -93,9 +93,9 @@ def hadamard_curve_from_variance(
 
 
 def hadamard_estimator_moments(n: int, factor: int) -> EstimatorMoments:
-    """Return the mean and the covariance of the Hadamard variance at one cluster size.
+    """Return the mean and the covariance of the Hadamard variance estimate at one cluster size.
 
-    In the example, white noise at m = 1 has 18 000 degrees of freedom for 35 000 third differences.
+    As the example shows, 35 000 third differences of white noise at m = 1 have 18 000 degrees of freedom.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def hadamard_estimator_moments(n: int, factor: int) -> EstimatorMoments:
     18000
     """
     terms = n + 1 - 3 * factor
-    lags, weights = quadrature_nodes(0, min(terms, MAX_LAG_CLUSTERS * factor), [factor, 2 * factor, 3 * factor])
+    lags, weights = summation_nodes(0, min(terms, MAX_LAG_CLUSTERS * factor), [factor, 2 * factor, 3 * factor])
     shared = np.zeros((4, lags.size))
     for p, weight in zip(range(-3, 4), (-1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0), strict=True):
         shared += weight * phase_autocovariance(lags + p * factor)
@@ -123,18 +123,18 @@ def hadamard_estimator_moments(n: int, factor: int) -> EstimatorMoments:
 
 @compiled
 def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
-    """Add the squared third differences of phase at one cluster size to sums.
+    """Add the squared third differences of phase at one cluster size to ``sums``.
 
     Parameters
     ----------
     ring : PhaseRing
-        Phase of the recording.
+        Ring buffer with the phase of the recording.
     m : int
         Cluster size in samples.
     sums : ndarray of float64, shape (k,)
-        Sums of squares, updated in place.
+        Sum of squares of each axis, updated in place.
     terms : ndarray of int64, shape (k,)
-        Number of third differences, updated in place.
+        Number of third differences of each axis, updated in place.
     """
     phase, missing, first, n = ring.phase, ring.missing, ring.first, ring.n
     places = phase.shape[0]

@@ -1,17 +1,17 @@
-"""Total and Hadamard variance of the live window, computed one averaging time at a time.
+"""Total and Hadamard variance of a sliding window of live samples, computed one averaging time at a time.
 
-Computing both variances for all averaging times would delay new samples. Each call of ``compute_next_tau`` therefore
-computes one variance at one averaging time. Results are returned after a round, which covers all averaging times of
-both variances.
+If both variances were computed for all averaging times at once, new samples would have to wait. Each call of
+``compute_next_tau`` therefore computes one variance at one averaging time. The results become available when both
+variances have been computed at all averaging times, which is called a round.
 
-The results lag behind the window. For 3.6 million samples, a round has 43 steps and takes 4.3 s with ten steps per
-second. The oldest value that ``curves_of_last_round`` returns is then 8.6 s old.
+The results are therefore slightly out of date. For 3.6 million samples and ten calls per second, a round of 43 calls
+takes 4.3 s. The values that ``curves_of_last_round`` returns are then up to 8.6 s old.
 
-Except at the reflected ends, the second differences of the total variance are also those of the Allan variance. The
-sums of the window are therefore reused if the window contains the same averaging time.
+Away from the reflected ends, the total variance and the Allan variance have the same second differences. The sums that
+the sliding window stores for an averaging time are therefore reused.
 
-Integer phase can overflow at long averaging times, so averaging times at which a difference could exceed 2⁶³ are left
-out. Sums that rounding alone can cause are set to zero.
+Averaging times at which a difference of integer phase could exceed 2⁶³ are left out, because the phase would overflow.
+Sums that are small enough to be caused by rounding alone are set to zero.
 """
 
 from collections.abc import Iterator
@@ -30,41 +30,40 @@ from monitor.estimation.allan.squared_difference_moments import (
     PhaseRing,
     compute_variance_from_squared_differences,
 )
-from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
 from monitor.estimation.allan.window_kernel import AXES
 
 TOTAL, HADAMARD = 0, 1
 MIN_SAMPLES: Final = 8
-"""Minimum number of samples for the computation."""
+"""Minimum number of samples in the window from which the variances are computed."""
 MOMENTS_RENEWAL_RATIO: Final = 1.02
-"""Growth of the window after which the bias and the degrees of freedom are recomputed."""
+"""Growth factor of the number of samples after which the bias and the degrees of freedom are recomputed."""
 MAX_ROUNDING_SQUARE: Final = (9.0, 16.0)
-"""Largest squared difference of total and Hadamard variance that rounding can cause, in squared units of phase.
+"""Largest squared difference of the total and the Hadamard variance that rounding can cause, in squared units of phase.
 
-Each limit is the square of half the sum of the absolute weights of a difference.
+Each value is (Σ |w| / 2)², where w are the weights of the phase points in a difference.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    variance: Floats  # [6] in squared units of the axis, not corrected for bias
-    terms: Ints  # [6] number of terms
+    variance: Floats  # [6] variance in squared units of the axis, not corrected for bias
+    terms: Ints  # [6] number of averaged differences
     moments: EstimatorMoments
 
 
 class LiveTotalAndHadamard:
-    """Total and Hadamard variance of a sliding window, computed one averaging time at a time.
-
+    """Computation of the total and Hadamard variance of a sliding window, one averaging time at a time.
 
     Parameters
     ----------
     window : AllanWindow
-                Sliding window, which is not changed.
+        Sliding window, which is not changed.
     totals : ndarray of int64 or None
-        Cluster sizes of the total variance in samples, below the window length. None means octaves.
+        Cluster sizes of the total variance in samples, below the window length. None means powers of two.
     hadamards : ndarray of int64 or None
-        Cluster sizes of the Hadamard variance in samples, up to a third of the window length. None means octaves.
+        Cluster sizes of the Hadamard variance in samples, up to a third of the window length. None means powers of two.
 
     Raises
     ------
@@ -84,15 +83,15 @@ class LiveTotalAndHadamard:
                 raise ConfigError(f"cluster sizes {factors.tolist()} must lie within 1 and {limit}")
         self._factors = [[int(m) for m in factors] for factors in given]
         self._moments: list[dict[int, EstimatorMoments]] = [{}, {}]
-        self.rounds = 0  # number of complete rounds
+        self.rounds = 0  # number of complete rounds over all averaging times
         self._window_resets = window.resets
         self._round = self._steps()
         self._last: tuple[list[_Result], list[_Result]] | None = None
 
     def compute_next_tau(self) -> None:
-        """Compute one variance at the next averaging time.
+        """Compute the total or Hadamard variance at the next averaging time.
 
-        If the window has been emptied, a new round begins, and the results of the last round are discarded.
+        If the sliding window has been emptied, the results are discarded and a new round begins.
         """
         if self._window.resets != self._window_resets:
             self._last = None
@@ -100,15 +99,15 @@ class LiveTotalAndHadamard:
         self._window_resets = self._window.resets
         next(self._round)
 
-    def curves_of_last_round(self, rate_hz: float, theta: Floats) -> tuple[TotalCurve, HadamardCurve] | None:
-        """Return both curves of the last complete round, or None before the end of the first round.
+    def curves_of_last_round(self, rate_hz: float, theta: Floats) -> tuple[TotalVarianceCurve, HadamardCurve] | None:
+        """Return the total and Hadamard variance of the last complete round, or None if there is none yet.
 
         Parameters
         ----------
         rate_hz : float
             Sample rate in Hz.
         theta : ndarray of float64, shape (5, 6)
-            Fitted Q² N² B² K² R² in SI, from which the bias and the degrees of freedom are computed.
+            Fitted Q², N², B², K², R² in SI units, from which the bias and the degrees of freedom are computed.
         """
         if self._last is None:
             return None

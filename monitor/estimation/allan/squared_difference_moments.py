@@ -1,14 +1,15 @@
-"""Mean and covariance of squared phase differences, for the bias and the degrees of freedom of a variance.
+"""Mean and covariance of squared phase differences, which determine the bias and degrees of freedom of a variance.
 
-A variance of the Allan family is a mean of squared differences d_k². Each difference d_k = Σ_p w_p x(k_p) is a weighted
-sum of a few phase points. The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q), where G is
-the generalised autocovariance of phase (``phase_autocovariance``). The formula also holds for points that are reflected
-at the ends of a recording. For Gaussian noise, the theorem of Isserlis gives Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
+The Allan, total and Hadamard variances are means of squared phase differences d_k². Each difference d_k = Σ_p w_p
+x(k_p) is a weighted sum of a few phase points. The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p
+− k_q), where G is the generalised autocovariance of phase (``phase_autocovariance``). The formula also holds for phase
+points that are reflected at the ends of a recording. For Gaussian noise, Isserlis' theorem gives Cov(d_j², d_k²) = 2
+Cov(d_j, d_k)².
 
-A ramp adds a known offset to each second difference. The square of the offset increases the mean, and the product of
-offset and noise increases the variance of the estimate.
+A linear drift of the rate adds a known offset to each second difference. The square of the offset increases the mean of
+the estimate, and the product of offset and noise increases its variance.
 
-All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
+Time is in units of one sample interval τ0, so θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -24,30 +25,30 @@ from monitor.estimation.allan.uncertainty import deviation_intervals
 from monitor.estimation.fit.coefficient_fit import TO_SI
 
 NUM_COEFFICIENTS: Final = 5
-"""Number of coefficients Q N B K R, in the order of θ."""
+"""Number of noise coefficients Q, N, B, K and R."""
 
 _BLOCK_GROWTH: Final = 1.5
-"""Ratio of the lengths of successive blocks."""
+"""Ratio between the lengths of successive summation blocks."""
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatorMoments:
-    """Mean and covariance of a variance estimate at one cluster size, for ``n`` samples without missing samples."""
+    """Mean and covariance of a variance estimate at one cluster size, for a recording without missing samples."""
 
-    n: int  # samples in the record
+    n: int  # number of samples in the recording
     factor: int  # cluster size in samples
-    terms: int  # number of differences averaged
-    mean: Floats  # [5] expectation of the variance for unit coefficients
-    allan: Floats  # [5] Allan variance for unit coefficients
-    covariance: Floats  # [5, 5] C of the quadratic form Var = Σ_ab θ_a θ_b C_ab
+    terms: int  # number of averaged differences
+    mean: Floats  # [5] expectation of the variance estimate for each unit coefficient
+    allan: Floats  # [5] Allan variance for each unit coefficient
+    covariance: Floats  # [5, 5] matrix C, so that the variance of the estimate is Σ_ab θ_a θ_b C_ab
 
 
 class PhaseRing(NamedTuple):
-    """Ring buffer of n + 1 or more phase points, for a recording of n samples."""
+    """Ring buffer with at least n + 1 phase points for n samples."""
 
-    phase: Floats | Ints  # [places, at least k] phase, or wrapping integer phase
+    phase: Floats | Ints  # [places, at least k] phase in floating point, or integer phase modulo 2⁶⁴
     missing: NDArray[np.int32]  # [places, at least k] running count of missing samples
-    first: int  # row of the oldest point
+    first: int  # row of the oldest phase point
     n: int  # number of samples
 
 
@@ -58,7 +59,7 @@ def _integrate_to_phase(values: Floats) -> PhaseRing:
     rate[:] = values
     absent = ~np.isfinite(rate)
     rate[absent] = 0.0
-    # phase of the mean-free rates stays small, so less precision is lost
+    # Without the mean of the rates, the phase stays small and loses less precision.
     rate -= rate.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
     rate[absent] = 0.0
     np.cumsum(rate, axis=0, out=rate)
@@ -69,18 +70,18 @@ def _integrate_to_phase(values: Floats) -> PhaseRing:
 def variance_from_squared_differences(
     values: Floats, factors: Ints, squared_weights: float, add_squares: Callable[[PhaseRing, int, Floats, Ints], None]
 ) -> tuple[Floats, Ints]:
-    """Return a variance of rates that is a mean of squared phase differences, and the number of differences.
+    """Return a variance of rates that is defined as a mean of squared phase differences, and the number of differences.
 
     Parameters
     ----------
     values : ndarray of float64, shape (n, k)
-        Rates of k axes; values that are not finite are missing.
+        Rates of k axes; non-finite values mean missing samples.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
     squared_weights : float
-        Divisor in the definition of the variance, see ``compute_variance_from_squared_differences``.
+        Divisor in the definition of the variance: 2 for second differences, 6 for third differences.
     add_squares : callable
-        Function that adds the squared differences at one cluster size to sums [k], and counts the differences [k].
+        Function that adds the squared differences at one cluster size to sums [k], and counts these differences [k].
     """
     ring = _integrate_to_phase(values)
     sums = np.zeros((factors.size, values.shape[1]))
@@ -98,7 +99,7 @@ def compute_variance_from_squared_differences(
     Parameters
     ----------
     sums : ndarray of float64, shape (m, k)
-        Sums of squared differences.
+        Sums of squared phase differences.
     terms : ndarray of int64, shape (m, k)
         Number of differences in each sum.
     factors : ndarray of int64, shape (m,)
@@ -111,14 +112,14 @@ def compute_variance_from_squared_differences(
 
 
 def theta_in_sample_units(theta: Floats, rate_hz: float) -> Floats:
-    """Convert squared coefficients θ from SI to units of one sample.
+    """Convert squared coefficients θ from SI units to units of one sample interval.
 
-    A negative Q², which represents a band limit, becomes 0.
+    A negative Q², which represents a limited bandwidth, is replaced by 0.
 
     Parameters
     ----------
     theta : ndarray of float64, shape (5, k)
-        Q² N² B² K² R² in SI.
+        Squared coefficients Q², N², B², K², R² in SI units.
     rate_hz : float
         Sample rate in Hz.
     """
@@ -130,28 +131,28 @@ def correct_bias_and_compute_intervals(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Correct measured variances for bias, and compute degrees of freedom and confidence intervals.
 
-    An estimate with the expectation E and the variance Var has 2 E²/Var degrees of freedom. Missing samples reduce the
+    An estimate with the expectation E and the variance V has 2 E²/V degrees of freedom. Missing samples reduce the
     degrees of freedom in proportion to the number of omitted differences.
 
     Parameters
     ----------
     moments : sequence of EstimatorMoments
-        Moments of the m cluster sizes.
+        Moments of the estimates at m cluster sizes.
     theta : ndarray of float64, shape (5, k)
-        Q² N² B² K² R² in units of one sample; NaN means unknown.
+        Squared coefficients Q², N², B², K², R² in units of one sample interval; NaN means unknown.
     variance : ndarray of float64, shape (m, k)
         Measured variances.
     terms : ndarray of int64, shape (m, k)
-        Number of differences averaged.
+        Number of averaged differences.
 
     Returns
     -------
     corrected : ndarray of float64, shape (m, k)
-        Variances without bias, which estimate the Allan variance.
+        Unbiased estimates of the Allan variance.
     edf : ndarray of float64, shape (m, k)
         Degrees of freedom; NaN if θ is unknown or the variance is zero.
     lo, hi : ndarray of float64, shape (m, k)
-        Ends of the 95 % interval of the deviation.
+        Lower and upper end of the 95 % confidence interval of the deviation.
     """
     mean = np.stack([one.mean for one in moments]) @ theta
     allan = np.stack([one.allan for one in moments]) @ theta
@@ -175,25 +176,25 @@ def phase_autocovariance(t: Floats) -> Floats:
     return np.stack([np.where(t == 0.0, 1.0, 0.0), -0.5 * t, flicker, (t * t - 1.0) * t / 12.0])
 
 
-def quadrature_nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
-    """Return nodes and weights to approximate the sum of a function over the integers begin ≤ k < end.
+def summation_nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
+    """Return nodes and weights that approximate the sum of a function over the integers begin ≤ k < end.
 
-    The range is divided into blocks, whose length grows with the distance from the nearest kink. The sum over a block
-    is replaced by a three-point Gauss rule, which is exact for polynomials of degree 5.
+    The range is divided into blocks, whose length grows with the distance from the nearest kink of the function. The
+    sum over a block is approximated by a three-point Gauss rule, which is exact for polynomials of degree 5.
 
     Parameters
     ----------
     begin, end : int
-        Range of the sum.
+        Range of the integers.
     kinks : iterable of int
-        Points at which the function or a derivative is not continuous.
+        Points at which the function or one of its derivatives is not continuous.
 
     Returns
     -------
     places, weights : ndarray of float64
-        Nodes and weights of the sum.
+        Nodes at which the function is evaluated, and weights of the function values.
 
-    >>> places, weights = quadrature_nodes(0, 1000, [0, 400])
+    >>> places, weights = summation_nodes(0, 1000, [0, 400])
     >>> places.size < 200, round(float(weights @ places**5) / sum(k**5 for k in range(1000)), 12)
     (True, 1.0)
     """

@@ -1,21 +1,22 @@
-"""Total variance of a rate: the Allan variance of a recording that is reflected at both ends.
+"""Total variance of a rate, which is the Allan variance of a recording that is extended by reflection at both ends.
 
-"Applications of total variance method in random error analysis of the fiber optic gyro signal" shows that a rate must
-be reflected as a rate and not as a phase. The mean over all phase points gives Howe's TOTVAR of the integrated rate
-(NIST SP 1065 eq. 25). The total variance is the mean of d_i² / (2 m²) over the inner points i, where d_i = x*_{i-m} − 2
-x*_i + x*_{i+m} is a second difference of reflected phase. Before the start, the reflected phase is x*_{-j} = 2 x_0 −
-x_j.
+The rate must be reflected as a rate and not as a phase, see "Applications of total variance method in random error
+analysis of the fiber optic gyro signal". The total variance equals Howe's TOTVAR of the integrated rate (NIST SP 1065
+eq. 25). The variance is the mean of d_i² / (2 m²) over the inner phase points i. Here d_i = x*_{i-m} − 2 x*_i +
+x*_{i+m} is a second difference of the extended phase x*. Before the start of the recording, x*_{-j} = 2 x_0 − x_j.
 
-``total_variance`` returns uncorrected variances, and ``compute_total_curve`` corrects the bias. For τ ≤ T/2, the
-expectation of the total variance is the Allan variance times 1 − a τ/T. The factor a is 0 for white noise, 0.481 for
-flicker noise, 0.750 for random walk (SP 1065 table 7) and −4/3 for quantization noise. The expectation and the degrees
-of freedom are computed exactly for any mixture of noise terms.
+The function ``total_variance`` returns biased variances, and ``compute_total_curve`` corrects the bias. For τ ≤ T/2,
+the expectation of the total variance is the Allan variance times 1 − a τ/T. The factor a is 0 for white noise, 0.481
+for flicker noise, 0.750 for random walk (SP 1065 table 7) and −4/3 for quantization noise. The expectation and the
+degrees of freedom are computed for any mixture of noise terms.
 
-The χ² confidence intervals are given for τ up to T/2. The bias correction uses coefficients that were fitted to the
-same recording. Beyond T/2, nominal 95 % intervals therefore contain the true value in only 67 to 92 of 100 recordings.
+Confidence intervals are computed only for τ ≤ T/2, because the bias correction depends on coefficients that were fitted
+to the same recording. Beyond T/2, nominal 95 % intervals would contain the true value in only 67 to 92 of 100
+recordings.
 
-A ramp R adds a known offset to every second difference. The mean includes the square of the offset, and the degrees of
-freedom include the product of offset and noise. Second differences that contain a missing sample are left out.
+A linear drift R adds a known offset to every second difference. The square of the offset increases the mean, and the
+product of offset and noise reduces the degrees of freedom. Second differences that contain a missing sample are left
+out.
 """
 
 from collections.abc import Sequence
@@ -33,56 +34,59 @@ from monitor.estimation.allan.squared_difference_moments import (
     PhaseRing,
     correct_bias_and_compute_intervals,
     phase_autocovariance,
-    quadrature_nodes,
+    summation_nodes,
     theta_in_sample_units,
     variance_from_squared_differences,
 )
 
 MIN_SHARE: Final = 0.5
-"""Minimum share of the second differences for a bias correction.
+"""Minimum share of the second differences that must be complete for a bias correction.
 
-If missing samples in the middle of a recording remove half of the second differences, the variance of random walk is
-18 % too low, and the variance of quantization noise is 21 % too high (3000 simulated recordings).
+Suppose that missing samples in the middle of a recording remove half of the second differences. In 3000 simulated
+recordings, the total variance was then 18 % too low for random walk and 21 % too high for quantization noise.
 """
 MAX_EXACT_TERMS: Final = 256
-"""Maximum number of samples for which all covariances are summed. Longer recordings use a coarse grid."""
+"""Maximum number of samples for which all covariances are summed.
+
+For longer recordings, the phase is sampled on a coarse grid.
+"""
 MIN_CLUSTER_POINTS: Final = 32
-"""Minimum number of grid points in a cluster."""
+"""Minimum number of points of the coarse grid in a cluster."""
 SQUARED_WEIGHTS: Final = 2.0
-"""Divisor in the definition of the Allan variance, σ² = mean of d² / (2 m²)."""
+"""Divisor in the definition of the Allan variance, which is the mean of d² / (2 m²) for second differences d."""
 _RAMP: Final = NUM_COEFFICIENTS - 1
-"""Row of the ramp R in θ."""
+"""Index of the linear drift R in θ."""
 
 
 @dataclass(frozen=True, slots=True)
-class TotalCurve:
+class TotalVarianceCurve:
     """Total variance of k axes at m averaging times, corrected for bias."""
 
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
-    tvar: Floats  # [m, k] in squared units of the axis; NaN if the noise is unknown or too many samples are missing
-    terms: Ints  # [m, k] number of differences averaged
+    tvar: Floats  # [m, k] total variance in squared units of the axis; NaN if the bias cannot be corrected
+    terms: Ints  # [m, k] number of averaged second differences
     edf: Floats  # [m, k] equivalent degrees of freedom; NaN where ``tvar`` is NaN
-    lo: Floats  # [m, k] lower end of the 95 % interval of the deviation; NaN beyond half the recording
-    hi: Floats  # [m, k] upper end of the 95 % interval of the deviation
+    lo: Floats  # [m, k] lower end of the 95 % confidence interval of the deviation; NaN for τ > T/2
+    hi: Floats  # [m, k] upper end of the 95 % confidence interval of the deviation; NaN for τ > T/2
 
 
 def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Return the uncorrected total variance of rates and the number of second differences.
+    """Return the total variance of rates without bias correction, and the number of averaged second differences.
 
     Parameters
     ----------
     values : ndarray of float64, shape (n, k)
-        Rates of k axes; values that are not finite are missing.
+        Rates of k axes; non-finite values mean missing samples.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples, below n.
 
     Returns
     -------
     tvar : ndarray of float64, shape (m, k)
-        Uncorrected total variance in squared units of the axis.
+        Total variance in squared units of the axis, not corrected for bias.
     terms : ndarray of int64, shape (m, k)
-        Number of terms.
+        Number of averaged second differences.
 
     >>> total_variance(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
@@ -90,17 +94,19 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, _add_all_terms)
 
 
-def compute_total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> TotalCurve:
+def compute_total_curve(
+    values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None
+) -> TotalVarianceCurve:
     """Compute the bias-corrected total variance of a recording with confidence intervals.
 
     Parameters
     ----------
     values : ndarray of float64, shape (n, k)
-        Rates of k axes; values that are not finite are missing.
+        Rates of k axes; non-finite values mean missing samples.
     rate_hz : float
         Sample rate in Hz.
     theta : ndarray of float64, shape (5, k)
-        Fitted Q² N² B² K² R² in SI; NaN means unknown.
+        Fitted Q², N², B², K², R² in SI units; NaN means unknown.
     factors : ndarray of int64, shape (m,), or None
         Cluster sizes in samples, below n. None means powers of two.
     """
@@ -114,21 +120,21 @@ def compute_total_curve(values: Floats, rate_hz: float, theta: Floats, factors: 
 
 def correct_total_variance(
     moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
-) -> TotalCurve:
-    """Correct given total variances for bias, and compute degrees of freedom and confidence intervals.
+) -> TotalVarianceCurve:
+    """Correct given total variances for bias, and compute their degrees of freedom and confidence intervals.
 
     Parameters
     ----------
     moments : sequence of EstimatorMoments
-        Moments of the m cluster sizes.
+        Moments of the total variance estimates at m cluster sizes.
     rate_hz : float
         Sample rate in Hz.
     theta : ndarray of float64, shape (5, k)
-        Fitted Q² N² B² K² R² in SI; NaN means unknown.
+        Fitted Q², N², B², K², R² in SI units; NaN means unknown.
     raw_variance : ndarray of float64, shape (m, k)
-        Uncorrected total variances.
+        Total variances that are not corrected for bias.
     terms : ndarray of int64, shape (m, k)
-        Number of terms.
+        Number of averaged second differences.
     """
     enough = terms >= MIN_SHARE * np.array([one.terms for one in moments])[:, None]
     tvar, edf, lo, hi = correct_bias_and_compute_intervals(
@@ -137,11 +143,11 @@ def correct_total_variance(
     factors = np.array([one.factor for one in moments])
     unsure = 2 * factors > np.array([one.n for one in moments])
     lo[unsure] = hi[unsure] = np.nan
-    return TotalCurve(factors / rate_hz, factors, tvar, terms, edf, lo, hi)
+    return TotalVarianceCurve(factors / rate_hz, factors, tvar, terms, edf, lo, hi)
 
 
 def total_estimator_moments(n: int, factor: int) -> EstimatorMoments:
-    """Return the mean and the covariance of the total variance at one cluster size.
+    """Return the mean and the covariance of the total variance estimate at one cluster size.
 
     Parameters
     ----------
@@ -154,7 +160,7 @@ def total_estimator_moments(n: int, factor: int) -> EstimatorMoments:
     >>> print(f"{one.mean[3] / one.allan[3]:.3f}")
     0.625
     """
-    places, weights = quadrature_nodes(1, n, [-(-factor // 2), factor, n - factor, n - factor // 2])
+    places, weights = summation_nodes(1, n, [-(-factor // 2), factor, n - factor, n - factor // 2])
     points, signs = _points(places, n, factor)
     half = 0.5 / factor**2
     mean = half / (n - 1) * (_squares(points, signs) @ weights)
@@ -163,7 +169,7 @@ def total_estimator_moments(n: int, factor: int) -> EstimatorMoments:
 
 
 def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
-    """Return the phase points [i, 5] of the second differences at ``places``, and the weights of the points."""
+    """Return the indices [i, 5] and weights of the phase points in the second differences at ``places``."""
     front, behind = places < m, places > n - m
     points = [0.0 * places, np.abs(places - m), places, np.minimum(places + m, 2 * n - m - places), n + 0.0 * places]
     signs = [2.0 * front, 1.0 - 2.0 * front, -2.0 + 0.0 * places, 1.0 - 2.0 * behind, 2.0 * behind]
@@ -171,7 +177,7 @@ def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
 
 
 def _squares(points: Floats, signs: Floats) -> Floats:
-    """Return the mean squares [5, i] of weighted sums of phase points, for unit coefficients."""
+    """Return the mean squares [5, i] of weighted sums of phase points for each unit coefficient."""
     lags = points[:, :, None] - points[:, None, :]
     random = np.einsum("ip,iq,aipq->ai", signs, signs, phase_autocovariance(lags))
     ramp = (signs * 0.5 * points**2).sum(axis=1) ** 2
@@ -179,10 +185,10 @@ def _squares(points: Floats, signs: Floats) -> Floats:
 
 
 def _covariance(n: int, m: int) -> Floats:
-    """Return the matrix [5, 5] of the quadratic form in θ for the variance of the total variance.
+    """Return the matrix C [5, 5] for which Σ_ab θ_a θ_b C_ab is the variance of the total variance estimate.
 
-    Longer recordings use a coarse grid, because the autocovariances are smooth. If a recording contains many clusters,
-    each additional second difference adds the same amount to the sums.
+    For recordings of more than ``MAX_EXACT_TERMS`` samples, the smooth autocovariances are evaluated on a coarse grid.
+    If a recording contains many clusters, each additional second difference adds the same amount to the sums.
     """
     scale = 2.0 * (0.5 / (m * m * (n - 1.0))) ** 2
     if n <= MAX_EXACT_TERMS:
@@ -200,9 +206,9 @@ def _covariance(n: int, m: int) -> Floats:
 def _pair_sums(n: int, m: int, step: float) -> Floats:
     """Return the sums [5, 5] of the products of covariances over all pairs of second differences.
 
-    The phase is sampled every ``step`` samples, so each pair represents step² pairs. The covariance of quantization
-    noise is nonzero only if phase points coincide, so each pair of coinciding points represents ``step`` pairs. The two
-    ends of the recording are exceptions, because all reflected second differences contain an end point.
+    On a coarse grid with one phase point per ``step`` samples, each pair represents step² pairs. The covariance of
+    quantization noise is nonzero only if phase points coincide, so each coinciding pair represents ``step`` pairs. The
+    two ends of the recording are exceptions, because all reflected second differences contain an end point.
     """
     at = np.arange(n + 1)
     lags = phase_autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
@@ -217,7 +223,7 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
     products[0] /= step
     products[1:, 0] /= step
     products[0, 0] = step * (parts[0] @ parts[0])
-    products[_RAMP, _RAMP] = 0.0  # a ramp alone has no variance
+    products[_RAMP, _RAMP] = 0.0  # a linear drift without noise has no variance
     joined = products[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS]
     joined[0] += products[NUM_COEFFICIENTS, :NUM_COEFFICIENTS]
     joined[:, 0] += products[:NUM_COEFFICIENTS, NUM_COEFFICIENTS]
@@ -226,7 +232,7 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
 
 
 def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
-    """Combine phase points [4, points, …] to second differences [4, terms, …]."""
+    """Combine phase points [4, points, …] into second differences [4, terms, …]."""
     terms = signs[:, 0, None] * of_points[:, rows[:, 0]]
     for p in range(1, rows.shape[1]):
         terms += signs[:, p, None] * of_points[:, rows[:, p]]
@@ -240,20 +246,20 @@ def _add_all_terms(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
 
 @compiled
 def add_total_variance_squares(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
-    """Add the squares of a range of second differences of reflected phase to sums.
+    """Add the squares of a range of second differences of the extended phase to ``sums``.
 
     Parameters
     ----------
     ring : PhaseRing
-        Phase of the recording.
+        Ring buffer with the phase of the recording.
     m : int
         Cluster size in samples.
     begin, end : int
-        Range begin ≤ i < end of the phase points.
+        Range begin ≤ i < end of the middle phase points of the second differences.
     sums : ndarray of float64, shape (k,)
-        Sums of squares, updated in place.
+        Sum of squares of each axis, updated in place.
     terms : ndarray of int64, shape (k,)
-        Number of second differences, updated in place.
+        Number of second differences of each axis, updated in place.
     """
     i = begin
     while i < end:
@@ -266,7 +272,7 @@ def add_total_variance_squares(ring: PhaseRing, m: int, begin: int, end: int, su
 
 @compiled
 def _add_run(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
-    """Add the squares of consecutive second differences that are all reflected in the same way.
+    """Add the squares of consecutive second differences whose phase points are reflected at the same ends.
 
     A reflected phase point is twice the phase at the end of the recording minus the phase at the mirror point.
     """

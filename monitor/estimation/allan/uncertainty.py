@@ -1,18 +1,19 @@
-"""Uncertainty of an Allan variance: covariances of the estimates, degrees of freedom and χ² intervals.
+"""Covariances, degrees of freedom and χ² confidence intervals of overlapping Allan variances.
 
-For Gaussian noise, the covariance of two overlapping Allan variances is a quadratic form in θ = (Q², N², B², K²),
-because Cov(d², e²) = 2 Cov(d, e)² (Isserlis):
+For Gaussian noise, Isserlis' theorem gives Cov(d², e²) = 2 Cov(d, e)² for second differences d and e. The covariance of
+two overlapping Allan variances is therefore a quadratic form in θ = (Q², N², B², K²):
 
     Cov(σ²_i, σ²_j) = Σ_ab θ_a θ_b C^ab_ij,   C^ab_ij = 1/(2 M_i M_j) Σ_c w(c) r^a_ij(c) r^b_ij(c).
 
-Here r is a second difference of the generalised autocovariance of phase, over clusters of m_i and m_j samples. The
-autocovariances of Q, N, B and K are δ(t), −|t|/2, t² ln|t| / 2π and (|t|³ − |t|)/12. The factor w(c) is the number of
-pairs of second differences at lag c, and M is the number of second differences.
+Here r is the covariance, divided by m_i m_j, of two second differences at lag c over clusters of m_i and m_j samples.
+The covariance follows from the generalised autocovariances of phase, which are δ(t) for Q, −|t|/2 for N, t² ln|t| / 2π
+for B, and (|t|³ − |t|)/12 for K. The factor w(c) is the number of pairs of second differences at lag c, and M is the
+number of second differences.
 
-For a mixture of noise terms, the exact number of degrees of freedom is 2 σ⁴ / Var(σ²). The formulas of Greenhall &
-Riley (PTTI 2003) hold for a single power law and have an error of 15–25 % near m = 1.
+For any mixture of noise terms, the number of degrees of freedom is 2 σ⁴ / Var(σ²). The formulas of Greenhall & Riley
+(PTTI 2003) hold only for a single power law. Their error is 15–25 % near m = 1.
 
-All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
+Time is in units of one sample interval τ0, so θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
 """
 
 import math
@@ -30,40 +31,40 @@ from monitor.noise.effects.ieee952.bias_instability import FLICKER_AVAR, BiasIns
 Q, N, B, K, R = range(5)
 
 NOISES: Final = 4
-"""Number of random noise terms, Q N B K. The ramp R is deterministic and adds no variance."""
+"""Number of random noise terms Q, N, B and K. The linear drift R is deterministic and adds no variance."""
 
 PAIRS: Final = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
-"""Pairs a ≤ b of noise terms, in the order of the last index of the table."""
+"""Pairs a ≤ b of noise terms, in the order of the last dimension of ``CovarianceTable.covariance``."""
 
 LAG_STEP: Final = 0.5
-"""Ratio of the length of a block of lags to the distance from the nearest kink."""
+"""Ratio between the length of a summation block and the distance of the block from the nearest kink."""
 
 TAIL: Final = 8.0
-"""Lag in units of (m_i + m_j) beyond which differences of t² ln t are computed from a series."""
+"""Lag in units of m_i + m_j beyond which differences of t² ln t are computed from a series expansion."""
 
 UNLIMITED_SAMPLES: Final = 1 << 62
-"""Number of samples that represents an unlimited number."""
+"""Number of samples that stands for "without limit"."""
 
 TABLE_STEP: Final = 1.1
-"""Growth of the window after which the covariance table is recomputed."""
+"""Growth factor of the number of samples after which the covariance table is recomputed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CovarianceTable:
-    """Covariances of Allan variances for one window length and unit coefficients. The arrays are read-only."""
+    """Covariances of Allan variances for one window length and unit coefficients, in read-only arrays."""
 
-    n: int  # samples in the window
+    n: int  # number of samples in the window
     factors: Ints  # [m] cluster sizes in samples
-    terms: Ints  # [m] number of second differences without missing samples; ≤ 0 if the window is too short
-    covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN if the window is too short
-    slope: Floats  # [4] variance of ``batch.rate_slope_from_thirds`` for unit coefficients
+    terms: Ints  # [m] number of second differences if no samples are missing; ≤ 0 if the window is too short
+    covariance: Floats  # [m, m, 10] C^ab_ij for the pairs a ≤ b; NaN if the window is too short
+    slope: Floats  # [4] variance of ``batch.rate_slope_from_thirds`` for each unit coefficient
     bend: Floats  # [m, 4] covariance of ``slope`` with ``batch.rate_slope_per_tau``
 
 
 class CovarianceTablesByAxis:
-    """Covariance tables of six axes for a growing window.
+    """Covariance tables of six axes whose number of samples grows.
 
-    Axes that use the whole window share a covariance table.
+    All axes that use the whole window share one covariance table.
 
     Parameters
     ----------
@@ -76,10 +77,10 @@ class CovarianceTablesByAxis:
     def __init__(self, factors: Ints, capacity: int) -> None:
         self._factors = factors
         self._capacity = capacity
-        self._tables: dict[int | None, CovarianceTable] = {}  # by restarted axis, or None for the whole window
+        self._tables: dict[int | None, CovarianceTable] = {}  # by index of a restarted axis; None for the whole window
 
     def table_of_axis(self, axis: int, n: int, window_samples: int) -> CovarianceTable:
-        """Return the covariance table of an axis, for n or up to 10 % fewer samples.
+        """Return the covariance table of an axis, computed for n or up to 10 % fewer samples.
 
         Parameters
         ----------
@@ -97,16 +98,16 @@ class CovarianceTablesByAxis:
         return known
 
     def samples_until_table_expires(self, table: CovarianceTable, n: int) -> int:
-        """Return the number of further samples for which a covariance table stays valid.
+        """Return the number of further samples after which a covariance table must be recomputed.
 
-        For a full window, the result is ``UNLIMITED_SAMPLES``.
+        The table of a full window never expires, so the result is ``UNLIMITED_SAMPLES``.
 
-            Parameters
-            ----------
-            table : CovarianceTable
-                Result of ``table_of_axis`` for n samples.
-            n : int
-                Number of newest samples that the axis uses.
+        Parameters
+        ----------
+        table : CovarianceTable
+            Result of ``table_of_axis`` for n samples.
+        n : int
+            Number of newest samples that the axis uses.
         """
         if n >= self._capacity:
             return UNLIMITED_SAMPLES
@@ -114,9 +115,9 @@ class CovarianceTablesByAxis:
 
 
 def covariance_table(n: int, factors: Ints) -> CovarianceTable:
-    """Compute the covariances of overlapping Allan variances for a window of n samples.
+    """Compute the covariances of the overlapping Allan variances of n samples.
 
-    In the example, white noise at m = 1 has 20 000 degrees of freedom for 30 000 second differences.
+    As the example shows, 30 000 second differences of white noise at m = 1 have 20 000 degrees of freedom.
 
     Parameters
     ----------
@@ -132,7 +133,7 @@ def covariance_table(n: int, factors: Ints) -> CovarianceTable:
     factors = np.ascontiguousarray(factors, np.int64)
     covariance = np.full((factors.size, factors.size, len(PAIRS)), np.nan)
     _fill(n, factors, covariance)
-    # t² ln t describes continuous 1/f noise, and sampled 1/f noise is weaker at the shortest τ.
+    # The autocovariance t² ln t describes continuous 1/f noise. Sampled 1/f noise is weaker at the shortest τ.
     share = np.array([_sampled_flicker(m) for m in factors.tolist()])
     for pair, (a, b) in enumerate(PAIRS):
         covariance[:, :, pair] *= np.outer(share, share) ** ((a == B) + (b == B))
@@ -145,15 +146,15 @@ def covariance_table(n: int, factors: Ints) -> CovarianceTable:
 
 @cache
 def _sampled_flicker(m: int) -> float:
-    """Return the ratio of the Allan deviations of sampled and continuous 1/f noise at one cluster size."""
+    """Return the ratio between the Allan deviations of sampled and continuous 1/f noise at one cluster size."""
     return float(np.sqrt(BiasInstability(B=1.0).avar(np.array([float(m)]), 1.0)[0] / FLICKER_AVAR))
 
 
 def _slope_variance(n: int) -> Floats:
-    """Return the variance [4] of ``batch.rate_slope_from_thirds`` for unit Q, N, B and K at τ0 = 1.
+    """Return the variance [4] of ``batch.rate_slope_from_thirds`` for unit Q, N, B and K and τ0 = 1.
 
-    The slope is a weighted sum of four phase points with the spacing τ = n/3, divided by 2τ². The variances of the
-    weighted sum are 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3.
+    The slope is a weighted sum of four phase points at intervals of τ = n/3, divided by 2τ². The variance of the
+    weighted sum is 4 for Q, 2τ for N, (9 ln 3 − 8 ln 2) τ²/π for B, and 5τ³/3 for K.
     """
     if n < 3:
         return np.full(NOISES, np.nan)
@@ -163,9 +164,10 @@ def _slope_variance(n: int) -> Floats:
 
 
 def _bend_covariance(n: int, m: int) -> Floats:
-    """Return the covariance [4] of the two slopes in ``batch`` at one cluster size, for unit Q, N, B and K.
+    """Return the covariance [4] of the two slopes in ``batch`` at one cluster size for unit Q, N, B and K.
 
-    Each slope is a weighted sum of phase points. At most 128 points represent each block of m points.
+    Each slope is a weighted sum of phase points. To limit the effort, at most 128 phase points represent a block of m
+    points.
     """
     if n < 3 or n + 1 <= 2 * m:
         return np.full(NOISES, np.nan)
@@ -181,17 +183,17 @@ def _bend_covariance(n: int, m: int) -> Floats:
     return np.array([float((weight * part).sum()) for part in parts])
 
 
-class PerTauSpanDegreesOfFreedom:
-    """Degrees of freedom of Allan variances that use a different number of newest samples at each τ.
+class DegreesOfFreedomWithSpanPerTau:
+    """Degrees of freedom of Allan variances that are computed from a different number of samples at each τ.
 
     Parameters
     ----------
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
     spans : ndarray of int64, shape (m,)
-        Number of samples that each τ uses.
+        Number of newest samples that are used at each τ.
     columns : ndarray of float64, shape (m, 4 or more)
-        Allan variance of unit Q, N, B and K at τ0 = 1.
+        Allan variances of unit Q, N, B and K at τ0 = 1, in the first four columns.
     """
 
     def __init__(self, factors: Ints, spans: Ints, columns: Floats) -> None:
@@ -208,11 +210,11 @@ class PerTauSpanDegreesOfFreedom:
         Parameters
         ----------
         theta : ndarray of float64, shape (5, k)
-            Q² N² B² K² R² in SI; NaN means not fitted.
+            Squared coefficients Q², N², B², K², R² in SI units; NaN means not fitted.
         rate_hz : float
             Sample rate in Hz.
         terms : ndarray of int64, shape (m, k)
-            Number of second differences averaged.
+            Number of averaged second differences.
         """
         shape = np.maximum(theta[:NOISES], 0.0) * (rate_hz ** np.array([2.0, 1.0, 0.0, -1.0]))[:, None]
         shape = np.where(np.isnan(shape).any(axis=0) | (shape.sum(axis=0) == 0.0), np.eye(NOISES)[1][:, None], shape)
@@ -229,11 +231,11 @@ def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) ->
     Parameters
     ----------
     avar : ndarray of float64
-        Allan variance; NaN stays NaN.
+        Allan variance. For NaN, the result is NaN.
     edf : ndarray of float64
         Degrees of freedom, in the shape of ``avar``.
     probability : float
-        Probability of the interval.
+        Probability that the interval contains the true value.
 
     Returns
     -------
@@ -247,7 +249,7 @@ def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) ->
     tail = (1.0 - probability) / 2.0
     safe = np.where(edf > 0.0, edf, np.nan)
     low, high = chi2_quantile(safe, tail), chi2_quantile(safe, 1.0 - tail)
-    # With less than one degree of freedom, the upper end may be infinite.
+    # With less than one degree of freedom, the upper end of the interval may be infinite.
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         lo, hi = np.sqrt(avar * safe / high), np.sqrt(avar * safe / low)
     return lo, np.where((low == 0.0) & (avar >= 0.0), np.inf, hi)
@@ -270,10 +272,9 @@ def _fill(n: int, factors: Ints, covariance: Floats) -> None:
 
 @compiled
 def _sum_lags(n: int, small: int, large: int, sums: Floats) -> None:
-    """Sum the products of covariances over the lags between two second differences.
+    """Sum the products of covariances over all lags between two second differences.
 
-    The covariances have kinks at a few lags. The sum over each smooth range between two kinks is approximated in
-    blocks.
+    The covariances have kinks at a few lags. Between two kinks, the sum over the lags is approximated in blocks.
     """
     for pair in range(10):
         sums[pair] = 0.0
@@ -297,9 +298,10 @@ def _sum_lags(n: int, small: int, large: int, sums: Floats) -> None:
 
 @compiled
 def _add_blocks(kink: int, count: int, side: float, n: int, small: int, large: int, sums: Floats) -> None:
-    """Add ``count`` lags that follow a kink, in blocks whose length grows with the distance from the kink.
+    """Add ``count`` lags on one side of a kink, in blocks whose length grows with the distance from the kink.
 
-    The sum over a block is approximated by the Gauss rule of ``squared_difference_moments.quadrature_nodes``.
+    The sum over a block is approximated by the three-point Gauss rule of
+    ``squared_difference_moments.summation_nodes``.
     """
     done = 0
     while done < count:

@@ -1,22 +1,22 @@
-"""Sliding window with the overlapping Allan variance of the last L samples, updated with every sample.
+"""Sliding window that updates the overlapping Allan variance of the last L samples with every new sample.
 
-For every cluster size m and axis, the window stores the sum S and the number C of the squared second differences of
-phase. The Allan variance of the rate is S / (2 m² C), see "Dynamic extraction of random drift error coefficients of
-MEMS gyroscopes", equations 12 to 15. A new sample adds one second difference and removes the oldest second difference,
-so the cost does not depend on the window length. Missing samples are NaN in the input.
+For every axis and cluster size m, the window stores the sum S and the number C of the squared second differences of
+phase. The Allan variance of the rate is S / (2 m² C) ("Dynamic extraction of random drift error coefficients of MEMS
+gyroscopes", equations 12 to 15). A new sample adds one second difference and removes the oldest one, so the cost does
+not depend on the window length. NaN in the input means a missing sample.
 
-Three measures keep the sums exact.
+Three measures keep the sums of squares exact.
 
-- Phase is an integer: the running sum of the samples times 2^s, modulo 2⁶⁴. The rounding error of each sample is added
-  to the next sample, so a second difference is exact to one unit of 2^-s. The exponent s is chosen so that full-scale
-  input cannot overflow at the longest τ.
-- A second difference has the same square when it is added and when it is removed. The rounding errors of the sums are
-  stored in a second double (Knuth's TwoSum).
-- A running count of missing samples shows whether a second difference contains a missing sample. Incomplete second
-  differences are neither added nor removed.
+- Phase is an integer: the running sum of the samples times 2^s, modulo 2⁶⁴. The rounding error of each sample is
+  carried over to the next sample. A second difference is therefore exact to one unit of 2^-s. The exponent s is chosen
+  so that full-scale input cannot cause an overflow at the longest τ.
+- A second difference of integer phase has exactly the same square when it is removed as when it was added. The rounding
+  errors of the sums are accumulated in a second double-precision number (Knuth's TwoSum).
+- A running count of missing samples shows whether a second difference is complete. Incomplete second differences are
+  neither added nor removed.
 
-Rounding adds white phase noise of variance 2^-2s/12. For an hour at 100 Hz and noise of 1e-4 rad/s or m/s² per sample,
-the relative change of the Allan variance is 1e-10.
+Rounding adds white phase noise of variance 2^-2s/12. For a window of one hour at 100 Hz and noise of 1e-4 rad/s or m/s²
+per sample, the relative change of the Allan variance is 1e-10.
 """
 
 from typing import Any, Final
@@ -38,8 +38,8 @@ from monitor.estimation.allan.window_kernel import (
     WIDTH,
     WindowBuffers,
     append_staged_samples,
+    drift_slopes_by_axis_and_tau,
     keep_newest,
-    rate_slopes_per_axis_and_tau,
     view_window_arrays,
 )
 
@@ -48,23 +48,24 @@ MIN_LENGTH: Final = 100
 MAX_LENGTH: Final = 10_000_000
 """Maximum window length in samples. Each sample needs up to 96 bytes of memory."""
 SKIP_BLOCK_ROWS: Final = 4096
-"""Largest number of missing samples processed in one call."""
+"""Maximum number of missing samples that are appended at a time."""
 FULL_SCALE: Final = (70.0,) * 3 + (400.0,) * 3 + (1.0,) * 2
-"""Largest mean over the longest τ in rad/s and m/s² (4000 °/s, 40 g)."""
+"""Largest allowed mean over the longest τ, in rad/s (4000 °/s) and m/s² (40 g)."""
 QUICK_S: Final = 10.0
-"""Minimum duration of the samples for a displayed Allan deviation, in seconds.
+"""Minimum duration of the samples from which a displayed Allan deviation is computed, in seconds.
 
-For 1000 samples at 100 Hz, the displayed Allan deviation at m = 1 fluctuates by 3 %.
+In 10 s at 100 Hz, the displayed Allan deviation at m = 1 fluctuates by 3 %.
 """
 QUICK_CLUSTERS: Final = 16
-"""Minimum number of clusters for a displayed Allan deviation, for an error of 20 %."""
+"""Minimum number of clusters from which a displayed Allan deviation is computed. The error is then about 20 %."""
 
 
-def samples_per_displayed_tau(factors: Ints, rate_hz: float, window_samples: int) -> Ints:
+def newest_samples_per_displayed_tau(factors: Ints, rate_hz: float, window_samples: int) -> Ints:
     """Return the number of newest samples from which each displayed Allan deviation is computed.
 
-    The duration is 16 τ, at least 10 s and at most the whole window. A change of N is therefore visible within a minute
-    for τ up to 3 s. A fit to the displayed Allan deviations would find spurious terms (``docs/windows.md``).
+    The duration of the samples is 16 τ, but at least 10 s and at most the whole window. A change of the white noise is
+    therefore visible within a minute for τ up to 3 s. The displayed values are not used for fits, because a fit to them
+    would find spurious noise terms (``docs/windows.md``).
 
     Parameters
     ----------
@@ -80,16 +81,16 @@ def samples_per_displayed_tau(factors: Ints, rate_hz: float, window_samples: int
     ndarray of int64, shape (m,)
         Number of newest samples for each cluster size.
 
-    >>> samples_per_displayed_tau(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
+    >>> newest_samples_per_displayed_tau(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
     [1000, 1600, 100000]
     """
     return np.minimum(np.maximum(QUICK_CLUSTERS * factors, round(QUICK_S * rate_hz)), window_samples)
 
 
 def integer_phase_scale(largest_cluster: int) -> Floats:
-    """Return the scale 2^s [LANES] that converts samples to integer phase.
+    """Return the scale factors 2^s [LANES] that convert samples to integer phase.
 
-    A scaled second difference at the largest cluster size stays below 2⁶³.
+    The factors are chosen so that second differences at the largest cluster size stay below 2⁶³.
     """
     bits = 62 - np.ceil(np.log2(2.0 * largest_cluster * np.array(FULL_SCALE)))
     return np.asarray(np.exp2(np.minimum(bits, 48.0)))
@@ -105,8 +106,8 @@ class AllanWindow:
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples, ascending, from 1 to length/2.
     spans : ndarray of int64, shape (m,), or None
-        Number of newest samples for each cluster size, from two clusters to ``length``. None means the whole window. If
-        spans are given, a cluster size may occur several times.
+        Number of newest samples that are used at each cluster size, from two clusters to ``length``. None means the
+        whole window. If ``spans`` is given, a cluster size may occur several times.
 
     Raises
     ------
@@ -135,7 +136,7 @@ class AllanWindow:
         self.spans = spans.astype(np.int64)
         self._taus = int(factors.size)
         self._scale = integer_phase_scale(int(factors.max()))
-        # Three arrays, because each array that is passed to a kernel costs 50 ns. See view_window_arrays.
+        # All data is stored in three arrays, because each array that is passed to compiled code costs 50 ns.
         taus, places = self._taus, length + 1 + RUN_SAMPLES
         self._ints = _aligned(LANES + -(-2 * taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
         self._floats = _aligned((2 + 2 * RUN_SAMPLES + 2 * taus + STAGE_SAMPLES) * LANES, np.float64)
@@ -160,7 +161,7 @@ class AllanWindow:
         return int(self._state[TOTAL])
 
     def discard_samples(self) -> None:
-        """Discard all samples."""
+        """Discard all samples in the window."""
         self.resets += 1
         self._terms[:] = 0
         self._floats[:] = 0
@@ -168,12 +169,12 @@ class AllanWindow:
         self._state[[TOTAL, LAST_MISSING, WIDTH]] = (0, -(1 << 62), LANES)
 
     def append_samples(self, values: Floats) -> None:
-        """Append samples to the window, and remove the oldest samples.
+        """Append samples to the window. If the window is full, the oldest samples are removed.
 
         Parameters
         ----------
         values : ndarray of float, shape (n, 6)
-            Samples in rad/s and m/s². NaN and values of 1e7 and more count as missing.
+            Samples in rad/s and m/s². NaN and values of 1e7 or more count as missing samples.
 
         Raises
         ------
@@ -194,11 +195,12 @@ class AllanWindow:
 
     def copy_to_input_buffer(self, values: Floats) -> None:
         """Copy up to ``STAGE_SAMPLES`` samples [n, 6] to the input buffer of the compiled kernels."""
-        # A copy, because each new memory layout of an array triggers a compilation of several seconds.
+        # The samples are copied, because each new memory layout of an array would trigger a compilation of several
+        # seconds.
         self._stage[: len(values)] = values
 
     def kernel_buffers(self) -> WindowBuffers:
-        """Return the arrays of the window for the compiled kernels."""
+        """Return the arrays of the window in the form that the compiled kernels expect."""
         return WindowBuffers(self._ints, self._floats, self._missing, self._taus, self.length)
 
     def append_missing_samples(self, n: int) -> None:
@@ -206,8 +208,7 @@ class AllanWindow:
         if n > self.length:
             self.discard_samples()
             return
-        # Blocks limit the memory for a long outage.
-
+        # The missing samples are appended in blocks, to limit the memory that a long outage needs.
         hole = np.full((min(n, SKIP_BLOCK_ROWS), AXES), np.nan)
         for start in range(0, n, SKIP_BLOCK_ROWS):
             self.append_samples(hole[: n - start])
@@ -230,20 +231,20 @@ class AllanWindow:
         sums = (self._sums + self._rest)[:, :AXES]
         m = self.factors[:, None] * self._scale[:AXES]
         terms = self._terms[:, :AXES]
-        # Rounding causes second differences of up to one unit on a constant axis.
+        # Even on a constant axis, rounding causes second differences of up to one unit.
         sums = np.where(sums <= terms, 0.0, sums)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
 
-    def rate_slopes_per_axis_and_tau(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
+    def drift_slopes_by_axis_and_tau(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
         """Return the slope of the rate of each axis, and the slope at each averaging time.
 
-        The definitions are given at ``batch.rate_slope_from_thirds`` and ``batch.rate_slope_per_tau``.
+        The slopes are defined in ``batch.rate_slope_from_thirds`` and ``batch.rate_slope_per_tau``.
 
         Parameters
         ----------
         lengths : ndarray of int64, shape (6,), or None
-            Number of newest samples of each axis, independent of ``spans``. None means all samples in the window.
+            Number of newest samples that are used for each axis. None means all samples in the window.
 
         Returns
         -------
@@ -254,15 +255,15 @@ class AllanWindow:
         """
         slope, slopes = np.empty(AXES), np.empty((self._taus, AXES))
         lengths = np.full(AXES, self.samples_in_window) if lengths is None else lengths
-        rate_slopes_per_axis_and_tau(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
+        drift_slopes_by_axis_and_tau(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
         return slope / self._scale[:AXES], slopes / self._scale[:AXES]
 
     def term_counts(self) -> Ints:
-        """Return the number of second differences [m, 6] in each Allan variance."""
+        """Return the number of second differences [m, 6] that each Allan variance averages."""
         return self._terms[:, :AXES].copy()
 
     def newest_samples(self, axis: int, n: int) -> Floats:
-        """Return up to n newest samples of one axis, computed from the phase; NaN means missing.
+        """Return up to n newest samples of one axis, reconstructed from the phase; NaN means missing.
 
         Parameters
         ----------
@@ -277,18 +278,18 @@ class AllanWindow:
         return np.where(np.diff(missing) > 0, np.nan, np.diff(phase) / self._scale[axis])
 
     def view_phase_ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
-        """Return a view of the ring buffer of phase, which is valid until samples are appended.
+        """Return a view of the phase in the ring buffer, which is valid until new samples are appended.
 
         Returns
         -------
         phase : ndarray of int64, shape (rows, LANES)
             Integer phase modulo 2⁶⁴. The first six columns are the axes.
         missing : ndarray of int32, shape (rows, LANES)
-            Running count of missing samples before each point.
+            Running count of the missing samples before each phase point.
         first : int
-            Row of the oldest phase point of the window.
+            Row of the oldest phase point in the window.
         unit : ndarray of float64, shape (6,)
-            Size of one unit of phase in rad/s and m/s².
+            Value of one integer unit of phase in rad/s and m/s².
         """
         rows = (self._phase.size // LANES, LANES)
         phase, missing = self._phase.reshape(rows), self._missing.reshape(rows)

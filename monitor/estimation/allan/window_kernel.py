@@ -1,7 +1,7 @@
-"""Compiled kernels of ``AllanWindow``, which append phase to the ring buffer and update the sums of all cluster sizes.
+"""Compiled kernels of ``AllanWindow``, which store phase in a ring buffer and update the sums of squared differences.
 
-The arithmetic is described in ``window``. Three arrays contain all data of a window (``WindowBuffers``), because each
-array that Python passes to compiled code costs 50 ns.
+The arithmetic is described in the module ``window``. All data of a window is stored in the three arrays of
+``WindowBuffers``, because each array that Python passes to compiled code costs 50 ns.
 """
 
 from typing import Final, NamedTuple
@@ -14,50 +14,53 @@ from monitor.common.compiled import compiled, inlined
 
 AXES: Final = 6
 LANES: Final = 8
-"""Number of columns per sample, which are six axes and two columns of padding."""
+"""Number of columns per sample: six axes and two columns of padding."""
 TOTAL, NEWEST, LAST_MISSING, WIDTH = 0, 1, 2, 3
-"""Indices of the state array.
+"""Indices of the elements of the state array.
 
 The elements are the number of samples since the last reset, the row of the newest phase point, the number of the newest
-missing sample, and ``LANES``. The kernel reads ``LANES`` from the array, because a loop of constant length would not be
-vectorized.
+missing sample, and ``LANES``. The compiled code reads ``LANES`` from the array, because a loop of constant length would
+not be vectorized.
 """
 RUN_SAMPLES: Final = 64
-"""Maximum number of samples whose phase is written before the sums are updated."""
+"""Maximum number of samples whose phase is stored before the sums of squared differences are updated."""
 STAGE_SAMPLES: Final = 512
-"""Maximum number of samples passed to the kernel at a time."""
+"""Maximum number of samples that are passed to the compiled code at a time."""
 LINE: Final = 8
 """Number of 8-byte numbers in a cache line."""
 MIN_PRESENT_SHARE: Final = 0.98
-"""Minimum share of samples that must be present for a slope."""
+"""Minimum share of samples that must be present to compute a slope."""
 LEVEL: Final = 64
 """Number of newest samples whose mean is the reference level of an axis."""
 NEVER: Final = 1 << 62
-"""Marker for a missing reference level."""
+"""Value that marks a missing reference level."""
 BEND_POINTS: Final = 64
-"""Number of phase points that represent a block. The error is 1 % of the standard deviation of the sum."""
+"""Number of phase points that represent a block in a sum.
+
+The resulting error is 1 % of the standard deviation of the sum.
+"""
 
 
 class WindowBuffers(NamedTuple):
-    """Memory of a window, in three arrays that are passed to compiled code."""
+    """Memory of a sliding window in three arrays, which are passed to compiled code."""
 
-    ints: Ints  # see ``view_window_arrays``
-    floats: Floats  # see ``view_window_arrays``
+    ints: Ints  # integer fields of ``WindowArrays``
+    floats: Floats  # floating-point fields of ``WindowArrays``
     missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
     taus: int  # number of cluster sizes
-    length: int  # samples in the full window
+    length: int  # number of samples in a full window
 
 
 class WindowArrays(NamedTuple):
-    """Views of the arrays of a window with m cluster sizes."""
+    """Views of the data of a sliding window with m cluster sizes."""
 
-    state: Ints  # [LANES] see ``TOTAL``
+    state: Ints  # [LANES] elements at the indices ``TOTAL``, ``NEWEST``, ``LAST_MISSING`` and ``WIDTH``
     factors: Ints  # [m] cluster sizes in samples
-    spans: Ints  # [m] number of newest samples that each row uses
+    spans: Ints  # [m] number of newest samples that are used at each cluster size
     terms: Ints  # [m · LANES] number of second differences in each sum
-    phase: Ints  # [places · LANES] ring of integer phase
-    scaling: Floats  # [2 · LANES] units of phase per unit of the axis, and rounding errors to add to the next sample
-    scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares that are added to the sums, and squares that are subtracted
+    phase: Ints  # [places · LANES] ring buffer of integer phase
+    scaling: Floats  # [2 · LANES] scale factors to integer phase, and rounding errors to add to the next sample
+    scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares to add to the sums, and squares to subtract
     sums: Floats  # [m · LANES] sums of squared second differences
     rest: Floats  # [m · LANES] rounding errors of the sums
     stage: Floats  # [at least STAGE_SAMPLES · AXES] input buffer
@@ -65,7 +68,7 @@ class WindowArrays(NamedTuple):
 
 
 def view_window_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int) -> WindowArrays:
-    """Return views of the parts of the arrays of a window.
+    """Return a view of each field that the arrays of a sliding window contain.
 
     Parameters
     ----------
@@ -83,28 +86,28 @@ def view_window_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], t
 
 
 compiled_view_window_arrays = compiled(view_window_arrays)
-"""Compiled version of ``view_window_arrays`` for kernels."""
+"""Version of ``view_window_arrays`` that compiled code can call."""
 
 
 @compiled
 def append_staged_samples(
     ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int
 ) -> None:
-    """Append n samples of the input buffer to the window, and update the sums of all cluster sizes.
+    """Append n samples from the input buffer to the window, and update the sums of all cluster sizes.
 
-    The kernel appends the phase of up to ``RUN_SAMPLES`` samples before the sums of each τ are updated. The processor
-    can prefetch the few memory ranges of one τ.
+    The phase of up to ``RUN_SAMPLES`` samples is stored before the sums of each τ are updated. In this order, the
+    processor can prefetch the few memory ranges that belong to one τ.
 
     Parameters
     ----------
     ints, floats, missing, taus
         Fields of ``WindowBuffers``.
     start : int
-        First row of the input buffer.
+        Index of the first sample in the input buffer.
     n : int
-        Number of rows.
+        Number of samples.
     """
-    # A single assignment, because each access to a field of a named tuple changes a reference count.
+    # All fields are unpacked at once, because each access to a field of a named tuple changes a reference count.
     state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = compiled_view_window_arrays(
         ints, floats, missing, taus
     )
@@ -117,7 +120,7 @@ def append_staged_samples(
         for row in range(done, done + run):
             _append(stage[row * AXES : (row + 1) * AXES], scaling, phase, missing, state)
         done += run
-        count = state[TOTAL] - run  # number of samples before this run
+        count = state[TOTAL] - run  # number of samples before this run of samples
         whole = count - state[LAST_MISSING] > length
         if run == 1 and whole and count >= length:
             for row in range(0, taus, RUN_SAMPLES):
@@ -143,14 +146,13 @@ def _add_run(
     rest: Floats,
     lanes: int,
 ) -> None:
-    """Update the sums of each τ for ``run`` new samples, whose phase begins at row ``first``."""
+    """Update the sums of each τ with ``run`` new samples, whose phase begins at row ``first`` of the ring buffer."""
     places = phase.size // LANES
     for i in range(factors.size):
-        row = max(0, 2 * factors[i] - 1 - count)  # first row with a complete term
+        row = max(0, 2 * factors[i] - 1 - count)  # first new sample that completes a second difference
         own = slice(i * LANES, (i + 1) * LANES)
         while row < run:
-            # up to the row at which the span becomes full
-
+            # stop at the sample at which second differences begin to leave the window
             now = first + row if first + row < places else first + row - places
             leaving = count + row >= spans[i]
             end = run if leaving else min(run, spans[i] - count)
@@ -168,7 +170,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
     state[NEWEST] = now // LANES
     for lane in range(sample.size):
         y = sample[lane] * scaling[lane] + scaling[LANES + lane]
-        if abs(y) < 4.0e18:  # false for NaN too
+        if abs(y) < 4.0e18:  # also false for NaN
             step = np.rint(y)
             scaling[LANES + lane] = y - step
             phase[now + lane] = phase[before + lane] + np.int64(step)
@@ -177,7 +179,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
             phase[now + lane] = phase[before + lane]
             count = missing[before + lane] + 1
             state[LAST_MISSING] = state[TOTAL]
-        if missing[now + lane] != count:  # Zeros are not written, to save memory.
+        if missing[now + lane] != count:  # Skipping writes of zeros saves memory.
             missing[now + lane] = count
 
 
@@ -197,9 +199,9 @@ def _slide(
     rest: Floats,
     lanes: int,
 ) -> int:
-    """Update the sums of one τ for up to ``rows`` new phase points, and return the number of processed points.
+    """Update the sums of one τ with up to ``rows`` new phase points, and return the number of processed phase points.
 
-    The number is smaller than ``rows`` if a range reaches the end of the ring buffer.
+    Fewer than ``rows`` phase points are processed if a memory range reaches the end of the ring buffer.
     """
     places = phase.size // LANES
     old = now - span - 1
@@ -225,12 +227,12 @@ def _slide(
 
 @compiled
 def ring_row(index: int, rows: int) -> int:
-    """Return the row of a phase point in the ring buffer, for an index that may be negative.
+    """Return the row of a phase point in the ring buffer for an index that may be negative.
 
     Parameters
     ----------
     index : int
-        Row of the phase point; negative before the start of the ring buffer.
+        Index of the phase point. A negative index counts from the end of the ring buffer.
     rows : int
         Number of rows in the ring buffer.
     """
@@ -249,7 +251,7 @@ def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> N
 def _remove_incomplete(
     missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, squares: Floats, terms: Ints
 ) -> None:
-    """Set the squares that contain a missing sample to zero, and add ``step`` to ``terms`` for each other square."""
+    """Set squares with a missing sample to zero, and add ``step`` to the count ``terms`` for each complete square."""
     for i in range(n):
         if missing[at0 * LANES + i] == missing[at2 * LANES + i]:
             terms[i % LANES] += step
@@ -259,10 +261,10 @@ def _remove_incomplete(
 
 @compiled
 def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats, lanes: int) -> None:
-    """Add the squares ``added`` to the sums, and subtract the squares ``evicted``.
+    """Add the squares ``added`` to the sums, and subtract the squares ``evicted`` from the sums.
 
-    The rounding errors are added to ``rest`` (TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B). The indices are unsigned
-    and ``lanes`` is an argument, because the inner loop would otherwise not be vectorized.
+    The rounding errors are accumulated in ``rest`` (TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B). The indices are
+    unsigned and ``lanes`` is an argument, because the compiler would otherwise not vectorize the inner loop.
     """
     for row in range(np.uintp(0), np.uintp(n), np.uintp(lanes)):
         for lane in range(np.uintp(lanes)):
@@ -280,9 +282,9 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 def _replace_terms(
     now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, sums: Floats, rest: Floats
 ) -> None:
-    """Update the sums of all τ for a single sample of a full window without missing samples.
+    """Update the sums of all τ with a single new sample, for a full window without missing samples.
 
-    A vector loop for each τ would be slower, so a single loop updates all sums.
+    A single loop over all averaging times is faster than an array operation for each averaging time.
     """
     places = phase.size // LANES
     added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
@@ -317,7 +319,8 @@ def keep_newest(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: in
     """
     w = compiled_view_window_arrays(ints, floats, missing, taus)
     state, places = w.state, w.phase.size // LANES
-    # The count of missing samples changes at every older point, so every older second difference is incomplete.
+    # The count of missing samples is set to change at every older phase point, so older second differences are
+    # incomplete.
     oldest = ring_row(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
         missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
@@ -346,7 +349,7 @@ def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
 
 @inlined
 def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
-    """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all are missing."""
+    """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all of them are missing."""
     places = phase.size // LANES
     last, first = newest * LANES + axis, ring_row(newest - min(n, LEVEL), places) * LANES + axis
     present = min(n, LEVEL) - (missing[last] - missing[first])
@@ -360,13 +363,13 @@ def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: i
     Parameters
     ----------
     phase : ndarray of int64, shape (places · LANES,)
-        Integer phase.
+        Ring buffer of integer phase.
     missing : ndarray of int32, shape (places · LANES,)
         Running count of missing samples.
     newest : int
         Row of the newest phase point.
     n : int
-        Number of newest samples.
+        Number of newest samples from which the slope is computed.
     axis : int
         Index of the axis.
 
@@ -394,7 +397,7 @@ def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: i
 
 
 @compiled
-def rate_slopes_per_axis_and_tau(
+def drift_slopes_by_axis_and_tau(
     ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, lengths: Ints, slope: Floats, slopes: Floats
 ) -> None:
     """Compute the slope of the rate of each axis, and the slope at each averaging time.
@@ -404,27 +407,27 @@ def rate_slopes_per_axis_and_tau(
     ints, floats, missing, taus
         Fields of ``WindowBuffers``.
     lengths : ndarray of int64, shape (6,)
-        Number of newest samples of each axis.
+        Number of newest samples that are used for each axis.
     slope : ndarray of float64, shape (6,)
-        Result of ``integer_slope_from_thirds`` for each axis, overwritten.
+        Output array for the result of ``integer_slope_from_thirds`` for each axis.
     slopes : ndarray of float64, shape (m, 6)
-        Result of ``mean_second_difference`` for each τ and axis, overwritten.
+        Output array for the result of ``mean_rate_slope`` for each τ and axis.
     """
     w = compiled_view_window_arrays(ints, floats, missing, taus)
     for axis in range(AXES):
         n, newest = lengths[axis], w.state[NEWEST]
         slope[axis] = integer_slope_from_thirds(w.phase, w.missing, newest, n, axis)
         for i in range(w.factors.size):
-            slopes[i, axis] = mean_second_difference(w.phase, w.missing, newest, n, w.factors[i], axis)
+            slopes[i, axis] = mean_rate_slope(w.phase, w.missing, newest, n, w.factors[i], axis)
 
 
 @compiled
-def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
+def mean_rate_slope(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
     """Return the mean second difference of phase over clusters of m samples, divided by m².
 
-    The sum of all second differences is a sum over four blocks of m phase points at the ends. About ``BEND_POINTS``
-    points represent each block. A missing sample is replaced by the mean of the newest samples. The result is in
-    integer units per sample, or NaN if too many samples are missing. The other parameters are described at
+    In the sum of all second differences, only four blocks of m phase points near the ends do not cancel. About
+    ``BEND_POINTS`` phase points represent each block. A missing sample is replaced by the mean of the newest samples.
+    The result is in integer units per sample, or NaN if too many samples are missing. The other parameters are those of
     ``integer_slope_from_thirds``.
     """
     places = phase.size // LANES
@@ -441,5 +444,5 @@ def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int,
         absent = missing[at0] - missing[at1] - missing[at2] + missing[at3]
         total += float(phase[at0] - phase[at1] - phase[at2] + phase[at3] + middle * absent)
     points = (m + stride - 1) // stride
-    # n + 1 − 2m is the number of second differences
+    # The number of second differences is n + 1 − 2m.
     return total / points * m / (n + 1.0 - 2 * m) / (float(m) * m)

@@ -1,21 +1,23 @@
 """Detection of noise changes, bias steps and bursts of outliers at a specified rate of false alarms.
 
-The variance of each axis is monitored in octaves of the averaging time. The reference variance of an octave is learned
-from the samples since the last change. A ``Change`` describes a noise change, a bias step or a burst of outliers.
+The variance of each axis is monitored separately at averaging times of 1, 2, 4, … samples, which are called octaves.
+The reference variance of an octave is learned from the samples since the last change. A ``Change`` describes a noise
+change, a bias step or a burst of outliers.
 
-- **False alarms.** 80 % of the accepted false alarms are assigned to noise changes, 10 % to bias steps and 10 % to
-  bursts. The threshold for noise changes is h = ln(tests per day · RATE_AT_ZERO / alarms per day). ``RATE_AT_ZERO`` was
-  measured at thresholds of 8 to 12 (``tests/experiments/benchmarks/changes.py``). Thresholds in use are 13 to 20.
-- **Learning.** An octave can raise an alarm when the reference has ``MIN_REFERENCE_TERMS`` terms and an age of
-  ``LEARN_S``. Short octaves learn for one minute, and long octaves learn for 128 clusters. Changes during the learning
-  time are not detected. A slow drift of the noise is eventually reported as a change, because the reference contains
-  all samples since the last change.
-- **After a change**, the samples since the change are the new reference.
-- **A burst** of outliers increases the number of large differences, but not their median. Samples of a burst are
-  removed from the reference.
+- **False alarms.** Of the accepted false alarms, 80 % are assigned to noise changes, 10 % to bias steps and 10 % to
+  bursts. The threshold for noise changes is h = ln(tests per day · RATE_AT_ZERO / alarms per day). The constant
+  ``RATE_AT_ZERO`` was measured at thresholds of 8 to 12 (``tests/experiments/benchmarks/changes.py``). Typical
+  thresholds are 13 to 20.
+- **Learning.** An octave can raise an alarm when its reference is older than ``LEARN_S`` and contains
+  ``MIN_REFERENCE_TERMS`` differences. Short octaves learn for one minute, and long octaves learn for 128 clusters.
+  Changes during the learning time are not detected. A slow drift of the noise is eventually reported as a change,
+  because the reference contains all samples since the last change.
+- **After a change**, the samples since the change become the new reference.
+- **Bursts.** A burst of outliers increases the number of large differences between samples, but not the median
+  difference. Samples in a burst are removed from the reference.
 
-``reconcile`` does not use this detector. Reconciliation compares the likelihood ratio of a step with the likelihood
-ratios of other effects.
+The command ``reconcile`` does not use this detector, because it compares the likelihood of a step with the likelihoods
+of other effects.
 """
 
 from collections.abc import Mapping
@@ -30,7 +32,7 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import DAY_S
-from monitor.common.units import format_axis_value
+from monitor.common.unit_formatting import format_axis_value
 from monitor.estimation.detection.change_kernel import (
     AFTER,
     BEFORE,
@@ -60,39 +62,42 @@ from monitor.estimation.detection.change_kernel import (
     S,
     advance_until_decision,
     make_change_state,
-    set_next_decision_time,
+    set_next_decision_sample,
 )
-from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_changed_coefficients
+from monitor.estimation.detection.changed_coefficient_identification import (
+    HaarVariancesBeforeAfter,
+    identify_changed_coefficients,
+)
 
 MAX_CLUSTER_S: Final = 300.0
 """Maximum cluster length in seconds.
 
-Longer clusters would need days of learning and would respond to temperature.
+Longer clusters would need days of learning and would respond to changes of the temperature.
 """
 LEARN_S: Final = 60.0
-"""Minimum learning time in seconds. Spectral lines of width 1/``LEARN_S`` are resolved in this time."""
+"""Minimum learning time in seconds. Spectral lines with a width of 1/``LEARN_S`` are resolved in this time."""
 MIN_DWELL_SAMPLES: Final = 256
-"""Minimum number of samples between an alarm and the decision about the cause."""
+"""Minimum number of samples between an alarm and the decision about its cause."""
 MAX_DWELL_S: Final = 60.0
-"""Maximum time in seconds between an alarm and the decision about the cause."""
+"""Maximum time in seconds between an alarm and the decision about its cause."""
 MAX_BURST_S: Final = 60.0
 """Maximum duration of a burst of outliers in seconds. After a longer burst, a new reference is learned."""
 RATE_AT_ZERO: Final = 0.07
-"""Number of false alarms per tested z² and per e^−h, for all six variance ratios together.
+"""Number of false alarms per tested squared difference, divided by e^−h, for all six variance ratios together.
 
-Measured values are 0.053 to 0.065 (``tests/experiments/benchmarks/changes.py``).
+The measured values are 0.053 to 0.065 (``tests/experiments/benchmarks/changes.py``).
 """
 NOISE_SHARE: Final = 0.8
-"""Share of the accepted false alarms for noise changes."""
+"""Share of the accepted false alarms that is assigned to noise changes."""
 OTHER_SHARE: Final = 0.1
-"""Share of the accepted false alarms for bias steps, and for bursts of outliers."""
+"""Share of the accepted false alarms that is assigned to bias steps, and likewise to bursts of outliers."""
 SKIP_BLOCK_ROWS: Final = 4096
-"""Maximum number of missing samples processed in one call."""
+"""Maximum number of missing samples that are processed at a time."""
 MAX_CLIPPED_RATIO: Final = 4.0
-"""Maximum variance ratio that is computed from clipped squares, because clipping reduces larger ratios."""
+"""Maximum variance ratio that is computed from clipped squares. Clipping would reduce larger ratios."""
 
 Q_OR_VIBRATION: Final = "quantization noise or vibration near Nyquist"
-"""Description of a change of Q, which quantization noise or a vibration can cause."""
+"""Description of a change of Q, which can be caused by quantization noise or by a vibration."""
 NOISE_NAMES: Final = {
     "g": {"Q": Q_OR_VIBRATION, "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
     "a": {
@@ -102,24 +107,25 @@ NOISE_NAMES: Final = {
         "K": "acceleration random walk",
     },
 }
-"""Names of the noise coefficients of gyroscopes (g) and accelerometers (a)."""
+"""Names of the noise coefficients for gyroscopes (g) and accelerometers (a)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Detected change of one axis. Times are numbers of samples since the start of the detector."""
+    """Detected change on one axis. Times are numbers of samples since the start of the detector."""
 
     kind: str  # noise_changed, bias_stepped, outlier_burst
     axis: int  # index into AXES
-    since: int  # estimated onset
-    found: int  # sample of the alarm; the change is returned up to one minute later
+    since: int  # estimated time at which the change began
+    found: int  # time of the alarm; the change is reported up to one minute later
     sigma: float  # significance in standard deviations
-    what: Mapping[str, tuple[float, float]]  # values before and after in SI units, or limits of the band in Hz
+    what: Mapping[str, tuple[float, float]]  # SI values before and after the change, or band limits in Hz
     text: str  # description for users
 
     def values_before_and_after(self) -> dict[str, dict[str, float]]:
-        """Return the values of ``what`` with the keys ``before`` and ``after``. A band has the keys ``from`` and
-        ``to``.
+        """Return the contents of ``what`` as dictionaries with the keys ``before`` and ``after``.
+
+        For a frequency band, the keys are ``from`` and ``to``.
         """
         return {
             name: {"from": first, "to": second} if name == "band" else {"before": first, "after": second}
@@ -127,7 +133,7 @@ class Change:
         }
 
 
-class ChangeDetector:
+class NoiseAndBiasChangeDetector:
     """Detector of noise changes, bias steps and bursts of outliers on six axes.
 
     Parameters
@@ -135,14 +141,14 @@ class ChangeDetector:
     rate_hz : float
         Sample rate in Hz.
     alarms_per_day : float
-        Accepted false alarms per day of all six axes.
+        Accepted number of false alarms per day, for all six axes together.
 
     Raises
     ------
     ConfigError
         If the sample rate or the number of false alarms is not positive.
 
-    >>> detector = ChangeDetector(100.0)
+    >>> detector = NoiseAndBiasChangeDetector(100.0)
     >>> noise = 1e-3 * np.random.default_rng(1).standard_normal((30_000, 6))
     >>> noise[20_000:, 2] *= 1.5
     >>> detector.process_samples(noise)
@@ -156,8 +162,8 @@ class ChangeDetector:
         self.rate_hz = rate_hz
         self._octaves = min(max(floor(log2(MAX_CLUSTER_S * rate_hz)), 7), 20) + 1
         self._state = make_change_state(self._octaves)
-        looks = DAY_S * rate_hz * len(AXES)  # number of z² and of block pairs per day
-        # The lower quantile is used, because 1 - p is rounded to 1 for p below 1e-16.
+        looks = DAY_S * rate_hz * len(AXES)  # number of squared differences and of block pairs per day
+        # The lower quantile is negated, because 1 - p is rounded to 1 if p is below 1e-16.
         once = -NormalDist().inv_cdf(min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
         self._state.levels[:] = (
             max(log(looks * RATE_AT_ZERO / (NOISE_SHARE * alarms_per_day)), 1.0),
@@ -173,14 +179,14 @@ class ChangeDetector:
 
     @property
     def octaves_ready_for_alarm(self) -> NDArray[np.bool_]:
-        """Boolean array [J, 6], True if the reference of the octave and axis is long enough for an alarm."""
+        """Boolean array [octaves, 6] that is True where the reference is long enough to raise an alarm."""
         band = self._state.band
         known = (band[:, :, N] >= MIN_REFERENCE_TERMS * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
         old_enough = self.samples_since_start - self._state.born >= LEARN_S * self.rate_hz
         return np.asarray((known & old_enough[:, None]).T)
 
     def process_samples(self, values: Floats) -> None:
-        """Search samples for changes.
+        """Search samples for noise changes, bias steps and bursts of outliers.
 
         Parameters
         ----------
@@ -203,7 +209,7 @@ class ChangeDetector:
                     (self._state.alarm[:, KIND] > 0) & (self._state.alarm[:, DUE] <= self.samples_since_start)
                 ):
                     self._decide(int(axis))
-                set_next_decision_time(self._state)
+                set_next_decision_sample(self._state)
 
     def skip_missing_samples(self, n_samples: int) -> None:
         """Process the given number of missing samples."""
@@ -212,7 +218,7 @@ class ChangeDetector:
             self.process_samples(hole[: n_samples - start])
 
     def take_changes(self) -> list[Change]:
-        """Return the changes detected since the last call, in the order of detection."""
+        """Return the changes that were detected since the last call, in the order of detection."""
         found, self._found = self._found, []
         return found
 
@@ -220,7 +226,7 @@ class ChangeDetector:
         """Discard the reference variances of one axis, or of all axes if ``axis`` is None."""
         for one in range(len(AXES)) if axis is None else (axis,):
             self._restart_reference(one)
-        set_next_decision_time(self._state)
+        set_next_decision_sample(self._state)
 
     def _decide(self, axis: int) -> None:
         s = self._state
@@ -238,29 +244,29 @@ class ChangeDetector:
             self._report_noise_change(axis, alarm, after, before_n, before_s)
 
     def _cum_at(self, sample: int) -> Floats:
-        """Return the first stored sums [6, J, 5] at or after a sample. Older sums are stored at larger intervals."""
+        """Return the first stored sums [6, J, 5] at or after a sample. The older the sums, the larger the intervals."""
         at = self._state.snap_at
         later = np.where(at >= sample, at, NEVER)
         return np.asarray(self._state.snap[np.unravel_index(int(later.argmin()), at.shape)])
 
     def _is_bulk_unchanged(self, axis: int, after: Floats, before: float) -> bool:
-        """Return True if the mean of z² has risen much more than the median, as for a burst of outliers."""
+        """Return True if the mean squared difference has risen much more than the median, as in a burst of outliers."""
         n, extremes = after[UNIT_N], after[UNIT_EXTREME]
         if extremes < 3 or not before > 0.0:
             return False
         return bool(self._bulk_variance_ratio(axis, after) < 1.0 + 0.5 * (after[UNIT_RAW] / n / before - 1.0))
 
     def _bulk_variance_ratio(self, axis: int, after: Floats) -> float:
-        """Return the ratio of the variances after and before an alarm, computed from the share of small differences.
+        """Return the ratio of the variances after and before an alarm without the effect of outliers.
 
-        Outliers hardly affect the share of differences below a fixed limit. For Gaussian noise, the share of small
-        differences determines the variance.
+        The variances are computed from the share of differences below a fixed limit, which outliers hardly affect. For
+        Gaussian noise, this share determines the variance.
         """
         whole = self._state.cum[axis, 0] - after
         usual, now = whole[UNIT_INSIDE] / whole[UNIT_N], after[UNIT_INSIDE] / after[UNIT_N]
         if not 0.02 < usual < 0.98 or now >= 1.0:
             return 1.0
-        # For Gaussian z, the share p of |z| < q·σ gives q = Φ⁻¹((1 + p)/2).
+        # If a share p of Gaussian values satisfies |z| < q·σ, then q = Φ⁻¹((1 + p)/2).
         quantile = NormalDist().inv_cdf
         return float((quantile(0.5 + 0.5 * usual) / quantile(0.5 + 0.5 * max(now, 1e-3))) ** 2)
 
@@ -290,10 +296,10 @@ class ChangeDetector:
         lasting = now - alarm[START] >= max(MAX_BURST_S * self.rate_hz, 2 * MIN_DWELL_SAMPLES)
         if latest > 0 and not lasting:
             s.alarm[axis] = alarm
-            s.alarm[axis, DUE] = now + MIN_DWELL_SAMPLES  # a multiple of TICK_SAMPLES, like all decision times
+            s.alarm[axis, DUE] = now + MIN_DWELL_SAMPLES  # remains a multiple of TICK_SAMPLES
             return
         count, variance = after[0, UNIT_EXTREME], before_s[0] / before_n[0]
-        # An outlier of size a contributes a²/2 to the sum of z².
+        # An outlier of size a contributes a²/2 to the sum of squared differences.
         scale = sqrt(2.0 * max(after[0, UNIT_RAW] - after[0, UNIT_S], 0.0) / max(count, 1.0))
         what = {"count": (0.0, float(count)), "scale": (sqrt(variance), scale)}
         text = f"{AXES[axis]} {count:.0f} outliers of about {format_axis_value(AXES[axis], scale)} within " + (
@@ -317,7 +323,7 @@ class ChangeDetector:
         self._clear_suspicion(axis)
 
     def _clear_suspicion(self, axis: int) -> None:
-        """Reset the evidence of one axis, and skip blocks that contain samples of the change."""
+        """Reset the evidence of one axis, and skip blocks that contain samples from before and after the change."""
         s = self._state
         s.cusum[axis] = s.unit[axis] = 0.0
         s.cusum[axis, :, :, SINCE] = self.samples_since_start
@@ -327,7 +333,7 @@ class ChangeDetector:
         s.fill[axis] = -under_way.astype(np.int64)
 
     def _restart_reference(self, axis: int, born: int | None = None) -> None:
-        """Discard the reference and the evidence of one axis. The block sums of the octaves are kept."""
+        """Discard the reference and the evidence of one axis, but keep the block sums of the octaves."""
         s = self._state
         s.born[axis] = self.samples_since_start if born is None else born
         s.band[axis] = s.spread[axis] = 0.0

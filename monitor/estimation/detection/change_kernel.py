@@ -1,26 +1,26 @@
-"""Compiled kernel of the change detector: Haar differences, cumulative sums (CUSUM) and alarms.
+"""Compiled part of the change detector, which computes Haar differences, cumulative sums (CUSUM) and alarms.
 
-Samples are processed in ticks of 32 samples. The kernel stops when a decision about an alarm is due, so the decision
-does not depend on the division of the input into blocks.
+Samples are processed in ticks of 32 samples. Processing stops when a decision about an alarm is due. The decision
+therefore does not depend on how the samples are divided into calls.
 
-- **Cascade.** Octave j combines the means of two successive blocks of m = 2^j samples to a Haar difference z = (mean −
-  mean')/√2. The mean square of z is the Allan variance at cluster size m. For white noise and random walk, all z are
-  independent. The cost is two additions per sample and axis.
+- **Haar differences.** In octave j, the means of two successive blocks of m = 2^j samples give the Haar difference z =
+  (mean − mean')/√2. The mean square of z is the Allan variance at cluster size m. For white noise and random walk, the
+  differences are independent. The computation takes two additions per sample and axis.
 - **Evidence.** Let S be the sum of the n squares z² since the start of the reference, and S₁ the sum of the n₁ squares
-  since a suspected change. The log-likelihood ratio of "variance multiplied by r" and "no change" is called the
-  evidence g:
+  since a suspected change. The evidence g is the log-likelihood ratio of the hypotheses "variance multiplied by r" and
+  "no change":
 
       g = −(n/2) ln(1 − (1 − 1/r) S₁/S) − (n₁/2) ln r.
 
   The evidence does not depend on the unknown variance. With a long reference, g is Page's CUSUM. Without a change, the
   mean of e^g is 1, so the probability of an alarm at threshold h within k tests is at most k e^−h (Shiryaev–Roberts).
-  If g ≤ 0, the suspected change is set to the current sample.
-- **Non-Gaussian and correlated noise.** z² is clipped at ``CLIP`` times the reference variance, which corresponds to
-  4σ. For Gaussian noise, clipping affects a share of 6e-5 of the values and reduces the mean by 2e-4. The evidence is
-  divided by the factor F, the variance of sums of z² relative to independent Gaussian z. Heavy tails, spectral lines
-  and coarse resolution increase F.
-- **Steps** are detected by comparing a pair of blocks with the next but one pair. The pair in between may contain the
-step.
+  If g ≤ 0, the time of the suspected change is set to the current sample.
+- **Non-Gaussian and correlated noise.** The squares z² are clipped at ``CLIP`` times the reference variance, which
+  corresponds to 4σ. For Gaussian noise, clipping affects a share of 6e-5 of the squares and reduces their mean by 2e-4.
+  The evidence is divided by the factor F by which the variance of sums of z² exceeds the variance for independent
+  Gaussian noise. Heavy tails, spectral lines and coarse resolution increase F.
+- **Bias steps** are detected by comparing the mean of a pair of blocks with the mean of the second pair before it. The
+  pair in between may contain the step.
 """
 
 from typing import Final, NamedTuple
@@ -32,93 +32,93 @@ from monitor.common.compiled import compiled
 
 AXES: Final = 6
 RATIOS: Final = np.array([1.2, 1.44, 2.25, 1 / 1.2, 1 / 1.44, 1 / 2.25])
-"""Ratios of the variance after and before a change for which the evidence is computed."""
+"""Ratios r between the variances after and before a change, for which the evidence is computed."""
 GAIN: Final = 1.0 - 1.0 / RATIOS
-"""The factor 1 − 1/r of each ratio r."""
+"""Factor 1 − 1/r for each variance ratio r."""
 HALF_LOG: Final = 0.5 * np.log(RATIOS)
-"""The term ½ ln r of each ratio r."""
+"""Term ½ ln r for each variance ratio r."""
 TICK_SAMPLES: Final = 32
-"""Number of samples in a tick. The evidence is updated once per tick, because logarithms are slow."""
+"""Number of samples in a tick. To save the time of computing logarithms, the evidence is updated once per tick."""
 SHORT: Final = 5
-"""Number of octaves that are shorter than a tick."""
+"""Number of octaves whose clusters are shorter than a tick."""
 RAREST: Final = 1e-6
-"""Minimum share of extreme values in the reference."""
+"""Minimum share of extreme values that is assumed for the reference."""
 HUGE: Final = 1e150
-"""Absolute value at or above which samples count as missing, because their square overflows."""
+"""Absolute value from which samples count as missing, because their squares would overflow."""
 CLIP: Final = 16.0
-"""Maximum of z² relative to the reference variance. Larger values are clipped."""
+"""Ratio of a squared Haar difference to the reference variance above which the square is clipped."""
 EXTREME: Final = 36.0
-"""Ratio of z² to the reference variance above which a difference is an outlier.
+"""Ratio of a squared Haar difference to the reference variance above which the difference is an outlier.
 
-The limit is 6σ, which a share of 2e-9 of Gaussian values exceeds.
+The ratio corresponds to 6σ, which a share of 2e-9 of Gaussian values exceeds.
 """
 MEDIAN: Final = 0.45494
-"""Median of χ² with one degree of freedom."""
+"""Median of the χ² distribution with one degree of freedom."""
 SEED: Final = 31
-"""Number of first z² of an octave. The median of these values determines the clip level."""
+"""Number of squared differences in an octave whose median determines the initial clip level."""
 SETTLED: Final = 256
-"""Number of z² after which the clip level is constant."""
+"""Number of squared differences in an octave after which the clip level no longer changes."""
 MIN_REFERENCE_TERMS: Final = 64
-"""Minimum number of terms of a reference for an alarm, multiplied by F².
+"""Minimum number of squared differences in a reference that can raise an alarm, if the factor F is 1.
 
-F terms contain the information of one independent term. The second factor F ensures that F is known for sums that are
-much longer than the correlation of the terms.
+The number is multiplied by F². The first factor F accounts for the information of correlated squares. The second factor
+F ensures that sums much longer than the correlation have been observed.
 """
 MIN_BAND_TERMS: Final = 16
-"""Minimum number of terms of a longer octave for the estimate of slow noise."""
+"""Minimum number of squared differences in a longer octave from which slow noise is estimated."""
 MIN_SPREAD_PAIRS: Final = 8
-"""Minimum number of pairs for an estimate of the factor F."""
+"""Minimum number of pairs of sums from which the factor F is estimated."""
 MAX_FLANK: Final = 12.0
-"""Maximum ratio of z² to the reference variance beside a step."""
+"""Maximum ratio of the squared Haar differences before and after a step to the reference variance."""
 CONFIRM_PAIRS: Final = 2
-"""Number of block pairs after a step that must confirm the step."""
+"""Number of block pairs after a step that must confirm the new mean."""
 SLOTS: Final = 4
-"""Number of stored sums per level in ``ChangeState.snap``."""
+"""Number of copies that each level of ``ChangeState.snap`` stores."""
 NEVER: Final = 1 << 62
-"""Sample number that means that no decision is due."""
+"""Sample number that stands for "no decision is due"."""
 
 N, S, LIMIT, SEEDED, F = range(5)
-"""Columns of ``ChangeState.band``."""
+"""Columns of ``ChangeState.band``, which contains the reference."""
 UNIT_N, UNIT_S, UNIT_RAW, UNIT_INSIDE, UNIT_EXTREME = range(5)
-"""Columns of ``ChangeState.unit`` and ``ChangeState.cum``."""
+"""Columns of ``ChangeState.unit`` and ``ChangeState.cum``, which contain sums of squared differences."""
 N1, S1, SINCE, G = range(4)
-"""Columns of ``ChangeState.cusum``."""
+"""Columns of ``ChangeState.cusum``, which contains the evidence for changes."""
 HELD, FULL, SQUARES, COUNT, SPREAD = range(5)
-"""Columns of ``ChangeState.spread``."""
+"""Columns of ``ChangeState.spread``, from which the factor F is computed."""
 NOISE, BURST, STEP = 1.0, 2.0, 3.0
 """Kinds of alarms."""
 KIND, START, FOUND, EVIDENCE, DUE = range(5)
-"""Columns of ``ChangeState.alarm``."""
+"""Columns of ``ChangeState.alarm``, which contains the pending alarms."""
 BEFORE, AFTER, PLACE, SIGMA, LEFT = range(1, 6)
-"""Columns of ``ChangeState.step``; column 0 is the octave."""
+"""Columns of ``ChangeState.step``, in which column 0 is the octave."""
 TOTAL, NEXT_DUE = 0, 1
-"""Elements of ``ChangeState.clock``."""
+"""Elements of ``ChangeState.clock``, which are sample numbers."""
 H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_TIME = range(6)
-"""Elements of ``ChangeState.levels``."""
+"""Elements of ``ChangeState.levels``, which are thresholds and times in samples."""
 
 
 class ChangeState(NamedTuple):
-    """State of the change detector for A = 6 axes, J octaves and L = 12 levels."""
+    """State of the change detector for A = 6 axes, J octaves and L = 12 levels of sums."""
 
-    levels: Floats  # [6] thresholds, and times in samples; see H_NOISE
-    clock: Ints  # [2] samples since the start; sample of the next decision
+    levels: Floats  # [6] thresholds, and times in samples, at the indices from H_NOISE to LEARN_TIME
+    clock: Ints  # [2] number of samples since the start, and sample number of the next decision
     born: Ints  # [A] first sample of the reference
     stage: Floats  # [A, 32] samples of the current tick
     half: Floats  # [A, J, 2] sum and number of samples of the first block of a pair
-    fill: Ints  # [A, J] number of complete pairs for the detection of steps; −1 excludes the current pair
-    ring: Floats  # [A, J, 2, 2] mean and block difference of the last two pairs
-    seeds: Floats  # [A, J, SEED] first z²
-    band: Floats  # [A, J, 5] reference: number and sum of clipped z², clip level, number of first z², F
+    fill: Ints  # [A, J] number of complete block pairs for step detection; −1 excludes the current pair
+    ring: Floats  # [A, J, 2, 2] mean and difference of the last two block pairs
+    seeds: Floats  # [A, J, SEED] first squared Haar differences z²
+    band: Floats  # [A, J, 5] reference: number and sum of clipped z², clip level, number of values in ``seeds``, F
     unit: (
         Floats  # [A, J, 5] since the last test: number, sum of clipped z², sum of z², number below the median, extremes
     )
     cum: Floats  # [A, J, 5] columns of ``unit`` since the start
-    cusum: Floats  # [A, J, 6, 4] n₁, S₁, first sample of the suspected change, evidence g
-    spread: Floats  # [A, J, L, 5] sums of z²: stored sum, 1 if stored, squared differences, pairs, spread F
-    burst: Floats  # [A, 2] CUSUM of extreme values, and the last sample with a CUSUM of zero
-    alarm: Floats  # [A, 5] pending alarm, see KIND; kind 0 means no alarm
+    cusum: Floats  # [A, J, 6, 4] n₁, S₁, time of the suspected change, evidence g
+    spread: Floats  # [A, J, L, 5] for the factor F: stored sum of z², 1 if stored, squared differences, pairs, F
+    burst: Floats  # [A, 2] CUSUM of extreme values, and the last sample at which it was zero
+    alarm: Floats  # [A, 5] pending alarm, with the columns from KIND to DUE; kind 0 means no alarm
     step: Floats  # [A, 6] octave or −1, mean before and after, position, significance, number of remaining pairs
-    snap: Floats  # [levels, SLOTS, A, J, 5] copies of ``cum``; older copies have larger intervals
+    snap: Floats  # [levels, SLOTS, A, J, 5] copies of ``cum``, at intervals that increase with age
     snap_at: Ints  # [levels, SLOTS] sample numbers of the copies
 
 
@@ -140,7 +140,7 @@ def make_change_state(octaves: int) -> ChangeState:
 
 @compiled
 def advance_until_decision(s: ChangeState, samples: Floats, first_row: int) -> int:
-    """Process samples until a decision about an alarm is due, and return the next row to process.
+    """Process samples until a decision about an alarm is due, and return the index of the next sample.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def advance_until_decision(s: ChangeState, samples: Floats, first_row: int) -> i
     samples : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
     first_row : int
-        First row to process.
+        Index of the first sample to process.
     """
     for row in range(first_row, len(samples)):
         place = s.clock[TOTAL] % TICK_SAMPLES
@@ -204,10 +204,10 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
 
 @compiled
 def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: int, j: int) -> None:
-    """Add the squared Haar differences of one octave within a tick.
+    """Add the squared Haar differences of one octave within a tick to the sums of the octave.
 
-    ``sums`` contains the sums over blocks of 2^j samples, and is replaced by the sums over blocks of twice the length.
-    Array views would be slower than the index arithmetic.
+    On input, ``sums`` contains sums over blocks of 2^j samples. On output, it contains sums over blocks of twice the
+    length. Indices are used because array views would be slower.
     """
     scale = 0.5 / (1 << j) ** 2
     limit = band[axis, j, LIMIT]
@@ -236,7 +236,10 @@ def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: 
 
 @compiled
 def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
-    """Process two blocks of 2^j samples. Blocks with more than 1/16 of the samples missing are ignored."""
+    """Process a pair of blocks of 2^j samples.
+
+    The pair is ignored if more than 1/16 of the samples of a block are missing.
+    """
     m = 1 << j
     least = m - m // 16
     fill = s.fill[axis, j]
@@ -259,7 +262,7 @@ def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: f
 
 @compiled
 def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: float) -> None:
-    """Add one z² to the sums of an octave. The first ``SEED`` values determine the clip level."""
+    """Add one squared Haar difference to the sums of an octave. The first ``SEED`` values determine the clip level."""
     if band[axis, j, SEEDED] == SEED:
         limit = band[axis, j, LIMIT]
         unit[axis, j, UNIT_N] += 1.0
@@ -276,9 +279,9 @@ def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: fl
         if scale == 0.0:
             for value in first:
                 scale += value
-            scale /= SEED  # more than half of the differences are zero, because the resolution is coarse
+            scale /= SEED  # With coarse resolution, the median is zero and the mean is used.
         if scale == 0.0:
-            one[SEEDED] = 0.0  # a constant axis has no noise
+            one[SEEDED] = 0.0  # The axis is constant, so new values are collected.
         one[LIMIT] = CLIP * scale
         one[N], one[S] = SEED, 0.0
         for value in first:
@@ -301,9 +304,9 @@ def _median_of_seeds(first: Floats) -> float:
 def _look(
     unit: Floats, cum: Floats, band: Floats, spread: Floats, cusum: Floats, axis: int, j: int, now: int, h: float
 ) -> int:
-    """Add new z² of one octave to the reference and to the evidence.
+    """Add the new squared Haar differences of one octave to the reference and to the evidence.
 
-    Return the index of the variance ratio with the largest evidence above the threshold h, or −1.
+    Return the index of the variance ratio with the largest evidence if the evidence exceeds the threshold h, else −1.
     """
     k, q = unit[axis, j, UNIT_N], unit[axis, j, UNIT_S]
     if k == 0.0:
@@ -325,9 +328,9 @@ def _look(
 def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: float) -> None:
     """Update the factor F of one octave.
 
-    F is the ratio of the squared Haar differences of sums of z² to the expectation for independent Gaussian z. The
-    largest ratio over sums of 1, 2, 4, … tests is used. A ratio that is not significantly above 1 is reduced by its
-    standard deviation.
+    The sums of z² over 1, 2, 4, … ticks are compared with the preceding sums of the same length. For each length, the
+    mean squared difference is divided by its expectation for independent Gaussian noise. F is the largest of these
+    ratios. A ratio that is not significantly above 1 is first reduced by its standard error.
     """
     v = band[axis, j, S] / band[axis, j, N]
     for level in range(spread.shape[2]):
@@ -343,7 +346,7 @@ def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: f
         if count >= MIN_SPREAD_PAIRS and v > 0.0:
             expected = 4.0 * k * (1 << level) * v * v * count
             found, error = spread[axis, j, level, SQUARES] / expected, np.sqrt(3.0 / count)
-            if found < 1.0 + 2.0 * error:  # A significantly larger value is not reduced.
+            if found < 1.0 + 2.0 * error:  # not significantly above 1
                 found /= 1.0 + error
             spread[axis, j, level, SPREAD] = found
             largest = 1.0
@@ -358,14 +361,14 @@ def _raise_cusums(
 ) -> int:
     """Update the evidence of all variance ratios.
 
-    Return the index of the ratio with the largest evidence above the threshold, or −1.
+    Return the index of the variance ratio with the largest evidence if the evidence exceeds the threshold, else −1.
     """
     n, total, spread = band[axis, j, N], band[axis, j, S], band[axis, j, F]
     best, largest = -1, threshold
     for i in range(RATIOS.size):
         n1 = cusum[axis, j, i, N1] + k
         s1 = cusum[axis, j, i, S1] + q
-        g = -1.0  # By Jensen's inequality, g is negative unless the variance has changed in the direction of r.
+        g = -1.0  # By Jensen's inequality, g < 0 unless the variance has changed in the direction of r.
         if (s1 * n - total * n1) * GAIN[i] > 0.0:
             g = (-0.5 * n * np.log(1.0 - GAIN[i] * s1 / total) - n1 * HALF_LOG[i]) / spread
         if g <= 0.0:
@@ -379,7 +382,7 @@ def _raise_cusums(
 
 @compiled
 def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
-    """Raise an alarm for a noise change. If the reference is too short, restart the reference instead."""
+    """Raise an alarm for a noise change, or restart the reference if it is too short."""
     since = s.cusum[axis, j, i, SINCE]
     enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2
     if enough and since - s.born[axis] >= s.levels[LEARN_TIME]:
@@ -390,7 +393,7 @@ def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
 
 @compiled
 def _relearn(s: ChangeState, axis: int, j: int) -> None:
-    """Restart the reference of an octave that changed during the learning time."""
+    """Restart the reference of an octave whose variance changed during the learning time."""
     s.band[axis, j] = 0.0
     s.band[axis, j, F] = 1.0
     s.spread[axis, j] = 0.0
@@ -402,7 +405,7 @@ def _relearn(s: ChangeState, axis: int, j: int) -> None:
 def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis: int, now: int) -> float:
     """Update and return the CUSUM of extreme values.
 
-    The CUSUM tests for a share of extreme values of at least 1 % that is also ten times the share at rest.
+    The CUSUM tests whether the share of extreme values has risen to ten times the usual share, and to at least 1 %.
     """
     outer = 2.0 * band[axis, 0, LIMIT] * (EXTREME / CLIP)  # (y − y')² is 2 z²
     if band[axis, 0, SEEDED] != SEED or outer == 0.0:
@@ -425,9 +428,9 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 
 @compiled
 def _alarm(s: ChangeState, axis: int, kind: float, since: float, evidence: float, now: int) -> None:
-    """Record an alarm, unless the axis already has an alarm.
+    """Record an alarm, unless another alarm is pending on the axis.
 
-    Within limits, the waiting time before the decision equals the time from the onset to the alarm.
+    The time from the alarm to the decision equals the time from the onset of the change to the alarm, within limits.
     """
     alarm = s.alarm[axis]
     if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):
@@ -435,12 +438,12 @@ def _alarm(s: ChangeState, axis: int, kind: float, since: float, evidence: float
     wait = np.ceil(min(max(now - since, s.levels[DWELL]), s.levels[LONGEST_DWELL]) / TICK_SAMPLES) * TICK_SAMPLES
     alarm[KIND], alarm[START], alarm[FOUND], alarm[EVIDENCE], alarm[DUE] = kind, since, now, evidence, now + wait
     s.step[axis, 0] = -1.0
-    set_next_decision_time(s)
+    set_next_decision_sample(s)
 
 
 @compiled
-def set_next_decision_time(s: ChangeState) -> None:
-    """Set the sample at which the kernel stops for the next decision."""
+def set_next_decision_sample(s: ChangeState) -> None:
+    """Set the sample number at which processing stops for the next decision."""
     s.clock[NEXT_DUE] = NEVER
     for axis in range(AXES):
         if s.alarm[axis, KIND] != 0.0:
@@ -449,9 +452,9 @@ def set_next_decision_time(s: ChangeState) -> None:
 
 @compiled
 def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: int) -> None:
-    """Search for a step between the newest pair of blocks and the next but one older pair.
+    """Search for a bias step between the newest pair of blocks and the second pair before it.
 
-    A step is rejected if the sensor moves or if a linear slope explains the difference.
+    A step is rejected if the sensor moves, or if a linear drift explains the difference of the means.
     """
     ring = s.ring[axis, j]
     height = mean - ring[0, 0]
@@ -470,11 +473,11 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
     for above in range(j + 1, j + 4):
         if s.band[axis, above, N] < MIN_BAND_TERMS:
             return
-        # Random walk and flicker noise also change the mean within four blocks.
+        # Random walk and flicker noise also change the mean over four blocks.
         v = max(v, 2.0 * s.band[axis, above, S] / s.band[axis, above, N])
     sigma = np.abs(height) / np.sqrt(v * band[F])
-    straight = height - 2.0 * (d + ring[0, 1])  # without the part that the slopes on both sides explain
-    share = (ring[1, 0] - ring[0, 0]) / height  # share of the middle pair that lies after the step
+    straight = height - 2.0 * (d + ring[0, 1])  # height without the linear drift on both sides
+    share = (ring[1, 0] - ring[0, 0]) / height  # share of the middle block pair that follows the step
     if sigma <= s.levels[STEP_SIGMA] or straight * height < 0.5 * square or not -0.3 < share < 1.3:
         return
     step, m = s.step[axis], 1 << j
@@ -485,7 +488,7 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
 
 @compiled
 def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
-    """Confirm a step after ``CONFIRM_PAIRS`` pairs at the new mean. Discard the step if the mean changes again."""
+    """Confirm a step after ``CONFIRM_PAIRS`` block pairs at the new mean, or discard it if the mean changes again."""
     step = s.step[axis]
     if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
         step[0] = -1.0
@@ -495,14 +498,14 @@ def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
         alarm = s.alarm[axis]
         alarm[KIND], alarm[START], alarm[FOUND] = STEP, step[PLACE], now
         alarm[EVIDENCE], alarm[DUE] = 0.5 * step[SIGMA] ** 2, now
-        set_next_decision_time(s)
+        set_next_decision_sample(s)
 
 
 @compiled
 def _remember(s: ChangeState, tick: int) -> None:
-    """Store a copy of ``cum``.
+    """Store a copy of the cumulative sums ``cum``.
 
-    Copies at odd multiples of 2^k ticks are stored in level k, so that older copies have larger intervals.
+    Copies at odd multiples of 2^k ticks are stored in level k, so the interval between copies increases with their age.
     """
     level = 0
     while tick & 1 == 0:

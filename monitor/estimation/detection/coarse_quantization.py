@@ -1,9 +1,9 @@
 """Detection of quantization steps that are large enough to distort the measured noise.
 
-The quantization step is the smallest distance between two different values of an axis. The noise is computed from the
-mean absolute difference of successive samples, which outliers and slow drift hardly affect.
+The quantization step is the smallest distance between two different values of an axis. The noise is estimated from the
+mean absolute difference of successive samples, because outliers and slow drift hardly affect it.
 
-``reconcile`` uses another method, which also detects steps far below the noise (``value_artifacts``).
+The command ``reconcile`` uses a method that also detects steps far below the noise, see ``value_artifacts``.
 """
 
 from dataclasses import dataclass
@@ -14,30 +14,33 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 
 MIN_STEP_TO_NOISE: Final = 0.5
-"""Minimum ratio of step and noise. Smaller steps increase the noise variance by at most two percent."""
+"""Minimum ratio of the quantization step to the noise.
+
+Smaller steps increase the noise variance by at most two percent.
+"""
 ROWS: Final = 4096
-"""Maximum number of samples in a stretch of the recording."""
+"""Maximum number of successive samples that are examined together."""
 MAX_STRETCHES: Final = 16
 GRID_TOLERANCE: Final = 0.1
-"""Maximum deviation from a whole number of steps, as a share of the step.
+"""Maximum deviation of a value from a whole number of steps, as a fraction of the step.
 
-The tolerance allows for values rounded to float32.
+The tolerance allows for values that were rounded to float32.
 """
 SIGMA_PER_MEAN_DISTANCE: Final = 0.8862269254527580
-"""Ratio √π/2 of σ to the mean absolute difference of two samples of Gaussian noise."""
+"""Ratio √π/2 between the standard deviation of Gaussian noise and the mean absolute difference of two samples."""
 
 
 @dataclass(frozen=True, slots=True)
-class QuantizationStep:
+class QuantizationStepAndNoise:
     """Quantization step and noise of one axis."""
 
     axis: int  # index into AXES
-    step: float  # rad/s or m/s²
-    noise: float  # standard deviation of successive samples, rad/s or m/s²
+    step: float  # quantization step, rad/s or m/s²
+    noise: float  # standard deviation from sample to sample, rad/s or m/s²
 
 
-def find_coarsely_quantized_axes(values: Floats) -> list[QuantizationStep]:
-    """Return the axes of samples [n, 6] with a quantization step of at least ``MIN_STEP_TO_NOISE`` times the noise.
+def find_coarsely_quantized_axes(values: Floats) -> list[QuantizationStepAndNoise]:
+    """Return the axes of samples [n, 6] whose quantization step is at least ``MIN_STEP_TO_NOISE`` times the noise.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[:, 4] = noise[:, 4].round()
@@ -56,12 +59,12 @@ def find_coarsely_quantized_axes(values: Floats) -> list[QuantizationStep]:
         levels = np.unique(np.concatenate(parts))
         step = _step(levels[np.isfinite(levels)], MIN_STEP_TO_NOISE * noise)
         if step is not None and noise > 0.0:
-            found.append(QuantizationStep(axis, step, noise))
+            found.append(QuantizationStepAndNoise(axis, step, noise))
     return found
 
 
 def _step(levels: Floats, least: float) -> float | None:
-    """Return the step of the regular grid that contains all values, or None if the step is below ``least``."""
+    """Return the step of the regular grid on which all values lie, or None if the step is below ``least``."""
     apart = np.diff(levels)
     if not apart.size or not apart.min() >= least:
         return None

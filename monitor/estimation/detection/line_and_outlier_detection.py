@@ -1,20 +1,20 @@
 """Detection of spectral lines, resonances and outliers in a recording.
 
-At most ``MAX_STRETCHES`` stretches of ``ROWS`` samples are searched, so even the longest recording takes less than a
-second. Stretches with more than ``MAX_MISSING_SHARE`` missing samples are skipped.
+At most ``MAX_STRETCHES`` segments of ``ROWS`` samples are searched, so the search takes less than a second even for
+long recordings. Segments in which more than ``MAX_MISSING_SHARE`` of the samples are missing are skipped.
 
-- **Spectral lines.** The periodograms of all stretches with a Hann window are averaged (Welch 1967). A peak must exceed
-  the medians of the neighbouring bins on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. Lines
-  are searched in single bins, and resonances in bins that are ``WIDE_BINS`` times wider. A line of amplitude A
-  contributes A² sin⁴(πfτ) / (m sin(πf/rate))² to the Allan variance (IEEE Std 952 annex C, for a mean of m samples).
-  Peaks that contribute less than ``MIN_LINE_SHARE`` at every averaging time are not reported.
-- **Outliers** deviate by more than ``OUTLIER_SIGMA`` σ from the median of a block of ``BLOCK`` samples. To exclude
-slopes, an outlier must also deviate by ``OUTLIER_SIGMA``/2 σ from the median of the neighbouring samples. σ is computed
-  from the median absolute deviation, and is at least one quantization step.
+- **Spectral lines.** The periodograms of all segments are computed with a Hann window and averaged (Welch 1967). A peak
+  must exceed the medians of the neighbouring bins on both sides by ``MIN_PEAK_SIGMA`` standard deviations and by the
+  factor ``MIN_PEAK_RATIO``. Lines are searched in single bins, and resonances in bins that are ``WIDE_BINS`` times
+  wider. A line of amplitude A contributes A² sin⁴(πfτ) / (m sin(πf/rate))² to the Allan variance (IEEE Std 952 annex C,
+  for a mean of m samples). A peak is not reported if its share of the Allan variance is below ``MIN_LINE_SHARE`` at
+  every averaging time.
+- **Outliers.** An outlier deviates by more than ``OUTLIER_SIGMA`` σ from the median of a block of ``BLOCK`` samples. To
+  exclude slopes, an outlier must also deviate by ``OUTLIER_SIGMA``/2 σ from the median of the neighbouring samples. The
+  standard deviation σ is computed from the median absolute deviation, and is at least one quantization step.
 
-Lines with fewer than ``FIRST_BIN`` cycles per stretch and lines of short duration are not detected.
-
-``reconcile`` tests lines and outliers by log-likelihood and does not use this module.
+Lines with fewer than ``FIRST_BIN`` cycles per segment and lines of short duration are not detected. The command
+``reconcile`` does not use this module, because it tests lines and outliers by log-likelihood.
 """
 
 from collections.abc import Iterator
@@ -31,56 +31,57 @@ from monitor.estimation.allan.curve import AllanCurve
 Mask = NDArray[np.bool_]
 
 ROWS: Final = 4096
-"""Maximum number of samples in a stretch of the recording."""
+"""Maximum number of samples in a segment of the recording."""
 MIN_ROWS: Final = 256
-"""Minimum number of samples in a stretch of the recording."""
+"""Minimum number of samples in a segment of the recording."""
 MIN_STRETCHES: Final = 8
-"""Minimum number of stretches for a spectrum."""
+"""Minimum number of segments over which a spectrum is averaged."""
 MAX_STRETCHES: Final = 128
-"""Maximum number of stretches for a spectrum."""
+"""Maximum number of segments over which a spectrum is averaged."""
 MAX_OUTLIER_STRETCHES: Final = 32
-"""Maximum number of stretches in the search for outliers.
+"""Maximum number of segments in which outliers are searched.
 
-With 131 072 samples, a share of 0.001 has a relative error of 10 %.
+In these 131 072 samples, a share of outliers of 0.001 is measured with a relative error of 10 %.
 """
 MAX_MISSING_SHARE: Final = 0.05
-"""Maximum share of missing samples in a stretch."""
+"""Maximum share of missing samples in a segment."""
 MIN_PEAK_SIGMA: Final = 6.5
-"""Minimum height of a peak in standard deviations.
+"""Minimum height of a spectral peak in standard deviations.
 
-With this limit, no line was found in 1000 simulated recordings of each noise type. The noise was white, flicker,
-quantized, random walk, low-pass filtered, coarse or repeated. Each recording had 2048 or 20 000 samples.
+With this limit, no false line was found in 1000 simulated recordings of each type of noise. The types were white,
+flicker, quantization and low-pass filtered noise, random walk, coarse resolution and repeated samples. Each recording
+had 2048 or 20 000 samples.
 """
 MIN_PEAK_RATIO: Final = 1.6
-"""Minimum ratio of a peak to the neighbouring bins.
+"""Minimum ratio of a spectral peak to the neighbouring bins.
 
-A slope or a filter edge has a smaller ratio.
+A sloping spectrum or the edge of a filter has a smaller ratio.
 """
 WIDE_BINS: Final = 16
-"""Width of the bins for resonances, in bins of the spectrum."""
+"""Width of the bins in which resonances are searched, in bins of the spectrum."""
 FIRST_BIN: Final = 6
-"""First bin in the search for peaks."""
+"""First bin of the spectrum that is searched for peaks."""
 MIN_BINS: Final = 64
-"""Minimum number of bins of a spectrum. With fewer bins, quantization noise resembles a peak."""
+"""Minimum number of bins in a spectrum. With fewer bins, quantization noise resembles a peak."""
 NEAR_BINS: Final = 3
-"""Number of bins on each side of a line that contain leakage of the Hann window."""
+"""Number of bins on each side of a line that contain spectral leakage of the Hann window."""
 SIDE_BINS: Final = 16
-"""Number of neighbouring bins on each side of a peak. Wide bins use a quarter of this number."""
+"""Number of neighbouring bins on each side with which a peak is compared. Wide bins use a quarter of this number."""
 FOOT_SIGMA: Final = 2.0
 """Minimum decrease in standard deviations over ``NEAR_BINS`` bins at the flank of a peak."""
 MIN_LINE_SHARE: Final = 0.002
-"""Minimum share of the Allan variance for a reported line."""
+"""Minimum share of the Allan variance that a reported line contributes."""
 MAX_LINES: Final = 3
-"""Maximum number of reported lines per axis."""
+"""Maximum number of lines that are reported per axis."""
 OUTLIER_SIGMA: Final = 5.0
 """Minimum deviation of an outlier in standard deviations."""
 BLOCK: Final = 63
-"""Number of samples in a block for the median.
+"""Number of samples in a block from which a median is computed.
 
-With an odd number, the median is one of the samples, and the deviations are whole quantization steps.
+If the number is odd, the median is one of the samples, and the deviations are whole quantization steps.
 """
 NEIGHBOURS: Final = 3
-"""Number of neighbouring samples on each side of an outlier. Up to three successive outliers are detected."""
+"""Number of samples on each side with which an outlier is compared. Up to three successive outliers are detected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,7 @@ class SpectralLine:
     axis: int  # index into AXES
     frequency_hz: float  # frequency after sampling, possibly an alias
     amplitude: float  # amplitude of a sinusoid with the same power, rad/s or m/s²
-    share: float  # largest share of the Allan variance at any averaging time
+    share: float  # largest share of the Allan variance over all averaging times
     wide: bool  # True for a resonance
 
 
@@ -98,13 +99,15 @@ class SpectralLine:
 class _Peak:
     """Peak in the spectrum of one axis."""
 
-    middle: float  # centre in bins
-    power: float  # mean square above the neighbouring bins, squared unit of the axis
+    middle: float  # centre of the peak in bins
+    power: float  # mean square in excess of the neighbouring bins, squared unit of the axis
     wide: bool  # True for a resonance
 
 
-def detect_spectral_lines(values: Floats, in_motion: Mask, rate_hz: float, curve: AllanCurve) -> list[SpectralLine]:
-    """Return the spectral lines of all axes. The strongest line of each axis is the first.
+def detect_spectral_lines_per_axis(
+    values: Floats, in_motion: Mask, rate_hz: float, curve: AllanCurve
+) -> list[SpectralLine]:
+    """Return the spectral lines of all axes. The lines of each axis are sorted from strong to weak.
 
     Parameters
     ----------
@@ -125,7 +128,7 @@ def detect_spectral_lines(values: Floats, in_motion: Mask, rate_hz: float, curve
         parts = [_filled(part) for part in _stretches(values[:, axis], in_motion, rows, MAX_STRETCHES)]
         if len(parts) < MIN_STRETCHES:
             continue
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # constant axes and extreme values
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # for constant axes and extreme values
             peaks = _peaks(_spectrum(np.stack(parts)), len(parts))
             of_axis = [_make_line(axis, peak, rate_hz / rows, rate_hz, curve) for peak in peaks]
         strong = sorted((one for one in of_axis if one.share >= MIN_LINE_SHARE), key=lambda one: -one.share)
@@ -180,7 +183,7 @@ def allan_variance_share_of_line(line: SpectralLine, curve: AllanCurve) -> Float
 
 
 def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[Floats]:
-    """Yield stretches [rows] with few missing samples; NaN means missing or in motion."""
+    """Yield segments [rows] with few missing samples, in which NaN means missing or in motion."""
     begins = np.linspace(0, len(column) - rows, min(most, max(2 * len(column) // rows - 1, 1))).astype(np.int64)
     for begin in begins:
         part = np.where(moving[begin : begin + rows], np.nan, column[begin : begin + rows])
@@ -189,23 +192,23 @@ def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[F
 
 
 def _filled(part: Floats) -> Floats:
-    """Return a stretch without the mean, and with 0 for missing samples."""
+    """Subtract the mean of a segment, and replace missing samples by 0."""
     there = np.isfinite(part)
     return np.where(there, part - part[there].mean(), 0.0)
 
 
 def _spectrum(parts: Floats) -> Floats:
-    """Return the mean square per bin [rows / 2] of zero-mean stretches [k, rows]."""
+    """Return the mean square per bin [rows / 2] of zero-mean segments [k, rows]."""
     window = np.hanning(parts.shape[1])
     turned = np.fft.rfft(parts * window, axis=1)[
         :, :-1
-    ]  # without the bin at half the rate, which has only one degree of freedom
+    ]  # The bin at half the sample rate is left out, because it has only one degree of freedom.
     power = (turned.real**2 + turned.imag**2).mean(axis=0)
     return np.asarray(2.0 * power / (parts.shape[1] * (window**2).sum()))
 
 
 def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
-    """Return the spectral lines, then the resonances."""
+    """Return the peaks of a spectrum, first the spectral lines and then the resonances."""
     taken = np.zeros(spectrum.size, np.bool_)
     found = []
     for width, side in ((1, SIDE_BINS), (WIDE_BINS, SIDE_BINS // 4)):
@@ -213,7 +216,7 @@ def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
         if power.size < MIN_BINS:
             continue
         runs = _find_runs(_significant_bins(power, parts * width, side))
-        # The flanks of higher peaks are excluded from the search.
+        # The highest peak comes first, because its flanks are excluded from the search for lower peaks.
         for first, last in sorted(runs, key=lambda run: -power[slice(*run)].max()):
             if first * width < FIRST_BIN or taken[first * width : last * width].any():
                 continue
@@ -253,7 +256,7 @@ def _find_feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int
 
 
 def _find_runs(marks: Mask) -> list[tuple[int, int]]:
-    """Return the first index and the end of each run of True."""
+    """Return the start and the end of each range of consecutive True elements."""
     edges = np.flatnonzero(np.diff(marks.astype(np.int8), prepend=0, append=0)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 

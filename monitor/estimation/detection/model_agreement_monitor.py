@@ -1,10 +1,10 @@
-"""Decisions whether the axes of a sensor agree with the noise model, with an event for each change of a decision.
+"""Monitor that decides whether each axis of a sensor agrees with the noise model, and reports changes as events.
 
-The window is compared with the noise model ten times per second, so successive comparisons are strongly correlated. An
-axis disagrees with the model if the largest difference exceeds ``AxisModelComparison.alarm`` in all comparisons during
-1/8 of the window. For differences above twice the threshold, ``MIN_SAMPLES`` samples are sufficient. An axis agrees
-again if the largest difference stays below ``null95`` during 1/8 of the window. In a simulation of 1600 windows of six
-axes with 128 comparisons each, a true model was rejected three times.
+The sliding window is compared with the noise model ten times per second, so successive comparisons are strongly
+correlated. An axis disagrees with the model if the largest difference exceeds ``AxisModelComparison.alarm`` while 1/8
+of the window is replaced by new samples. If the difference is larger than twice this limit, ``MIN_SAMPLES`` new samples
+are sufficient. An axis agrees again if the largest difference stays below ``null95`` while 1/8 of the window is
+replaced. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was rejected three times.
 """
 
 from collections.abc import Mapping
@@ -12,21 +12,21 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.data_types import AXES, Event
-from monitor.estimation.detection.model_comparison import MIN_SAMPLES, AxisModelComparison, ModelComparison
+from monitor.estimation.detection.comparison_with_noise_model import MIN_SAMPLES, AxisModelComparison, ModelComparison
 
 KIND: Final = "model_disagrees"
 RENEWED_SHARE: Final = 0.125
-"""Share of the window that must be new before a decision changes."""
+"""Share of the samples in the window that must be new before a decision changes."""
 CLEAR_FACTOR: Final = 2.0
-"""Ratio of the difference to the threshold above which fewer new samples are sufficient."""
+"""Ratio of the difference to the alarm limit above which fewer new samples are sufficient."""
 
 
 @dataclass(slots=True)
 class _Axis:
-    """State of the decision for one axis."""
+    """Current decision for one axis, and the evidence against it."""
 
     agrees: bool | None = None  # None until the first decision
-    since: tuple[int, int] | None = None  # number of samples and time of the first comparison against the decision
+    since: tuple[int, int] | None = None  # sample count and time at the first contradicting comparison
 
 
 class ModelAgreementMonitor:
@@ -37,7 +37,7 @@ class ModelAgreementMonitor:
 
     @property
     def agreement_by_axis(self) -> Mapping[str, bool]:
-        """Decision for each axis, True if the axis agrees with the noise model. Undecided axes are omitted."""
+        """Current decision for each axis, True if the axis agrees with the noise model. Undecided axes are omitted."""
         return {axis: one.agrees for axis, one in self._axes.items() if one.agrees is not None}
 
     def update_decisions(self, comparison: ModelComparison) -> list[Event]:
@@ -47,7 +47,7 @@ class ModelAgreementMonitor:
 
     def _update_axis(self, axis: _Axis, gap: AxisModelComparison, comparison: ModelComparison) -> Event | None:
         if axis.agrees is None and gap.gap <= gap.alarm:
-            axis.agrees = True  # an initial agreement is not reported
+            axis.agrees = True  # Initial agreement is not reported as an event.
         contradicted = gap.gap < gap.null95 if axis.agrees is False else gap.gap > gap.alarm
         if not contradicted:
             axis.since = None

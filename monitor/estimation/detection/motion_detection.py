@@ -1,12 +1,12 @@
 """Detection of motion, knocks and handling of the sensor.
 
-The detector replaces samples in motion by NaN and reports each episode of motion. The noise at rest is learned
-continuously from the samples (``motion_kernel``). For each episode, one block before the motion and two blocks after
-the motion are replaced as well.
+The detector replaces samples in motion by NaN and reports each episode of motion. It continuously learns the noise at
+rest from the samples, see ``motion_kernel``. The samples are processed in blocks. One block before and two blocks after
+each episode are replaced as well.
 
-The detector delays samples by two blocks, which is 0.5 s, or 16 samples at sample rates below 32 Hz. A disturbance that
-stays constant for 60 s counts as rest. During the first eight blocks, only signals that are too strong for a sensor at
-rest count as motion. Rotation at a constant rate below 2 °/s and motion below the noise are not detected.
+The detector delays samples by two blocks, which take 0.5 s, or 16 samples at sample rates below 32 Hz. A disturbance
+that stays constant for 60 s counts as rest. During the first eight blocks, only signals that no sensor shows at rest
+count as motion. Rotation at a constant rate below 2 °/s and motion below the noise are not detected.
 """
 
 from collections import deque
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Ints, SampleBlock, make_block
-from monitor.common.units import format_axis_value
+from monitor.common.unit_formatting import format_axis_value
 from monitor.estimation.detection.motion_kernel import (
     AXIS,
     BEGAN,
@@ -31,18 +31,18 @@ from monitor.estimation.detection.motion_kernel import (
 )
 
 BLOCK_S: Final = 0.25
-"""Length of a block in seconds."""
+"""Length of a block of samples in seconds."""
 MIN_BLOCK_SAMPLES: Final = 8
 """Minimum number of samples in a block."""
 MAX_KNOCK_BLOCKS: Final = 2
-"""Maximum number of moving blocks of a knock that does not change the orientation."""
+"""Maximum number of moving blocks in an episode that counts as a knock, if the orientation does not change."""
 
 Kind = Literal["knock", "motion", "handling/orientation"]
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
-    """Episode of motion."""
+class MotionEpisode:
+    """Detected episode of motion."""
 
     kind: Kind
     since: int  # index of the first replaced sample, counting missing samples
@@ -79,7 +79,7 @@ class MotionDetector:
         self._state = make_motion_state()
         self._held: deque[tuple[int, SampleBlock]] = deque()  # delayed blocks, with the index of the first sample
         self._index = 0  # index of the next sample
-        self._motions: list[Motion] = []
+        self._motions: list[MotionEpisode] = []
 
     @property
     def is_moving(self) -> bool:
@@ -87,7 +87,7 @@ class MotionDetector:
         return bool(self._state.place[BEGAN] >= 0)
 
     def advance_and_take_decided(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Process a block of samples, and return the samples with a final decision, oldest first."""
+        """Process a block of samples, and return the samples for which the decision is final, oldest first."""
         first = self._index + samples.lost
         self._held.append((first, samples))
         self._index = first + len(samples)
@@ -98,15 +98,15 @@ class MotionDetector:
         return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
     def flush_delayed_samples(self) -> list[SampleBlock]:
-        """Return the delayed samples at the end of the stream, and end the current episode."""
+        """Return the delayed samples at the end of the stream, and end the current episode of motion."""
         blocks, moving, episodes = _allocate_output(0, self._size)
         filled = advance_motion_detection(
             _read_only(np.empty((0, len(AXES)))), 0, self._size, True, self._state, blocks, moving, episodes
         )
         return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
-    def take_motions(self) -> list[Motion]:
-        """Return the episodes of motion that ended since the last call."""
+    def take_motions(self) -> list[MotionEpisode]:
+        """Return the episodes of motion that have ended since the last call."""
         motions, self._motions = self._motions, []
         return motions
 
@@ -128,7 +128,7 @@ class MotionDetector:
         return out
 
 
-def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[Motion]]:
+def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[MotionEpisode]]:
     """Detect motion in a whole recording on a regular time grid.
 
     Parameters
@@ -142,8 +142,8 @@ def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], li
     -------
     moving : ndarray of bool, shape (n,)
         True for samples in motion.
-    motions : list of Motion
-        Episodes of motion.
+    motions : list of MotionEpisode
+        Detected episodes of motion.
     """
     size = samples_per_block(rate_hz)
     kernel_state = make_motion_state()
@@ -156,14 +156,14 @@ def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], li
 
 
 def samples_per_block(rate_hz: float) -> int:
-    """Return the number of samples in a block."""
+    """Return the number of samples in a block at a given sample rate."""
     return max(round(BLOCK_S * rate_hz), MIN_BLOCK_SAMPLES)
 
 
 def _read_only(values: Floats) -> Floats:
     """Return the samples as a contiguous read-only array.
 
-    Numba compiles a kernel again for each memory layout and for writable arrays.
+    For each other memory layout, and for writable arrays, Numba would compile the kernel again.
     """
     view = np.ascontiguousarray(values, np.float64).view()
     view.flags.writeable = False
@@ -182,7 +182,7 @@ def _remove_moving(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlo
     return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
 
-def _make_motion(episode: Floats, size: int, rate_hz: float) -> Motion:
+def _make_motion(episode: Floats, size: int, rate_hz: float) -> MotionEpisode:
     first, last = int(episode[FIRST]), int(episode[LAST])
     axis, peak = AXES[int(episode[AXIS])], float(episode[PEAK])
     moving = last - first + 1
@@ -193,4 +193,4 @@ def _make_motion(episode: Floats, size: int, rate_hz: float) -> Motion:
     text = f"{verb[kind]} for {seconds:.1f} s: {size_text}"
     if kind == "knock":
         text = f"knocked: {size_text}"
-    return Motion(kind, max(first - 1, 0) * size, (last + 1 + REMOVED_AFTER) * size, seconds, axis, peak, text)
+    return MotionEpisode(kind, max(first - 1, 0) * size, (last + 1 + REMOVED_AFTER) * size, seconds, axis, peak, text)

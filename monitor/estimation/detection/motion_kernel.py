@@ -1,14 +1,16 @@
-"""Compiled kernel of the motion detector, which learns the noise at rest and decides for each block of samples.
+"""Compiled part of the motion detector, which learns the noise at rest and decides whether each block is in motion.
 
-A block is described by the log variance and the mean of each axis. The sample with the largest deviation is excluded,
-so a single outlier does not count as motion. The reference consists of the medians and the quartiles over the last
-``REFERENCE_BLOCKS`` blocks at rest. Up to a quarter of unusual blocks does not affect the reference.
+A block of samples is described by the mean and the logarithm of the variance of each axis. The sample with the largest
+deviation is excluded, so a single outlier does not count as motion. The reference consists of the medians and the
+quartiles over the last ``REFERENCE_BLOCKS`` blocks at rest. Unusual blocks do not affect the reference if they are
+fewer than a quarter.
 
-A block is moving if the variance of an axis is too large or the mean of an axis is too far from the reference. A
-constant new mean is a new orientation, which shifts the reference. A constant disturbance becomes the new reference. A
-far smaller variance also starts a new reference, because the old reference was learned in motion.
+A block is in motion if the variance of an axis is too large, or if the mean of an axis is too far from the reference.
+If the mean stays constant at a new value, the orientation has changed, and the reference is shifted. A disturbance that
+stays constant becomes the new reference. A much smaller variance also starts a new reference, because the old reference
+must have been learned in motion.
 
-The sample index determines the block, so decisions do not depend on the division of the input into calls.
+The index of a sample determines its block, so decisions do not depend on how the samples are divided into calls.
 """
 
 from math import exp, inf, log, nan, sqrt
@@ -23,58 +25,61 @@ from monitor.common.distributions import NORMAL_QUARTILE
 AXES: Final = 6
 GYROS: Final = 3
 REFERENCE_BLOCKS: Final = 240
-"""Number of blocks in the reference.
+"""Maximum number of blocks in the reference.
 
-240 blocks of 0.25 s take 60 s. A disturbance that lasts longer counts as rest.
+The 240 blocks of 0.25 s take 60 s. A constant disturbance that lasts longer counts as rest.
 """
 MIN_REFERENCE_BLOCKS: Final = 8
-"""Minimum number of blocks at rest in a reference. The limits of a new reference are twice as wide."""
+"""Minimum number of blocks at rest in a reference.
+
+With this number, the limits are twice as wide as with a long reference.
+"""
 BAND: Final = 8.0
 """Maximum deviation of a block at rest from the reference, in standard deviations."""
 LOUDER: Final = log(4.0)
-"""Minimum increase of the log variance for motion. The change detector reports smaller increases."""
+"""Minimum increase of the log variance that counts as motion. The change detector reports smaller increases."""
 LOUDEST: Final = log(100.0)
-"""Increase of the log variance that is always motion."""
+"""Increase of the log variance that always counts as motion."""
 TOGETHER: Final = log(2.5)
-"""Minimum mean increase of the log variance over all axes for weak motion."""
+"""Minimum increase of the log variance, averaged over all axes, that counts as weak motion."""
 TOGGLE: Final = 0.25
-"""Variance of an output that alternates between two adjacent levels, in squared quantization steps."""
+"""Variance of a signal that alternates between two adjacent quantization levels, in squared quantization steps."""
 DRIFT: Final = 100.0
-"""Maximum deviation of a mean at rest, relative to the deviation expected from the noise within blocks."""
+"""Maximum deviation of a block mean at rest, relative to the deviation expected from the noise within blocks."""
 QUIETER: Final = log(9.0)
-"""Minimum decrease of the log variance below the lower quartile that starts a new reference.
+"""Minimum decrease of the log variance below the lower quartile of the reference that starts a new reference.
 
-Most axes must be this quiet for ``MIN_REFERENCE_BLOCKS`` blocks.
+At least half of the axes must be this quiet for ``MIN_REFERENCE_BLOCKS`` blocks.
 """
 NEVER_AT_REST: Final = (0.1,) * 3 + (1.0,) * 3
-"""Limits in rad/s and m/s² that no MEMS sensor exceeds at rest.
+"""Limits in rad/s and m/s² that the noise of a MEMS sensor does not exceed at rest.
 
-Without a reference, the limits apply to the rms within a block and to the change between blocks.
+Before a reference exists, the limits apply to the rms within a block and to the change of the mean between blocks.
 """
 SETTLED: Final = 4
-"""Number of constant blocks after which a new mean is a new orientation."""
+"""Number of successive blocks with a constant mean after which a new orientation is accepted."""
 NEW_BIAS: Final = 0.035
 """Maximum bias change of a gyroscope after handling, in rad/s (2 °/s).
 
-A larger change counts as rotation until ``SPUN`` blocks have passed.
+A larger change counts as rotation for the first ``SPUN`` blocks.
 """
 SPUN: Final = 40
-"""Number of blocks (10 s) after which a larger bias change without other motion is accepted.
+"""Number of blocks (10 s) after which a larger change of the bias is accepted, if nothing else indicates motion.
 
-The reference was then learned during rotation.
+In this case, the reference must have been learned during rotation.
 """
 REMOVED_AFTER: Final = 2
 """Number of blocks that are replaced after a moving block."""
 EPISODE_GAP_BLOCKS: Final = 4
 """Number of blocks at rest that end an episode of motion."""
 LOOK_EVERY: Final = 20
-"""Number of blocks between two tests for a constant disturbance."""
+"""Number of blocks between two tests whether a disturbance is constant."""
 WANDER: Final = 4.0
-"""Maximum ratio of the scatter of the means to the scatter expected from the noise within blocks."""
+"""Maximum scatter of the block means, relative to the scatter expected from the noise within blocks."""
 MIN_VARIANCE: Final = 1e-30
-"""Variance of a constant signal."""
+"""Variance that is assigned to a constant signal, because the logarithm of zero is not finite."""
 MIN_BLOCK_SAMPLES: Final = 4
-"""Minimum number of samples in a block for a decision."""
+"""Minimum number of samples that a block must contain to be tested for motion."""
 
 OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED = range(10)
 """Elements of ``MotionState.place``:
@@ -89,9 +94,9 @@ OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED =
 - ``TURNED``: 1 if the orientation changed in the current episode.
 """
 FIRST, LAST, CHANGED, AXIS, PEAK = range(5)
-"""Columns of an episode: first and last moving block, change of the orientation, axis and size of the peak."""
+"""Columns of an episode: first and last moving block, change of the orientation, axis of the peak, size of the peak."""
 LOG_VARIANCE, MEAN = 0, 1
-"""Block statistics, which are the first index of the ring buffers."""
+"""Indices of the block statistics in the first dimension of the ring buffers."""
 COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
 """Columns of ``MotionState.open``:
 
@@ -107,13 +112,13 @@ COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
 class MotionState(NamedTuple):
     """State of the motion detector."""
 
-    place: Ints  # [10] counters and flags, see OPEN
-    open: Floats  # [6, 8] current block, see COUNT
-    seen: Ints  # [6] total number of learned blocks
-    shifted: Floats  # [6] sum of the shifts of the mean by new orientations
-    ring: Floats  # [2, 6, REFERENCE_BLOCKS] log variance and mean of blocks at rest, ring buffer
+    place: Ints  # [10] counters and flags, at the indices from OPEN to TURNED
+    open: Floats  # [6, 8] current block, with the columns from COUNT to STEP
+    seen: Ints  # [6] total number of blocks that were added to the reference
+    shifted: Floats  # [6] sum of the shifts of the mean caused by new orientations
+    ring: Floats  # [2, 6, REFERENCE_BLOCKS] ring buffer of the log variance and the mean of blocks at rest
     ordered: Floats  # [2, 6, REFERENCE_BLOCKS] sorted values of ``ring``
-    recent: Floats  # [2, 6, REFERENCE_BLOCKS] log variance and mean of all recent blocks
+    recent: Floats  # [2, 6, REFERENCE_BLOCKS] ring buffer of the log variance and the mean of all recent blocks
     peaks: Floats  # [2, 6] largest deviation in the current episode, in SI units and relative to the noise
 
 
@@ -141,7 +146,7 @@ def advance_motion_detection(
     moving: Ints,
     episodes: Floats,
 ) -> Ints:
-    """Process consecutive samples, and write new decisions and finished episodes to the output arrays.
+    """Process consecutive samples, and write new decisions and completed episodes of motion to the output arrays.
 
     Parameters
     ----------
@@ -152,18 +157,18 @@ def advance_motion_detection(
     block_samples : int
         Number of samples in a block.
     stream_ends : bool
-        True at the end of the stream, to decide for the last block and to end the current episode.
+        True at the end of the stream, to decide on the last block and to end the current episode.
     s : MotionState
         State of the motion detector, updated in place.
     blocks, moving : ndarray of int64, shape (at least n/size + 2,)
-        Output: number of each decided block, and 1 for a moving block.
+        Output arrays for the number of each decided block, and for the decision, which is 1 for motion.
     episodes : ndarray of float64, shape (at least n/size + 2, 5)
-        Output: finished episodes, with the columns ``FIRST``, ``LAST``, ``CHANGED``, ``AXIS`` and ``PEAK``.
+        Output array for completed episodes, with the columns ``FIRST``, ``LAST``, ``CHANGED``, ``AXIS`` and ``PEAK``.
 
     Returns
     -------
     ndarray of int64, shape (2,)
-        Numbers of new decisions and of finished episodes.
+        Number of new decisions, and number of completed episodes.
     """
     filled = np.zeros(2, np.int64)
     for i in range(values.shape[0]):
@@ -222,7 +227,7 @@ def _close(size: int, s: MotionState, blocks: Ints, moving: Ints, episodes: Floa
 
 @compiled
 def _measure(a: int, s: MotionState, now: Floats) -> None:
-    """Compute the log variance and the mean of one axis, without the sample of the largest deviation."""
+    """Compute the log variance and the mean of one axis, excluding the sample with the largest deviation."""
     n = s.open[a, COUNT]
     mean = s.open[a, SUM] / n
     square = s.open[a, SQUARES] - n * mean * mean
@@ -231,11 +236,11 @@ def _measure(a: int, s: MotionState, now: Floats) -> None:
     furthest = high if high > -low else low
     square = max(square - furthest * furthest * n / (n - 1.0), 0.0)
     mean -= furthest / (n - 1.0)
-    floor = s.open[a, STEP] ** 2 / 12.0  # maximum variance of a constant output
+    floor = s.open[a, STEP] ** 2 / 12.0  # variance of the quantization error
     now[LOG_VARIANCE, a] = log(square / (n - 2.0) + floor + MIN_VARIANCE)
     now[MEAN, a] = mean
     floor = log(floor + MIN_VARIANCE)
-    if s.ordered[LOG_VARIANCE, a, 0] < floor:  # the step was not known when these values were learned
+    if s.ordered[LOG_VARIANCE, a, 0] < floor:  # the quantization step was unknown when these values were learned
         for ring in (s.ordered, s.ring, s.recent):
             for k in range(REFERENCE_BLOCKS):
                 if ring[LOG_VARIANCE, a, k] < floor:
@@ -247,7 +252,7 @@ def _measure(a: int, s: MotionState, now: Floats) -> None:
 
 @compiled
 def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
-    """Return True if the block is moving. A new orientation shifts the reference."""
+    """Return True if a block is in motion. If the orientation has changed, the reference is shifted."""
     loud, off, rotates = False, False, False
     still = follows
     before = (s.place[RECENT] - 1) % REFERENCE_BLOCKS
@@ -263,7 +268,7 @@ def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
         young = 1.0 + MIN_REFERENCE_BLOCKS / n
         step = s.open[a, STEP]
         middle = _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)
-        # √(2/ν) approximates the standard deviation of ln(χ²/ν).
+        # The standard deviation of ln(χ²/ν) is approximately √(2/ν).
         sigma = min(max(_scatter(s.ordered[LOG_VARIANCE, a], n), sqrt(2.0 / (size - 2.0))), LOUDEST / BAND)
         loud |= exp(now[LOG_VARIANCE, a]) > exp(middle + young * max(LOUDER, BAND * sigma)) + step * step
         rise = log(max(exp(now[LOG_VARIANCE, a]) - TOGGLE * step * step, MIN_VARIANCE)) - middle
@@ -287,14 +292,14 @@ def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
 
 @compiled
 def _band(a: int, n: int, size: int, s: MotionState) -> float:
-    """Return the maximum deviation of a mean at rest from the median of the reference."""
+    """Return the maximum deviation of a block mean at rest from the median of the reference."""
     explained = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) / sqrt(size)
     return BAND * min(max(_scatter(s.ordered[MEAN, a], n), explained), DRIFT / BAND * explained)
 
 
 @compiled
 def _take_over(now: Floats, s: MotionState) -> None:
-    """Shift the means of the reference to the current means. The scatter does not change."""
+    """Shift the means of the reference to the current means, without a change of their scatter."""
     for a in range(AXES):
         n = min(s.seen[a], REFERENCE_BLOCKS)
         if now[MEAN, a] == now[MEAN, a] and n > 0:
@@ -373,7 +378,7 @@ def _rank(ordered: Floats, n: int, value: float) -> int:
 
 @compiled
 def _begin_anew(blocks: int, s: MotionState) -> None:
-    """Replace the reference by the most recent blocks."""
+    """Discard the reference, and learn a new reference from the most recent blocks."""
     for a in range(AXES):
         s.seen[a], s.shifted[a] = 0, 0.0
         for kind in range(2):
@@ -388,9 +393,9 @@ def _begin_anew(blocks: int, s: MotionState) -> None:
 
 @compiled
 def _steady(size: int, s: MotionState) -> bool:
-    """Return True if the last ``REFERENCE_BLOCKS`` blocks contain a constant disturbance.
+    """Return True if the signal has been statistically constant during the last ``REFERENCE_BLOCKS`` blocks.
 
-    The first and the second half must agree, without bursts and without drift of the mean.
+    The first and the second half of the blocks must agree, without bursts of noise and without drift of the mean.
     """
     half, ordered = REFERENCE_BLOCKS // 2, np.empty(REFERENCE_BLOCKS)
     for a in range(AXES):
@@ -420,7 +425,7 @@ def _steady(size: int, s: MotionState) -> bool:
 
 @compiled
 def _sort_recent(s: MotionState, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
-    """Write recent values without NaN to ``ordered`` in ascending order, and return the number of values."""
+    """Write the recent values except NaN to ``ordered`` in ascending order, and return the number of values."""
     n = 0
     for k in range(begin, end):
         value = s.recent[kind, a, (s.place[RECENT] + k) % REFERENCE_BLOCKS]
@@ -455,7 +460,7 @@ def _quantile(ordered: Floats, n: int, p: float) -> float:
 
 @compiled
 def _scatter(ordered: Floats, n: int) -> float:
-    """Return the standard deviation, computed from the larger distance of a quartile from the median."""
+    """Return the standard deviation, estimated from the median and the quartile that is farther from it."""
     low, middle, high = _quantile(ordered, n, 0.25), _quantile(ordered, n, 0.5), _quantile(ordered, n, 0.75)
     return max(high - middle, middle - low) / NORMAL_QUARTILE
 

@@ -1,9 +1,11 @@
-"""Share of rows in a recording that repeat the previous row because the sensor had no new measurement.
+"""Share of samples that repeat the previous sample because the sensor had no new measurement.
 
-Values can also repeat by chance if the resolution is coarse, but only on single axes. A repeated measurement repeats
-all axes. The noise may change during a recording, so the share is the median over stretches of ``ROWS`` rows.
+With coarse resolution, values can also repeat by chance, but only on single axes, whereas a repeated measurement
+repeats all axes. Because the noise may change during a recording, the share is the median over segments of ``ROWS``
+samples.
 
-``reconcile`` tests each axis separately, because it needs the positions of the repeated samples.
+The command ``reconcile`` does not use this module but tests each axis separately, because it needs the positions of the
+repeated samples.
 """
 
 from typing import Final
@@ -15,20 +17,20 @@ from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 
 ROWS: Final = 1000
-"""Number of rows in a stretch with constant noise."""
+"""Number of samples in a segment, during which the noise is assumed to be constant."""
 MAX_STRETCHES: Final = 500
 BISECTIONS: Final = 40
 
 
-def estimate_repeated_row_share(values: Floats) -> float:
-    """Return the share of rows [n, 6] that repeat the previous row because the sensor had no new measurement.
+def estimate_stale_sample_share(values: Floats) -> float:
+    """Return the share of samples [n, 6] that repeat the previous sample because the sensor had no new measurement.
 
     Let s be the share of repeated measurements, and q_a the probability that the value of axis a repeats by chance.
-    Axis a then repeats in a share s + (1 - s) q_a of all rows. All axes repeat in a share s + (1 - s) Π q_a. The
-    function solves these equations for s. NaN means missing. The share is 0 for fewer than two measured axes.
+    Axis a then repeats in a share s + (1 - s) q_a of all samples, and all axes repeat in a share s + (1 - s) Π q_a. The
+    function solves these equations for s. NaN means missing. For fewer than two measured axes, the share is 0.
 
     >>> noise = np.random.default_rng(0).normal(size=(5000, 6)).round()
-    >>> estimate_repeated_row_share(noise), round(estimate_repeated_row_share(noise.repeat(2, axis=0)), 1)
+    >>> estimate_stale_sample_share(noise), round(estimate_stale_sample_share(noise.repeat(2, axis=0)), 1)
     (0.0, 0.5)
     """
     there = np.array([not np.isnan(column[:1]).all() or not np.isnan(column).all() for column in values.T])
@@ -67,10 +69,10 @@ def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, pairs: Ints, 
 
 
 def _solve_share(each: Floats, all_of_them: Floats) -> Floats:
-    """Return the shares s [k] that solve all_of_them = s + (1 - s) Π (each - s)/(1 - s), by bisection.
+    """Solve all_of_them = s + (1 - s) Π (each - s)/(1 - s) for the shares s [k] by bisection.
 
-    ``each`` [k, axes] is the share of repeats of each axis. ``all_of_them`` [k] is the share of rows in which all axes
-    repeat.
+    ``each`` [k, axes] is the share of samples in which an axis repeats. ``all_of_them`` [k] is the share of samples in
+    which all axes repeat.
     """
     explained = each.prod(axis=1)
     none = all_of_them <= explained + 3.0 * np.sqrt(explained / ROWS)

@@ -1,20 +1,20 @@
-"""Motion and change detection for the samples of one device, before the samples reach the estimator.
+"""Detection of motion and noise changes in the samples of one device, before the samples reach the estimator.
 
-Motion and changes are reported as events. After a noise change, the monitor requests a restart of the axis. The change
-detector ignores samples in motion.
+Motion and noise changes are reported as events. After a noise change, the monitor requests that the estimator discards
+the old samples of the axis. The change detector ignores samples in motion.
 """
 
 from dataclasses import dataclass
 from typing import Final
 
 from drivers.data_types import AXES, Event, SampleBlock
-from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.motion_detection import Motion, MotionDetector
+from monitor.estimation.detection.change_detection import Change, NoiseAndBiasChangeDetector
+from monitor.estimation.detection.motion_detection import MotionDetector, MotionEpisode
 
 MAX_RATE_CHANGE: Final = 0.02
-"""Maximum relative change of the sample rate without a restart of the detectors."""
+"""Maximum relative change of the sample rate for which the detectors continue without a restart."""
 MAX_SKIPPED_SAMPLES: Final = 10_000_000
-"""Maximum number of missing samples that the change detector processes, which takes 1.6 s.
+"""Maximum number of successive missing samples that the change detector processes, which takes 1.6 s.
 
 After a longer gap, the change detector is restarted.
 """
@@ -22,25 +22,25 @@ After a longer gap, the change detector is restarted.
 
 @dataclass(frozen=True, slots=True)
 class AxisRestartRequest:
-    """Request to discard old samples of one axis after a noise change."""
+    """Request to discard the old samples of one axis after a noise change."""
 
     axis: int  # index into AXES
     samples: int  # number of samples since the noise change, including missing samples
 
 
 class SignalMonitor:
-    """Motion and change detection for one device.
+    """Detector of motion and noise changes for one device.
 
     Parameters
     ----------
     rate_hz : float
         Sample rate in Hz.
     remove_motion : bool
-        True to replace samples in motion by NaN. False to return all samples unchanged and without delay.
+        True to replace samples in motion by NaN, False to return all samples unchanged and without delay.
     alarms_per_day : float
-        Accepted false alarms of the change detector per day. 0 disables the change detector.
+        Accepted number of false alarms of the change detector per day. The value 0 disables the change detector.
     keep_samples_at_rest : bool
-        True to store samples at rest for ``take_samples_at_rest``.
+        True to store the samples that ``take_samples_with_motion_masked`` returns.
     """
 
     def __init__(
@@ -56,13 +56,13 @@ class SignalMonitor:
         self._keep_samples_at_rest = keep_samples_at_rest
         self._still: list[SampleBlock] = []
         self.orientation_changes = 0
-        """Number of changes of the orientation."""
-        self._received = 0  # samples since the start, including missing ones
+        """Number of times the orientation has changed."""
+        self._received = 0  # number of samples since the start, including missing samples
         self._newest_ns = 0
         self._moved_before = 0
         self._events: list[Event] = []
         self._restarts: list[AxisRestartRequest] = []
-        self._pending: list[SampleBlock] = []  # delayed blocks of the previous sample rate
+        self._pending: list[SampleBlock] = []  # delayed blocks that were received at the previous sample rate
         self._begin()
 
     @property
@@ -76,9 +76,9 @@ class SignalMonitor:
         return self._moved_before + self._rest.samples_in_motion
 
     def set_rate(self, rate_hz: float) -> None:
-        """Set a more accurate sample rate.
+        """Set a more accurate value of the sample rate.
 
-        The detectors restart if the rate differs by more than ``MAX_RATE_CHANGE``.
+        The detectors are restarted if the relative change of the rate exceeds ``MAX_RATE_CHANGE``.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._pending = self.flush_delayed_samples()
@@ -87,7 +87,7 @@ class SignalMonitor:
             self._begin()
 
     def process_samples(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Process a block of samples, and return the blocks for the estimator."""
+        """Process a block of samples, and return the blocks that are ready for the estimator."""
         self._received += samples.lost + len(samples)
         self._newest_ns = int(samples.t_ns[-1])
         still = self._rest.advance_and_take_decided(samples)
@@ -101,7 +101,7 @@ class SignalMonitor:
         return self._with_pending(still) if self._remove_motion else []
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call."""
+        """Return the events of motion and changes since the last call."""
         events, self._events = self._events, []
         return events
 
@@ -110,16 +110,18 @@ class SignalMonitor:
         restarts, self._restarts = self._restarts, []
         return restarts
 
-    def take_samples_at_rest(self) -> list[SampleBlock]:
-        """Return the samples at rest since the last call. Samples in motion are NaN."""
+    def take_samples_with_motion_masked(self) -> list[SampleBlock]:
+        """Return the samples since the last call, with NaN for samples in motion."""
         still, self._still = self._still, []
         return still
 
     def _begin(self) -> None:
         self._began = self._received
         self._rest = MotionDetector(self._rate_hz)
-        self._first = 0  # index of the first sample of the change detector, relative to ``_began``
-        self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day) if self._alarms_per_day > 0.0 else None
+        self._first = 0  # index of the first sample that the change detector received, relative to ``_began``
+        self._changes = (
+            NoiseAndBiasChangeDetector(self._rate_hz, self._alarms_per_day) if self._alarms_per_day > 0.0 else None
+        )
 
     def _with_pending(self, still: list[SampleBlock]) -> list[SampleBlock]:
         earlier, self._pending = self._pending, []
@@ -137,13 +139,13 @@ class SignalMonitor:
             if samples.lost > MAX_SKIPPED_SAMPLES:
                 self._report_changes(self._changes)
                 self._first += self._changes.samples_since_start + samples.lost
-                self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day)
+                self._changes = NoiseAndBiasChangeDetector(self._rate_hz, self._alarms_per_day)
             elif samples.lost:
                 self._changes.skip_missing_samples(samples.lost)
             self._changes.process_samples(samples.values)
         self._report_changes(self._changes)
 
-    def _report_changes(self, changes: ChangeDetector) -> None:
+    def _report_changes(self, changes: NoiseAndBiasChangeDetector) -> None:
         for change in changes.take_changes():
             self._events.append(self._change_event(change))
             if change.kind == "noise_changed":
@@ -152,7 +154,7 @@ class SignalMonitor:
                 )
                 self._restarts.append(AxisRestartRequest(change.axis, handed_on - change.since))
 
-    def _motion_event(self, motion: Motion) -> Event:
+    def _motion_event(self, motion: MotionEpisode) -> Event:
         what = {"moved": {"seconds": motion.seconds, "peak": motion.peak}}
         return Event("moved", self._t_ns(motion.until), motion.text, motion.axis, what, self._t_ns(motion.since))
 
@@ -162,5 +164,5 @@ class SignalMonitor:
         return Event(change.kind, found_ns, change.text, AXES[change.axis], what, since_ns, change.sigma)
 
     def _t_ns(self, index: int) -> int:
-        """Return the time of a sample from the index since the last restart, at most the time of the newest sample."""
+        """Return the time of a sample from its index since the restart, at most the time of the newest sample."""
         return self._newest_ns - round(max(self._received - self._began - 1 - index, 0) / self._rate_hz * 1e9)

@@ -16,19 +16,19 @@ SYMBOLS: Final = ("Q", "N", "B", "K", "R")
 class Status(IntEnum):
     """Status of a noise coefficient."""
 
-    UNESTIMATED = 0  # too few data, or withheld; value, lo and hi are NaN
-    UPPER_BOUND = 1  # value is NaN, lo is 0, hi is the one-sided 95 % upper bound
-    ESTIMATED = 2  # value with a two-sided 95 % interval
+    UNESTIMATED = 0  # not known, for example because of too little data; value, lo and hi are NaN
+    UPPER_BOUND = 1  # only an upper bound is known; value is NaN, lo is 0, hi is the one-sided 95 % upper bound
+    ESTIMATED = 2  # the value and the two-sided 95 % confidence interval are known
 
 
 @dataclass(frozen=True, slots=True)
 class Coefficients:
-    """Values and 95 % intervals of the coefficients of six axes in SI units (rad, m, s).
+    """Noise coefficients of six axes with 95 % confidence intervals, in SI units (rad, m, s).
 
-    The rows are Q N B K R, and the columns are gx to az.
+    The rows are in the order Q, N, B, K, R, and the columns in the order gx, gy, gz, ax, ay, az.
     """
 
     value: Floats  # [5, 6] NaN unless the status is ESTIMATED
-    lo: Floats  # [5, 6] lower end of the 95 % interval
-    hi: Floats  # [5, 6] upper end of the 95 % interval
+    lo: Floats  # [5, 6] lower end of the 95 % confidence interval
+    hi: Floats  # [5, 6] upper end of the 95 % confidence interval
     status: NDArray[np.int8]  # [5, 6] values of ``Status``

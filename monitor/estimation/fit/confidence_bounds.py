@@ -1,4 +1,4 @@
-"""Compiled functions for the confidence interval and the upper bound of a coefficient."""
+"""Compiled functions that compute the confidence interval and the upper bound of a noise coefficient."""
 
 from typing import Final
 
@@ -11,30 +11,30 @@ from monitor.estimation.fit.fit_kernel_types import TermResults
 from monitor.estimation.fit.least_squares import N, Q
 
 UPPER_BOUND_Z: Final = Z95
-"""Normal quantile of an upper bound.
+"""Quantile of the normal distribution from which an upper bound is computed.
 
-Large terms are estimated instead of bounded, so the probability of the reported bounds is below 97.5 %, but at least
-95 %.
+An upper bound is only reported for small coefficients, because large coefficients are estimated. The probability that a
+reported bound holds is therefore not 97.5 %, but at least 95 %.
 """
 EXCLUSION_SIGMA: Final = 3.3
-"""Deviation in σ at which a measured Allan variance excludes the contribution of a term.
+"""Deviation in σ at which a measured Allan variance excludes the contribution of a noise term.
 
-The probability that any of 20 Allan variances deviates by 3.3 σ is 1 %.
+With a probability of 1 %, at least one of 20 Allan variances deviates by 3.3 σ.
 """
 MIN_CUBE_ROOT_FACTOR: Final = 0.05
-"""Minimum factor of the cube root of χ² for a finite upper limit."""
+"""Minimum value of the normalized cube root of χ² for which the upper limit is finite."""
 
 
 @compiled
 def pearson_quantile(z: float, skewness: float) -> float:
-    """Return the quantile of probability Φ(z) of the standardized Pearson III distribution.
+    """Return the quantile of the standardized Pearson III distribution for the probability Φ(z).
 
-    The χ² approximation of Wilson & Hilferty (1931) is used.
+    The quantile is computed with the approximation of Wilson & Hilferty (1931).
 
     Parameters
     ----------
     z : float
-        Quantile of the normal distribution.
+        Quantile of the standard normal distribution.
     skewness : float
         Skewness of the distribution.
     """
@@ -44,11 +44,11 @@ def pearson_quantile(z: float, skewness: float) -> float:
 
 @compiled
 def confidence_interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> float:
-    """Return one end of the confidence interval of a coefficient.
+    """Return the lower or upper end of the confidence interval of a coefficient.
 
-    The end is √t, where the estimate û exceeds the true squared coefficient t by k standard deviations √v(t). The
-    factor k is a quantile of the Pearson III distribution with skewness 2 √c2. The squared coefficient t solves the
-    equation (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0. A negative solution is replaced by zero.
+    The end of the interval is √t, where the estimate û differs from t by k standard deviations √v(t). The factor k is a
+    quantile of the Pearson III distribution with skewness 2 √c2. The value t is a solution of the quadratic equation (1
+    − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0. A negative solution is replaced by zero.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def confidence_interval_end(estimate: float, c0: float, c1: float, c2: float, z:
     c0, c1, c2 : float
         Coefficients of the variance v(t) = c0 + c1 t + c2 t² of û.
     z : float
-        Normal quantile, positive for the lower end and negative for the upper end.
+        Quantile of the normal distribution, positive for the lower end and negative for the upper end.
     """
     k = pearson_quantile(z, 2.0 * np.sqrt(c2))
     a = 1.0 - k * k * c2
@@ -73,21 +73,21 @@ def confidence_interval_end(estimate: float, c0: float, c1: float, c2: float, z:
 def limit_terms_by_measured_avar(
     avar: Floats, edf: Floats, rows: Ints, unit_avar: Floats, filter_memory: int, terms: TermResults
 ) -> None:
-    """Limit each coefficient so that the contribution of the term exceeds no measured Allan variance.
+    """Limit each coefficient so that no noise term alone exceeds a measured Allan variance.
 
-    N is only limited at τ of more than ``filter_memory`` samples, because a filter in the sensor may have removed white
-    noise at shorter τ.
+    N is only limited at τ of more than ``filter_memory`` samples. At shorter τ, a low-pass filter in the sensor may
+    have removed white noise.
 
     Parameters
     ----------
     avar, edf : ndarray of float64, shape (m,)
-        Allan variance and its degrees of freedom.
+        Allan variances and their degrees of freedom.
     rows : ndarray of int64
-        Indices of the τ in use.
+        Indices of the τ to use.
     unit_avar : ndarray of float64, shape (m, 5)
-        Allan variance of unit coefficients.
+        Allan variance for each unit coefficient.
     filter_memory : int
-        Memory of the filter in samples.
+        Length of the impulse response of the low-pass filter in samples.
     terms : TermResults
         Results of the fit, updated in place.
     """
@@ -106,18 +106,18 @@ def limit_terms_by_measured_avar(
 
 @compiled
 def avar_upper_limit(avar: float, edf: float, z: float) -> float:
-    """Return the upper limit of the true Allan variance at z σ (Wilson & Hilferty 1931).
+    """Return the upper confidence limit of the true Allan variance at z σ (Wilson & Hilferty 1931).
 
-    The limit is infinite if there are too few degrees of freedom.
+    With too few degrees of freedom, the limit is infinite.
 
     Parameters
     ----------
     avar : float
         Measured Allan variance.
     edf : float
-        Degrees of freedom.
+        Degrees of freedom of the Allan variance.
     z : float
-        Normal quantile.
+        Quantile of the standard normal distribution.
     """
     spread = 2.0 / (9.0 * max(edf, 1.0))
     shrunk = 1.0 - spread - z * np.sqrt(spread)
@@ -126,14 +126,14 @@ def avar_upper_limit(avar: float, edf: float, z: float) -> float:
 
 @compiled
 def bound_q_by_first_point(avar: float, edf: float, unit_avar: float, terms: TermResults) -> None:
-    """Bound Q by the Allan variance at the shortest τ, because Q cannot be estimated for a band-limited sensor.
+    """Compute an upper bound of Q from the Allan variance at the shortest τ.
 
     Parameters
     ----------
     avar, edf : float
-        Allan variance at the shortest τ, and the degrees of freedom.
+        Allan variance at the shortest τ, and its degrees of freedom.
     unit_avar : float
-        Allan variance of Q = 1 at the same τ.
+        Allan variance of unit Q at the shortest τ.
     terms : TermResults
         Results of the fit, updated in place.
     """

@@ -1,7 +1,7 @@
-"""Compiled kernel of the fit, which computes the weights and the non-negative solution of each axis.
+"""Compiled functions that fit the noise coefficients of each axis by weighted non-negative least squares.
 
-The units are described in ``fit_kernel_types``. For given weights, the coefficients are a linear function of the Allan
-variances. The kernel stores this linear map for ``continuous_refit``, with the limits within which the map is valid.
+The units are described in ``fit_kernel_types``. For given weights, the squared coefficients are a linear function of
+the Allan variances. This linear function and the limits within which it is valid are stored for ``continuous_refit``.
 """
 
 from typing import Final
@@ -13,13 +13,13 @@ from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES, PAIRS
 from monitor.estimation.fit.confidence_bounds import bound_q_by_first_point, limit_terms_by_measured_avar
 from monitor.estimation.fit.fit_kernel_types import (
-    CurvesOfAxes,
     FitOptions,
     FitOutput,
     LeastSquares,
     SharedInputs,
     SolutionMaps,
     TermResults,
+    VariancesAndSlopesOfAxes,
 )
 from monitor.estimation.fit.least_squares import (
     N,
@@ -31,34 +31,34 @@ from monitor.estimation.fit.least_squares import (
     solve_nonnegative,
 )
 from monitor.estimation.fit.term_selection import (
-    compute_map_validity_limits,
-    select_ramp,
+    compute_linear_map_validity_limits,
     select_terms,
     store_linear_map,
     tighten_bounds,
+    update_ramp_selection,
 )
 
 MIN_ROWS: Final = NOISES + 1
-"""Minimum number of τ for a fit of four terms."""
+"""Minimum number of averaging times for a fit of the four noise terms Q, N, B and K."""
 COLD_PASSES: Final = 3
-"""Number of times the weights are recomputed in a fit without a start."""
+"""Number of iterations that recompute the weights if no previous fit is known."""
 WARM_PASSES: Final = 1
-"""Number of times the weights are recomputed in a fit that starts from a recent fit."""
+"""Number of iterations that recompute the weights if the fit starts from a recent fit."""
 MISFIT_SIGMA: Final = 4.0
 """Residual in σ above which the Allan variance at a short τ contradicts the fit."""
 REPEATED_MISFIT_SIGMA: Final = 2.5
 """Residual in σ above which the Allan variance at a short τ contradicts a fit with a negative Q².
 
-A lower limit prevents a bias of N.
+This limit is lower than ``MISFIT_SIGMA`` to prevent a bias of N.
 """
 TOTAL_MISFIT_SIGMA: Final = 6.0
-"""Number of standard deviations of χ² above which the five terms do not explain the Allan variances."""
+"""Deviation of χ² in σ above which the five noise terms do not explain the Allan variances."""
 SHORT_ROWS: Final = 4
-"""Number of shortest τ at which the residuals are tested."""
+"""Number of averaging times, from the shortest τ, at which the residuals are tested."""
 FILTER_MEMORY: Final = 16
-"""Largest cluster size in samples that can be left out."""
+"""Largest cluster size in samples that can be left out of a fit."""
 WHITE: Final = PAIRS.index((N, N))
-"""Index of the pair (N, N) in ``CovarianceTable.covariance``."""
+"""Index of the pair (N, N) in the last dimension of ``CovarianceTable.covariance``."""
 
 
 @compiled
@@ -66,12 +66,12 @@ def fit_axes(
     first_axis: int,
     end_axis: int,
     shared: SharedInputs,
-    curves: CurvesOfAxes,
+    curves: VariancesAndSlopesOfAxes,
     options: FitOptions,
     output: FitOutput,
     maps: SolutionMaps,
 ) -> None:
-    """Fit the coefficients of the axes first_axis ≤ axis < end_axis.
+    """Fit the noise coefficients of the axes first_axis ≤ axis < end_axis.
 
     Parameters
     ----------
@@ -79,14 +79,14 @@ def fit_axes(
         Range of axes.
     shared : SharedInputs
         Inputs that are the same for all axes.
-    curves : CurvesOfAxes
-        Measured Allan variances and slopes.
+    curves : VariancesAndSlopesOfAxes
+        Measured Allan variances and slopes of the rate.
     options : FitOptions
-        Thresholds and weights.
+        Thresholds to add and to drop noise terms, and the kind of weights.
     output : FitOutput
-        Results, updated in place.
+        Results of the fit, updated in place.
     maps : SolutionMaps
-        Linear maps of the solutions, updated in place.
+        Linear maps from the Allan variances to the solutions, updated in place.
     """
     for axis in range(first_axis, end_axis):
         _fit_axis(axis, shared, curves, options, output, maps)
@@ -94,7 +94,12 @@ def fit_axes(
 
 @compiled
 def _fit_axis(
-    axis: int, shared: SharedInputs, curves: CurvesOfAxes, options: FitOptions, output: FitOutput, maps: SolutionMaps
+    axis: int,
+    shared: SharedInputs,
+    curves: VariancesAndSlopesOfAxes,
+    options: FitOptions,
+    output: FitOutput,
+    maps: SolutionMaps,
 ) -> None:
     curve, slope, m = curves.avar[axis], curves.slope[axis], curves.avar.shape[1]
     straight = slope == slope
@@ -118,14 +123,14 @@ def _fit_axis(
     tests = select_terms(problem, used, options, straight, misfit, terms)
     tighten_bounds(problem, used, misfit, tests, terms)
     for a in range(5):
-        if terms.status[a] == 1 and not terms.hi[a] < np.inf:  # there are too few τ for a bound
+        if terms.status[a] == 1 and not terms.hi[a] < np.inf:  # too few averaging times for an upper bound
             terms.status[a], terms.lo[a], terms.hi[a] = 0, np.nan, np.nan
-    noise, most, maps.either[axis] = select_ramp(slope, shared.slope_variance, options, terms)
+    noise, most, maps.either[axis] = update_ramp_selection(slope, shared.slope_variance, options, terms)
     compute_observation_variances(problem, rows, terms.theta)
     _draw(axis, rows, shared.columns, noise, problem.variance, output)
     maps.free[axis] = free
     if store_linear_map(axis, used, problem, curves, output, maps):
-        compute_map_validity_limits(maps.low[axis], maps.high[axis], options, tests, most, terms)
+        compute_linear_map_validity_limits(maps.low[axis], maps.high[axis], options, tests, most, terms)
     if misfit > 1.0:
         limit_terms_by_measured_avar(curve, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms)
     if free:
@@ -134,8 +139,8 @@ def _fit_axis(
 
 
 @compiled
-def _prepare_rows(axis: int, shared: SharedInputs, curves: CurvesOfAxes, problem: LeastSquares) -> Ints:
-    """Return the indices of the τ in use, and subtract the contribution of the slope from the Allan variances."""
+def _prepare_rows(axis: int, shared: SharedInputs, curves: VariancesAndSlopesOfAxes, problem: LeastSquares) -> Ints:
+    """Subtract the contribution of the slope from the Allan variances, and return the indices of the τ to use."""
     curve, terms, slope = curves.avar[axis], curves.terms[axis], curves.slope[axis]
     rows, count = np.empty(curve.size, np.int64), 0
     for i in range(curve.size):
@@ -158,9 +163,9 @@ def _fit_or_fall_back(
     options: FitOptions,
     output: FitOutput,
 ) -> tuple[int, bool]:
-    """Fit with the full covariance, or with the variances alone if the misfit is too large.
+    """Fit with the full covariance matrix, or with the variances alone if the misfit is too large.
 
-    Return the number of shortest τ that are left out, and True if Q² may be negative.
+    Return the number of the shortest τ that are left out, and True if Q² may be negative.
     """
     full_covariance, theta = options.full_covariance, output.theta[axis]
     while True:
@@ -168,7 +173,7 @@ def _fit_or_fall_back(
         scatter, limit = _misfit(problem, rows[first:], theta)
         if not full_covariance or scatter <= limit:
             break
-        full_covariance = False  # for noise other than the five terms, the covariances are wrong
+        full_covariance = False  # the covariances only hold for the five noise terms
     output.left_out[axis], output.scatter[axis] = first, scatter
     output.misfit[axis] = scatter if scatter > limit else 1.0
     return first, free
@@ -184,7 +189,7 @@ def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats
             model += columns[i, a] * theta[a]
             positive += columns[i, a] * max(theta[a], 0.0)
         output.fitted[axis, i] = model if k >= output.left_out[axis] and model > 0.0 else np.nan
-        # The product of a ramp with the noise of the mean second difference adds 4 R² (m²/2)² Var(slope).
+        # The product of linear drift and noise in the mean second difference adds the variance 4 R² (m²/2)² Var(slope).
         variance[i] += 4.0 * theta[R] * columns[i, R] ** 2 * noise
         output.edf[axis, i] = 2.0 * positive * positive / variance[i]
 
@@ -199,9 +204,9 @@ def _fit_terms(
     warm: bool,
     theta: Floats,
 ) -> tuple[int, bool]:
-    """Fit Q N B K with recomputed weights.
+    """Fit Q, N, B and K iteratively with recomputed weights.
 
-    Return the number of shortest τ that are left out, and True if Q² may be negative.
+    Return the number of the shortest τ that are left out, and True if Q² may be negative.
     """
     first, free = 0, False
     warm = warm and theta[N] > 0.0
@@ -210,7 +215,7 @@ def _fit_terms(
         if warm:
             compute_weights(problem, used, theta, full_covariance)
         else:
-            for i in used:  # the first weights assume white noise
+            for i in used:  # the weights of the first iteration assume white noise
                 variance = curve[i] * curve[i] * problem.covariance[i, i, WHITE] / problem.columns[i, N] ** 2
                 for a in range(5):
                     problem.weighted[i, a] = problem.columns[i, a] / variance
@@ -225,7 +230,7 @@ def _fit_terms(
             free = True
         elif used.size > MIN_ROWS and problem.columns[used[0], N] * FILTER_MEMORY >= 1.0:
             first += 1
-        else:  # The cause is not a low-pass filter.
+        else:  # A low-pass filter does not explain the misfit.
             first, free, may_drop_short_taus = 0, False, False
     compute_normal_equations(problem, used)
     solve_nonnegative(problem.normal, problem.right, free, theta)
@@ -234,9 +239,9 @@ def _fit_terms(
 
 @compiled
 def _misfit(problem: LeastSquares, rows: Ints, theta: Floats) -> tuple[float, float]:
-    """Return the mean squared residual in σ², and the limit of the mean squared residual for the five terms.
+    """Return the mean squared residual in σ², and the largest value that the five noise terms would explain.
 
-    Above the limit, the confidence intervals are widened (Birge 1932).
+    If the mean squared residual exceeds the limit, the confidence intervals are widened (Birge 1932).
     """
     level, columns, variance = problem.level, problem.columns, problem.variance
     total, freedom = 0.0, rows.size
@@ -258,7 +263,8 @@ def _misfit(problem: LeastSquares, rows: Ints, theta: Floats) -> tuple[float, fl
 def _is_contradicted(problem: LeastSquares, rows: Ints, theta: Floats, limit: float) -> bool:
     """Return True if any residual exceeds ``limit`` σ.
 
-    The residual is computed from the cube root of χ², which is approximately normal (Wilson & Hilferty 1931).
+    Residuals are computed from the cube root of χ², whose distribution is approximately normal (Wilson & Hilferty
+    1931).
     """
     columns = problem.columns
     for i in rows:

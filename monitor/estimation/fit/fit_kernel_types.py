@@ -1,7 +1,7 @@
-"""Named tuples of arrays that the compiled functions of the fit exchange.
+"""Named tuples of arrays that are passed between the compiled functions of the fit.
 
-All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²). NaN means that a result
-is unknown.
+Time is in units of one sample interval τ0, so θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²). NaN means that a result is
+unknown.
 """
 
 from typing import Final, NamedTuple
@@ -13,35 +13,35 @@ from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.uncertainty import NOISES
 
 LIMIT_COUNT: Final = 2 * NOISES
-"""Number of limits in ``SolutionMaps``, for θ and for the unconstrained solution û of Q N B K."""
+"""Number of limits in ``SolutionMaps`` for the solution θ and the unconstrained solution û of Q, N, B and K."""
 
 
 class SharedInputs(NamedTuple):
-    """Inputs of a fit that are the same for all axes at one window length."""
+    """Inputs of a fit that are the same for all axes with the same number of samples."""
 
-    columns: Floats  # [m, 5] Allan variance of unit coefficients
-    flat: Floats  # [m, 5] ``columns`` after subtraction of the measured slope
-    covariance: Floats  # [m, m, 10] ``CovarianceTable.covariance``
-    whole: Floats  # [m] number of second differences in a window without missing samples
-    slope_variance: Floats  # [4] variance of the slope of the rate for unit coefficients
-    ignored_direction: Floats  # [m] change of the Allan variances that has no effect on the fit; 0 for none
+    columns: Floats  # [m, 5] Allan variance for each unit coefficient
+    flat: Floats  # [m, 5] ``columns`` if the contribution of the measured slope has been subtracted
+    covariance: Floats  # [m, m, 10] field ``CovarianceTable.covariance``
+    whole: Floats  # [m] number of second differences if no samples are missing
+    slope_variance: Floats  # [4] variance of the slope of the rate for each unit coefficient
+    ignored_direction: Floats  # [m] change of the Allan variances that must not affect the fit; 0 for none
     may_drop_short_taus: bool  # True to leave out the shortest τ if they contradict the fit
 
 
-class CurvesOfAxes(NamedTuple):
-    """Measured Allan variances and slopes, with one row per axis."""
+class VariancesAndSlopesOfAxes(NamedTuple):
+    """Measured Allan variances and slopes of the rate, with one row per axis."""
 
     avar: Floats  # [axes, m] Allan variance
-    terms: Floats  # [axes, m] number of second differences averaged
+    terms: Floats  # [axes, m] number of averaged second differences
     slope: Floats  # [axes] slope of the rate; NaN means not measured
     slopes: Floats  # [axes, m] slope of the rate at each τ
 
 
 class FitOptions(NamedTuple):
-    """Options of a fit."""
+    """Thresholds and weights of a fit."""
 
-    enter: float  # threshold in σ to add a term
-    leave: float  # threshold in σ to drop a term
+    enter: float  # threshold in σ to add a noise term
+    leave: float  # threshold in σ to drop a noise term
     full_covariance: bool  # True to weight by the covariances of all τ, False to weight by their variances alone
     warm: bool  # True to start with the weights of ``FitOutput.theta``
 
@@ -49,53 +49,53 @@ class FitOptions(NamedTuple):
 class FitOutput(NamedTuple):
     """Results of a fit, with one row per axis."""
 
-    entered: NDArray[np.bool_]  # [axes, 5] True for terms in the fit; on input, of the previous fit
-    theta: Floats  # [axes, 5] squared coefficients; on input, the start of a warm fit
-    lo: Floats  # [axes, 5] lower end of the interval
-    hi: Floats  # [axes, 5] upper end of the interval
+    entered: NDArray[np.bool_]  # [axes, 5] True for noise terms in the fit; on input, terms of the previous fit
+    theta: Floats  # [axes, 5] squared coefficients; on input, result of a recent fit
+    lo: Floats  # [axes, 5] lower end of the confidence interval
+    hi: Floats  # [axes, 5] upper end of the confidence interval
     status: NDArray[np.int8]  # [axes, 5] values of ``Status``
     edf: Floats  # [axes, m] degrees of freedom of the Allan variance
     fitted: Floats  # [axes, m] Allan variance of the fitted model
-    left_out: Ints  # [axes] number of shortest τ left out
-    misfit: Floats  # [axes] ``scatter`` if the residuals are significantly too large, otherwise 1
-    scatter: Floats  # [axes] mean squared residual relative to the variance expected from the five terms
+    left_out: Ints  # [axes] number of averaging times that are left out, from the shortest τ
+    misfit: Floats  # [axes] equal to ``scatter`` if the residuals are significantly too large, otherwise 1
+    scatter: Floats  # [axes] mean squared residual, relative to the variance that the five noise terms explain
 
 
 class TermResults(NamedTuple):
-    """Results of the fit of one axis, which are rows of ``FitOutput``."""
+    """Results of the fit of one axis, which are views of one row of ``FitOutput``."""
 
-    entered: NDArray[np.bool_]  # [5] True for terms in the fit
+    entered: NDArray[np.bool_]  # [5] True for noise terms in the fit
 
     theta: Floats  # [5] squared coefficients
-    lo: Floats  # [5] lower end of the interval
-    hi: Floats  # [5] upper end of the interval
+    lo: Floats  # [5] lower end of the confidence interval
+    hi: Floats  # [5] upper end of the confidence interval
     status: NDArray[np.int8]  # [5] values of ``Status``
 
 
 class LeastSquares(NamedTuple):
-    """Weighted least-squares problem of one axis, with memory for weights and normal equations."""
+    """Weighted least-squares problem of one axis, with its weights and normal equations."""
 
     level: Floats  # [m] observations y: Allan variances without the contribution of the slope
-    stretch: Floats  # [m] square root of the ratio of possible to present second differences
-    columns: Floats  # [m, 5] columns X
-    covariance: Floats  # [m, m, 10] ``CovarianceTable.covariance``
-    ignored_direction: Floats  # [m] change without effect on the fit; the outer product is added to V
-    variance: Floats  # [m] variances of the observations under the model
+    stretch: Floats  # [m] square root of the ratio of all second differences to complete second differences
+    columns: Floats  # [m, 5] design matrix X
+    covariance: Floats  # [m, m, 10] field ``CovarianceTable.covariance``
+    ignored_direction: Floats  # [m] change of y that must not affect the fit; its outer product is added to V
+    variance: Floats  # [m] variances of the observations, the diagonal of V
     weighted: Floats  # [m, 5] V⁻¹ X
     normal: Floats  # [5, 5] Xᵀ V⁻¹ X
     right: Floats  # [5] Xᵀ V⁻¹ y
 
 
 class TermTests(NamedTuple):
-    """Test statistics of the terms Q N B K of one axis."""
+    """Test statistics of the noise terms Q, N, B and K of one axis."""
 
     estimate: Floats  # [5] unconstrained solution û
-    absent_variance: Floats  # [4] variance of û for an absent term
-    enter_limit: Floats  # [4] value of û above which an absent term is added
+    absent_variance: Floats  # [4] variance of û if the noise term is absent
+    enter_limit: Floats  # [4] value of û above which an absent noise term is added
 
 
 class SolutionMaps(NamedTuple):
-    """Linear maps from the Allan variances of each axis to the coefficients, with limits of validity.
+    """Linear maps from the Allan variances of each axis to the squared coefficients, with limits of validity.
 
     The right-hand side of the normal equations is r = Xᵀ V⁻¹ y. The constrained solution is θ = ``inverse`` r, and the
     unconstrained solution is û = ``whole`` r.
@@ -105,11 +105,11 @@ class SolutionMaps(NamedTuple):
     ramp: Floats  # [axes, NOISES] factor of slope² that is subtracted from r
     twist: Floats  # [axes, NOISES] factor of the slope that is subtracted from r
     normal: Floats  # [axes, 5, 5] Xᵀ V⁻¹ X
-    inverse: Floats  # [axes, NOISES, NOISES]
-    whole: Floats  # [axes, NOISES, NOISES]
+    inverse: Floats  # [axes, NOISES, NOISES] linear map from r to θ
+    whole: Floats  # [axes, NOISES, NOISES] linear map from r to û
     low: Floats  # [axes, LIMIT_COUNT + 1] lower limits of θ, of û and of the absolute slope
     high: Floats  # [axes, LIMIT_COUNT + 1] upper limits of θ, of û and of the absolute slope
-    used: Ints  # [axes, 2] range of the τ in use; empty if there is no solution
+    used: Ints  # [axes, 2] range of the τ that are used; empty if there is no solution
     free: NDArray[np.bool_]  # [axes] True if Q² may be negative
     straight: NDArray[np.bool_]  # [axes] True if slope² τ²/2 is subtracted from the Allan variance
     either: NDArray[np.bool_]  # [axes] True if K and R cannot be distinguished
@@ -125,7 +125,7 @@ def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput
     m : int
         Number of τ.
     entered : ndarray of bool, shape (axes, 5)
-        Terms of the previous fit, which become part of the result.
+        Noise terms of the previous fit, which become part of the returned object.
     """
     theta, lo, hi = np.full((3, axes, 5), np.nan)
     edf, fitted = np.full((2, axes, m), np.nan)
@@ -134,7 +134,7 @@ def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput
 
 
 def empty_solution_maps(axes: int, m: int) -> SolutionMaps:
-    """Allocate the arrays for linear maps, which are invalid before a fit.
+    """Allocate the arrays for linear maps, which are marked as invalid.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Compiled solver for small weighted least-squares problems with correlated observations and non-negative solutions.
+"""Compiled solver for small non-negative least-squares problems with correlated observations.
 
-``fit_kernel_types.LeastSquares`` contains the problem for all τ, and ``rows`` contains the indices of the τ in use.
-Loops are used because they compile several times faster than array expressions.
+A ``LeastSquares`` object contains the observations at all τ, and ``tau_indices`` selects the τ to use. The code uses
+loops because they compile several times faster than array expressions.
 """
 
 from typing import Final
@@ -14,12 +14,12 @@ from monitor.estimation.allan.uncertainty import NOISES
 from monitor.estimation.fit.fit_kernel_types import LeastSquares
 
 SINGULAR_COVARIANCE: Final = 1e-9
-"""Smallest pivot of a regular correlation matrix of the observations."""
+"""Pivot below which the correlation matrix of the observations counts as singular."""
 SINGULAR_NORMAL: Final = 1e-12
-"""Smallest pivot of a regular correlation matrix of the coefficients."""
+"""Pivot below which the correlation matrix of the coefficients counts as singular."""
 
 Q, N, B, K, R = range(5)
-"""Rows of the coefficients in θ."""
+"""Indices of the coefficients in θ."""
 
 
 @compiled
@@ -35,57 +35,62 @@ def _allan_covariance(theta: Floats, c: Floats) -> float:
 
 
 @compiled
-def compute_observation_variances(problem: LeastSquares, rows: Ints, theta: Floats) -> None:
-    """Compute the variances of the observations under a model.
+def compute_observation_variances(problem: LeastSquares, tau_indices: Ints, theta: Floats) -> None:
+    """Compute the variances of the observations that a noise model predicts.
 
     Parameters
     ----------
     problem : LeastSquares
-        Problem, in which ``variance`` is overwritten.
-    rows : ndarray of int64
-        Indices of the τ in use.
+        Least-squares problem, whose field ``variance`` is overwritten.
+    tau_indices : ndarray of int64
+        Indices of the τ to use.
     theta : ndarray of float64, shape (5,)
-        Squared coefficients of the model.
+        Squared coefficients of the noise model.
     """
-    for i in rows:
+    for i in tau_indices:
         stretch = problem.stretch[i]
         problem.variance[i] = _allan_covariance(theta, problem.covariance[i, i]) * stretch * stretch
 
 
 @compiled
-def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full_covariance: bool) -> None:
-    """Compute the weights V⁻¹ X from the covariance V of the observations under a model.
+def compute_weights(problem: LeastSquares, tau_indices: Ints, theta: Floats, full_covariance: bool) -> None:
+    """Compute the weights V⁻¹ X from the covariance matrix V of the observations that a noise model predicts.
 
     Parameters
     ----------
     problem : LeastSquares
-        Problem, in which ``variance`` and ``weighted`` are overwritten.
-    rows : ndarray of int64
-        Indices of the τ in use.
+        Least-squares problem, whose fields ``variance`` and ``weighted`` are overwritten.
+    tau_indices : ndarray of int64
+        Indices of the τ to use.
     theta : ndarray of float64, shape (5,)
-        Squared coefficients of the model.
+        Squared coefficients of the noise model.
     full_covariance : bool
-        True to use the covariances, False to use the variances alone.
+        True to use the full covariance matrix, False to use the variances alone.
     """
-    compute_observation_variances(problem, rows, theta)
-    if full_covariance and _whiten(problem, rows, theta):
+    compute_observation_variances(problem, tau_indices, theta)
+    if full_covariance and _whiten(problem, tau_indices, theta):
         return
     weighted, columns, variance = problem.weighted, problem.columns, problem.variance
-    for i in rows:
+    for i in tau_indices:
         for a in range(5):
             weighted[i, a] = columns[i, a] / variance[i]
 
 
 @compiled
-def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
-    """Compute V⁻¹ X by Cholesky decomposition; return False if the correlation matrix is not positive definite."""
-    # Local variables, because each access to a field in a loop changes a reference count.
-    m, variance, stretch, ignored_direction = rows.size, problem.variance, problem.stretch, problem.ignored_direction
+def _whiten(problem: LeastSquares, tau_indices: Ints, theta: Floats) -> bool:
+    """Compute V⁻¹ X by Cholesky decomposition, and return False if the correlation matrix is singular."""
+    # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
+    m, variance, stretch, ignored_direction = (
+        tau_indices.size,
+        problem.variance,
+        problem.stretch,
+        problem.ignored_direction,
+    )
     covariance, columns, weighted = problem.covariance, problem.columns, problem.weighted
     factor, column = np.empty((m, m)), np.empty(m)
     for k in range(m):
         for j in range(k + 1):
-            i, h = rows[k], rows[j]
+            i, h = tau_indices[k], tau_indices[j]
             x = (
                 _allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h]
                 + ignored_direction[i] * ignored_direction[h]
@@ -95,25 +100,25 @@ def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
         return False
     for a in range(5):
         for k in range(m):
-            column[k] = columns[rows[k], a] / np.sqrt(variance[rows[k]])
+            column[k] = columns[tau_indices[k], a] / np.sqrt(variance[tau_indices[k]])
         _substitute(factor, m, column)
         for k in range(m):
-            weighted[rows[k], a] = column[k] / np.sqrt(variance[rows[k]])
+            weighted[tau_indices[k], a] = column[k] / np.sqrt(variance[tau_indices[k]])
     return True
 
 
 @compiled
-def compute_normal_equations(problem: LeastSquares, rows: Ints) -> None:
+def compute_normal_equations(problem: LeastSquares, tau_indices: Ints) -> None:
     """Compute the matrices Xᵀ V⁻¹ X and Xᵀ V⁻¹ y of the normal equations.
 
-    A column of zeros represents a term that is not fitted.
+    A column of zeros represents a noise term that is not fitted.
 
     Parameters
     ----------
     problem : LeastSquares
-        Problem with weights, in which ``normal`` and ``right`` are overwritten.
-    rows : ndarray of int64
-        Indices of the τ in use.
+        Least-squares problem with weights, whose fields ``normal`` and ``right`` are overwritten.
+    tau_indices : ndarray of int64
+        Indices of the τ to use.
     """
     normal, right, weighted = problem.normal, problem.right, problem.weighted
     level, columns = problem.level, problem.columns
@@ -121,7 +126,7 @@ def compute_normal_equations(problem: LeastSquares, rows: Ints) -> None:
         right[a] = 0.0
         for b in range(a + 1):
             normal[a, b] = 0.0
-    for i in rows:
+    for i in tau_indices:
         for a in range(5):
             right[a] += weighted[i, a] * level[i]
             for b in range(a + 1):
@@ -135,20 +140,20 @@ def compute_normal_equations(problem: LeastSquares, rows: Ints) -> None:
 
 @compiled
 def solve_nonnegative(normal: Floats, right_side: Floats, q_may_be_negative: bool, theta: Floats) -> None:
-    """Solve the least-squares problem with non-negative Q N B K.
+    """Solve the least-squares problem with the constraint that the squared coefficients are non-negative.
 
-    The solution is positive on the subset of terms that meets the Kuhn–Tucker conditions.
+    The positive coefficients of the solution are those that satisfy the Kuhn–Tucker conditions.
 
     Parameters
     ----------
     normal : ndarray of float64, shape (5, 5)
-        Normal matrix.
+        Matrix Xᵀ V⁻¹ X of the normal equations.
     right_side : ndarray of float64, shape (5,)
-        Right-hand side.
+        Right-hand side Xᵀ V⁻¹ y of the normal equations.
     q_may_be_negative : bool
-        True if Q² may be negative.
+        True to allow a negative Q².
     theta : ndarray of float64, shape (5,)
-        Solution, overwritten.
+        Output array for the solution.
     """
     for subset in range(2**NOISES - 1, 0, -1):
         if not solve_on_subset(normal, right_side, subset, theta):
@@ -171,23 +176,23 @@ def solve_nonnegative(normal: Floats, right_side: Floats, q_may_be_negative: boo
 
 @compiled
 def solve_on_subset(normal: Floats, right_side: Floats, subset: int, solution: Floats) -> bool:
-    """Solve the normal equations on a subset of the columns by Cholesky decomposition.
+    """Solve the normal equations for a subset of the coefficients by Cholesky decomposition.
 
     Parameters
     ----------
     normal : ndarray of float64, shape (5, 5)
-        Normal matrix.
+        Matrix Xᵀ V⁻¹ X of the normal equations.
     right_side : ndarray of float64, shape (5,)
-        Right-hand side.
+        Right-hand side Xᵀ V⁻¹ y of the normal equations.
     subset : int
-        Bit set of the columns.
+        Bit set of the coefficients.
     solution : ndarray of float64, shape (5,)
-        Solution, which is zero outside the subset.
+        Output array for the solution, which is zero outside the subset.
 
     Returns
     -------
     bool
-        False if the columns cannot be distinguished.
+        False if the matrix of the subset is singular.
     """
     terms, factor, scaled, n = np.empty(5, np.int64), np.empty((5, 5)), np.empty(5), 0
     for a in range(5):
@@ -211,7 +216,7 @@ def solve_on_subset(normal: Floats, right_side: Floats, subset: int, solution: F
 
 @compiled
 def _factorize(matrix: Floats, n: int, singular: float) -> bool:
-    """Replace a correlation matrix [n, n] by the Cholesky factor; return False if the matrix is singular."""
+    """Replace a correlation matrix [n, n] by its Cholesky factor, and return False if the matrix is singular."""
     for k in range(n):
         for j in range(k + 1):
             x = matrix[k, j]
@@ -228,7 +233,7 @@ def _factorize(matrix: Floats, n: int, singular: float) -> bool:
 
 @compiled
 def _substitute(factor: Floats, n: int, x: Floats) -> None:
-    """Replace the right-hand side x [n] by the solution, for the Cholesky factor of a matrix."""
+    """Solve a linear system in place, where ``factor`` is the Cholesky factor and x [n] the right-hand side."""
     for k in range(n):
         y = x[k]
         for c in range(k):
@@ -243,7 +248,7 @@ def _substitute(factor: Floats, n: int, x: Floats) -> None:
 
 @compiled
 def nonzero_term_bits(theta: Floats) -> int:
-    """Return the nonzero terms as a bit set."""
+    """Return the bit set of the nonzero coefficients."""
     subset = 0
     for a in range(NOISES):
         if theta[a] != 0.0:
@@ -253,21 +258,21 @@ def nonzero_term_bits(theta: Floats) -> int:
 
 @compiled
 def invert_on_subset(normal: Floats, subset: int, inverse: Floats) -> bool:
-    """Compute the inverse of the normal matrix on the terms of a subset.
+    """Compute the inverse of the normal matrix for a subset of the coefficients.
 
     Parameters
     ----------
     normal : ndarray of float64, shape (5, 5)
-        Normal matrix.
+        Matrix Xᵀ V⁻¹ X of the normal equations.
     subset : int
-        Bit set of the terms.
+        Bit set of the selected coefficients.
     inverse : ndarray of float64, shape (4, 4)
-        Inverse, which is zero outside the subset.
+        Output array for the inverse, which is zero outside the subset.
 
     Returns
     -------
     bool
-        False if the terms cannot be distinguished.
+        False if the selected part of the normal matrix is singular.
     """
     unit, solution = np.empty(5), np.empty(5)
     for a in range(NOISES):

@@ -1,14 +1,14 @@
-"""Search for the low-pass filter of a sensor, and fit of the coefficients with this filter.
+"""Search for the low-pass filter of a sensor, and fit of the noise coefficients with this filter.
 
-If the bandwidth of a sensor is below half the sample rate, the Allan variance at the shortest τ is smaller than N²/τ,
-which biases N. In this module, the design matrix contains the Allan variance of white noise after a Butterworth
-low-pass filter. The filter is either a digital filter at the sample rate or an analogue filter before sampling. The
-order from 1 to 4 and the cutoff with the smallest misfit are used, and the fit allows for the uncertainty of the
-cutoff. If no low-pass filter explains the Allan variances, the result of ``fit_coefficients`` without the shortest τ is
-kept.
+If the bandwidth of a sensor is less than half the sample rate, the Allan variance at the shortest τ is smaller than
+N²/τ. The coefficient N would therefore be biased. The fit in this module therefore uses the Allan variance of white
+noise after a Butterworth low-pass filter. The filter is either a digital filter at the sample rate or an analogue
+filter before sampling. The search selects the order from 1 to 4 and the cutoff frequency with the smallest misfit. The
+fit takes the uncertainty of the cutoff frequency into account. If no low-pass filter explains the Allan variances, the
+fit without the shortest τ is kept.
 
-N is the level of the white noise in the passband. Q is only bounded, because Q and the filter cannot be distinguished.
-A filter is only accepted if the spectrum decreases above the cutoff.
+N is the level of the white noise in the passband. Only an upper bound of Q is given, because the effects of Q and the
+filter cannot be distinguished. A filter is only accepted if the measured spectrum decreases above the cutoff frequency.
 """
 
 from collections.abc import Generator, Sequence
@@ -25,7 +25,7 @@ from monitor.estimation.allan.uncertainty import CovarianceTable
 from monitor.estimation.fit.coefficient_fit import (
     DesignMatrix,
     Fit,
-    MeasuredCurve,
+    MeasuredVariancesAndSlopes,
     fit_coefficients,
     replace_axis_results,
 )
@@ -34,57 +34,57 @@ from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, avar_upper_l
 from monitor.estimation.fit.least_squares import N, Q
 
 Kind = Literal["digital", "sampled"]
-"""Kind of a low-pass filter: digital at the sample rate, or analogue before sampling."""
+"""Kind of a low-pass filter: "digital" at the sample rate, or analogue before the signal is "sampled"."""
 FAMILIES: Final[tuple[tuple[Kind, int], ...]] = tuple(
     (kind, order) for order in (1, 2, 3, 4) for kind in ("digital", "sampled")
 )
-"""Kinds and orders of the low-pass filters in the search."""
+"""Kinds and orders of the low-pass filters among which the search selects."""
 CUTOFFS: Final = np.geomspace(0.005, 0.49, 56)
 """Grid of cutoff frequencies, as fractions of the sample rate."""
 SPECTRUM_BINS: Final = 1 << 13
 """Number of bins of the squared frequency response from zero to half the sample rate."""
 REFINED_FAMILIES: Final = 3
-"""Number of filter kinds and orders for which the cutoff is refined."""
+"""Number of combinations of filter kind and order for which the cutoff frequency is refined."""
 CUTOFFS_PER_STEP: Final = 8
-"""Number of grid cutoffs in one step of the search."""
+"""Number of cutoff frequencies from the grid that one step of the search evaluates."""
 REFINED_CUTOFFS_PER_STEP: Final = 10
-"""Number of refined cutoffs in one step of the search."""
+"""Number of refined cutoff frequencies that one step of the search evaluates."""
 CUTOFF_TOLERANCE: Final = 1e-4
-"""Tolerance of the logarithm of the refined cutoff."""
+"""Relative tolerance of the refined cutoff frequency."""
 ALIASES: Final = 8
-"""Number of aliases on each side in the frequency response of a sampled analogue filter."""
+"""Number of aliases of positive and of negative frequency in the response of a sampled analogue filter."""
 MAX_SCATTER: Final = 2.0
-"""Largest mean squared residual, relative to the expected variance, of an accepted filter."""
+"""Largest mean squared residual of the fit with an accepted filter, relative to the expected variance."""
 POWER_BINS: Final = 1024
 """Number of bins of the measured power spectrum from zero to half the sample rate."""
 MAX_STRETCHES: Final = 64
-"""Maximum number of segments that are averaged in a power spectrum."""
+"""Maximum number of segments of the recording over which a power spectrum is averaged."""
 MIN_STRETCHES: Final = 4
-"""Minimum number of segments for a power spectrum."""
+"""Minimum number of segments of the recording over which a power spectrum is averaged."""
 STOPBAND_START: Final = 1.2
-"""Start of the stopband, as a multiple of the cutoff."""
+"""Start of the stopband, as a multiple of the cutoff frequency."""
 MAX_STOPBAND_RATIO: Final = 2.0
-"""Largest ratio of the measured to the expected stopband level."""
+"""Largest ratio of the measured level in the stopband to the expected level."""
 MAX_STOPBAND_SHARE: Final = 0.05
-"""Fraction of the passband level that is added to the limit of the stopband level."""
+"""Fraction of the passband level by which the limit of the stopband level is increased."""
 CUTOFF_STEP: Final = 1.01
-"""Relative step of the cutoff for the numerical derivative."""
+"""Factor by which the cutoff frequency is changed to compute a numerical derivative."""
 LOG_CUTOFF_SIGMA: Final = 3.0
-"""Prior standard deviation of the logarithm of the cutoff, which allows any cutoff."""
+"""Prior standard deviation of the logarithm of the cutoff frequency. The large value allows any cutoff frequency."""
 
 
 @dataclass(frozen=True, slots=True)
 class LowPass:
-    """Butterworth low-pass filter."""
+    """Butterworth low-pass filter of a sensor."""
 
     kind: Kind
     order: int
-    cutoff: float  # as a fraction of the sample rate
+    cutoff: float  # cutoff frequency as a fraction of the sample rate
 
     def avar(self, factors: Ints) -> Floats:
-        """Return the Allan variance [m] of filtered white noise with N = 1 in the passband, at τ0 = 1.
+        """Return the Allan variance [m] of filtered white noise with N = 1 in the passband and τ0 = 1.
 
-        The Allan variance is (4 V(m) − V(2m)) / 2m², where V(m) is the variance of a sum of m samples.
+        It is computed as (4 V(m) − V(2m)) / 2m², where V(m) is the variance of a sum of m samples.
 
         >>> LowPass("digital", 2, 0.1).avar(np.array([1, 1000])).round(6).tolist()
         [0.024355, 0.000998]
@@ -109,14 +109,14 @@ def _squared_response(kind: Kind, order: int, cutoff: float, bins: int = SPECTRU
 
 @lru_cache(1024)
 def _column(low_pass: LowPass, factors: bytes) -> Floats:
-    """Return the Allan variance of a low-pass filter from a cache, for the bytes of an int64 array."""
+    """Return the cached Allan variance of filtered white noise. The cluster sizes are the bytes of an int64 array."""
     return low_pass.avar(np.frombuffer(factors, np.int64))
 
 
 def _autocovariance_sums(kind: Kind, order: int, cutoff: float) -> tuple[Floats, Floats]:
-    """Return the sums of r(k) and |k| r(k) over |k| < n for n = 1, 2, …, with the autocovariance r.
+    """Return the sums of r(k) and |k| r(k) over |k| < n for n = 1, 2, …, where r is the autocovariance.
 
-    The filtered white noise is scaled so that the sum of all r is 1.
+    The filtered white noise is scaled so that the autocovariances r sum to 1.
     """
     r = np.fft.irfft(_squared_response(kind, order, cutoff))[:SPECTRUM_BINS]
     both = np.where(np.arange(SPECTRUM_BINS) > 0, 2.0, 1.0) * r
@@ -125,9 +125,9 @@ def _autocovariance_sums(kind: Kind, order: int, cutoff: float) -> tuple[Floats,
 
 
 def power_spectrum(rates: Floats) -> Floats:
-    """Return the power spectrum [POWER_BINS + 1] of the rates [n] of one axis in arbitrary units.
+    """Return the power spectrum [POWER_BINS + 1] of one axis in arbitrary units.
 
-    The result is the mean over segments with few missing samples, or an empty array if there are too few samples.
+    The spectrum is averaged over segments with few missing samples. If there are too few segments, the result is empty.
     """
     rows = 2 * POWER_BINS
     begins = np.unique(np.linspace(0, len(rates) - rows, MAX_STRETCHES).astype(np.int64))
@@ -143,14 +143,14 @@ def power_spectrum(rates: Floats) -> Floats:
 
 
 def is_visible_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
-    """Return True if a measured power spectrum decreases above the cutoff of a low-pass filter.
+    """Return True if a measured power spectrum decreases above the cutoff frequency of a low-pass filter.
 
-    The medians of the passband and the stopband are compared, because a median is insensitive to spectral lines.
+    The function compares the medians of passband and stopband, because a median is insensitive to spectral lines.
 
     Parameters
     ----------
     low_pass : LowPass
-        Filter to test.
+        Low-pass filter to test.
     power : ndarray of float64, shape (POWER_BINS + 1,)
         Power spectrum of the axis, from ``power_spectrum``.
     """
@@ -167,74 +167,80 @@ def is_visible_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
 
 
 def refit_with_low_passes(
-    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
+    design: DesignMatrix,
+    table: CovarianceTable,
+    measured: MeasuredVariancesAndSlopes,
+    five_term_fit: Fit,
+    filters: Sequence[LowPass | None],
 ) -> tuple[Fit, list[LowPass | None]]:
-    """Fit axes whose Allan variances contradict the five terms again, with low-pass filters.
+    """Repeat the fit with a low-pass filter for axes whose Allan variances contradict the five noise terms.
 
     Parameters
     ----------
     design : DesignMatrix
-        Design matrix of the first fit.
+        Design matrix of the fit without low-pass filters.
     table : CovarianceTable
-        Covariances of the first fit.
-    measured : MeasuredCurve
-        Measured Allan variances of the first fit.
-    found : Fit
-        First fit, without low-pass filters.
+        Covariances of the Allan variances.
+    measured : MeasuredVariancesAndSlopes
+        Measured Allan variances and slopes of the rate.
+    five_term_fit : Fit
+        Fit without low-pass filters.
     filters : sequence of LowPass or None
-        Low-pass filter of each axis from ``find_low_pass``, or None.
+        Result of ``find_low_pass`` for each axis.
 
     Returns
     -------
     fit : Fit
-        Fit with the accepted filters.
+        Fit that takes the accepted filters into account.
     filters : list of LowPass or None
-        Accepted filter of each axis.
+        Accepted filter of each axis, or None.
     """
     used: list[LowPass | None] = [None] * len(filters)
     for axis, low_pass in enumerate(filters):
-        if low_pass is not None and is_contradicted_by_curve(found, axis):
+        if low_pass is not None and curve_contradicts_five_terms(five_term_fit, axis):
             better = _fit_low_pass(design, table, measured.select_axis(axis), low_pass)
             if better.scatter[0] < MAX_SCATTER:
                 _bound_q(design, better, measured.select_axis(axis))
-                found = replace_axis_results(found, axis, better)
+                five_term_fit = replace_axis_results(five_term_fit, axis, better)
                 used[axis] = low_pass
-    return found, used
+    return five_term_fit, used
 
 
-def _bound_q(design: DesignMatrix, found: Fit, measured: MeasuredCurve) -> None:
-    """Bound Q by the Allan variance at the shortest τ."""
-    c, first = found.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
-    most = avar_upper_limit(measured.avar[first, 0], found.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
+def _bound_q(design: DesignMatrix, fit: Fit, measured: MeasuredVariancesAndSlopes) -> None:
+    """Compute an upper bound of Q from the Allan variance at the shortest τ."""
+    c, first = fit.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
+    most = avar_upper_limit(measured.avar[first, 0], fit.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
     if np.isfinite(most):
         c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 
 
-def is_contradicted_by_curve(found: Fit, axis: int) -> bool:
-    """Return True if the Allan variances of an axis contradict the five terms.
+def curve_contradicts_five_terms(five_term_fit: Fit, axis: int) -> bool:
+    """Return True if the Allan variances of an axis contradict the five noise terms.
 
     Parameters
     ----------
-    found : Fit
-        Fit of the Allan variances.
+    five_term_fit : Fit
+        Fit without a low-pass filter.
     axis : int
-        Column of the fit.
+        Index of the axis in the fit.
     """
-    return bool(found.left_out[axis] > 0 or found.theta[0, axis] < 0.0 or found.misfit[axis] > 1.0)
+    return bool(
+        five_term_fit.left_out[axis] > 0 or five_term_fit.theta[0, axis] < 0.0 or five_term_fit.misfit[axis] > 1.0
+    )
 
 
 def find_low_pass(
-    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, power: Floats
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredVariancesAndSlopes, power: Floats
 ) -> LowPass | None:
-    """Return the low-pass filter with the smallest misfit for one axis, or None if no filter is accepted.
+    """Return the low-pass filter that best explains the Allan variances of one axis, or None if no filter is accepted.
 
     Parameters
     ----------
     design : DesignMatrix
         Design matrix for the cluster sizes.
     table : CovarianceTable
-        Covariances for the window length.
-    measured : MeasuredCurve
+        Covariances of the Allan variances.
+    measured : MeasuredVariancesAndSlopes
         Measured Allan variances of a single axis.
     power : ndarray of float64
         Power spectrum of the axis, from ``power_spectrum``.
@@ -249,12 +255,11 @@ def find_low_pass(
 
 
 def search_low_pass_in_steps(
-    design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, power: Floats
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredVariancesAndSlopes, power: Floats
 ) -> Generator[None, None, LowPass | None]:
-    """Search for the low-pass filter of one axis in steps of a few milliseconds.
+    """Search for the low-pass filter of one axis in steps that take a few milliseconds.
 
-    The generator yields after each step and returns the filter or None. The parameters are described at
-    ``find_low_pass``.
+    The generator yields after each step. The parameters and the result are those of ``find_low_pass``.
     """
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     grids: list[list[float]] = []
@@ -299,7 +304,7 @@ def _yield_after_several_steps(
             yield
 
 
-def _fit_columns(design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve) -> Fit:
+def _fit_columns(design: DesignMatrix, table: CovarianceTable, measured: MeasuredVariancesAndSlopes) -> Fit:
     return fit_coefficients(design, table, measured, full_covariance=False, may_drop_short_taus=False)
 
 
@@ -309,8 +314,10 @@ def _with_noise_column(design: DesignMatrix, column: Floats) -> DesignMatrix:
     return replace(design, columns=columns)
 
 
-def _fit_low_pass(design: DesignMatrix, table: CovarianceTable, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
-    """Return the fit with a filter whose cutoff is uncertain."""
+def _fit_low_pass(
+    design: DesignMatrix, table: CovarianceTable, measured: MeasuredVariancesAndSlopes, low_pass: LowPass
+) -> Fit:
+    """Fit the coefficients with a low-pass filter whose cutoff frequency is uncertain."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     up, down = (
         _column(replace(low_pass, cutoff=low_pass.cutoff * by), factors) for by in (CUTOFF_STEP, 1.0 / CUTOFF_STEP)

@@ -1,7 +1,7 @@
-"""Selection of significant terms, their confidence intervals, and the limits within which a solution stays valid.
+"""Selection of the significant noise terms, computation of their confidence intervals, and storage of the linear maps.
 
-All decisions use the unconstrained solution û. If the true squared coefficient is t, the variance of û is v(t) = c0 +
-c1 t + c2 t². The method is described in ``coefficient_fit``.
+All decisions are based on the unconstrained solution û. If the true squared coefficient is t, the variance of û is v(t)
+= c0 + c1 t + c2 t². The method is described in ``coefficient_fit``.
 """
 
 from typing import Final
@@ -15,13 +15,13 @@ from monitor.estimation.allan.uncertainty import NOISES
 from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, confidence_interval_end, pearson_quantile
 from monitor.estimation.fit.fit_kernel_types import (
     LIMIT_COUNT,
-    CurvesOfAxes,
     FitOptions,
     FitOutput,
     LeastSquares,
     SolutionMaps,
     TermResults,
     TermTests,
+    VariancesAndSlopesOfAxes,
 )
 from monitor.estimation.fit.least_squares import (
     K,
@@ -35,33 +35,33 @@ from monitor.estimation.fit.least_squares import (
 )
 
 MAX_THETA_CHANGE: Final = 0.4
-"""Relative change of θ above which the linear map is recomputed, if the change also exceeds ``MAX_THETA_SIGMA``."""
+"""Relative change of θ above which the linear map is recomputed, provided that it also exceeds ``MAX_THETA_SIGMA``."""
 MAX_THETA_SIGMA: Final = 1.0
 """Change of θ in standard deviations up to which the linear map is not recomputed."""
 DETECTABLE_SIGMA: Final = 3.0
-"""Size in σ at which a term is detected."""
+"""Size of a squared coefficient, in σ, at which the noise term is detected."""
 
 
 @compiled
 def select_terms(
     problem: LeastSquares, rows: Ints, options: FitOptions, straight: bool, misfit: float, terms: TermResults
 ) -> TermTests:
-    """Select the significant terms, and compute confidence intervals and upper bounds.
+    """Select the significant noise terms, and compute confidence intervals and upper bounds.
 
     Parameters
     ----------
     problem : LeastSquares
-        Problem with its weights and normal equations.
+        Least-squares problem with its weights and normal equations.
     rows : ndarray of int64
-        Indices of the τ in use.
+        Indices of the τ to use.
     options : FitOptions
-        Thresholds to add and to drop a term.
+        Thresholds to add and to drop a noise term.
     straight : bool
-        True if the contribution of the slope has been subtracted.
+        True if the contribution of the slope has been subtracted from the Allan variances.
     misfit : float
-        Factor by which variances are multiplied.
+        Factor by which the variances of the estimates are multiplied.
     terms : TermResults
-        Results of the axis, updated in place.
+        Results of the fit of one axis, updated in place.
     """
     count = NOISES if straight else 5
     tests, gain = TermTests(np.zeros(5), np.empty(NOISES), np.empty(NOISES)), np.zeros((5, rows.size))
@@ -75,7 +75,7 @@ def select_terms(
         tests.enter_limit[a], tests.absent_variance[a] = np.inf, misfit * forms[a, 0]
     for a in range(count):
         c0, c1, c2 = misfit * forms[a, 0], misfit * forms[a, 1], forms[a, 2]
-        if c0 <= 0.0 and c2 <= 0.0:  # there was no solution
+        if c0 <= 0.0 and c2 <= 0.0:  # the normal equations have no solution
             continue
         if a != R:
             tests.enter_limit[a] = max(options.enter, pearson_quantile(Z95, 2.0 * np.sqrt(c2))) * np.sqrt(c0)
@@ -91,39 +91,39 @@ def _select_term(
     low = confidence_interval_end(estimate, c0, c1, c2, Z95)
     high = confidence_interval_end(estimate, c0, c1, c2, -Z95)
     if terms.theta[a] > 0.0 and not low < np.sqrt(terms.theta[a]) < high:
-        # θ differs from û if other terms are fixed at zero, so the interval must cover both.
+        # If other coefficients are fixed at zero, θ differs from û, so the interval must contain both values.
         low = min(low, confidence_interval_end(terms.theta[a], c0, c1, c2, Z95))
         high = max(high, confidence_interval_end(terms.theta[a], c0, c1, c2, -Z95))
-    # A term is not added while the interval includes zero.
+    # A noise term is not added while the confidence interval includes zero.
     seen = terms.entered[a] or low > 0.0
     terms.entered[a] = seen and a != R and terms.theta[a] > 0.0 and estimate > threshold * np.sqrt(c0)
     if terms.entered[a]:
         terms.status[a], terms.lo[a], terms.hi[a] = 2, low, high
     else:
-        # A negative estimate is replaced by zero, so that the upper bound is not too small.
+        # A negative estimate is replaced by zero, because the upper bound would otherwise be too small.
         terms.status[a], terms.lo[a] = 1, 0.0
         terms.hi[a] = confidence_interval_end(max(estimate, 0.0), c0, c1, c2, -UPPER_BOUND_Z)
 
 
 @compiled
 def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: TermTests, terms: TermResults) -> None:
-    """Recompute the upper bounds of absent terms with better weights.
+    """Recompute the upper bounds of absent noise terms with better weights.
 
-    Weights for an absent K make little use of long τ, so the upper bound of K would be very large. The bounds are
-    therefore computed with weights for a term that is just large enough to be detected.
+    The weights for K = 0 make little use of long τ, so the upper bound of K would be very large. The bounds are
+    therefore computed with the weights for a noise term that is just large enough to be detected.
 
     Parameters
     ----------
     problem : LeastSquares
-        Problem of the axis.
+        Least-squares problem of the axis.
     rows : ndarray of int64
-        Indices of the τ in use.
+        Indices of the τ to use.
     misfit : float
-        Factor by which variances are multiplied.
+        Factor by which the variances of the estimates are multiplied.
     tests : TermTests
         Result of ``select_terms``.
     terms : TermResults
-        Results of the axis, in which ``hi`` is updated in place.
+        Results of the fit of one axis, whose field ``hi`` is updated in place.
     """
     m = problem.level.size
     own = LeastSquares(
@@ -155,9 +155,9 @@ def _estimate(gain: Floats, problem: LeastSquares, rows: Ints) -> float:
 
 @compiled
 def _map_to_term(a: int, problem: LeastSquares, rows: Ints, gain: Floats) -> bool:
-    """Compute the linear map from the Allan variances to the unconstrained estimate of term a.
+    """Compute the linear map from the Allan variances to the unconstrained estimate of coefficient a.
 
-    Return False if the terms cannot be distinguished.
+    Return False if the coefficients cannot be distinguished.
     """
     unit, solution, weighted = np.zeros(5), np.empty(5), problem.weighted
     unit[a] = 1.0
@@ -173,7 +173,7 @@ def _map_to_term(a: int, problem: LeastSquares, rows: Ints, gain: Floats) -> boo
 
 @compiled
 def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Floats, covariance: Floats) -> Floats:
-    """Return the coefficients c0, c1, c2 of the variance of û for the terms first ≤ a < end."""
+    """Return c0, c1 and c2 of the variance of û for the coefficients first ≤ a < end."""
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
     forms, bent, own = np.zeros((end - first, 3)), np.zeros(5), np.zeros(5)
     for i in range(rows.size):
@@ -185,7 +185,7 @@ def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Float
             bent[2] = q * c[2] + n * c[5] + k * c[8]
             bent[3] = q * c[3] + n * c[6] + b * c[8]
             others = n * (n * c[4] + b * c[5] + k * c[6]) + b * (n * c[5] + b * c[7] + k * c[8])
-            others += k * (n * c[6] + b * c[8] + k * c[9])  # without Q
+            others += k * (n * c[6] + b * c[8] + k * c[9])  # variance of all terms except Q
             twice = 1.0 if i == j else 2.0
             for index in range(end - first):
                 a = first + index
@@ -205,28 +205,28 @@ def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Float
 
 
 @compiled
-def select_ramp(
+def update_ramp_selection(
     slope: float, slope_variance: Floats, options: FitOptions, terms: TermResults
 ) -> tuple[float, float, bool]:
-    """Include R in the fit if the slope of the rate is significantly larger than expected from noise.
+    """Include R in the fit if the slope of the rate is significantly larger than noise alone would cause.
 
     Parameters
     ----------
     slope : float
-        Slope of the rate in units of one sample; NaN means not measured.
+        Slope of the rate per sample interval; NaN means not measured.
     slope_variance : ndarray of float64, shape (4,)
-        Variance of the slope for unit coefficients.
+        Variance of the slope for each unit coefficient.
     options : FitOptions
-        Thresholds to add and to drop a term.
+        Thresholds to add and to drop a noise term.
     terms : TermResults
-        Results of the axis, updated in place.
+        Results of the fit of one axis, updated in place.
 
     Returns
     -------
     noise : float
-        Variance of the slope under the fitted noise; 0 if the slope is not measured.
+        Variance of the slope that the fitted noise causes; 0 if the slope is not measured.
     most : float
-        Variance of the slope with K at the upper end of the confidence interval; NaN if the slope is not measured.
+        Variance of the slope if K is at the upper end of its confidence interval; NaN if the slope is not measured.
     either : bool
         True if the rate drifts, but K and R cannot be distinguished.
     """
@@ -243,7 +243,7 @@ def select_ramp(
     status[R] = 2 if terms.entered[R] else 1
     terms.lo[R] = max(abs(slope) - Z95 * np.sqrt(most), 0.0) if terms.entered[R] else 0.0
     terms.hi[R] = abs(slope) + (Z95 if terms.entered[R] else UPPER_BOUND_Z) * np.sqrt(most)
-    # K is only bounded, and the other terms do not explain the slope.
+    # Only an upper bound of K is known, and the other noise terms do not explain the slope.
     others = noise - max(theta[K], 0.0) * slope_variance[K]
     either = status[K] == 1 and status[R] == 1 and slope * slope > options.enter**2 * others
     return noise, most, bool(either)
@@ -251,24 +251,29 @@ def select_ramp(
 
 @compiled
 def store_linear_map(
-    axis: int, rows: Ints, problem: LeastSquares, curves: CurvesOfAxes, output: FitOutput, maps: SolutionMaps
+    axis: int,
+    rows: Ints,
+    problem: LeastSquares,
+    curves: VariancesAndSlopesOfAxes,
+    output: FitOutput,
+    maps: SolutionMaps,
 ) -> bool:
-    """Store the solution of one axis as a linear map from the Allan variances to the coefficients.
+    """Store the solution of one axis as a linear map from the Allan variances to the squared coefficients.
 
     Parameters
     ----------
     axis : int
         Index of the axis.
     rows : ndarray of int64
-        Indices of the τ in use.
+        Indices of the τ to use.
     problem : LeastSquares
-        Problem with its weights and normal equations.
-    curves : CurvesOfAxes
-        Measured Allan variances and slopes.
+        Least-squares problem with its weights and normal equations.
+    curves : VariancesAndSlopesOfAxes
+        Measured Allan variances and slopes of the rate.
     output : FitOutput
         Results of the fit.
     maps : SolutionMaps
-        Linear maps, updated in place.
+        Linear maps of all axes, updated in place.
 
     Returns
     -------
@@ -276,7 +281,7 @@ def store_linear_map(
         False if the solution cannot be stored as a linear map.
     """
     if rows[-1] - rows[0] != rows.size - 1:
-        return False  # the indices of the τ in use are not consecutive
+        return False  # a linear map requires consecutive indices of τ
     for a in range(5):
         for b in range(5):
             maps.normal[axis, a, b] = problem.normal[a, b]
@@ -299,7 +304,7 @@ def store_linear_map(
 
 
 @compiled
-def compute_map_validity_limits(
+def compute_linear_map_validity_limits(
     low: Floats, high: Floats, options: FitOptions, tests: TermTests, most: float, terms: TermResults
 ) -> None:
     """Compute the limits within which the linear map of one axis stays valid.
@@ -307,21 +312,21 @@ def compute_map_validity_limits(
     Parameters
     ----------
     low, high : ndarray of float64, shape (LIMIT_COUNT + 1,)
-        Limits in ``SolutionMaps``, overwritten.
+        Output arrays for the limits in ``SolutionMaps``.
     options : FitOptions
-        Thresholds to add and to drop a term.
+        Thresholds to add and to drop a noise term.
     tests : TermTests
         Result of ``select_terms``.
     most : float
-        Variance of the slope from ``select_ramp``; NaN if the slope is not measured.
+        Variance of the slope, as returned by ``update_ramp_selection``; NaN if the slope is not measured.
     terms : TermResults
-        Results of the axis.
+        Results of the fit of one axis.
     """
     for a in range(NOISES):
         sigma = np.sqrt(tests.absent_variance[a])
         reach = max(MAX_THETA_CHANGE * abs(terms.theta[a]), MAX_THETA_SIGMA * sigma)
         low[a], high[a] = terms.theta[a] - reach, terms.theta[a] + reach
-        # A term is added or dropped at the limits of û.
+        # At these limits of û, a noise term would be added or dropped.
         low[NOISES + a], high[NOISES + a] = -np.inf, np.inf
         if terms.entered[a]:
             low[NOISES + a] = options.leave * sigma

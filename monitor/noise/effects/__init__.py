@@ -3,18 +3,26 @@
 from typing import Final
 
 from monitor.noise.effect import Effect, Transform
-from monitor.noise.effects.biases.bias import Bias as Bias
+from monitor.noise.effects.biases.bias import ConstantBias as ConstantBias
+from monitor.noise.effects.biases.bias_curve import BiasCurve as BiasCurve
 from monitor.noise.effects.biases.bias_step import BiasStep as BiasStep
 from monitor.noise.effects.biases.temperature_bias import TemperatureBias as TemperatureBias
+from monitor.noise.effects.biases.temperature_hysteresis import TemperatureHysteresis as TemperatureHysteresis
 from monitor.noise.effects.biases.temperature_lag import TemperatureLag as TemperatureLag
 from monitor.noise.effects.biases.turn_on_transient import TurnOnTransient as TurnOnTransient
+from monitor.noise.effects.coupling.axis_permutation import AxisPermutation as AxisPermutation
 from monitor.noise.effects.coupling.cross_axis import CrossAxis as CrossAxis
 from monitor.noise.effects.coupling.g_sensitivity import GSensitivity as GSensitivity
+from monitor.noise.effects.disturbances.common_vibration import CommonVibration as CommonVibration
+from monitor.noise.effects.disturbances.heavy_tails import HeavyTails as HeavyTails
 from monitor.noise.effects.disturbances.narrowband import Narrowband as Narrowband
 from monitor.noise.effects.disturbances.noise_step import NoiseStep as NoiseStep
 from monitor.noise.effects.disturbances.outliers import Outliers as Outliers
 from monitor.noise.effects.disturbances.poisson_steps import PoissonSteps as PoissonSteps
+from monitor.noise.effects.disturbances.power_law import PowerLaw as PowerLaw
+from monitor.noise.effects.disturbances.pulse_train import PulseTrain as PulseTrain
 from monitor.noise.effects.disturbances.random_telegraph import RandomTelegraph as RandomTelegraph
+from monitor.noise.effects.disturbances.variance_modulation import VarianceModulation as VarianceModulation
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk as AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability as BiasInstability
 from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated as ExponentiallyCorrelated
@@ -28,6 +36,7 @@ from monitor.noise.effects.signal_chain.sample_hold import RandomSampleHold as R
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError as SampleRateError
 from monitor.noise.effects.signal_chain.saturation import Saturation as Saturation
 from monitor.noise.effects.signal_chain.scale_factor import ScaleFactor as ScaleFactor
+from monitor.noise.effects.signal_chain.unit_error import UnitError as UnitError
 
 TRANSFORM_ORDER: Final[tuple[type[Transform], ...]] = (
     ScaleFactor,
@@ -36,6 +45,7 @@ TRANSFORM_ORDER: Final[tuple[type[Transform], ...]] = (
     Saturation,
     Resolution,
     RandomSampleHold,
+    UnitError,
 )
 """Order in which transforms are applied.
 
@@ -43,7 +53,7 @@ Transforms of the same kind are applied in the order of the model.
 """
 
 _ALL: Final[tuple[type[Effect], ...]] = (
-    Bias,
+    ConstantBias,
     QuantizationNoise,
     AngleRandomWalk,
     BiasInstability,
@@ -52,16 +62,24 @@ _ALL: Final[tuple[type[Effect], ...]] = (
     ExponentiallyCorrelated,
     Sinusoidal,
     Narrowband,
+    CommonVibration,
     TemperatureBias,
     TemperatureLag,
+    TemperatureHysteresis,
     TurnOnTransient,
     BiasStep,
+    BiasCurve,
     RandomTelegraph,
     PoissonSteps,
     Outliers,
+    PulseTrain,
     NoiseStep,
+    VarianceModulation,
     GSensitivity,
     CrossAxis,
+    PowerLaw,
+    AxisPermutation,
+    HeavyTails,
     *TRANSFORM_ORDER,
 )
 EFFECTS: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in _ALL}

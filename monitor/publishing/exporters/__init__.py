@@ -1,12 +1,12 @@
 """Export of noise coefficients as parameter files for Kalibr, MATLAB and Kalman filters.
 
-Each exporter returns the text of a file with units, the source of the coefficients and the inflation factor. N of IEEE
-Std 952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. K in rad/s/√s equals the density, in
-rad/s²/√Hz, of the white noise that drives the bias.
+Each exporter returns the text of a file that states units, the source of the coefficients and the inflation factor. The
+coefficient N of IEEE Std 952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. The coefficient K in
+rad/s/√s equals the density, in rad/s²/√Hz, of the white noise that drives the bias.
 
-The inflation factor multiplies N, B and K, because a sensor on a vehicle has more noise than a sensor at rest.
-Exporters for filters use an upper bound as the value and add a comment. The exporter for simulation ignores upper
-bounds. All text is ASCII, because some target programs require ASCII.
+The inflation factor multiplies N, B and K, because a sensor on a vehicle has more noise than a sensor at rest. If only
+an upper bound of a coefficient is known, exporters for filters use the bound as the value and add a comment. The
+exporter for simulation ignores upper bounds. The text is ASCII, because some target programs require ASCII.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from typing import Any, Final
 from drivers.errors import ConfigError
 from drivers.number_ranges import COEFFICIENT, INFLATION
 from monitor.publishing.exporters.exported_coefficients import (
-    ExportedCoefficient,
+    AxisCoefficientOrBound,
     NoiseCoefficients,
     from_analysis_json,
     from_model,
@@ -23,16 +23,16 @@ from monitor.publishing.exporters.exported_coefficients import (
 )
 from monitor.publishing.exporters.gyroparams import export_gyroparams
 from monitor.publishing.exporters.kalibr import export_kalibr
-from monitor.publishing.exporters.kalman import export_kalman
+from monitor.publishing.exporters.kalman import export_kalman_process_noise
 
-__all__ = ["FORMATS", "ExportedCoefficient", "NoiseCoefficients", "export", "from_analysis_json", "from_model"]
+__all__ = ["FORMATS", "AxisCoefficientOrBound", "NoiseCoefficients", "export", "from_analysis_json", "from_model"]
 
 FORMATS: Final[dict[str, Callable[..., str]]] = {
     "kalibr": export_kalibr,
     "gyroparams": export_gyroparams,
-    "kalman": export_kalman,
+    "kalman": export_kalman_process_noise,
 }
-"""Export function of each format."""
+"""Function that exports noise coefficients, for each file format."""
 
 
 def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, **options: Any) -> str:
@@ -41,13 +41,13 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
     Parameters
     ----------
     noise
-        Coefficients from ``from_model`` or ``from_analysis_json``.
+        Noise coefficients that ``from_model`` or ``from_analysis_json`` returned.
     format_name
-        Name of the format, a key of FORMATS.
+        Name of the file format, a key of FORMATS.
     inflation
-        Factor on N, B and K, at least 1.
+        Factor that multiplies N, B and K, at least 1.
     options
-        Options of the format: rostopic for ``kalibr``; dt_s and correlation_time_s for ``kalman``.
+        Options of the file format: rostopic for ``kalibr``, dt_s and correlation_time_s for ``kalman``.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Noise coefficients to export, and comments that all export formats share.
 
-The coefficients are read from a noise model or from the output of ``analyze --json``. Noise effects that have no
-exported coefficient, such as a spectral line, are listed by name in a comment.
+The coefficients come from a noise model or from the output of ``analyze --json``. A comment in the exported file lists
+the noise effects that the file cannot represent, such as a spectral line.
 """
 
 import math
@@ -14,7 +14,7 @@ import msgspec
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.number_ranges import RATE_HZ
-from monitor.common.units import KINDS, Kind, axes_of
+from monitor.common.unit_formatting import KINDS, Kind, axes_of
 from monitor.noise.effect import Source, gyro_and_accel_units
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -26,7 +26,7 @@ COEFFICIENT_EFFECTS: Final[dict[str, type[Source]]] = {
     "K": RateRandomWalk,
     "R": RateRamp,
 }
-"""Noise effect that each coefficient describes."""
+"""Class of the noise effect that each coefficient describes."""
 
 
 def ascii_unit(letter: str, kind: Kind) -> str:
@@ -37,17 +37,17 @@ def ascii_unit(letter: str, kind: Kind) -> str:
 
     Parameters
     ----------
-    letter
-        Coefficient.
+        letter
+        Symbol of the coefficient: Q, N, B, K or R.
     kind
-        Kind of sensor.
+        Kind of sensor: gyro or accel.
     """
     unit = gyro_and_accel_units(COEFFICIENT_EFFECTS[letter])[letter][KINDS.index(kind)]
     return unit.replace("√s", "sqrt(s)").replace("²", "^2").replace("³", "^3")
 
 
 @dataclass(frozen=True, slots=True)
-class ExportedCoefficient:
+class AxisCoefficientOrBound:
     """Noise coefficient of one axis in SI units, as a value or an upper bound."""
 
     value: float
@@ -56,17 +56,17 @@ class ExportedCoefficient:
 
 @dataclass(frozen=True, slots=True)
 class NoiseCoefficients:
-    """Noise coefficients by axis and symbol. Unknown coefficients are absent."""
+    """Known noise coefficients by axis and symbol."""
 
-    axes: Mapping[str, Mapping[str, ExportedCoefficient]]
+    axes: Mapping[str, Mapping[str, AxisCoefficientOrBound]]
     sample_rate_hz: float | None
     source: str  # source of the coefficients, for the header of the file
-    left_out: tuple[str, ...] = ()  # other effects, such as "gz.sinusoidal"
+    left_out: tuple[str, ...] = ()  # effects that no coefficient represents, such as "gz.sinusoidal"
     measured: bool = False  # True if the coefficients come from a recording
     warnings: tuple[str, ...] = ()  # ASCII warnings for the header of the file
 
-    def coefficient_by_axis(self, kind: Kind, letter: str) -> dict[str, ExportedCoefficient]:
-        """Return one noise coefficient for each axis on which the coefficient is known.
+    def coefficient_by_axis(self, kind: Kind, letter: str) -> dict[str, AxisCoefficientOrBound]:
+        """Return the noise coefficient with the given symbol for each axis on which it is known.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class NoiseCoefficients:
 
 
 def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficients:
-    """Return the coefficients of a noise model, adding the variances of equal effects on one axis.
+    """Return the coefficients of a noise model. The variances of equal effects on one axis are added.
 
     >>> model = NoiseModel.from_toml('sample_rate = 100.0\\n["g*".angle_random_walk]\\nN = 1.5e-4')
     >>> from_model(model).axes["gz"]["N"].value
@@ -87,13 +87,13 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
 
     Parameters
     ----------
-    model
-        Noise model.
+        model
+        Noise model with the effects of each axis.
     source
         Source of the coefficients, for the header of the file.
     """
     letters = {effect.name: letter for letter, effect in COEFFICIENT_EFFECTS.items()}
-    axes: dict[str, dict[str, ExportedCoefficient]] = {}
+    axes: dict[str, dict[str, AxisCoefficientOrBound]] = {}
     left_out = []
     for axis, effects in model.effects.items():
         sizes: dict[str, float] = {}
@@ -103,7 +103,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
                 left_out.append(f"{axis}.{one.name}")
             else:
                 sizes[letter] = math.hypot(sizes.get(letter, 0.0), getattr(one, letter))
-        axes[axis] = {letter: ExportedCoefficient(size) for letter, size in sizes.items() if size > 0.0}
+        axes[axis] = {letter: AxisCoefficientOrBound(size) for letter, size in sizes.items() if size > 0.0}
     known = {axis: axes[axis] for axis in AXES if axes.get(axis)}
     return NoiseCoefficients(known, model.sample_rate_hz, source, tuple(left_out))
 
@@ -124,7 +124,7 @@ class _Axis(msgspec.Struct):
 
 
 class _Analysis(msgspec.Struct):
-    """Keys of the analysis JSON that an export needs."""
+    """Keys of the JSON output of ``analyze`` that an export needs."""
 
     schema: str
     axes: dict[str, _Axis]
@@ -136,15 +136,15 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
 
     Parameters
     ----------
-    json_text
-        JSON text.
+        json_text
+        Output of ``imu-monitor analyze --json``.
     source
         Source of the coefficients, for the header of the file.
 
     Raises
     ------
     ConfigError
-        If the text is not an analysis in JSON, or if the sample rate is outside the supported range.
+        If the text is not the output of ``analyze --json``, or if the sample rate is outside the supported range.
     """
     try:
         found = msgspec.json.decode(json_text, type=_Analysis)
@@ -157,13 +157,13 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
             RATE_HZ.check(found.rate)
     except ConfigError as error:
         raise ConfigError(f"rate: {error}") from None
-    axes: dict[str, dict[str, ExportedCoefficient]] = {}
+    axes: dict[str, dict[str, AxisCoefficientOrBound]] = {}
     for axis in (axis for axis in AXES if axis in found.axes):
         for letter, one in found.axes[axis].coefficients.items():
             if one.status == "estimated" and one.value is not None:
-                axes.setdefault(axis, {})[letter] = ExportedCoefficient(one.value)
+                axes.setdefault(axis, {})[letter] = AxisCoefficientOrBound(one.value)
             elif one.status == "upper_bound" and one.hi is not None:
-                axes.setdefault(axis, {})[letter] = ExportedCoefficient(one.hi, bound=True)
+                axes.setdefault(axis, {})[letter] = AxisCoefficientOrBound(one.hi, bound=True)
     warnings = tuple(
         f"{axis} follows its temperature, which explains {math.floor(100.0 * mark.share):d} % of its slow variance: "
         f"B and K of {axis} describe temperature as well as noise"
@@ -174,27 +174,27 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
 
 
 def missing_coefficient_error(noise: NoiseCoefficients, message: str) -> ImuError:
-    """Return the error for a missing coefficient: NotReady for a recording, ConfigError for a noise model.
+    """Return the exception for a missing coefficient: NotReady for a recording, ConfigError for a noise model.
 
     Parameters
     ----------
     noise
-        Coefficients of the recording or the model.
+        Coefficients of the recording or the noise model.
     message
-        Message.
+        Text of the exception.
     """
     return NotReady(f"{message}: a longer recording is needed") if noise.measured else ConfigError(message)
 
 
 def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: str) -> list[str]:
-    """Return comments with the source of the coefficients, the inflation factor and warnings.
+    """Return comment lines that state the source of the coefficients, the inflation factor and warnings.
 
     Parameters
     ----------
     noise
-        Coefficients.
+        Noise coefficients to export.
     inflation
-        Factor on N, B and K.
+        Factor that multiplies N, B and K.
     comment_sign
         Characters that begin a comment in the file.
     """
@@ -210,12 +210,12 @@ def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: st
 def comment_on_omitted_terms(
     noise: NoiseCoefficients, represented_letters: Collection[str], comment_sign: str
 ) -> list[str]:
-    """Return a comment that lists the noise terms that the export format cannot represent.
+    """Return comment lines that list the noise terms that the export format cannot represent.
 
     Parameters
     ----------
     noise
-        Coefficients.
+        Noise coefficients to export.
     represented_letters
         Symbols of the coefficients that the export format represents.
     comment_sign
@@ -231,7 +231,7 @@ def comment_on_omitted_terms(
 
 
 def format_float(value: float) -> str:
-    """Format a number with seven digits in a notation that YAML 1.1, TOML and MATLAB read as a float.
+    """Format a number with seven digits, so that YAML 1.1, TOML and MATLAB read it as a float.
 
     >>> format_float(1.5e-4)
     '1.500000e-04'
@@ -240,5 +240,5 @@ def format_float(value: float) -> str:
 
 
 def join_lines(lines: Iterable[str]) -> str:
-    """Join lines with newlines, and end the text with a newline."""
+    """Join lines with newline characters, and end the text with a newline character."""
     return "\n".join(lines) + "\n"

@@ -1,17 +1,18 @@
 """Export of noise coefficients as a MATLAB script for the MathWorks model ``imuSensor``.
 
-``NoiseDensity`` is N of IEEE Std 952 with the noise type ``single-sided``, for which σ = NoiseDensity·√rate per sample.
-The default noise type of MathWorks would give noise that is smaller by √2. ``BiasInstability`` is the σ of the white
-noise at the input of a filter. With the filter ``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995), the bias has the
-spectrum B²/(2πf) of IEEE Std 952. The default filter of MathWorks has one pole at 0.5 and does not generate flicker
-noise.
+The property ``NoiseDensity`` is N of IEEE Std 952 if the noise type is ``single-sided``, because the standard deviation
+of a sample is then NoiseDensity·√rate. The default noise type of MathWorks would give noise that is smaller by √2. The
+property ``BiasInstability`` is the standard deviation of the white noise at the input of a filter. With the filter
+``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995), the bias has the spectrum B²/(2πf) of IEEE Std 952. The default filter
+of MathWorks has one pole at 0.5 and does not generate flicker noise.
 
-A coefficient with only an upper bound is set to 0, because the script is meant for simulation.
+If only an upper bound of a coefficient is known, the coefficient is set to 0, because the script is meant for
+simulation.
 """
 
 from typing import Final
 
-from monitor.common.units import Kind, axes_of
+from monitor.common.unit_formatting import Kind, axes_of
 from monitor.publishing.exporters.exported_coefficients import (
     NoiseCoefficients,
     ascii_unit,
@@ -22,7 +23,7 @@ from monitor.publishing.exporters.exported_coefficients import (
 )
 
 N_POLES: Final = 500
-"""Number of poles of the 1/f filter, as in the Allan variance example of MathWorks."""
+"""Number of poles of the 1/f filter, the same as in the Allan variance example of MathWorks."""
 
 
 def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
@@ -33,7 +34,7 @@ def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
     noise
         Noise coefficients of each axis, in SI units.
     inflation
-        Factor on N, B and K.
+        Factor that multiplies N, B and K.
     """
     lines = [
         "% Noise of an IMU for imuSensor (Navigation Toolbox, or Sensor Fusion and Tracking Toolbox), R2023b or newer",
@@ -66,7 +67,7 @@ def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
 
 
 def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit: str, inflation: float) -> str:
-    """Write 0 for an unknown coefficient, and name the axis in a comment."""
+    """Return a property with the values of three axes. An unknown coefficient is 0, and a comment names its axis."""
     known, values, said = noise.coefficient_by_axis(kind, letter), [], ""
     for axis in axes_of(kind):
         term = known.get(axis)

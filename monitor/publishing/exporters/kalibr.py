@@ -1,18 +1,18 @@
 """Export of noise coefficients as ``imu.yaml`` of Kalibr, with continuous-time noise densities.
 
-The file contains one value for each kind of sensor, which is the largest of the three axes. Keys and units follow the
-pages "YAML formats" and "IMU Noise Model" in the Kalibr wiki. Kalibr multiplies the white-noise density by 1/√Δt and
-the random-walk density by √Δt, so the densities are N and K of IEEE Std 952. Kalibr rejects zero, so a missing
-coefficient is an error. If all axes have only upper bounds, the largest bound is exported with a comment.
+The file contains one value for each kind of sensor, which is the largest value of the three axes. Keys and units follow
+the pages "YAML formats" and "IMU Noise Model" in the Kalibr wiki. Kalibr multiplies the white-noise density by 1/√Δt
+and the random-walk density by √Δt, so these densities are N and K of IEEE Std 952. Kalibr rejects a density of zero, so
+a missing coefficient is an error. If all axes have only upper bounds, the largest bound is exported with a comment.
 """
 
 from typing import Final
 
 from drivers.errors import ConfigError
-from monitor.common.units import Kind
+from monitor.common.unit_formatting import Kind
 from monitor.publishing.exporters.exported_coefficients import (
     COEFFICIENT_EFFECTS,
-    ExportedCoefficient,
+    AxisCoefficientOrBound,
     NoiseCoefficients,
     ascii_unit,
     comment_on_omitted_terms,
@@ -29,16 +29,16 @@ INFLATION_COMMENT: Final = (
 
 
 def export_kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
-    """Export noise coefficients as the text of ``imu.yaml``.
+    """Return the text of ``imu.yaml`` with the noise densities of gyroscopes and accelerometers.
 
     Parameters
     ----------
     noise
         Noise coefficients of each axis, in SI units.
     inflation
-        Factor on the densities.
+        Factor that multiplies the noise densities.
     rostopic
-        ROS topic of the IMU.
+        ROS topic on which the IMU publishes.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def export_kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: st
     return join_lines([*lines, *comment_on_omitted_terms(noise, "NK", "#")])
 
 
-def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[ExportedCoefficient, str]:
+def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[AxisCoefficientOrBound, str]:
     """Return the largest estimate of three axes, or the largest upper bound if there is no estimate."""
     known = noise.coefficient_by_axis(kind, letter)
     if not known:

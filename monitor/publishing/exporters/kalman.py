@@ -1,19 +1,21 @@
 """Export of the process noise of a Kalman filter as TOML, with the discrete matrices F and Q of each axis.
 
-The error model of one gyroscope has three states. For an accelerometer, velocity replaces the angle.
+The error model of one gyroscope axis has three states: the angle error, a random-walk bias and a Gauss-Markov bias. For
+an accelerometer axis, the velocity error replaces the angle error.
 
     angle' = walk + markov + white
     walk' = white noise of density K²
     markov' = -markov/T + white noise of density 2σ²/T
 
-The white noise of the rate has the density N². A first-order Gauss-Markov process approximates flicker noise, because
-flicker noise has no finite-dimensional state model. The Allan deviation of the Gauss-Markov process peaks at 0.618 σ
-and τ = 1.89 T (IEEE Std 952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B.
+The white noise of the rate has the density N². Flicker noise has no finite-dimensional state model, so a first-order
+Gauss-Markov process approximates it. The Allan deviation of the Gauss-Markov process has a peak of 0.618 σ at τ =
+1.89 T (IEEE Std 952). The standard deviation σ is chosen so that this peak equals the Allan deviation of flicker noise,
+0.664 B.
 
-Flicker noise dominates from τ = N²/(0.664 B)² to τ = 3 (0.664 B)²/K². The correlation time T places the peak at the
-geometric mean of these limits, τ = √3 N/K. If N or K is unknown, the user must specify T. Without T, the file omits
-flicker noise and states the omission in a comment. An upper bound is used as the value, because a larger process noise
-is the safer choice.
+Bias instability dominates the Allan deviation from τ = N²/(0.664 B)² to τ = 3 (0.664 B)²/K². The correlation time T
+places the peak at the geometric mean of these limits, τ = √3 N/K. If N or K is unknown, the user must specify T.
+Without T, the file omits flicker noise and says so in a comment. If only an upper bound of a coefficient is known, the
+bound is used as the value, because too large a process noise is safer than too small a process noise.
 """
 
 import math
@@ -25,10 +27,10 @@ import numpy as np
 from drivers.data_types import Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import DURATION_S
-from monitor.common.units import sensor_kind
+from monitor.common.unit_formatting import sensor_kind
 from monitor.noise.effects import BiasInstability
 from monitor.publishing.exporters.exported_coefficients import (
-    ExportedCoefficient,
+    AxisCoefficientOrBound,
     NoiseCoefficients,
     ascii_unit,
     comment_on_omitted_terms,
@@ -37,11 +39,11 @@ from monitor.publishing.exporters.exported_coefficients import (
     join_lines,
 )
 
-FLICKER_TAU_S: Final = np.array([1000.0])  # any τ much longer than the sample interval gives the same deviation
+FLICKER_TAU_S: Final = np.array([1000.0])  # much longer than a sample, where the deviation of flicker noise is constant
 MARKOV_PEAK_RATIO: Final = 0.437 * math.sqrt(2.0)
 """Ratio of the peak Allan deviation of the Gauss-Markov process to σ: 0.437 q √T with q² = 2σ²/T (IEEE Std 952)."""
 MARKOV_PEAK_AT: Final = 1.89
-"""Averaging time of the peak in units of the correlation time T."""
+"""Averaging time at which the Allan deviation of the Gauss-Markov process peaks, in units of T."""
 SERIES_BELOW: Final = 0.1
 """Value of dt/T below which differences of exponentials are computed from a power series."""
 
@@ -54,7 +56,7 @@ HEADER_COMMENT: Final = (
 )
 
 
-def export_kalman(
+def export_kalman_process_noise(
     noise: NoiseCoefficients, inflation: float = 1.0, dt_s: float | None = None, correlation_time_s: float | None = None
 ) -> str:
     """Export the process noise of a Kalman filter as TOML.
@@ -64,9 +66,9 @@ def export_kalman(
     noise
         Noise coefficients of each axis, in SI units.
     inflation
-        Factor on N, B and K.
+        Factor that multiplies N, B and K.
     dt_s
-        Time step [s]. By default, the sample period.
+        Time step of the filter [s]. By default, the sample period of the noise model or recording.
     correlation_time_s
         Correlation time T of the Gauss-Markov process [s]. By default, T is computed from N and K.
 
@@ -98,7 +100,7 @@ def export_kalman(
 
 
 def _markov_sigma(B: float) -> float:
-    """Return σ of the Gauss-Markov process with the peak Allan deviation 0.664 B.
+    """Return the standard deviation σ of the Gauss-Markov process whose Allan deviation peaks at 0.664 B.
 
     >>> round(_markov_sigma(1.0), 3)
     1.075
@@ -107,7 +109,7 @@ def _markov_sigma(B: float) -> float:
 
 
 def _markov_time_s(N: float, K: float) -> float:
-    """Return the correlation time [s] of the Gauss-Markov process that peaks at τ = √3 N/K.
+    """Return the correlation time [s] of the Gauss-Markov process whose Allan deviation peaks at τ = √3 N/K.
 
     >>> round(_markov_time_s(N=1.5e-4, K=1.5e-6), 1)
     91.6
@@ -142,8 +144,8 @@ def process_noise_matrix(dt_s: float, N: float, K: float, markov_sigma: float, c
         White noise, in rad/√s or m/s/√s.
     K
         Rate random walk, in rad/s/√s or m/s²/√s.
-    markov_sigma
-        σ of the Gauss-Markov process, in rad/s or m/s².
+        markov_sigma
+        Standard deviation σ of the Gauss-Markov process, in rad/s or m/s².
     correlation_time_s
         Correlation time T [s].
     """
@@ -164,7 +166,11 @@ def _integrated_markov_variance(x: float) -> float:
 
 
 def _axis(
-    axis: str, terms: Mapping[str, ExportedCoefficient], inflation: float, dt_s: float, correlation_time_s: float | None
+    axis: str,
+    terms: Mapping[str, AxisCoefficientOrBound],
+    inflation: float,
+    dt_s: float,
+    correlation_time_s: float | None,
 ) -> list[str]:
     kind = sensor_kind(axis)
     rate, drift = ascii_unit("B", kind), ascii_unit("R", kind)
@@ -198,7 +204,7 @@ def _axis(
     ]
 
 
-def _remarks(terms: Mapping[str, ExportedCoefficient]) -> list[str]:
+def _remarks(terms: Mapping[str, AxisCoefficientOrBound]) -> list[str]:
     unknown = [letter for letter in "NBK" if letter not in terms]
     bounds = [letter for letter in "NBK" if letter in terms and terms[letter].bound]
     lines = [f"# unknown, set to 0: {', '.join(unknown)}"] if unknown else []

@@ -1,1 +1,1 @@
-"""Messages published over zenoh, and JSON output of commands."""
+"""Messages that the daemon publishes over zenoh, and the JSON output of commands."""

@@ -8,11 +8,11 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
-from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
+from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemovalComparison
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
@@ -28,7 +28,7 @@ SCHEMA: Final = "imu-monitor/analyze/1"
 
 
 class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of one axis with averaging times and 95 % intervals."""
+    """Allan, total or Hadamard deviations of one axis with averaging times and 95 % intervals."""
 
     tau: Floats
     deviation: Floats
@@ -36,8 +36,8 @@ class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
     hi: Floats
 
     @classmethod
-    def from_curve(cls, curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> Self:
-        """Build the deviations of one axis from a curve."""
+    def from_curve(cls, curve: AllanCurve | TotalVarianceCurve | HadamardCurve, axis: int) -> Self:
+        """Build the deviations of one axis from the variances of all axes."""
         return cls(curve.tau_s, *deviations_with_interval_ends(curve, axis))
 
 
@@ -59,8 +59,8 @@ class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
     share: dict[str, float | None]
 
     @classmethod
-    def from_temperature_removal(cls, removal: TemperatureRemoval, axis: str) -> Self:
-        """Build the coefficients of one axis."""
+    def coefficients_from_temperature_removal(cls, removal: TemperatureRemovalComparison, axis: str) -> Self:
+        """Build the coefficients of one axis from the fits with and without the temperature-correlated bias."""
         i = AXES.index(axis)
         values = coefficient_values(removal.coefficients, i, removal.k_or_r[i])
         return cls(
@@ -71,7 +71,7 @@ class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
 
 
 class AxisAnalysis(msgspec.Struct, frozen=True, kw_only=True):
-    """Analysis results of one axis. Deviations that were not computed are absent."""
+    """Analysis results of one axis. Deviations that were not computed are absent from the JSON output."""
 
     allan: AxisDeviations
     total: AxisDeviations | UnsetType = UNSET
@@ -110,7 +110,7 @@ class ChangeValues(msgspec.Struct, frozen=True):
         return cls(change.kind, AXES[change.axis], t, change.sigma, change.values_before_and_after(), change.text)
 
 
-class CoefficientSeries(msgspec.Struct, frozen=True, eq=False):
+class CoefficientTimeSeries(msgspec.Struct, frozen=True, eq=False):
     """Time series of one noise coefficient of one axis."""
 
     value: Floats
@@ -125,13 +125,13 @@ class DynamicAllanAxis(msgspec.Struct, frozen=True, eq=False):
     deviation: NDArray[np.float64]
     lo: NDArray[np.float64]
     hi: NDArray[np.float64]
-    coefficients: dict[str, CoefficientSeries]
+    coefficients: dict[str, CoefficientTimeSeries]
 
     @classmethod
     def from_dynamic_allan(cls, dynamic: DynamicAllan, axis: int) -> Self:
         """Build the dynamic Allan deviations of one axis."""
         coefficients = {
-            symbol: CoefficientSeries(
+            symbol: CoefficientTimeSeries(
                 dynamic.value[:, row, axis],
                 dynamic.value_lo[:, row, axis],
                 dynamic.value_hi[:, row, axis],
@@ -152,7 +152,7 @@ class DynamicAllanValues(msgspec.Struct, frozen=True, eq=False):
 
 
 class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="schema", tag=SCHEMA):
-    """Output of ``analyze --json``."""
+    """JSON object that ``analyze --json`` writes."""
 
     rate: float
     samples: int
@@ -167,25 +167,25 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
     def from_analysis(
         cls,
         result: RecordingAnalysis,
-        total: TotalCurve | None = None,
+        total: TotalVarianceCurve | None = None,
         hadamard: HadamardCurve | None = None,
         dynamic: DynamicAllan | None = None,
-        temperature: TemperatureRemoval | None = None,
+        temperature: TemperatureRemovalComparison | None = None,
     ) -> Self:
         """Build the JSON output of an analysis.
 
         Parameters
         ----------
         result
-            The analysis.
-        total
-            Total variance.
+            Analysis of the recording.
+                total
+            Total variance, or None to omit total deviations.
         hadamard
-            Hadamard variance.
+            Hadamard variance, or None to omit Hadamard deviations.
         dynamic
-            Dynamic Allan variance.
+            Allan deviations over time, or None if the analysis has no sliding window.
         temperature
-            K and R after the temperature-correlated bias has been removed.
+            K and R after removal of the temperature-correlated bias, or None without a recorded temperature.
         """
         estimate = result.estimate
         measured = measured_axes(estimate.curve)
@@ -199,7 +199,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
                 temperature=_temperature_values(result, temperature, axis),
                 without_temperature=UNSET
                 if temperature is None or axis not in temperature.models
-                else CoefficientsWithoutTemperature.from_temperature_removal(temperature, axis),
+                else CoefficientsWithoutTemperature.coefficients_from_temperature_removal(temperature, axis),
             )
             for i, axis in measured
         }
@@ -230,7 +230,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
 
 
 class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag=SCHEMA):
-    """Output of ``analyze --json`` if no estimate is possible. ``notes`` contains the reason."""
+    """JSON object that ``analyze --json`` writes if no estimate is possible. ``notes`` contains the reason."""
 
     samples: int
     notes: list[str]
@@ -242,7 +242,7 @@ class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag
 
 
 def _temperature_values(
-    result: RecordingAnalysis, temperature: TemperatureRemoval | None, axis: str
+    result: RecordingAnalysis, temperature: TemperatureRemovalComparison | None, axis: str
 ) -> TemperatureDependenceValues | UnsetType:
     if temperature is None or axis not in result.axes_of_temperature:
         return UNSET

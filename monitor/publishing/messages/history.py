@@ -1,8 +1,9 @@
 """Stored results as JSON, for the zenoh reply ``imu/<device>/history`` and for ``history --json``.
 
-All lists are indexed by time bucket. For each quantity, ``value`` is the last value in the bucket, and ``low`` and
-``high`` are the extremes. The status of a coefficient is ``upper_bound`` if the bucket contains upper bounds but no
-estimates. Numbers are written with nine digits, which preserve every float32 value exactly.
+A history divides time into intervals, which are called buckets. Each list has one element per bucket. For each
+quantity, ``value`` is the last value in a bucket, and ``low`` and ``high`` are the smallest and the largest value. The
+status of a coefficient is ``upper_bound`` if the bucket contains upper bounds but no estimates. Numbers are written
+with nine digits, which preserve every float32 value exactly.
 """
 
 from typing import Any, Final, Literal, Self
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats, Ints
 from monitor.common import topics
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
-from monitor.history.bucket import COUNTS, STATES
-from monitor.history.column_conversion import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
+from monitor.history.estimate_to_columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
+from monitor.history.history_row import COUNTS, STATES
 from monitor.history.history_table import MAX_EVENTS, ColumnStatistics, HistoryTable
 from monitor.history.query_parameters import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
 from monitor.history.stored_events import StoredEvent
@@ -35,7 +36,7 @@ STATUS_COLUMNS: Final = (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
 _STATUS_NAMES: Final = {status.value: status.name.lower() for status in Status}
 
 
-class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+class MinMaxLastHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """Last value, minimum and maximum of a quantity in each time bucket."""
 
     value: Floats
@@ -44,17 +45,17 @@ class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @classmethod
     def from_column(cls, column: ColumnStatistics) -> Self:
-        """Build the history of a quantity from a stored column."""
+        """Build the history of a quantity from the stored statistics."""
         return cls(value=_nine_digits(column.last), low=_nine_digits(column.low), high=_nine_digits(column.high))
 
     def to_column(self, *shape: int) -> ColumnStatistics:
-        """Return the stored column. A shape [buckets, columns] gives several columns."""
+        """Return the statistics of one quantity, or of several quantities for a shape [buckets, columns]."""
         low, high, last = (_checked(one, shape) for one in (self.low, self.high, self.value))
         return ColumnStatistics((~np.isnan(last)).astype(np.int64), low, high, last)
 
 
-class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
-    """History of one noise coefficient with intervals, numbers of estimates and statuses."""
+class CoefficientHistory(MinMaxLastHistory, frozen=True, kw_only=True):
+    """History of one noise coefficient with 95 % intervals, numbers of estimates and statuses."""
 
     lo: Floats
     hi: Floats
@@ -63,7 +64,7 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
 
     @classmethod
     def coefficient_from_history(cls, past: HistoryTable, value_column: str) -> Self:
-        """Build the history of a coefficient from the value column, such as gz.N."""
+        """Build the history of the coefficient whose values are stored in the given column, such as gz.N."""
         value, bound = past.select_column(value_column), past.select_column(f"{value_column}.bound")
         lo, hi = (past.select_column(f"{value_column}.{end}") for end in ("lo", "hi"))
         estimated, bounded = value.n > 0, bound.n > 0
@@ -79,15 +80,15 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
             status=[_STATUS_NAMES[one] for one in status.tolist()],
         )
 
-    def coefficient_columns(self, value_column: str, bucket_count: int) -> dict[str, ColumnStatistics]:
+    def stored_columns_of_coefficient(self, value_column: str, bucket_count: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of the coefficient by name.
 
         Parameters
         ----------
         value_column
-            Name of the column of the value, such as gz.N.
+            Name of the column that contains the values, such as gz.N.
         bucket_count
-            Number of buckets.
+            Number of time buckets.
         """
         value, n = self.to_column(bucket_count), _checked(self.n, (bucket_count,))
         lo, hi = (_checked(one, (bucket_count,)) for one in (self.lo, self.hi))
@@ -106,7 +107,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """History of Allan deviations, with arrays of shape [buckets, τ] for each axis."""
 
     tau: list[float]
-    axes: dict[str, NumberHistory]
+    axes: dict[str, MinMaxLastHistory]
 
     @classmethod
     def deviations_from_history(cls, past: HistoryTable, axes: tuple[str, ...]) -> Self:
@@ -118,7 +119,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
                 n, low, high, last = (
                     np.column_stack([getattr(one, part) for one in columns]) for part in ("n", "low", "high", "last")
                 )
-                found[axis] = NumberHistory.from_column(ColumnStatistics(n, low, high, last))
+                found[axis] = MinMaxLastHistory.from_column(ColumnStatistics(n, low, high, last))
         return cls(tau=[float(tau) for tau in taus], axes=found)
 
     def deviation_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
@@ -133,32 +134,36 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return columns
 
 
-class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """History of the state and the sample counters of a device."""
+class DeviceStatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """History of the state, the sample counters and the temperature of a device."""
 
     state: list[Literal["ended", "running", "waiting", "lost"]]
     received: Ints
     lost: Ints
     bad: Ints
     overflowed: Ints
-    rate: NumberHistory | UnsetType | None = UNSET
-    latency: NumberHistory | UnsetType | None = UNSET
-    memory: NumberHistory | UnsetType | None = UNSET
-    temperature: NumberHistory | UnsetType | None = UNSET
+    rate: MinMaxLastHistory | UnsetType | None = UNSET
+    latency: MinMaxLastHistory | UnsetType | None = UNSET
+    memory: MinMaxLastHistory | UnsetType | None = UNSET
+    temperature: MinMaxLastHistory | UnsetType | None = UNSET
 
     @classmethod
     def status_from_history(cls, past: HistoryTable) -> Self:
         """Build the history of states, sample counters and temperature."""
         counts: dict[str, Any] = {name: past.counts[:, i] for i, name in enumerate(COUNTS)}
         numbers: dict[str, Any] = {
-            name: NumberHistory.from_column(past.select_column(name)) for name in STATUS_COLUMNS if name in past.names
+            name: MinMaxLastHistory.from_column(past.select_column(name))
+            for name in STATUS_COLUMNS
+            if name in past.names
         }
         return cls(state=[STATES[one] for one in past.state.tolist()], **counts, **numbers)
 
-    def status_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
+    def device_status_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of rate, latency, memory and temperature by name."""
         numbers = {name: getattr(self, name) for name in STATUS_COLUMNS}
-        return {name: one.to_column(bucket_count) for name, one in numbers.items() if isinstance(one, NumberHistory)}
+        return {
+            name: one.to_column(bucket_count) for name, one in numbers.items() if isinstance(one, MinMaxLastHistory)
+        }
 
 
 class PastEvent(
@@ -167,7 +172,7 @@ class PastEvent(
     kw_only=True,
     rename={"t_s": "t", "since_s": "since", "represented_events": "stands_for"},
 ):
-    """Stored event of a device. ``stands_for`` is the number of events that the entry represents."""
+    """Stored event of a device. ``represented_events`` counts this event and deleted events of the same kind."""
 
     t_s: float
     kind: str
@@ -180,14 +185,14 @@ class PastEvent(
 
     @classmethod
     def from_stored_event(cls, event: StoredEvent) -> Self:
-        """Build the message entry from a stored event."""
+        """Build the entry of a history message from a stored event."""
         return cls(
             **attributes_with_field_names(cls, event)
             | {"what": {name: dict(sides) for name, sides in event.what.items()}}
         )
 
     def to_event(self) -> StoredEvent:
-        """Return the stored event with control characters removed from all texts."""
+        """Convert the entry to a stored event, and remove control characters from all texts."""
         what = {
             name: {side: np.nan if one is None else one for side, one in sides.items()}
             for name, sides in self.what.items()
@@ -202,7 +207,7 @@ class PastEvent(
 
 
 class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.schema_name()):
-    """Message ``imu/<device>/history`` with stored results. Parts that were not requested are absent."""
+    """Message ``imu/<device>/history`` with stored results. It contains only the requested parts."""
 
     topic = topics.HISTORY
     from_: float = msgspec.field(name="from")
@@ -212,7 +217,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
     width: Ints
     axes: dict[str, dict[str, CoefficientHistory]] | UnsetType | None = UNSET
     deviations: DeviationHistory | UnsetType | None = UNSET
-    status: StatusHistory | UnsetType | None = UNSET
+    status: DeviceStatusHistory | UnsetType | None = UNSET
     events: list[PastEvent] | UnsetType | None = UNSET
     events_in_all: int | UnsetType = UNSET
 
@@ -223,9 +228,9 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
         Parameters
         ----------
         past
-            The stored results.
+            Stored results that the reply contains.
         query
-            The query.
+            Parameters of the history query.
         t
             Unix time of the newest sample [s].
         samples
@@ -252,13 +257,13 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
             deviations=DeviationHistory.deviations_from_history(past, query.axes)
             if DEVIATIONS in query.what
             else UNSET,
-            status=StatusHistory.status_from_history(past) if STATUS in query.what else UNSET,
+            status=DeviceStatusHistory.status_from_history(past) if STATUS in query.what else UNSET,
             events=[PastEvent.from_stored_event(one) for one in past.events] if EVENTS in query.what else UNSET,
             events_in_all=past.events_in_all if EVENTS in query.what else UNSET,
         )
 
     def to_table(self) -> HistoryTable:
-        """Convert the message to a history table.
+        """Convert the message to a table of stored results.
 
         Raises
         ------
@@ -272,12 +277,12 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
         for axis, coefficients in (self.axes or {}).items():
             for symbol, one in coefficients.items():
                 if axis in AXES and symbol in SYMBOLS:
-                    columns |= one.coefficient_columns(f"{axis}.{symbol}", buckets)
+                    columns |= one.stored_columns_of_coefficient(f"{axis}.{symbol}", buckets)
         if self.deviations:
             columns |= self.deviations.deviation_columns(buckets)
         counts, state = np.zeros((buckets, len(COUNTS)), np.int64), np.full(buckets, STATES.index("running"))
         if self.status:
-            columns |= self.status.status_columns(buckets)
+            columns |= self.status.device_status_columns(buckets)
             counts = np.column_stack([_checked(getattr(self.status, name), (buckets,)) for name in COUNTS])
             state = _checked(np.array([STATES.index(one) for one in self.status.state], np.int64), (buckets,))
         with np.errstate(over="ignore"):  # a value beyond the range of float32 becomes infinite
@@ -319,12 +324,12 @@ def _column_without_extremes(last: Floats) -> ColumnStatistics:
 
 
 def _nine_digits(column: Floats) -> Floats:
-    """Round values to nine digits, which identify every float32."""
+    """Round values to nine significant digits, which distinguish all float32 values."""
     return np.array([float(f"{one:.9g}") for one in column.ravel().tolist()]).reshape(column.shape)
 
 
 def _checked(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an array of the expected shape. Accept an empty array if there are no buckets."""
+    """Return the array if it has the expected shape. Accept any empty array if there are no buckets."""
     if array.shape != shape and (array.size or 0 not in shape):
         raise ValueError("lists of different lengths")
     return array.reshape(shape)

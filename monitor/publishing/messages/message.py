@@ -1,8 +1,8 @@
 """Base class of all messages, and encoding of messages as JSON.
 
-The publisher, ``watch``, ``view`` and history queries use the same structs. The order of the fields is the order of the
-JSON keys. NaN is written as null, because JSON cannot represent NaN. In an array, null is read as NaN. Unknown keys are
-ignored, so that messages of newer daemons remain readable.
+The publisher, ``watch``, ``view`` and history queries use the same message classes. The order of the fields in a class
+is the order of the JSON keys. NaN is written as null, because JSON cannot represent NaN. In an array, null is read as
+NaN. Unknown keys are ignored, so that messages of newer daemons remain readable.
 """
 
 from functools import cache
@@ -15,24 +15,24 @@ from drivers.data_types import Ints
 from monitor.common.topics import Topic
 
 MAX_PAYLOAD_BYTES: Final = 1_000_000
-"""Largest accepted payload. A message of six axes has a few kilobytes."""
+"""Largest accepted payload. A typical message about six axes has a few kilobytes."""
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="schema"):
-    """Base class of messages about one device. msgspec writes and checks the key ``schema``."""
+    """Base class of messages about one device. The library msgspec writes and checks the key ``schema``."""
 
     topic: ClassVar[Topic]
 
     device: str = ""
     t: float | None = None
-    """Unix time of the newest sample [s]. None before the first sample of a device that has its own clock."""
+    """Unix time of the newest sample [s]. None until a device that supplies its own sample times has sent a sample."""
     samples: Count = 0
     """Number of samples of the device since the start."""
 
     @classmethod
     def from_result(cls, device: str, t: float | None, samples: int, result: Any) -> Self:
-        """Build the message from a result.
+        """Build the message from a result of the daemon.
 
         Parameters
         ----------
@@ -41,9 +41,9 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
         t
             Unix time of the result [s].
         samples
-            Number of samples of the device since the start, used if the result does not contain the number.
+            Number of samples of the device since the start. A result with an attribute ``samples`` replaces it.
         result
-            Result of the daemon.
+            Result whose attributes have the names of message fields.
         """
         head = {"device": device, "t": t, "samples": samples}
         return cls(**head | attributes_with_field_names(cls, result) | cls._convert(t, result))
@@ -62,16 +62,16 @@ M = TypeVar("M", bound=Message)
 
 
 def decode_message(message_type: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_BYTES) -> M:
-    """Decode a message.
+    """Decode a message of the given class.
 
     Parameters
     ----------
     message_type
-        Class of the message.
+        Expected class of the message.
     payload
-        JSON text.
+        JSON text of the message.
     max_bytes
-        Largest accepted payload.
+        Largest accepted size of the payload.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def decode_message(message_type: type[M], payload: bytes, max_bytes: int = MAX_P
     if len(payload) > max_bytes:
         raise ValueError(f"the payload has {len(payload)} bytes; at most {max_bytes} are read")
     try:
-        found = _decoder(message_type).decode(payload)  # decoding errors are ValueErrors
+        found = _decoder(message_type).decode(payload)  # msgspec reports decoding errors as ValueError
     except RecursionError as error:
         raise ValueError(str(error)) from error
     if not isinstance(found, message_type):
@@ -90,7 +90,7 @@ def decode_message(message_type: type[M], payload: bytes, max_bytes: int = MAX_P
 
 
 def encode_json(value: Any) -> bytes:
-    """Encode structs, arrays and built-in types as JSON."""
+    """Encode msgspec structs, NumPy arrays and built-in types as JSON."""
     return _ENCODER.encode(value)
 
 
@@ -99,10 +99,10 @@ def attributes_with_field_names(struct_type: type[msgspec.Struct], source: objec
 
     Parameters
     ----------
-    struct_type
-        Class of the struct.
+        struct_type
+        Class of the msgspec struct.
     source
-        The object.
+        Object with the attributes.
     """
     return {name: getattr(source, name) for name in struct_type.__struct_fields__ if hasattr(source, name)}
 
@@ -135,7 +135,7 @@ def _decode_array(kind: Any, value: Any) -> Any:
 
 @cache
 def _decoder(kind: type[M]) -> "msgspec.json.Decoder[M | Message]":
-    """Return a decoder for a union, because msgspec requires the key ``schema`` only in unions."""
+    """Return a decoder for a union of classes, because msgspec requires the key ``schema`` only in unions."""
     return msgspec.json.Decoder(kind | Message, dec_hook=_decode_array)
 
 

@@ -16,8 +16,8 @@ from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.detection.model_comparison import ModelComparison
+from monitor.estimation.allan.total import TotalVarianceCurve
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.noise.standard_terms import unit_coefficient_allan_variances
@@ -30,7 +30,7 @@ from monitor.publishing.messages.message import (
 )
 
 MAX_AVERAGING_TIMES: Final = 1000
-"""Largest accepted number of averaging times."""
+"""Largest number of averaging times that a received message may contain."""
 MAX_TEXT_LENGTH: Final = 400
 """Largest length of received texts, which limits the memory use of the receiver."""
 MAX_OUTPUTS: Final = 16
@@ -38,14 +38,14 @@ STATUSES: Final = {status.name.lower(): status for status in Status}
 
 
 class TotalAndHadamardCurves(NamedTuple):
-    """Total and Hadamard deviations of the samples in the window."""
+    """Total and Hadamard variances of the samples in the sliding window."""
 
-    total: TotalCurve
+    total: TotalVarianceCurve
     hadamard: HadamardCurve
 
 
 class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of one axis with 95 % intervals."""
+    """Allan, total or Hadamard deviations of one axis with 95 % intervals."""
 
     deviation: Floats
     lo: Floats
@@ -53,7 +53,7 @@ class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
 
 
 class AllanAxis(DeviationCurve, frozen=True):
-    """Allan deviations of one axis. ``recent`` uses only the last max(10 s, 16 τ) of samples."""
+    """Allan deviations of one axis. The field ``recent`` uses only the last max(10 s, 16 τ) of samples."""
 
     recent: DeviationCurve | UnsetType = UNSET
 
@@ -66,25 +66,25 @@ class CoefficientValue(msgspec.Struct, frozen=True):
     hi: float | None = None
     status: str = ""
     other: str | UnsetType | None = msgspec.field(name="or", default=UNSET)
-    """Alternative coefficient, K or R, if the data cannot distinguish K from R."""
+    """Other coefficient, K or R, that explains the data equally well. Unset if the data distinguish K from R."""
 
 
-class WindowResultMessage(
+class SlidingWindowMessage(
     Message,
     frozen=True,
     kw_only=True,
     rename={"rate_hz": "rate", "window_s": "window", "filled_s": "filled", "tau_s": "tau"},
 ):
-    """Base class of messages with results of the sample window."""
+    """Base class of messages with results that are computed from the sliding window."""
 
     rate_hz: float | None = None
     window_s: float | None = None
-    """Length of the full window."""
+    """Length of the sliding window [s]."""
     filled_s: float | None = None
-    """Filled part of the window."""
+    """Duration of the samples that the sliding window contains [s]."""
 
 
-class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema_name()):
+class AllanMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema_name()):
     """Message ``imu/<device>/allan`` with the Allan deviations of each measured axis."""
 
     topic = topics.ALLAN
@@ -104,12 +104,12 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         return {"filled_s": result.curve.n / result.rate_hz, "tau_s": result.curve.tau_s, "axes": axes}
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
-        """Convert the message to an estimate with unknown degrees of freedom.
+        """Convert the message to an estimate whose degrees of freedom are unknown.
 
         Parameters
         ----------
         coefficients
-            Coefficients of the device, from which the fitted curve is computed.
+            Noise coefficients of the device, from which the fitted Allan variance is computed.
         k_or_r
             Axes on which the data cannot distinguish K from R.
 
@@ -144,7 +144,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         )
 
 
-class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema_name()):
+class CoefficientsMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema_name()):
     """Message ``imu/<device>/coefficients`` with Q, N, B, K and R of each measured axis."""
 
     topic = topics.COEFFICIENTS
@@ -159,7 +159,7 @@ class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=to
         return {"filled_s": result.curve.n / result.rate_hz, "axes": axes}
 
     def to_coefficients(self) -> Coefficients:
-        """Convert the message to the coefficients of all axes.
+        """Convert the message to an array of the noise coefficients of all axes.
 
         Raises
         ------
@@ -180,16 +180,16 @@ class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=to
 
 
 class TauRange(msgspec.Struct, frozen=True):
-    """Range of averaging times [s]."""
+    """First and last averaging time of a range [s]."""
 
     tau: tuple[float, float]
 
 
-class AxisModelGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+class AxisModelComparisonValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Comparison of the measured Allan deviation of one axis with the noise model."""
 
     agrees: bool | None = None
-    """True if the axis agrees with the noise model, decided with hysteresis. None before the first decision."""
+    """True if the axis agrees with the noise model, based on a test with hysteresis. None before the first decision."""
     gap: float
     where: TauRange
     ratio: float | None = None
@@ -200,59 +200,59 @@ class AxisModelGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     z: Floats | None = None
 
 
-class ModelGapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema_name()):
-    """Message ``imu/<device>/gap`` with the comparison of measured Allan deviations and noise model."""
+class ModelGapMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema_name()):
+    """Message ``imu/<device>/gap`` that compares the measured Allan deviations with the noise model."""
 
     topic = topics.GAP
     tau_s: Floats | None = None
-    axes: dict[str, AxisModelGapValues]
+    axes: dict[str, AxisModelComparisonValues]
 
     @classmethod
     def _convert(cls, _t: float | None, result: ModelComparison) -> dict[str, Any]:
         axes = {
-            axis: AxisModelGapValues(
+            axis: AxisModelComparisonValues(
                 agrees=result.agrees.get(axis),
                 where=TauRange(one.tau_s),
-                **attributes_with_field_names(AxisModelGapValues, one),
+                **attributes_with_field_names(AxisModelComparisonValues, one),
             )
             for axis, one in result.axes.items()
         }
         return {"filled_s": result.n / result.rate_hz, "axes": axes}
 
 
-class AxisThermalValues(msgspec.Struct, frozen=True):
-    """Mean bias of one axis in an interval, with predictions. ``text`` states why a prediction is missing."""
+class AxisBiasPrediction(msgspec.Struct, frozen=True):
+    """Measured and predicted mean bias of one axis in an interval. ``text`` states why a prediction is missing."""
 
     bias: float | None
     error: float | None
     multi_step: PredictionInterval | None
-    """Prediction from the temperature alone."""
+    """Bias predicted from the temperature alone."""
     one_step: PredictionInterval | None
-    """Prediction from the temperature and the preceding bias."""
+    """Bias predicted from the temperature and the mean bias of the preceding interval."""
     model: str | None
     slope: float | None
     text: str
 
 
-class ThermalMessage(
+class ThermalPredictionMessage(
     Message,
     frozen=True,
     kw_only=True,
     tag=topics.THERMAL.schema_name(),
     rename={"interval_s": "interval", "temperature_c": "temperature"},
 ):
-    """Message ``imu/<device>/thermal`` with measured and predicted mean biases of the interval that ends at ``t``."""
+    """Message ``imu/<device>/thermal`` with the measured and predicted mean bias of the interval that ends at ``t``."""
 
     topic = topics.THERMAL
     interval_s: float
     temperature_c: float | None
-    axes: dict[str, AxisThermalValues]
+    axes: dict[str, AxisBiasPrediction]
 
     @classmethod
     def _convert(cls, _t: float | None, result: ThermalIntervalResult) -> dict[str, Any]:
         axes = {
-            axis: AxisThermalValues(
-                **attributes_with_field_names(AxisThermalValues, one) | {"model": one.model or None}
+            axis: AxisBiasPrediction(
+                **attributes_with_field_names(AxisBiasPrediction, one) | {"model": one.model or None}
             )
             for axis, one in result.axes.items()
         }
@@ -260,14 +260,14 @@ class ThermalMessage(
 
 
 class DeviationTable(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of all measured axes at common averaging times."""
+    """Total or Hadamard deviations of all measured axes at the same averaging times."""
 
     tau: Floats
     axes: dict[str, DeviationCurve]
 
     @classmethod
-    def from_curve(cls, curve: TotalCurve | HadamardCurve) -> Self:
-        """Build the table of deviations, without the axes that have no deviation."""
+    def from_curve(cls, curve: TotalVarianceCurve | HadamardCurve) -> Self:
+        """Build the table from the variances of all axes, and omit axes without values."""
         curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
@@ -294,9 +294,9 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_n
     kind: str
     axis: str | None = None
     what: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
-    """Values by coefficient, such as the values before and after a change."""
+    """Values of the affected coefficients, such as the values before and after a change."""
     since: float | None = None
-    """Unix time at which the reported condition began [s]."""
+    """Unix time at which the condition that the event reports began [s]."""
     sigma: float | None = None
     text: str
 
@@ -310,7 +310,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_n
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode an event of another process, and remove control characters from all texts.
+        """Decode an event from another process, and remove control characters from all texts.
 
         Raises
         ------
@@ -334,7 +334,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_n
 
 
 class LatencyPercentiles(msgspec.Struct, frozen=True):
-    """Percentiles of the latency from receipt to publication [s]."""
+    """Percentiles of the time from the receipt of a sample to its publication [s]."""
 
     p50: float | None = None
     p99: float | None = None
@@ -378,7 +378,7 @@ class StatusMessage(
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a status of another process, and remove control characters from all texts.
+        """Decode a status message from another process, and remove control characters from all texts.
 
         Raises
         ------
@@ -410,19 +410,19 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema_nam
 
 
 class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema_name()):
-    """First keys of the reply to ``imu/<device>/command/reconcile``, which precede the keys of the report."""
+    """Reply to ``imu/<device>/command/reconcile``. The keys of this class precede the keys of the report."""
 
     topic = topics.RECONCILE
 
     def encode_report(self, report: Mapping[str, Any], exit_status: int, folder: str | None) -> bytes:
-        """Encode the reply with the report as JSON.
+        """Encode the reply and the report as one JSON object.
 
         Parameters
         ----------
         report
-            Report of the command.
+            JSON report of the command ``reconcile``.
         exit_status
-            Exit status of the command.
+            Exit status of the command ``reconcile``.
         folder
             Folder that contains the complete report. None if the report was not saved.
         """
@@ -439,7 +439,7 @@ def coefficient_values(
     Parameters
     ----------
     coefficients
-        Coefficients of all axes.
+        Noise coefficients of all axes.
     axis
         Column of the axis.
     k_r_ambiguous
@@ -459,20 +459,20 @@ def coefficient_values(
 
 
 def event_start_s(unix_s: float, event: Event) -> float | None:
-    """Return the Unix time [s] at which the condition of an event began, or None if unknown.
+    """Return the Unix time [s] at which the condition that an event reports began, or None if it is unknown.
 
     Parameters
     ----------
     unix_s
         Unix time of the event [s].
     event
-        The event.
+        Event of a device.
     """
     return None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
 
 
 def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
-    """Return the Allan variance of the estimated noise terms, shape [m, 6]. Axes without estimates are NaN.
+    """Return the sum of the Allan variances of all estimated noise terms, shape [m, 6], NaN for axes without estimates.
 
     Parameters
     ----------
@@ -481,7 +481,7 @@ def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficie
     rate_hz
         Sample rate [Hz].
     coefficients
-        Coefficients of all axes.
+        Noise coefficients of all axes.
     """
     total: Floats = unit_coefficient_allan_variances(tau_s, 1.0 / rate_hz) @ np.nan_to_num(coefficients.value) ** 2
     total[:, np.isnan(coefficients.value).all(axis=0)] = np.nan
@@ -489,21 +489,21 @@ def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficie
 
 
 def deviations_with_interval_ends(
-    curve: AllanCurve | TotalCurve | HadamardCurve, axis: int
+    curve: AllanCurve | TotalVarianceCurve | HadamardCurve, axis: int
 ) -> tuple[Floats, Floats, Floats]:
     """Return the deviations of one axis and the ends of the 95 % intervals, each of shape [m].
 
     Parameters
     ----------
-    curve
-        Variances of all axes.
+        curve
+        Allan, total or Hadamard variances of all axes.
     axis
         Column of the axis.
     """
     match curve:
         case AllanCurve():
             variance = curve.avar
-        case TotalCurve():
+        case TotalVarianceCurve():
             variance = curve.tvar
         case HadamardCurve():
             variance = curve.hvar

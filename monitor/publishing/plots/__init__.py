@@ -1,1 +1,1 @@
-"""Plots as image files and as SVG elements of HTML reports."""
+"""Plots of results, written as image files or embedded as SVG elements in HTML reports."""

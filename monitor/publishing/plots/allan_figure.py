@@ -1,8 +1,8 @@
-"""Allan plot of one kind of sensor, for the image of ``analyze --plot`` and for the HTML report.
+"""Allan plot of the gyroscopes or the accelerometers, for the image of ``analyze --plot`` and for the HTML report.
 
-The plot shows the measured Allan deviations with 95 % bands, and the fitted deviations as dashed lines. Each estimated
-noise term has a thin line with a ring at the averaging time at which the coefficient is read (IEEE Std 952). Markers,
-rings and dashes differ between axes, so that equal deviations of two axes remain visible.
+The plot shows the measured Allan deviations with 95 % bands, and the fitted Allan deviations as dashed lines. Each
+estimated noise term has a thin line with a ring at the averaging time at which its coefficient is read (IEEE Std 952).
+Markers, rings and dashes differ between axes, so that equal Allan deviations of two axes remain visible.
 """
 
 from collections.abc import Collection, Sequence
@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
-from monitor.common.units import DEVIATION_UNITS, KIND_NAMES, Kind, axes_of
+from monitor.common.unit_formatting import DEVIATION_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.standard_terms import UNIT_SOURCES
@@ -33,38 +33,38 @@ READING_TAU_S: Final = {
     "N": 1.0,
     "K": 3.0,
     "R": 2.0**0.5,
-}  # averaging time at which the deviation of the noise term equals the coefficient
-LINE_TAU_S: Final = np.array([1e-6, 1e9])  # ends of the line of a noise term, outside every plot
-TAU0_S: Final = 1e-9  # sample interval that is too short to affect the line of a noise term
+}  # averaging time at which the Allan deviation of the noise term equals the coefficient
+LINE_TAU_S: Final = np.array([1e-6, 1e9])  # the line of a noise term ends outside every plot
+TAU0_S: Final = 1e-9  # sample period that is too short to affect the line of a noise term
 LEGEND_TEXT: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
 )
 OTHER_LINE_STYLES: Final = ("-", ":", "-.")
 TERM_LINE_ALPHA: Final = 0.4
-MAX_DEPTH_RATIO: Final = 300.0  # largest ratio between the lowest point and a ring; lower rings are omitted
-MAX_BAND_RATIO: Final = 3.0  # a band extends the plot by at most this factor beyond the points
+MAX_DEPTH_RATIO: Final = 300.0  # a ring is omitted if it is lower than the lowest point by more than this factor
+MAX_BAND_RATIO: Final = 3.0  # the confidence bands extend the plot by at most this factor beyond the points
 MARGIN_FACTOR: Final = 1.6
 MIN_LETTER_DISTANCE: Final = 0.045  # smallest distance between two labels, as a share of the height of the plot
 
 
 @dataclass(frozen=True, slots=True)
 class AdditionalDeviation:
-    """Total or Hadamard deviation to draw in addition to the Allan deviation."""
+    """Total or Hadamard deviation that is drawn in addition to the Allan deviation."""
 
     name: str  # "total" or "Hadamard"
     tau_s: Floats  # [k]
     deviation: Floats  # [k, 6] SI unit of the axis
     lo: Floats  # [k, 6] ends of the 95 % interval; NaN if unknown
     hi: Floats
-    only_beyond: bool = False  # True to draw only averaging times beyond the Allan deviation
+    only_beyond: bool = False  # True to draw only averaging times longer than those of the Allan deviation
 
     def drawn_points_mask(self, axis: int, longest_allan_tau_s: float) -> NDArray[np.bool_]:
-        """Return a mask of the points of one axis that the plot shows, shape [k].
+        """Return a mask of the averaging times at which the plot shows a point for one axis, shape [k].
 
         Parameters
         ----------
         axis
-            Column of the axis.
+            Column index of the axis.
         longest_allan_tau_s
             Longest averaging time of the Allan deviation of this axis [s].
         """
@@ -73,18 +73,18 @@ class AdditionalDeviation:
 
 
 def additional_deviations(
-    total: TotalCurve | None = None, hadamard: HadamardCurve | None = None
+    total: TotalVarianceCurve | None = None, hadamard: HadamardCurve | None = None
 ) -> list[AdditionalDeviation]:
-    """Return the total and Hadamard deviations to draw.
+    """Return the total and Hadamard deviations that are drawn in addition to the Allan deviation.
 
     The total deviation is drawn only beyond the longest averaging time of the Allan deviation.
 
     Parameters
     ----------
-    total
-        Total variance, or None.
+        total
+        Total variance, or None to draw no total deviation.
     hadamard
-        Hadamard variance, or None.
+        Hadamard variance, or None to draw no Hadamard deviation.
     """
     found = []
     if total is not None:
@@ -102,24 +102,24 @@ class _Ring:
 
     letter: str
     tau_s: float
-    sigma: float  # deviation in the unit of the plot
-    number: int  # 0, 1 or 2 for x, y or z
-    line: Floats  # deviation of the term at both ends of LINE_TAU_S
+    sigma: float  # Allan deviation at the ring, in the unit of the plot
+    number: int  # 0, 1 or 2 for the axis x, y or z
+    line: Floats  # Allan deviation of the noise term at the two values of LINE_TAU_S
 
 
 def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequence[AdditionalDeviation] = ()) -> None:
-    """Draw the Allan plot of one kind of sensor.
+    """Draw the Allan plot of the gyroscopes or the accelerometers.
 
     Parameters
     ----------
     panel
-        Axes of matplotlib.
+        Axes object of matplotlib.
     estimate
-        Estimate of the whole recording.
+        Estimate from the whole recording.
     kind
-        Kind of sensor.
+        Kind of sensor: gyro or accel.
     others
-        Other deviations of the same recording.
+        Total and Hadamard deviations of the same recording.
     """
     factor = DEVIATION_UNITS[kind].factor
     tau_s, minimum_tau_s = estimate.curve.tau_s, _tau_of_minimum_s(estimate, kind)
@@ -156,8 +156,8 @@ def _draw_other(
     panel: "Axes", other: AdditionalDeviation, points: NDArray[np.bool_], number: int, i: int, factor: float,
     longest_allan_tau_s: float, line_style: str,
 ) -> Floats:  # fmt: skip
-    """Draw an additional deviation of one axis, and return the drawn values."""
-    # The line begins at the last point of the Allan deviation to show the connection.
+    """Draw the total or Hadamard deviation of one axis, and return the drawn values."""
+    # The line begins at the last point of the Allan deviation, which the total deviation continues.
     line = points | (other.tau_s == longest_allan_tau_s) if other.only_beyond else points
     y, colour = other.deviation[:, i] * factor, COLOURS[number]
     panel.plot(other.tau_s[line], y[line], line_style, color=colour, linewidth=0.9, alpha=0.8, zorder=2)
@@ -169,7 +169,7 @@ def _draw_other(
 
 
 def _tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
-    """Return the averaging time [s] with the lowest mean deviation, at which B is read."""
+    """Return the averaging time [s] with the lowest mean Allan deviation, at which B is read."""
     avar = estimate.curve.avar[:, [AXES.index(axis) for axis in axes_of(kind)]]
     good = np.isfinite(avar) & (avar > 0)
     common = (good | ~good.any(axis=0)).all(axis=1) & good.any(axis=1)
@@ -223,7 +223,7 @@ def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
 
 
 def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
-    """Group rings of one coefficient whose labels would overlap."""
+    """Group rings of the same coefficient whose labels would overlap, so that each group has one label."""
     bottom, top = np.log(panel.get_ylim())
     groups: list[list[_Ring]] = []
     for ring in sorted(rings, key=lambda one: (one.letter, one.sigma)):

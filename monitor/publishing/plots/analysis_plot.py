@@ -1,7 +1,7 @@
-"""Plot of one analysis, for ``imu-monitor analyze --plot FILE.png``.
+"""Plot of the analysis of a recording, for ``imu-monitor analyze --plot FILE.png``.
 
-The figure shows Allan plots, tables of coefficients and dynamic Allan deviations, with one column for each kind of
-sensor.
+The figure shows Allan plots, tables of coefficients, and Allan deviations over time. Gyroscopes and accelerometers have
+separate columns.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.data_types import AXES
-from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of, format_duration
+from monitor.common.unit_formatting import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of, format_duration
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
@@ -31,8 +31,8 @@ from monitor.publishing.plots.style import COLOURS, GREY, create_figure, figure_
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-INCHES: Final = (7.2, 7.6)  # size of one Allan plot with table
-COLUMNS: Final = (0.0, 0.46, 0.65, 0.84)  # left edges of the columns, as shares of the table width
+INCHES: Final = (7.2, 7.6)  # width and height of one Allan plot with table
+COLUMNS: Final = (0.0, 0.46, 0.65, 0.84)  # left edges of the table columns, as shares of the table width
 TABLE_LEGEND: Final = (
     "small print: 95 % interval;  ≤ one-sided 95 % bound;  — too few data;  K or R: the data do not show which"
 )
@@ -40,12 +40,12 @@ TABLE_LEGEND: Final = (
 
 @dataclass(frozen=True, slots=True)
 class AnalysisPlotData:
-    """Content of the analysis plot and of the HTML report of one recording."""
+    """Analysis results of one recording that the plot and the HTML report show."""
 
     analysis: RecordingAnalysis
-    others: Sequence[AdditionalDeviation] = ()  # such as total and Hadamard deviation
+    others: Sequence[AdditionalDeviation] = ()  # total and Hadamard deviations
     dynamic: DynamicAllan | None = None
-    marks: Sequence[ChangeMark] = ()  # changes to mark in the dynamic Allan deviation
+    marks: Sequence[ChangeMark] = ()  # changes that are marked in the plots over time
 
 
 def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "") -> None:
@@ -84,13 +84,13 @@ def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "")
 
 
 def measured_kinds(estimate: Estimate) -> list[Kind]:
-    """Return the kinds of sensor with measured axes, or both kinds if no axis is measured."""
+    """Return the kinds of sensor that have measured axes, or gyro and accel if no axis is measured."""
     present = {axis for _, axis in measured_axes(estimate.curve)}
     return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
 
 
 def describe_recording(estimate: Estimate) -> str:
-    """Return one line with the number of samples, the rate, the duration and the number of missing samples."""
+    """Return one line that states the number of samples, the rate, the duration and the number of missing samples."""
     missing = estimate.curve.n - estimate.samples
     gaps = f", {missing:,} missing" if missing > 0 else ""
     duration = format_duration(estimate.curve.n / estimate.rate_hz)
@@ -103,9 +103,9 @@ def is_k_r_ambiguous(estimate: Estimate, letter: str, axis: str) -> bool:
     Parameters
     ----------
     estimate
-        The estimate.
-    letter
-        Coefficient.
+        Estimate of the noise coefficients.
+        letter
+        Symbol of the coefficient: Q, N, B, K or R.
     axis
         Name of the axis.
     """

@@ -1,7 +1,7 @@
-"""Colours of the axes in all plots, which colour-blind readers can distinguish.
+"""Colours of the x, y and z axes in all plots, which colour-blind people can distinguish.
 
-The colours are close to vermilion, bluish green and sky blue of the Okabe-Ito palette, and also differ in lightness. A
-gyroscope and an accelerometer of the same direction share a colour, because they never share a plot.
+The colours are similar to vermilion, bluish green and sky blue of the Okabe-Ito palette, and also differ in lightness.
+The gyroscope and the accelerometer of an axis have the same colour, because they never appear in the same plot.
 """
 
 from typing import Final
@@ -20,21 +20,21 @@ BACKGROUND: Final[Colour] = (13, 16, 17)
 FRAME: Final[Colour] = (92, 98, 104)
 MAJOR: Final[Colour] = (48, 53, 57)
 MINOR: Final[Colour] = (23, 27, 29)
-TEXT: Final[Colour] = (236, 239, 242)  # legible on label boxes in the dark and light themes
+TEXT: Final[Colour] = (236, 239, 242)  # legible on label boxes in the dark and in the light theme of the viewer
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 
 def blend_colours(colour: Colour, colour_share: float, background: Colour = BACKGROUND) -> Colour:
-    """Return the mixture of a colour and a background, as a translucent area would appear.
+    """Return the colour in which a translucent area appears on a background.
 
     Parameters
     ----------
     colour
-        Colour as red, green and blue, 0 to 255.
+                Colour of the area as red, green and blue, 0 to 255.
     colour_share
-        Share of the colour, 0 to 1.
+        Opacity of the area, 0 to 1.
     background
-        Background colour.
+        Colour of the background as red, green and blue, 0 to 255.
     """
     r, g, b = (round(colour_share * c + (1 - colour_share) * d) for c, d in zip(colour, background, strict=True))
     return r, g, b

@@ -1,6 +1,6 @@
-"""Plot of drift compensation, with the drift over time and the Allan deviation before and after compensation.
+"""Plot of the drift over time, and of the Allan deviations before and after drift compensation.
 
-The predicted drift of a long recording is averaged over groups of intervals, so that the 95 % band stays visible.
+In a long recording, the predicted drift is averaged over groups of intervals, so that the 95 % band remains visible.
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from monitor.common.distributions import Z95
-from monitor.common.units import DEVIATION_UNITS, format_duration
+from monitor.common.unit_formatting import DEVIATION_UNITS, format_duration
 from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.sage_husa import USED
 from monitor.publishing.plots import style
@@ -30,7 +30,7 @@ def save_compensation_plot(result: DriftCompensationResult, path: Path) -> None:
     Parameters
     ----------
     result
-        Results of the compensation.
+        Results of the drift compensation of a recording.
     path
         File to write. The suffix selects the format.
 
@@ -74,7 +74,7 @@ def _draw_drift(panel: "Axes", axis: str, result: DriftCompensationResult) -> No
 
 
 def _average_groups(values: Floats, size: int) -> Floats:
-    """Return the means of groups of ``size`` values, without an incomplete last group."""
+    """Return the means of successive groups of ``size`` values. An incomplete last group is omitted."""
     return np.asarray(values[: values.size // size * size].reshape(-1, size).mean(axis=1))
 
 

@@ -1,8 +1,8 @@
-"""Plot of the dynamic Allan deviation of one kind of sensor, with heat maps and coefficients over time.
+"""Plot of the Allan deviation over time (dynamic Allan deviation), with heat maps and noise coefficients.
 
-The time axis shows the end of the window. The colour of a heat map is the deviation divided by the median deviation
-over time. Cells are pale if the 95 % interval contains the median. A coefficient that is estimated in at least 5 % of
-the time steps has a panel. A vertical line marks a detected change.
+The time axis shows the end of the sliding window. The colour of a heat map is the Allan deviation divided by its median
+over time. Cells are pale if the 95 % interval of the Allan deviation contains the median. A noise coefficient has a
+panel if it is estimated in at least 5 % of the time steps. A vertical line marks a detected change.
 """
 
 import warnings
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
-from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
+from monitor.common.unit_formatting import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.plots import style
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 HEAT_MAP_INCHES: Final = 1.35
 COEFFICIENT_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
-MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of estimated time steps of a coefficient with a panel
+MIN_ESTIMATED_SHARE: Final = 0.05  # a coefficient that is estimated in a smaller share of the time steps has no panel
 PALE_ALPHA: Final = 0.3
-MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels, as a share of the width
+MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels of changes, as a share of the width
 COLOUR_SCALE_RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible upper ends of the colour scale
 MIN_CELLS_IN_SCALE: Final = 0.95  # smallest share of the cells inside the colour scale
-BAND_ENDS_INSIDE: Final = 0.9  # share of the ends of the bands that lie inside a panel
+BAND_ENDS_INSIDE: Final = 0.9  # share of the ends of confidence bands that lie inside a panel
 
 
 @dataclass(frozen=True, slots=True)
 class ChangeMark:
-    """Time and axis of a change that the plot marks."""
+    """Time and axis of a detected change that is marked in the plot."""
 
     t_s: float  # time since the first sample
     axis: str
@@ -54,23 +54,23 @@ def _shown_axes(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
 
 
 def dynamic_figure_height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
-    """Return the height of the dynamic Allan figure [inches].
+    """Return the height of the figure that ``draw_dynamic_panels`` needs [inches].
 
     Parameters
     ----------
     dynamic
-        Dynamic Allan deviation.
+        Allan deviations over time.
     kind
-        Kind of sensor.
+        Kind of sensor: gyro or accel.
     """
     heat_maps, coefficients = len(_shown_axes(dynamic, kind)), len(_shown_coefficients(dynamic, kind))
     return SPARE_INCHES + HEAT_MAP_INCHES * heat_maps + COEFFICIENT_INCHES * coefficients
 
 
 def divide_by_time_median(dynamic: DynamicAllan) -> Floats:
-    """Return the deviation divided by the median over time, shape [T, m, 6].
+    """Return each Allan deviation divided by its median over time, shape [T, m, 6].
 
-    The ratio is NaN if the deviation is missing or the median is zero.
+    The ratio is NaN if the Allan deviation is missing or its median is zero.
 
     >>> from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan as of
     >>> steady = of(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0)
@@ -84,18 +84,18 @@ def divide_by_time_median(dynamic: DynamicAllan) -> Floats:
 def draw_dynamic_panels(
     figure: "Figure | SubFigure", dynamic: DynamicAllan, kind: Kind, marks: Sequence[ChangeMark] = ()
 ) -> None:
-    """Draw the heat maps and the coefficients of one kind of sensor over time.
+    """Draw heat maps and noise coefficients of the gyroscopes or the accelerometers over time.
 
     Parameters
     ----------
     figure
-        Figure to fill.
+        Empty figure in which the panels are drawn.
     dynamic
-        Dynamic Allan deviation.
+        Allan deviations over time.
     kind
-        Kind of sensor.
+        Kind of sensor: gyro or accel.
     marks
-        Changes to draw. Changes of the other kind of sensor are ignored.
+        Detected changes to mark. Changes on axes of the other kind are ignored.
     """
     axes, letters = _shown_axes(dynamic, kind), _shown_coefficients(dynamic, kind)
     ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
@@ -135,7 +135,7 @@ def _draw_changes(heat_map: "Axes", others: "Sequence[Axes]", axis: str, times: 
 
 
 def _group_times(times: Sequence[float], distance: float) -> list[list[float]]:
-    """Group times so that the means of neighbouring groups are at least ``distance`` apart.
+    """Group times so that the mean times of neighbouring groups are at least ``distance`` apart.
 
     >>> _group_times([1.0, 9.0, 1.5, 2.0], 2.0)
     [[1.0, 1.5, 2.0], [9.0]]
@@ -143,7 +143,7 @@ def _group_times(times: Sequence[float], distance: float) -> list[list[float]]:
     groups: list[list[float]] = []
     for time in sorted(times):
         groups.append([time])
-        # The mean of a merged group may be too close to the previous group.
+        # The mean time of a merged group may now be too close to that of the previous group.
         while len(groups) > 1 and float(np.mean(groups[-1]) - np.mean(groups[-2])) < distance:
             groups[-2:] = [groups[-2] + groups[-1]]
     return groups
@@ -190,14 +190,14 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
             np.where(estimated, part[:, row, i] * unit.factor, np.nan)
             for part in (dynamic.value, dynamic.value_lo, dynamic.value_hi)
         )
-        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # a large vector image otherwise
+        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # a vector image would be large
         panel.plot(t, value, color=colour, label=axis)
         alone = _isolated(estimated)
         panel.plot(t[alone], value[alone], ".", color=colour, markersize=3.5)
         values.append(value)
         ends.append((lo, hi))
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    style.set_y_scale(panel, low, high, 0.25)
+    style.choose_y_scale_and_limits(panel, low, high, 0.25)
     if not (low > 0 and high > style.LOG_SCALE_RATIO * low):
         lowest, highest = np.nanquantile(ends, [1.0 - BAND_ENDS_INSIDE, BAND_ENDS_INSIDE]).tolist()
         bottom, top = panel.get_ylim()
@@ -208,15 +208,15 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
 
 
 def _isolated(estimated: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask of points without neighbours, which a line plot does not show."""
+    """Return a mask of estimated points without estimated neighbours, which a line plot does not show."""
     padded = np.concatenate([[False], estimated, [False]])
     return np.asarray(estimated & ~padded[:-2] & ~padded[2:])
 
 
 def _median(dynamic: DynamicAllan) -> Floats:
-    """Return the median deviation over time, shape [1, m, 6], with NaN for a missing or zero median."""
+    """Return the median Allan deviation over time, shape [1, m, 6], NaN if it is missing or zero."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # an axis that is not measured raises this warning
+        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy warns if an axis contains only NaN
         median = np.nanmedian(dynamic.deviation, axis=0, keepdims=True)
     return np.asarray(np.where(median > 0.0, median, np.nan))
 
@@ -235,7 +235,7 @@ def _time_edges(t: Floats) -> Floats:
 
 
 def _tau_edges(tau_s: Floats) -> Floats:
-    """Return the cell edges as geometric means of neighbouring averaging times."""
+    """Return the edges of the heat map cells, which are geometric means of neighbouring averaging times."""
     if tau_s.size == 1:
         return np.array([0.7, 1.4]) * float(tau_s[0])
     middle = np.sqrt(tau_s[1:] * tau_s[:-1])

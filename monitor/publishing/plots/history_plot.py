@@ -1,7 +1,7 @@
 """Plot of the history of a device, with coefficients, temperature, missing samples and events.
 
-A line shows the last value of each bucket, a dark band the extremes, and a pale band the 95 % interval. Lines are
-interrupted where buckets are missing. Vertical lines mark events.
+A line shows the last value in each time interval (bucket), a dark band the extremes, and a pale band the 95 % interval.
+The line is interrupted where buckets are missing. Vertical lines mark events.
 """
 
 from collections.abc import Sequence
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
 from drivers.number_ranges import DAY_S
-from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
+from monitor.common.unit_formatting import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
 from monitor.estimation.fit.coefficient_values import SYMBOLS
-from monitor.history.bucket import COUNTS, STATES
+from monitor.history.history_row import COUNTS, STATES
 from monitor.history.history_table import HistoryTable
 from monitor.history.stored_events import StoredEvent
 from monitor.publishing.plots import style
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 PANEL_INCHES: Final = (7.4, 1.75)
 SPARE_INCHES: Final = 1.1  # height of title and time axis
-TITLE_PAD_POINTS: Final = 26.0  # space between the first panel and its title, for the labels of events
+TITLE_PAD_POINTS: Final = 26.0  # space for the labels of events between the first panel and its title
 EXTREMES_ALPHA: Final = 0.45
 NOT_RUNNING_COLOUR: Final = "#d9534f"
 EVENT_LABELS: Final = {
@@ -40,23 +40,23 @@ EVENT_LABELS: Final = {
     "temperature_unexplained": "temperature",
     "drift_unexplained": "drift",
 }
-"""Label of each drawn kind of event."""
-MAX_EVENTS: Final = 40  # largest number of drawn events; the most significant events are selected
-MIN_LABEL_DISTANCE: Final = 0.055  # smallest distance between two labels, as a share of the width
+"""Label of each kind of event that the plot shows."""
+MAX_EVENTS: Final = 40  # only the most significant events are drawn
+MIN_LABEL_DISTANCE: Final = 0.055  # smallest distance between two labels of events, as a share of the width
 PRIORITY_KINDS: Final = ("noise_changed", "bias_stepped", "limit_crossed", "model_disagrees")
 
 
 def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES) -> None:
-    """Write the plot of a history to a file.
+    """Write the plot of the stored results of a device to a file.
 
     Parameters
     ----------
     past
-        The history.
+        Stored history of the device.
     path
         File to write. The suffix selects the format.
     axes
-        Axes to draw.
+                Names of the axes to draw.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
         lows.append(np.nanmin(low))
         highs.append(np.nanmax(high))
     if lows:
-        style.set_y_scale(panel, float(min(lows)), float(max(highs)), 0.15)
+        style.choose_y_scale_and_limits(panel, float(min(lows)), float(max(highs)), 0.15)
         panel.legend(loc="upper left", ncols=3, fontsize=style.SMALL_TEXT, frameon=True, edgecolor="none")
     else:
         _draw_absence(panel, "never estimated")
@@ -150,7 +150,7 @@ def _draw_absence(panel: "Axes", text: str) -> None:
 
 
 def _draw_title(panel: "Axes", text: str) -> None:
-    """Draw the title inside the panel, because event labels occupy the space above."""
+    """Draw the title inside the panel, because the labels of events occupy the space above the panel."""
     position: dict[str, Any] = {"transform": panel.transAxes, "ha": "right", "va": "top", "bbox": style.LABEL_BOX}
     panel.text(0.995, 0.95, text, fontsize=9, color=style.GREY, **position)
 
@@ -177,7 +177,7 @@ def _draw_events(panels: "Sequence[Axes]", events: Sequence[StoredEvent]) -> Non
             (t, 1.0), xycoords=("data", "axes fraction"), xytext=(1, 3), textcoords="offset points",
             fontsize=7.5, color=colour, rotation=25, ha="left", va="bottom", annotation_clip=False,
         )  # fmt: skip
-        label.set_in_layout(False)  # the title reserves the space
+        label.set_in_layout(False)  # the padding of the title already reserves space for the label
 
 
 def _set_dates(panels: Any, past: HistoryTable) -> None:
@@ -192,7 +192,7 @@ def _set_dates(panels: Any, past: HistoryTable) -> None:
 
 
 def _with_gaps(past: HistoryTable, *columns: Floats) -> tuple[Floats, ...]:
-    """Return times in days and columns, with NaN inserted where buckets are missing."""
+    """Return times in days and the given columns, with NaN inserted where time intervals are missing."""
     ends, starts = past.end_s[:-1], past.start_s[1:]
     gaps: NDArray[np.int64] = np.flatnonzero(starts > ends) + 1
     t = np.insert(_days(past.start_s + 0.5 * past.width_s), gaps, _days(ends[gaps - 1].astype(np.float64)))

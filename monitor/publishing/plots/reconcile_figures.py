@@ -5,7 +5,7 @@ simulated from the model. A gap chart shows the difference between measurement a
 of each diagnostic. An interval chart shows one parameter in several recordings.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from typing import TYPE_CHECKING, Final
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.units import DEVIATION_UNITS, sensor_kind
+from monitor.common.unit_formatting import DEVIATION_UNITS, sensor_kind
 from monitor.publishing.plots import style
 from monitor.publishing.reports.reconcile_sentences import (
     diagnostic_name,
@@ -22,7 +22,7 @@ from monitor.publishing.reports.reconcile_sentences import (
     gap_to_threshold_ratio,
     readable_name,
 )
-from monitor.reconcile.result import DiagnosticGap, Location, ParameterInterval, PlotData
+from monitor.reconcile.result import DiagnosticGap, DiagnosticPlotData, Location, ParameterInterval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,6 +43,8 @@ MIN_DETAIL_SHARE: Final = 0.01  # smallest extension of a detail plot, as a shar
 MIN_DETAIL_POINTS: Final = 8
 ROW_INCHES: Final = 0.21  # height of one row of a gap chart or an interval chart
 ROWS_WIDTH_INCHES: Final = 5.6
+ALLAN_INCHES: Final = (5.6, 3.5)  # size of an Allan deviation before and after the search
+MARK_SHARE: Final = 0.1  # height of the labels above the curves, as a share of the height of the curves
 MAX_NAME_LENGTH: Final = 32
 MIN_GAP_RATIO: Final = 0.05  # a smaller ratio of gap to threshold is drawn at this value
 
@@ -65,7 +67,11 @@ class DiagnosticPlot:
 
 
 def diagnostic_comparison_svg(
-    model_panels: Sequence[tuple[str, PlotData]], axis: str, width: float, height: float, where: Location | None = None
+    model_panels: Sequence[tuple[str, DiagnosticPlotData]],
+    axis: str,
+    width: float,
+    height: float,
+    where: Location | None = None,
 ) -> str:
     """Draw one diagnostic with a panel for each model, and return the figure as an SVG element.
 
@@ -83,19 +89,59 @@ def diagnostic_comparison_svg(
     plots = [
         to_displayed_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
     ]
-    limits = common_y_limits(plots)
-    left, right, top, bottom = MARGINS_INCHES
-    share = width / len(plots)
     with style.figure_style():
-        figure = style.create_figure(width, height, layout=None)
-        for i, plot in enumerate(plots):
-            size = ((share - left - right) / width, (height - top - bottom) / height)
-            panel = figure.add_axes(((i * share + left) / width, bottom / height, *size))
-            _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), style.axis_colour(axis), limits)
-        return style.to_svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
+        return _draw_comparison(*_create_panels(len(plots), width, height), plots, axis)
 
 
-def select_diagnostic_view(views: Sequence[PlotData], diagnostic_id: str, where: Location) -> PlotData | None:
+def before_and_after_svgs(
+    views: Sequence[tuple[DiagnosticPlotData, DiagnosticPlotData]], axis: str, width: float, height: float
+) -> list[str]:
+    """Draw each diagnostic with a panel before and a panel after a step, and return the figures as SVG elements.
+
+    All figures use the same panels, because matplotlib needs much time to create panels and ticks.
+
+    Parameters
+    ----------
+    views
+        Data of each diagnostic before and after the step.
+    axis
+        Name of the axis.
+    width, height
+        Size of each figure [inches].
+    """
+    drawn = []
+    with style.figure_style():
+        figure, panels = _create_panels(2, width, height)
+        for pair in views:
+            plots = [
+                to_displayed_units(title, view, axis, None)
+                for title, view in zip(("before", "after"), pair, strict=True)
+            ]
+            drawn.append(_draw_comparison(figure, panels, plots, axis))
+            for artist in [artist for panel in panels for artist in (*panel.lines, *panel.collections)]:
+                artist.remove()
+    return drawn
+
+
+def _create_panels(count: int, width: float, height: float) -> "tuple[Figure, list[Axes]]":
+    """Create a figure with panels side by side."""
+    left, right, top, bottom = MARGINS_INCHES
+    share = width / count
+    size = ((share - left - right) / width, (height - top - bottom) / height)
+    figure = style.create_figure(width, height, layout=None)
+    return figure, [figure.add_axes(((i * share + left) / width, bottom / height, *size)) for i in range(count)]
+
+
+def _draw_comparison(figure: "Figure", panels: "Sequence[Axes]", plots: Sequence[DiagnosticPlot], axis: str) -> str:
+    limits = common_y_limits(plots)
+    for i, (panel, plot) in enumerate(zip(panels, plots, strict=True)):
+        _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), style.axis_colour(axis), limits)
+    return style.to_svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
+
+
+def select_diagnostic_view(
+    views: Sequence[DiagnosticPlotData], diagnostic_id: str, where: Location
+) -> DiagnosticPlotData | None:
     """Return the data of a diagnostic, or of the first diagnostic whose x axis shows the range.
 
     Parameters
@@ -111,7 +157,7 @@ def select_diagnostic_view(views: Sequence[PlotData], diagnostic_id: str, where:
     return next(iter(own or [view for view in views if range_on_x_axis(view, where) is not None]), None)
 
 
-def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | None:
+def range_on_x_axis(view: DiagnosticPlotData, where: Location) -> tuple[float, float] | None:
     """Return the range along the x axis of a diagnostic, or None if the x axis shows another quantity.
 
     Parameters
@@ -135,7 +181,7 @@ def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | No
     return None
 
 
-def zoomed_view(view: PlotData, where: Location) -> PlotData | None:
+def zoomed_view(view: DiagnosticPlotData, where: Location) -> DiagnosticPlotData | None:
     """Return the diagnostic data near a narrow range, or None if the range is wide enough to be visible.
 
     Parameters
@@ -162,7 +208,7 @@ def zoomed_view(view: PlotData, where: Location) -> PlotData | None:
     return replace(view, y_name="detail", **lines)
 
 
-def to_displayed_units(title: str, view: PlotData, axis: str, where: Location | None) -> DiagnosticPlot:
+def to_displayed_units(title: str, view: DiagnosticPlotData, axis: str, where: Location | None) -> DiagnosticPlot:
     """Convert the data of a diagnostic to displayed units.
 
     Parameters
@@ -242,16 +288,62 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
         ends = np.clip(plot.mark, left, right).tolist()
         # The outline keeps a very narrow range visible.
         panel.axvspan(*ends, facecolor=style.ORANGE, edgecolor=style.ORANGE, alpha=0.35, linewidth=3)
-        panel.set_title(plot.mark_label, loc="right", fontsize=9, color=RANGE_TEXT_COLOUR, fontweight="bold")
+        panel.set_title(plot.mark_label, loc="right", y=1.0, fontsize=9, color=RANGE_TEXT_COLOUR, fontweight="bold")
     else:
-        panel.set_title(plot.title, loc="right", fontsize=9)
+        panel.set_title(plot.title, loc="right", y=1.0, fontsize=9)
     for which in "xy" if plot.log else ():
         style.style_log_axis(panel, which, minor_grid=False)
     if not plot.log:
         panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
         panel.yaxis.set_major_formatter(lambda value, _: style.format_tick(value))
     panel.tick_params(labelsize=8.5)
-    panel.set_title(plot.y_label, loc="left", fontsize=9, color=style.GREY)
+    panel.set_title(plot.y_label, loc="left", y=1.0, fontsize=9, color=style.GREY)
+
+
+def allan_before_and_after_svg(
+    before: DiagnosticPlotData, after: DiagnosticPlotData, axis: str, marks: Mapping[float, str]
+) -> str:
+    """Draw the measured Allan deviation, and the Allan deviation of the model before and after the search.
+
+    The result is an SVG element. If the search replaced samples, such as outliers, their share of the measured Allan
+    variance is added to the extended model.
+
+    Parameters
+    ----------
+    before
+        Allan deviation with the model under test.
+    after
+        Allan deviation with the extended model.
+    axis
+        Name of the axis.
+    marks
+        Averaging time [s] and label of each mark.
+    """
+    replaced = np.fmax(before.measured**2 - after.measured**2, 0.0)
+    curves = {name: np.sqrt(getattr(after, name) ** 2 + replaced) for name in ("measured", "expected", "lo", "hi")}
+    first, last = (to_displayed_units("", view, axis, None) for view in (before, replace(after, **curves)))
+    with style.figure_style():
+        figure = style.create_figure(*ALLAN_INCHES)
+        panel = figure.subplots()
+        low, high = common_y_limits([first, last])
+        x_limits = float(first.x.min()) / 1.15, float(first.x.max()) * 1.15
+        panel.set(xscale="log", yscale="log", xlim=x_limits, ylim=(low, high * (high / low) ** MARK_SHARE))
+        panel.fill_between(last.x, np.fmax(last.lo, 0.1 * low), last.hi, color=BAND_COLOUR, linewidth=0)
+        panel.plot(first.x, first.measured, "o-", color=style.axis_colour(axis), markersize=4.5, label="measured")
+        panel.plot(first.x, first.expected, ":", color=style.GREY, linewidth=1.6, label="model before")
+        panel.plot(last.x, last.expected, "--", color=style.DARK, linewidth=1.2, label="model after")
+        for tau_s, label in marks.items():
+            panel.axvline(tau_s, color=style.ORANGE, linewidth=1.2, alpha=0.7, zorder=0)
+            panel.annotate(
+                label, (tau_s, 0.97), xycoords=panel.get_xaxis_transform(), ha="center", va="top",
+                color=RANGE_TEXT_COLOUR, fontsize=9, fontweight="bold", bbox=style.LABEL_BOX,
+            )  # fmt: skip
+        for which in "xy":
+            style.style_log_axis(panel, which, minor_grid=False)
+        panel.set_xlabel(first.x_label)
+        panel.set_title(f"{axis}: {first.y_label}", fontsize=9.5, color=style.GREY)
+        style.draw_legend_above(panel, 3)
+        return style.to_svg_element(figure, f"{axis}: Allan deviation before and after the search")
 
 
 def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap] = ()) -> str:

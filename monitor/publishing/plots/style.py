@@ -1,7 +1,7 @@
 """Style of all figures, and output of figures as image files and SVG elements.
 
-Figures do not use pyplot and need no display. Equal figures give identical files, because files contain no date and no
-random identifiers. matplotlib is imported when a figure is drawn.
+Figures do not use pyplot and need no display. Drawing the same data twice gives identical files, because the files
+contain no date and no random identifiers. matplotlib is imported when the first figure is drawn.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 COLOURS: Final = ("#D55E00", "#009E73", "#0072B2")  # x y z: vermilion, bluish green, blue (Okabe & Ito)
 DARK: Final = "#222222"
 GREY: Final = "#6b6b6b"
-ORANGE: Final = "#E69F00"  # marks the range in which a diagnostic found a difference (Okabe & Ito)
+ORANGE: Final = "#E69F00"  # marks a range in which recording and model differ (Okabe & Ito)
 MINOR_GRID_COLOUR: Final = "#ececec"
 BAND_ALPHA: Final = 0.16
 DASHES: Final = (0, (4, 2))
@@ -44,7 +44,7 @@ STYLE: Final[dict[Any, Any]] = {
     "axes.edgecolor": "#999999",
     "xtick.color": DARK,
     "ytick.color": DARK,
-    "xtick.bottom": False,  # the grid shows the position of a tick
+    "xtick.bottom": False,  # grid lines show the positions of ticks
     "ytick.left": False,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -63,12 +63,12 @@ STYLE: Final[dict[Any, Any]] = {
     "svg.hashsalt": "imu-monitor",
 }
 UNDATED: Final[dict[str, dict[str, Any]]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-"""Metadata settings that omit the date from a file, by suffix."""
-RASTER_DPI: Final = 80  # resolution of heat maps and dense bands, which are images inside an SVG
-FEW_DECADES_RATIO: Final = 60.0  # below this ratio of the limits, an axis has labels between powers of ten
+"""Metadata settings that omit the date from a file, by the suffix of the file."""
+RASTER_DPI: Final = 80  # resolution of heat maps and dense bands, which are raster images inside an SVG
+FEW_DECADES_RATIO: Final = 60.0  # if the ratio of the limits is smaller, an axis also has labels between powers of ten
 MAX_LABELS: Final = 7  # largest number of powers of ten with a label
-LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
-MAX_INTERVAL_RATIO: Final = 1.5  # largest drawn ratio between the end of an interval and the value
+LOG_SCALE_RATIO: Final = 3.0  # values that differ by a larger factor are drawn on a logarithmic scale
+MAX_INTERVAL_RATIO: Final = 1.5  # an interval is not drawn if its end differs from the value by more than this factor
 SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LABEL_BOX: Final[dict[str, Any]] = {
     "boxstyle": "square,pad=0.15",
@@ -76,19 +76,19 @@ LABEL_BOX: Final[dict[str, Any]] = {
     "edgecolor": "none",
     "alpha": 0.8,
 }
-"""Box behind a label inside a panel, which keeps the text legible over curves."""
+"""Style of the box behind a label in a panel, which keeps the label legible over curves."""
 TIME_UNITS: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
-"""Name and length [s] of each time unit, and the duration [s] below which the unit is used."""
+"""Name and length [s] of each time unit, and the duration [s] below which a time axis uses this unit."""
 
 
 def axis_colour(axis: str) -> str:
-    """Return the colour of an axis, which is the same for gyroscopes and accelerometers."""
+    """Return the colour of a gyroscope or accelerometer axis, which depends only on the direction x, y or z."""
     return COLOURS[AXES.index(axis) % 3]
 
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Apply the figure style inside the ``with`` block.
+    """Return a context manager that applies the figure style inside a ``with`` block.
 
     Raises
     ------
@@ -110,9 +110,10 @@ def create_figure(width: float, height: float, layout: Literal["constrained"] | 
     Parameters
     ----------
     width, height
-        Size [inches].
+                Width and height of the figure [inches].
     layout
-        By default, matplotlib arranges panels without overlapping labels. None keeps the given positions.
+        By default, matplotlib arranges the panels so that labels do not overlap. With None, panels keep their
+        positions.
     """
     from matplotlib.figure import Figure
 
@@ -148,17 +149,17 @@ def to_svg_element(figure: "Figure", description: str) -> str:
     figure
         Figure to convert.
     description
-        Text alternative for readers who cannot see the figure.
+                Text alternative for people who cannot see the figure.
     """
     text = io.StringIO()
     figure.savefig(text, format="svg", dpi=RASTER_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     element = text.getvalue()[text.getvalue().index("<svg") :]
     element = re.sub(r' (?:width|height)="[\d.]+pt"', "", element, count=2)
     element = element.replace("<svg", f'<svg role="img" aria-label="{html.escape(description)}"', 1)
-    element = re.sub(r'<g id="[^"]*"', "<g", element)  # the identifiers are not used
+    element = re.sub(r'<g id="[^"]*"', "<g", element)  # no element refers to these identifiers
     element = re.sub(r"<[^>]*>", lambda tag: re.sub(r"\d+\.\d{3,}", _shorten, tag[0]), element)
-    element = re.sub(r"\n(?:L )?\s*", " ", element)  # without a letter, a path continues with lines
-    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on a page need different identifiers
+    element = re.sub(r"\n(?:L )?\s*", " ", element)  # in an SVG path, coordinates without a letter continue a line
+    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on the same page need different identifiers
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}", element)
 
 
@@ -167,7 +168,7 @@ def _shorten(number: re.Match[str]) -> str:
 
 
 def format_tick(value: float) -> str:
-    """Format the number of a tick.
+    """Format the number at a tick of an axis.
 
     >>> format_tick(0.01), format_tick(-2000.0), format_tick(1e4), format_tick(2.5e-7)
     ('0.01', '−2000', '10⁴', '2.5·10⁻⁷')
@@ -181,16 +182,16 @@ def format_tick(value: float) -> str:
 
 
 def style_log_axis(panel: "Axes", which: str, minor_grid: bool = True) -> None:
-    """Label a logarithmic axis with plain numbers and draw the grid.
+    """Label a logarithmic axis with plain numbers and draw the grid lines.
 
-    Powers of ten have labels. On an axis with few decades, the factors 2 and 5 also have labels.
+    Powers of ten have labels. If the axis covers few decades, their multiples by 2 and 5 also have labels.
 
     Parameters
     ----------
     panel
-        Axes of matplotlib with final limits.
+        Axes object of matplotlib, whose limits have already been set.
     which
-        Name of the axis: x or y.
+        Axis to label: x or y.
     minor_grid
         True to draw grid lines between the powers of ten.
     """
@@ -210,14 +211,14 @@ def draw_band(panel: "Axes", x: Floats, lo: Floats, hi: Floats, colour: str, **o
 
     Parameters
     ----------
-    panel
-        Axes of matplotlib.
+        panel
+        Axes object of matplotlib.
     x, lo, hi
-        Position and ends of the interval, shape [n].
+        Horizontal positions, and lower and upper ends of the intervals, shape [n].
     colour
         Colour of the band.
     options
-        Further options of ``fill_between``.
+        Further options of matplotlib's ``fill_between``.
     """
     panel.fill_between(x, lo, hi, **{"color": colour, "alpha": BAND_ALPHA, "linewidth": 0, **options})
 
@@ -227,27 +228,27 @@ def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
 
     Parameters
     ----------
-    panel
-        Axes of matplotlib.
+        panel
+        Axes object of matplotlib.
     columns
         Number of columns of the legend.
     options
-        Further options of ``legend``.
+        Further options of matplotlib's ``legend``.
     """
     panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=columns, **options)
 
 
-def set_y_scale(panel: "Axes", smallest: float, largest: float, margin: float) -> None:
-    """Set the scale and the limits of the y axis, with a logarithmic scale for a wide range of values.
+def choose_y_scale_and_limits(panel: "Axes", smallest: float, largest: float, margin: float) -> None:
+    """Set the scale and the limits of the y axis. A wide range of values gives a logarithmic scale.
 
     Parameters
     ----------
     panel
-        Axes of matplotlib.
+        Axes object of matplotlib.
     smallest, largest
-        Smallest and largest value that is drawn.
+        Smallest and largest of the drawn values.
     margin
-        Margin of a linear scale above and below, as a share of the range.
+        Margin above and below the values on a linear scale, as a share of their range.
     """
     if smallest > 0 and largest > LOG_SCALE_RATIO * smallest:
         panel.set_yscale("log")
@@ -259,19 +260,19 @@ def set_y_scale(panel: "Axes", smallest: float, largest: float, margin: float) -
 
 
 def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
-    """Return interval ends, with NaN for wide intervals that would dominate the scale of a plot.
+    """Return the ends of intervals, NaN for wide intervals that would dominate the scale of a plot.
 
     Parameters
     ----------
     value, lo, hi
-        Values and interval ends, of equal shape.
+        Values, and lower and upper ends of their intervals, all of the same shape.
     """
     near = (lo * MAX_INTERVAL_RATIO > value) & (hi < value * MAX_INTERVAL_RATIO)
     return np.where(near, lo, np.nan), np.where(near, hi, np.nan)
 
 
 def select_time_unit(duration_s: float) -> tuple[str, float]:
-    """Return the name and the length [s] of a suitable time unit for a time axis.
+    """Return the name and the length [s] of a time unit that suits a time axis of the given duration.
 
     >>> select_time_unit(7200.0), select_time_unit(5e5)
     (('min', 60.0), ('d', 86400.0))

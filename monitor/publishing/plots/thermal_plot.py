@@ -1,11 +1,11 @@
-"""Plots of bias and temperature over time, and of bias against temperature."""
+"""Plots of the bias and the temperature over time, and of the bias against the temperature."""
 
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from monitor.common.units import DEVIATION_UNITS, format_duration, sensor_kind
+from monitor.common.unit_formatting import DEVIATION_UNITS, format_duration, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import ThermalPrediction, predict_interval_means
 from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalPredictionReport
@@ -15,12 +15,12 @@ ROW_INCHES: Final = (11.0, 2.6)
 
 
 def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
-    """Write a plot of interval means and fitted thermal models to a file.
+    """Write a plot of the mean bias in each interval and of the fitted thermal models to a file.
 
     Parameters
     ----------
     report
-        The fitted models.
+        Results of the thermal model fit.
     path
         File to write. The suffix selects the format.
 
@@ -42,12 +42,12 @@ def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
 
 
 def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) -> None:
-    """Write a plot of interval means and thermal predictions, with the offset removed, to a file.
+    """Write a plot of the mean bias in each interval and of the thermal predictions, without their offset, to a file.
 
     Parameters
     ----------
     report
-        The predictions.
+        Results of the thermal prediction.
     path
         File to write. The suffix selects the format.
 

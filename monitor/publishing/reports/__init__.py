@@ -1,1 +1,1 @@
-"""HTML reports, Rerun recordings and tables of results."""
+"""Results written to files as HTML reports, Rerun recordings and tables."""

@@ -1,6 +1,6 @@
-"""HTML report of one analysis, for ``imu-monitor analyze --plot FILE.html``.
+"""HTML report on the analysis of a recording, for ``imu-monitor analyze --plot FILE.html``.
 
-The page is self-contained. Heat maps are raster images, so that the page stays below one megabyte.
+The page is self-contained. Heat maps are embedded as raster images, so that the page is smaller than one megabyte.
 """
 
 from pathlib import Path
@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from monitor.common.units import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_duration, format_number
+from monitor.common.unit_formatting import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_duration, format_number
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
@@ -36,9 +36,9 @@ def write_html_report(plot_data: AnalysisPlotData, path: Path, title: str = "") 
     plot_data
         Analysis of the recording.
     path
-        File to write.
+                HTML file to write.
     title
-        Title of the page.
+        Title of the HTML page.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def write_html_report(plot_data: AnalysisPlotData, path: Path, title: str = "") 
 
 
 def render_page(plot_data: AnalysisPlotData, title: str = "") -> str:
-    """Return the HTML report as text. The parameters and errors are those of ``write_html_report``."""
+    """Return the text of the HTML report. The parameters and exceptions are those of ``write_html_report``."""
     analysis = plot_data.analysis
     return render_template(
         "report.html.j2",
@@ -71,7 +71,7 @@ def render_page(plot_data: AnalysisPlotData, title: str = "") -> str:
 
 
 def recording_facts(analysis: RecordingAnalysis) -> tuple[tuple[str, str], ...]:
-    """Return names and values of the properties of a recording."""
+    """Return the names and values of the properties of a recording that the report lists."""
     estimate = analysis.estimate
     missing = max(estimate.curve.n - estimate.samples, 0)
     share = f" ({format_number(100.0 * missing / estimate.curve.n, 2)} %)" if missing else ""
@@ -85,14 +85,14 @@ def recording_facts(analysis: RecordingAnalysis) -> tuple[tuple[str, str], ...]:
 
 
 def format_value_and_interval(estimate: Estimate, letter: str, axis: str) -> tuple[str, str]:
-    """Return the value of a coefficient with unit, and the interval or the reason for a missing interval.
+    """Return a noise coefficient with its unit, and its 95 % interval or the reason why there is no interval.
 
     Parameters
     ----------
     estimate
-        The estimate.
-    letter
-        Coefficient.
+        Estimate of the noise coefficients.
+        letter
+        Symbol of the coefficient: Q, N, B, K or R.
     axis
         Name of the axis.
     """

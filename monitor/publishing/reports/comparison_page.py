@@ -1,22 +1,22 @@
 """HTML report on the comparison of several recordings of one sensor, ``report.html``.
 
-The page is self-contained and contains a summary, the results of each recording, and the noise effects. For each
-recording without an effect, the page states why the effect may be absent.
+The self-contained page contains a summary, the results of each recording, and the noise effects that were found. If an
+effect was not found in a recording, the page states why it may be absent.
 """
 
-from monitor.common.units import format_duration
+from monitor.common.unit_formatting import format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots.reconcile_figures import interval_chart_svg
 from monitor.publishing.plots.style import axis_colour
-from monitor.publishing.reports import comparison_sentences, reconcile_sentences
+from monitor.publishing.reports import reconcile_sentences, recording_comparison_sentences
 from monitor.publishing.reports.html_page import render_template
 from monitor.publishing.reports.reconcile_sentences import FormattedParameter, parameter_unit, readable_name
 from monitor.reconcile.result import AddedOrResizedEffect
-from monitor.reconcile.several_recordings.comparison import Comparison, MatchedEffect
+from monitor.reconcile.several_recordings.comparison import Comparison, EffectInRecordings
 
 
 def render_page(c: Comparison) -> str:
-    """Return the HTML report of a comparison as text.
+    """Return the HTML report on the comparison of several recordings as text.
 
     Raises
     ------
@@ -28,7 +28,7 @@ def render_page(c: Comparison) -> str:
         title=f"{len(c.runs)} recordings of one sensor",
         c=c,
         words=reconcile_sentences,
-        comparison_words=comparison_sentences,
+        comparison_words=recording_comparison_sentences,
         effects=EFFECTS,
         axis_colour=axis_colour,
         format_duration=format_duration,
@@ -38,7 +38,7 @@ def render_page(c: Comparison) -> str:
     )
 
 
-def _rows(seen: MatchedEffect) -> list[tuple[str, AddedOrResizedEffect]]:
+def _rows(seen: EffectInRecordings) -> list[tuple[str, AddedOrResizedEffect]]:
     return [*seen.steps.items(), ("all together", seen.step_with_pooled_parameters())]
 
 
@@ -46,8 +46,8 @@ def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) ->
     return {one.name: one for one in reconcile_sentences.format_parameters(step, axis, c.baseline)}
 
 
-def _draw_intervals(seen: MatchedEffect, axis: str) -> str:
-    """Draw the first parameter with an interval, or return an empty string without intervals."""
+def _draw_intervals(seen: EffectInRecordings, axis: str) -> str:
+    """Return a drawing of the first effect parameter that has intervals, or an empty string if none has intervals."""
     name = next((name for name, one in seen.parameters.items() if one.freedom), "")
     rows = [(run, step.parameters[name]) for run, step in _rows(seen) if name in step.parameters]
     if not any(one.lo is not None and one.hi is not None and one.hi > one.lo for _, one in rows):

@@ -1,8 +1,8 @@
-"""Export of a history as a table in CSV, Parquet, Arrow or .npz format.
+"""Export of the stored results of a device as a table in CSV, Parquet, Arrow or .npz format.
 
-Each row is a time bucket, and each column is a quantity in SI units. Column names contain the unit in ASCII, as in
-``gz.N (rad/sqrt(s))``. The columns with the extremes of ``gz.N`` are named ``gz.N low`` and ``gz.N high``. If writing
-fails, no file remains.
+Each row is a time interval (bucket), and each column is a quantity in SI units. Column names contain the unit in ASCII,
+as in ``gz.N (rad/sqrt(s))``. The smallest and largest values of ``gz.N`` are in the columns ``gz.N low`` and ``gz.N
+high``. If the export fails, no incomplete file remains.
 """
 
 from pathlib import Path
@@ -13,8 +13,8 @@ import numpy as np
 from drivers.data_types import Floats
 from drivers.recordings.formats import find_format
 from drivers.recordings.writing import atomic_write_path
-from monitor.common.units import sensor_kind
-from monitor.history.bucket import COUNTS, STATES
+from monitor.common.unit_formatting import sensor_kind
+from monitor.history.history_row import COUNTS, STATES
 from monitor.history.history_table import HistoryTable
 from monitor.publishing.exporters.exported_coefficients import ascii_unit
 
@@ -23,14 +23,14 @@ STATE_COLUMN_NAME: Final = "state (" + "; ".join(f"{i} {name}" for i, name in en
 
 
 def save_history(past: HistoryTable, path: Path) -> None:
-    """Write a history to a file in the format that the suffix selects.
+    """Write the stored results of a device to a file. The suffix of the file selects the format.
 
     Parameters
     ----------
     past
-        The history.
+        Stored history of the device.
     path
-        File to write.
+                File to write, with a suffix such as .csv or .parquet.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Rendering of self-contained HTML pages from templates. Equal values give identical pages."""
+"""Rendering of self-contained HTML pages from templates. The same values always give an identical page."""
 
 from typing import Any, Final
 
@@ -8,12 +8,12 @@ MISSING_MESSAGE: Final = 'matplotlib and Jinja2 are needed: pip install "imu-mon
 
 
 def render_template(name: str, **values: Any) -> str:
-    """Render a template as an HTML page.
+    """Return the HTML page that a template gives for the given values.
 
     Parameters
     ----------
     name
-        File name of the template.
+                File name of the Jinja2 template.
     values
         Values and functions that the template uses.
 

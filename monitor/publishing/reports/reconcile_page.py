@@ -1,27 +1,40 @@
 """HTML report of a reconciliation, ``report.html``.
 
-The page is self-contained and contains a summary, a table of the axes, and a section for each step. A section shows the
-added or changed noise effect, and all diagnostics before and after the step.
+The page is self-contained. It begins with the summary, the Allan deviation of each axis that differs, and the ranked
+findings. A folded part contains a table of the axes, and a section for each step with all diagnostics before and after
+the step.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import log
 from typing import Final
 
 from drivers.data_types import AXES
-from monitor.common.units import format_duration
+from monitor.common.unit_formatting import format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots import reconcile_figures, style
-from monitor.publishing.plots.reconcile_figures import diagnostic_comparison_svg, select_diagnostic_view, zoomed_view
+from monitor.publishing.plots.reconcile_figures import (
+    allan_before_and_after_svg,
+    before_and_after_svgs,
+    diagnostic_comparison_svg,
+    select_diagnostic_view,
+    zoomed_view,
+)
 from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
-from monitor.reconcile.result import AxisResult, DiagnosticGap, DiagnosticSnapshot, PlotData, Reconciliation
+from monitor.reconcile.result import AxisModelDiagnostics, AxisResult, DiagnosticGap, DiagnosticPlotData, Reconciliation
+from monitor.reconcile.summary import summary_sentences
+from monitor.reconcile.summary.ranked_findings import GapRanking, rank_findings
+from monitor.reconcile.summary.summary_sentences import summarize
 
 RANGE_INCHES: Final = (8.0, 3.3)  # size of a plot without a detail plot
 RANGE_WITH_DETAIL_INCHES: Final = (4.9, 3.3)  # size of a plot next to a detail plot
 DETAIL_INCHES: Final = (3.33, 3.3)
 PAIR_INCHES: Final = (6.8, 2.35)
 SINGLE_INCHES: Final = (3.4, 2.05)
+MIN_MARKED_LOG_RATIO: Final = 0.01
+"""Smallest logarithmic change of the Allan deviation that is marked, about the width of a line in the figure."""
 
 
 def render_page(r: Reconciliation, title: str = "") -> str:
@@ -39,8 +52,13 @@ def render_page(r: Reconciliation, title: str = "") -> str:
     ConfigError
         If matplotlib or Jinja2 is not installed.
     """
+    ranking = rank_findings(r)
     return render_template(
         "reconcile.html.j2",
+        summary=summarize(r),
+        ranking=ranking,
+        summary_words=summary_sentences,
+        draw_allan=lambda result: _draw_allan(result, ranking),
         title=title or "Recording",
         r=r,
         results=[r.axes[axis] for axis in AXES if axis in r.axes],
@@ -64,6 +82,22 @@ def render_page(r: Reconciliation, title: str = "") -> str:
     )
 
 
+def _draw_allan(result: AxisResult, ranking: GapRanking) -> str | None:
+    """Draw the Allan deviation before and after the search. The marks are the numbers of the findings."""
+    before, after = (
+        next((view for view in snapshot.plots if view.lens == "allan"), None) for snapshot in (result.start, result.end)
+    )
+    if before is None or after is None:
+        return None
+    marks: dict[float, str] = {}
+    for number, one in enumerate(ranking.findings, start=1):
+        influence = one.influences.get(result.axis)
+        if influence is not None and abs(log(influence.ratio)) > MIN_MARKED_LOG_RATIO:
+            known = marks.get(influence.tau_s)
+            marks[influence.tau_s] = f"{known}, {number}" if known else str(number)
+    return allan_before_and_after_svg(before, after, result.axis, marks)
+
+
 def _pair_scores(
     before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap]
 ) -> list[tuple[DiagnosticGap, DiagnosticGap | None]]:
@@ -76,20 +110,17 @@ def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list
     return [(lens, [scores.get(lens) for scores in known]) for lens in dict.fromkeys(one for k in known for one in k)]
 
 
-def _draw_single(view: PlotData, axis: str) -> str:
+def _draw_single(view: DiagnosticPlotData, axis: str) -> str:
     return diagnostic_comparison_svg([("", view)], axis, *SINGLE_INCHES)
 
 
-def _draw_pairs(before: DiagnosticSnapshot, after: DiagnosticSnapshot, axis: str) -> list[str]:
+def _draw_pairs(before: AxisModelDiagnostics, after: AxisModelDiagnostics, axis: str) -> list[str]:
     later = {view.lens: view for view in after.plots}
-    return [
-        diagnostic_comparison_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
-        for view in before.plots
-        if view.lens in later
-    ]
+    pairs = [(view, later[view.lens]) for view in before.plots if view.lens in later]
+    return before_and_after_svgs(pairs, axis, *PAIR_INCHES)
 
 
-def _draw_range(snapshot: DiagnosticSnapshot, found: DiagnosticGap, axis: str) -> list[str]:
+def _draw_range(snapshot: AxisModelDiagnostics, found: DiagnosticGap, axis: str) -> list[str]:
     view = select_diagnostic_view(snapshot.plots, found.lens, found.where)
     if view is None:
         return []

@@ -18,14 +18,22 @@ import rerun.blueprint as rrb
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from monitor.common.units import format_duration
+from monitor.common.unit_formatting import format_duration
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.reconcile_figures import MAX_MARKERS, DiagnosticPlot, common_y_limits, to_displayed_units
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH, ChartScale, clip_to_box, decade_range, finite_sections
+from monitor.publishing.rerun.allan_chart import (
+    HEIGHT,
+    WIDTH,
+    ChartDecadeRange,
+    clip_to_box,
+    decade_range,
+    finite_sections,
+)
 from monitor.publishing.rerun.allan_drawing import fill_band, log_grid, log_lines
 from monitor.publishing.rerun.shared_views import collapsed_blueprint, drawing_view, markdown_document
-from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
+from monitor.reconcile.result import AxisModelDiagnostics, AxisResult, Reconciliation
+from monitor.reconcile.summary.summary_sentences import summarize
 
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
@@ -83,12 +91,12 @@ def _overview(r: Reconciliation) -> str:
         steps = "; ".join(f"{step.kind} {words.describe_step(step, axis, r.baseline)}" for step in result.steps)
         left_over = "; ".join(words.describe_gap(one, axis) for one in result.left_over)
         rows.append(f"| **{axis}** | {words.RESULT_TEXTS[result.verdict]} | {steps or '—'} | {left_over or '—'} |")
-    head = "| axis | verdict | added or retuned | left over |\n|:--|:--|:--|:--|"
+    head = "| axis | verdict | changes of the model | left over |\n|:--|:--|:--|:--|"
     recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {format_duration(r.duration_s)}"
     notes = [f"note: {note}" for note in r.notes]
     faults = [f"recording: {finding.sentence}" for finding in r.recording_findings]
     title, table = f"## {words.RESULT_TEXTS[r.verdict]}", "\n".join([head, *rows])
-    return "\n\n".join([title, *faults, words.summarize(r), recorded, table, *notes])
+    return "\n\n".join([title, " ".join(summarize(r)), *faults, recorded, table, *notes])
 
 
 def _steps_text(r: Reconciliation, result: AxisResult) -> str:
@@ -115,7 +123,7 @@ def _axes(r: Reconciliation) -> list[str]:
     return [axis for axis in AXES if axis in r.axes]
 
 
-def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
+def _snapshots_by_step(result: AxisResult) -> list[AxisModelDiagnostics]:
     return [result.start, *(step.snapshot_after for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
@@ -186,7 +194,7 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
     ]
     plots = {step: to_displayed_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
-    scale = ChartScale(decade_range(plot.x for plot in every), decade_range([np.array(common_y_limits(every))]))
+    scale = ChartDecadeRange(decade_range(plot.x for plot in every), decade_range([np.array(common_y_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
         _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
     stream.reset_time()
@@ -198,7 +206,7 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
 
 
 def _log_curves(
-    stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str, static: bool
+    stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, plot: DiagnosticPlot, axis: str, static: bool
 ) -> None:
     # A lower end of zero is drawn below the box, because zero has no logarithm.
     low, high = (scale.to_chart_positions(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
@@ -212,7 +220,9 @@ def _log_curves(
     log_lines(log, f"{path}/expected", expected, [axis_colours.TEXT], 1.0, 10.0)
 
 
-def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: ChartScale, result: AxisResult, lens: str) -> None:
+def _log_found_ranges(
+    stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, result: AxisResult, lens: str
+) -> None:
     view = next(view for view in result.start.plots if view.lens == lens)
     founds = [step.before for step in result.steps] + list(result.left_over)
     marks = [to_displayed_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
@@ -225,7 +235,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: ChartScale, 
     log_lines(partial(stream.log, static=True), f"{path}/place", frames, [RANGE_COLOUR], 0.75, -5.0)
 
 
-def _log_grid(stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str) -> None:
+def _log_grid(stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, plot: DiagnosticPlot, axis: str) -> None:
     log = partial(stream.log, static=True)
     key = [("measured", axis_colours.AXIS_COLOURS[axis]), ("model", axis_colours.TEXT), ("95 %", BAND_COLOUR)]
     names = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]

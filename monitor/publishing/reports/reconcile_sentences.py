@@ -10,8 +10,7 @@ from dataclasses import dataclass, fields
 from math import floor, isfinite, log10, nan
 from typing import Any, Final
 
-from drivers.data_types import AXES
-from monitor.common.units import (
+from monitor.common.unit_formatting import (
     COEFFICIENT_UNITS,
     DEGREE,
     DEVIATION_UNITS,
@@ -33,8 +32,9 @@ from monitor.reconcile.result import (
     DiagnosticGap,
     Location,
     ParameterInterval,
-    Reconciliation,
 )
+from monitor.reconcile.summary.ranked_findings import RankedGapCause
+from monitor.reconcile.summary.summary_sentences import join_words
 
 RESULT_TEXTS: Final = {
     "agrees": "agrees",
@@ -57,14 +57,18 @@ _SI_OF_COEFFICIENTS: Final = {
 FIELD_UNITS: Final = {
     **_SI_OF_COEFFICIENTS,
     "1": Unit(1.0, ""),
+    "rad/s³": Unit(_DEGREES_PER_HOUR * 3600.0**2, "°/h/h²"),
+    "m/s⁴": Unit(MICRO_G * 3600.0**2, "µg/h²"),
     "rad/s/°C": Unit(_DEGREES_PER_HOUR, "°/h/°C"),
     "rad/s/°C²": Unit(_DEGREES_PER_HOUR, "°/h/°C²"),
+    "rad/s/°C³": Unit(_DEGREES_PER_HOUR, "°/h/°C³"),
     "rad/s per m/s²": Unit(_DEGREES_PER_HOUR * GRAVITY, "°/h/g"),
     **dict.fromkeys(("(rad/s)²/Hz", "rad²/s²/Hz"), Unit(_DEGREES_PER_HOUR**2, "(°/h)²/Hz")),
     "rad/s/√Hz": Unit(_DEGREES_PER_HOUR, "°/h/√Hz"),
     **dict.fromkeys(("(rad/s)²", "rad²/s²"), Unit(_DEGREES_PER_HOUR**2, "(°/h)²")),
     "m/s²/°C": Unit(MICRO_G, "µg/°C"),
     "m/s²/°C²": Unit(MICRO_G, "µg/°C²"),
+    "m/s²/°C³": Unit(MICRO_G, "µg/°C³"),
     **dict.fromkeys(("(m/s²)²/Hz", "m²/s⁴/Hz"), Unit(MICRO_G**2, "µg²/Hz")),
     "m/s²/√Hz": Unit(MICRO_G, "µg/√Hz"),
     **dict.fromkeys(("(m/s²)²", "m²/s⁴"), Unit(MICRO_G**2, "µg²")),
@@ -152,7 +156,7 @@ def format_range(where: Location, axis: str) -> str:
         Name of the axis, which determines the units.
     """
     texts = []
-    for name, ends in where.resolved_dimensions().items():
+    for name, ends in where.resolved_location_dimensions().items():
         if isinstance(ends, str):
             texts.append(f"from {ends}")
             continue
@@ -235,22 +239,13 @@ def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -
     return f"{readable_name(step.effect)}: {', '.join(said)}" if said else readable_name(step.effect)
 
 
-def summarize(r: Reconciliation) -> str:
-    """Summarize the result of a reconciliation in a few sentences."""
-    differ = [axis for axis in AXES if axis in r.axes and r.axes[axis].verdict != "agrees"]
-    unexplained = [axis for axis in differ if r.axes[axis].left_over]
-    model = "The model of five classic terms, fitted first," if r.fitted_first else "The model"
-    if r.verdict == "agrees":
-        axes = "one axis" if len(r.axes) == 1 else f"all {len(r.axes)} axes"
-        return f"{model} and the recording agree: on {axes}, no diagnostic shows a difference larger than chance."
-    head = f"{model} and the recording differ by more than chance on {_join(differ)}."
-    if r.verdict == "unexplained":
-        return f"{head} No known effect explains the difference, so no effect is named."
-    steps = _join(_count_steps([step for axis in differ for step in r.axes[axis].steps]))
-    if r.verdict == "partly_explained":
-        rest = f"On {_join(unexplained)}, a difference remains that no known effect explains."
-        return f"{head} The difference is partly explained with {steps}. {rest}"
-    return f"{head} With {steps}, no difference larger than chance remains."
+def describe_allan_influence(finding: RankedGapCause) -> str:
+    """Describe the largest influence of a finding on the Allan deviation, such as "× 1.24 at τ = 0.01 s (gz)"."""
+    axis = finding.most_influenced_axis
+    if axis is None:
+        return "—"
+    one = finding.influences[axis]
+    return f"× {_short(one.ratio)} at τ = {_short(one.tau_s)} s ({axis})"
 
 
 def describe_result(result: AxisResult) -> str:
@@ -271,10 +266,10 @@ def describe_alternatives(step: AddedOrResizedEffect) -> str:
     if not step.runners_up:
         return "No other effect explains the gap nearly as well."
     tried = [f"{readable_name(one.effect)} ({format_probability(one.confidence)})" for one in step.runners_up]
-    return f"Less likely explanations of the same gap: {_join(tried)}."
+    return f"Less likely explanations of the same gap: {join_words(tried)}."
 
 
-def describe_held_out_gap(step: AddedOrResizedEffect) -> str:
+def describe_held_out_gap_change(step: AddedOrResizedEffect) -> str:
     """Describe the gap before and after a step on data that were not used to choose the effect."""
     before, after = step.held_out_before, step.held_out_after
     if before is None or after is None:
@@ -342,22 +337,3 @@ def _short(value: float) -> str:
     """Format a number with at most four digits and without trailing zeros."""
     text = f"{value:.4g}" if 1e-4 <= abs(value) < 1e5 or value == 0.0 else format_number(value)
     return text.replace("-", "−", 1) if value < 0.0 else text
-
-
-def _count_steps(steps: Sequence[AddedOrResizedEffect]) -> list[str]:
-    texts = []
-    for kind, noun in (("added", "added effect"), ("retuned", "retuned term")):
-        names = [readable_name(step.effect) for step in steps if step.kind == kind]
-        if names:
-            plural = "" if len(names) == 1 else "s"
-            texts.append(f"{len(names)} {noun}{plural} ({_join(list(dict.fromkeys(names)))})")
-    return texts
-
-
-def _join(texts: Sequence[str]) -> str:
-    """Join texts with commas and "and".
-
-    >>> _join(["gx"]), _join(["gx", "gy", "gz"])
-    ('gx', 'gx, gy and gz')
-    """
-    return " and ".join([", ".join(texts[:-1]), texts[-1]]) if len(texts) > 1 else "".join(texts)

@@ -1,1 +1,1 @@
-"""The Rerun viewer."""
+"""Display of results in the Rerun viewer."""

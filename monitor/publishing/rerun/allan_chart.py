@@ -1,7 +1,7 @@
 """Geometry of a log-log Allan plot for a viewer without logarithmic axes.
 
-Averaging times and deviations are converted to points and lines in chart units. The chart is a box of fixed size with a
-y axis that points down, as in the 2D view of Rerun.
+The functions convert averaging times and Allan deviations to points and lines in chart units. The chart is a box of
+fixed size with a y axis that points down, as in the 2D view of Rerun.
 """
 
 import math
@@ -16,27 +16,27 @@ from drivers.data_types import Floats
 WIDTH: Final = 16.0
 HEIGHT: Final = 11.5
 MIN_DECADES: Final = 2.0
-FILL_STEPS: Final = 96  # number of vertical strokes that fill a band
+FILL_STEPS: Final = 96  # number of vertical lines that fill a confidence band
 
 
 @dataclass(frozen=True, slots=True)
-class ChartScale:
-    """Decades of averaging times and deviations that the chart shows, as exponents of ten."""
+class ChartDecadeRange:
+    """Range of averaging times and Allan deviations that the chart shows, as exponents of ten."""
 
     x: tuple[int, int]
     y: tuple[int, int]
 
     def to_chart_positions(self, tau: Floats, sigma: Floats) -> Floats:
-        """Convert averaging times and deviations to chart positions, shape [n, 2].
+        """Convert averaging times and Allan deviations to chart positions, shape [n, 2].
 
-        Positions are NaN where the deviation is not positive.
+        A position is NaN if its deviation is not positive.
 
         Parameters
         ----------
         tau
             Averaging times [s], shape [n].
         sigma
-            Deviations in the unit of the plot, shape [n].
+                        Allan deviations in the unit of the plot, shape [n].
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             log_tau, log_sigma = np.log10(tau), np.log10(np.where(sigma > 0, sigma, np.nan))
@@ -48,7 +48,7 @@ class ChartScale:
 
 
 def decade_range(values: Iterable[Floats], min_decades: int = int(MIN_DECADES)) -> tuple[int, int]:
-    """Return the exponents of the decades that contain all positive finite numbers.
+    """Return the exponents of the powers of ten between which all positive finite numbers lie.
 
     >>> decade_range([np.array([0.02, 300.0])])
     (-2, 3)
@@ -58,7 +58,7 @@ def decade_range(values: Iterable[Floats], min_decades: int = int(MIN_DECADES)) 
     values
         Arrays of numbers.
     min_decades
-        Smallest number of decades.
+                Smallest number of decades of the range.
     """
     good = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
     if good.size == 0:
@@ -74,14 +74,14 @@ def clip_to_box(y: Floats) -> Floats:
 
 
 def finite_sections(positions: Floats) -> list[Floats]:
-    """Split a line at NaN into sections with at least two points."""
+    """Split a line at NaN, and return the sections with at least two points."""
     good = np.isfinite(positions).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     return [positions[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
 
 
 def dash_line(line: Floats, length: float = 0.22) -> list[Floats]:
-    """Divide a line of shape [n, 2] into dashes that are as long as the spaces between the dashes.
+    """Divide a line into dashes that are as long as the gaps between the dashes.
 
     >>> [stroke.tolist() for stroke in dash_line(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)]
     [[[0.0, 0.0], [1.0, 0.0]], [[2.0, 0.0], [3.0, 0.0]]]
@@ -100,7 +100,7 @@ def dash_line(line: Floats, length: float = 0.22) -> list[Floats]:
 
 
 def band_strokes(low: Floats, high: Floats) -> Floats:
-    """Return vertical strokes that fill the area between two curves, shape [FILL_STEPS, 2, 2].
+    """Return vertical lines that fill the area between two curves, shape [FILL_STEPS, 2, 2].
 
     Parameters
     ----------
@@ -118,12 +118,12 @@ def band_strokes(low: Floats, high: Floats) -> Floats:
 
 
 def interval_strokes(low: Floats, high: Floats) -> Floats:
-    """Return one vertical stroke per point from the lower to the upper end of the interval, shape [n, 2, 2].
+    """Return a vertical line for each interval from its lower to its upper end, shape [n, 2, 2].
 
     Parameters
     ----------
     low, high
-        Chart positions of the ends, shape [n, 2].
+        Chart positions of the lower and upper ends, shape [n, 2].
     """
     good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
     strokes = np.stack([low[good], high[good]], axis=1)
@@ -141,8 +141,8 @@ class ChartGrid:
     ticks: list[tuple[float, float, str]]  # x, y, label
 
 
-def chart_grid(scale: ChartScale) -> ChartGrid:
-    """Return grid lines at powers of ten and at multiples, and tick labels outside the box."""
+def chart_grid(scale: ChartDecadeRange) -> ChartGrid:
+    """Return grid lines at powers of ten and their multiples, and tick labels outside the box of the chart."""
     x_at, x_minor = _line_positions(scale.x, WIDTH)
     y_at, y_minor = _line_positions(scale.y, HEIGHT)
     flip = HEIGHT
@@ -157,7 +157,7 @@ def chart_grid(scale: ChartScale) -> ChartGrid:
 
 
 def _line_positions(span: tuple[int, int], length: float) -> tuple[list[float], list[float]]:
-    """Return positions of the powers of ten, and of the multiples 2 to 9, along an axis."""
+    """Return the positions of the powers of ten along an axis, and the positions of their multiples by 2 to 9."""
     per_decade = length / (span[1] - span[0])
     at = [i * per_decade for i in range(span[1] - span[0] + 1)]
     between = [a + math.log10(k) * per_decade for a in at[:-1] for k in range(2, 10)]
@@ -173,5 +173,5 @@ def _horizontal(y: float) -> Floats:
 
 
 def _tick(power: int) -> str:
-    """Format a power of ten, with exponent notation outside 0.0001 to 10000."""
+    """Format a power of ten. Values below 0.0001 or above 10000 have exponent notation."""
     return f"{10.0**power:g}" if -4 <= power <= 4 else f"1e{power}"

@@ -1,7 +1,7 @@
 """Allan plots in the viewer, with measured deviations, intervals, fitted deviations and the noise model.
 
-Rerun draws a plot as lines and points in chart units. The entity of an axis therefore also contains the deviations in
-SI units, for programs that read the recording. Importing this module imports Rerun.
+Rerun draws a plot as lines and points in chart units. For programs that read the Rerun recording, the entity of each
+axis therefore also contains the Allan deviations in SI units. Importing this module imports Rerun.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,8 +12,8 @@ import numpy as np
 import rerun as rr
 
 from drivers.data_types import AXES, Floats
-from monitor.common.units import DEVIATION_UNITS, KINDS, Kind, axes_of, sensor_kind
-from monitor.estimation.detection.model_comparison import ModelComparison
+from monitor.common.unit_formatting import DEVIATION_UNITS, KINDS, Kind, axes_of, sensor_kind
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.axis_colours import Colour
@@ -21,7 +21,7 @@ from monitor.publishing.rerun.allan_chart import (
     FILL_STEPS,
     HEIGHT,
     WIDTH,
-    ChartScale,
+    ChartDecadeRange,
     band_strokes,
     chart_grid,
     dash_line,
@@ -31,24 +31,24 @@ from monitor.publishing.rerun.allan_chart import (
 )
 
 Log = Callable[..., Any]
-"""Function that logs an entity, given the path and the components."""
+"""Function that logs components under the path of a Rerun entity."""
 
 
-class AllanPlot:
-    """Allan plots of one device, with a plot for each kind of sensor.
+class AllanPlotPair:
+    """Allan plots of one device, one for the gyroscopes and one for the accelerometers.
 
     Parameters
     ----------
     log
-        Function that logs an entity.
+        Function that logs a Rerun entity.
     path
-        Path of the plots.
+        Path of the entities in the Rerun recording.
     """
 
     def __init__(self, log: Log, path: str) -> None:
         self._log = log
         self._path = path
-        self._scales: dict[Kind, ChartScale] = {}  # scale of the newest grid
+        self._scales: dict[Kind, ChartDecadeRange] = {}  # range of the grid that was drawn last
 
     def draw(self, estimate: Estimate, gap: ModelComparison | None) -> None:
         """Draw the Allan deviations of an estimate.
@@ -56,9 +56,9 @@ class AllanPlot:
         Parameters
         ----------
         estimate
-            The estimate.
+                        Estimate with the measured and fitted Allan deviations.
         gap
-            Comparison with the noise model, which is drawn as dashed lines. None if there is no model.
+            Comparison with the noise model, which is drawn as dashed lines. None if the device has no model.
         """
         for kind in KINDS:
             curves = [
@@ -66,9 +66,9 @@ class AllanPlot:
             ]
             if not curves:
                 continue
-            scale = ChartScale(
+            scale = ChartDecadeRange(
                 decade_range(one.tau for one in curves),
-                decade_range(part for one in curves for part in one.curves_in_y_range),
+                decade_range(part for one in curves for part in one.curves_that_set_y_range),
             )
             if self._scales.get(kind) != scale:
                 self._scales[kind] = scale
@@ -76,7 +76,7 @@ class AllanPlot:
             for curve in curves:
                 self._draw_curve(scale, curve)
 
-    def _draw_grid(self, kind: Kind, scale: ChartScale, axes: Sequence[str]) -> None:
+    def _draw_grid(self, kind: Kind, scale: ChartDecadeRange, axes: Sequence[str]) -> None:
         path = f"{self._path}/{kind}"
         titles = [
             (WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"),
@@ -90,7 +90,7 @@ class AllanPlot:
         )
         self._log(f"{path}/legend", label_points([(x, -0.85, axis) for axis, x in ends]))
 
-    def _draw_curve(self, scale: ChartScale, curve: "_Curve") -> None:
+    def _draw_curve(self, scale: ChartDecadeRange, curve: "_Curve") -> None:
         path, colour = f"{self._path}/{curve.axis}", axis_colours.AXIS_COLOURS[curve.axis]
         low, high, fitted, model, deviation = (
             scale.to_chart_positions(curve.tau, part)
@@ -115,7 +115,7 @@ class AllanPlot:
 
 @dataclass(frozen=True)
 class _Curve:
-    """Deviations of one axis in the unit of the Allan plot."""
+    """Measured, fitted and modelled Allan deviations of one axis in the unit of the plot."""
 
     axis: str
     tau: Floats
@@ -123,17 +123,17 @@ class _Curve:
     lo: Floats
     hi: Floats
     fitted: Floats
-    model: Floats  # deviation of the noise model; NaN without a model
+    model: Floats  # Allan deviation of the noise model; NaN without a model
     si: dict[str, Floats]
 
     @property
-    def curves_in_y_range(self) -> tuple[Floats, ...]:
-        """Curves that determine the range of the y axis. Intervals may extend beyond the range."""
+    def curves_that_set_y_range(self) -> tuple[Floats, ...]:
+        """Curves that determine the range of the y axis. Confidence intervals may extend beyond this range."""
         return self.deviation, self.fitted, self.model
 
     @classmethod
     def from_estimate(cls, estimate: Estimate, axis: str, gap: ModelComparison | None) -> "_Curve | None":
-        """Return None if the axis has fewer than two deviations."""
+        """Return the curves of one axis, or None if the axis has fewer than two Allan deviations."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
         if int(rows.sum()) < 2:
@@ -148,20 +148,20 @@ class _Curve:
 
 
 def log_grid(
-    log: Log, path: str, scale: ChartScale, labels_path: str, labels: Sequence[tuple[float, float, str]]
+    log: Log, path: str, scale: ChartDecadeRange, labels_path: str, labels: Sequence[tuple[float, float, str]]
 ) -> None:
     """Log the grid lines, tick labels and further labels of a plot.
 
     Parameters
     ----------
     log
-        Function that logs an entity.
+        Function that logs a Rerun entity.
     path
-        Path of the lines.
+        Path of the entity with the grid lines.
     scale
-        Range of the plot.
+        Range of averaging times and Allan deviations.
     labels_path
-        Path of the labels.
+        Path of the entity with the labels.
     labels
         Further labels, each given by x, y and text.
     """
@@ -175,12 +175,12 @@ def log_grid(
 def log_lines(
     log: Log, path: str, strips: Sequence[Floats], line_colours: Sequence[Colour], radius: float, order: float
 ) -> None:
-    """Log lines with colours and a width.
+    """Log lines with the given colours and width.
 
     Parameters
     ----------
     log
-        Function that logs an entity.
+        Function that logs a Rerun entity.
     path
         Path of the entity.
     strips
@@ -188,16 +188,16 @@ def log_lines(
     line_colours
         One colour for each line, or one for all lines.
     radius
-        Half of the line width [points of the screen].
+                Half of the line width, in points of the screen.
     order
-        Drawing order; higher values are in front.
+        Drawing order. Lines with higher values are in front.
     """
     radii = rr.Radius.ui_points(radius)
     log(path, rr.LineStrips2D(strips, colors=line_colours, radii=radii, draw_order=order))
 
 
 def fill_band(low: Floats, high: Floats, colour: Colour) -> rr.LineStrips2D:
-    """Return vertical strokes that fill the area between two curves.
+    """Return a Rerun component with vertical lines that fill the area between two curves.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def fill_band(low: Floats, high: Floats, colour: Colour) -> rr.LineStrips2D:
 
 
 def label_points(labels: Sequence[tuple[float, float, str]]) -> rr.Points2D:
-    """Return labels as points of a 2D view. Each label has the coordinates x and y and a text."""
+    """Return labels, each given by x, y and a text, as points of a 2D view."""
     return rr.Points2D(
         [(x, y) for x, y, _ in labels],
         labels=[text for _, _, text in labels],

@@ -1,8 +1,8 @@
-"""History of the Allan deviations of a device, in a table of limited size for the live view.
+"""History of the Allan deviations of a device, in a table of limited size for the live viewer.
 
-Each column is the mean logarithmic deviation of all estimates in a time interval. When the table has COLUMNS columns,
-neighbouring columns are averaged in pairs, and the time interval of a column doubles. The table covers the
-whole history with constant memory.
+Each column contains the mean logarithm of the Allan deviations of all estimates in a time interval. When the table has
+COLUMNS columns, neighbouring columns are averaged in pairs, and later columns cover twice the time. The table therefore
+covers the whole history with constant memory.
 """
 
 import numpy as np
@@ -11,19 +11,19 @@ from drivers.data_types import AXES, Floats, Ints
 from monitor.estimation.estimate import Estimate
 
 COLUMNS = 300
-"""Largest number of columns, which must be even because columns are merged in pairs."""
+"""Largest number of columns. The number must be even, because columns are averaged in pairs."""
 INITIAL_COLUMN_S = 2.0
-"""Initial duration of a column [s], in the time of the samples."""
+"""Duration of sample time that a column covers initially [s]."""
 
 
 class AllanHistory:
     """Allan deviations of one device over time.
 
-    An estimate with different averaging times or an earlier time starts a new history.
+    If an estimate has other averaging times or an earlier time than its predecessor, a new history starts.
     """
 
     def __init__(self, column_s: float = INITIAL_COLUMN_S) -> None:
-        """Create an empty history with columns of ``column_s`` seconds."""
+        """Create an empty history whose columns initially cover ``column_s`` seconds."""
         self._first_s = column_s
         self._reset(np.empty(0), 0.0)
 
@@ -31,7 +31,7 @@ class AllanHistory:
         self.column_s = self._first_s
         self.tau_s = tau_s  # [m]
         self.ends_s: list[float] = []  # Unix time [s] of the newest estimate in each column
-        self._columns: list[Floats] = []  # [m, 6] natural logarithm of the deviation
+        self._columns: list[Floats] = []  # [m, 6] natural logarithm of the Allan deviation
         self._begin_column(wall_s)
 
     def _begin_column(self, wall_s: float) -> None:
@@ -39,7 +39,7 @@ class AllanHistory:
         self._sums: Floats = np.zeros((self.tau_s.size, len(AXES)))
         self._counts: Ints = np.zeros((self.tau_s.size, len(AXES)), np.int64)
 
-    def add_estimate(self, wall_s: float, estimate: Estimate) -> bool:
+    def add_estimate_and_check_column_complete(self, wall_s: float, estimate: Estimate) -> bool:
         """Add an estimate. Return True if the estimate completes a column.
 
         Parameters
@@ -47,11 +47,11 @@ class AllanHistory:
         wall_s
             Unix time of the estimate [s].
         estimate
-            The estimate.
+                        Estimate with the Allan deviations to add.
         """
         if wall_s < self._newest_s or not np.array_equal(self.tau_s, estimate.curve.tau_s):
             self._reset(estimate.curve.tau_s, wall_s)
-        # The recent deviations use only the newest samples, so that a change appears without delay.
+        # Recent Allan deviations use only the newest samples, so that a change of the noise appears without delay.
         avar = (estimate.display_curve or estimate.curve).avar
         there = np.isfinite(avar) & (avar > 0.0)
         self._sums[there] += 0.5 * np.log(avar[there])
@@ -75,9 +75,9 @@ class AllanHistory:
         self.column_s *= 2.0
 
     def log_ratio_to_median(self) -> Floats:
-        """Return the logarithm of the deviation divided by the median over time, shape [columns, m, 6].
+        """Return the logarithm of each Allan deviation divided by its median over time, shape [columns, m, 6].
 
-        Missing deviations are NaN.
+        The values are NaN where Allan deviations are missing.
         """
         whole = np.stack(self._columns) if self._columns else np.empty((0, self.tau_s.size, len(AXES)))
         there = np.isfinite(whole).any(axis=0)

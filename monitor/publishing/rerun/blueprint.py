@@ -1,7 +1,8 @@
 """Layout of the Rerun viewer.
 
-A single device fills the window. Several devices have an overview and one tab each. The tab of a device contains panels
-for current noise and for noise over time. Importing this module imports Rerun.
+A single device fills the window of the viewer. With several devices, there is an overview and a tab for each device.
+The tab of a device contains panels for its present noise and for the noise over time. Importing this module imports
+Rerun.
 """
 
 from collections.abc import Sequence
@@ -10,9 +11,18 @@ from typing import Final
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
-from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KIND_NAMES, KINDS, SAMPLE_UNITS, Kind, axes_of
+from monitor.common.unit_formatting import (
+    COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
+    KIND_NAMES,
+    KINDS,
+    SAMPLE_UNITS,
+    Kind,
+    axes_of,
+)
 from monitor.publishing.rerun import dynamic_heat_map
 from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
+from monitor.publishing.rerun.panel_scene import PANELS
 from monitor.publishing.rerun.shared_views import (
     RAW_SAMPLES_S,
     TIMELINE,
@@ -21,28 +31,27 @@ from monitor.publishing.rerun.shared_views import (
     temperature_view,
     time_series_view,
 )
-from monitor.publishing.rerun.viewer_content import PANELS
-from monitor.publishing.rerun.viewer_settings import DeviceInfo
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 
 NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
 TYPICAL_TAU_COUNT: Final = 17
-"""Number of averaging times of a one-hour window at 100 Hz."""
+"""Number of averaging times of a sliding window of one hour at 100 Hz."""
 MAX_DEVICES_WITH_ACCEL: Final = 4
-"""Largest number of devices for which the overview also shows accelerometers."""
+"""Largest number of devices for which the overview shows accelerometers as well as gyroscopes."""
 MAX_GRID_COLUMNS: Final = 4
 SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
-def blueprint(devices: Sequence[DeviceInfo], fleet: bool = False) -> rrb.Blueprint:
+def blueprint(devices: Sequence[ViewerDeviceDescription], fleet: bool = False) -> rrb.Blueprint:
     """Return the Rerun layout for a list of devices.
 
     Parameters
     ----------
     devices
-        The devices.
+        Devices to show.
     fleet
-        True if the overview is a table that also contains devices without detail.
+                True if the overview is a table that also lists devices that are not shown in detail.
     """
     pages, names = [_device(one) for one in devices], [one.name for one in devices]
     if fleet:
@@ -52,12 +61,12 @@ def blueprint(devices: Sequence[DeviceInfo], fleet: bool = False) -> rrb.Bluepri
     return collapsed_blueprint(root, TIMELINE)
 
 
-def _device(device: DeviceInfo) -> rrb.Container:
+def _device(device: ViewerDeviceDescription) -> rrb.Container:
     tabs = [tab for panel in PANELS if (tab := panel.tab_layout(device)) is not None]
     return rrb.Tabs(_now(device), _dynamic(device.name), *tabs, active_tab=0, name=device.name)
 
 
-def _now(device: DeviceInfo) -> rrb.Container:
+def _now(device: ViewerDeviceDescription) -> rrb.Container:
     name = device.name
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{name}/status", name="Is it healthy?"),

@@ -1,8 +1,8 @@
 """Heat maps of the Allan deviation of a device over time, under ``/<device>/dynamic/<axis>`` in the viewer.
 
-Time increases to the right and the averaging time τ increases upwards. The colour is the deviation divided by the
-median over time. Each heat map is a PNG image with a palette. Rerun draws no axes on an image, so labels are drawn as
-points with text. Importing this module imports Rerun.
+Time increases to the right, and the averaging time τ increases upwards. The colour shows the Allan deviation divided by
+its median over time. Each heat map is a PNG image with a palette. Rerun draws no axes on an image, so labels are drawn
+as points with text. Importing this module imports Rerun.
 """
 
 import io
@@ -14,23 +14,23 @@ import rerun as rr
 from PIL import Image  # installed with rerun-sdk
 
 from drivers.data_types import AXES, Floats
-from monitor.common.units import format_utc
+from monitor.common.unit_formatting import format_utc
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.rerun.allan_drawing import Log, label_points
 from monitor.publishing.rerun.allan_history_table import COLUMNS, AllanHistory
 
-HEIGHT: Final = 60  # approximate height of an image [pixels]; three images fit into a tab
+HEIGHT: Final = 60  # approximate height of a heat map [pixels]; three heat maps fit into a tab
 COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median
 SHADES: Final = 127  # shades on either side of the median
 NO_VALUE_INDEX: Final = 2 * SHADES + 1  # palette index of a missing deviation
-MIN_COLUMNS: Final = 4  # number of columns required for a meaningful median
+MIN_COLUMNS: Final = 4  # smallest number of columns that gives a meaningful median
 BAR_X: Final = COLUMNS + 9.0
 BAR_STEPS: Final = 24
 LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and below the image, for labels
 
 
 def heat_map_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the limits in x and y of a heat map view with the given number of averaging times."""
+    """Return the x and y limits of the view of a heat map with the given number of averaging times."""
     left, above, right, below = LABEL_MARGINS_PX
     return (-left, COLUMNS + right), (-above, _rows(tau_count) * tau_count + below)
 
@@ -41,11 +41,11 @@ def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
     Parameters
     ----------
     log
-        Function that logs an entity.
+                Function that logs a Rerun entity.
     path
-        Path of the heat maps.
+        Path of the entities with the heat maps.
     allan_history
-        Deviations over time.
+        Allan deviations over time.
     """
     whole = allan_history.log_ratio_to_median()
     if len(whole) < MIN_COLUMNS:
@@ -64,7 +64,7 @@ def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
 
 
 def encode_heat_map(log_ratio: Floats) -> bytes:
-    """Encode the logarithm of the deviation divided by the median, shape [columns, m], as a PNG image."""
+    """Encode logarithms of Allan deviations divided by their medians, shape [columns, m], as a PNG image."""
     share = np.clip(np.nan_to_num(log_ratio) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
     shade = np.where(np.isfinite(log_ratio), np.rint(SHADES * (1.0 + share)), NO_VALUE_INDEX).astype(np.uint8)
     wide = shade[np.arange(COLUMNS) * len(log_ratio) // COLUMNS]
@@ -76,7 +76,7 @@ def encode_heat_map(log_ratio: Floats) -> bytes:
 
 
 def _palette() -> tuple[axis_colours.Colour, ...]:
-    """Return blue below the median, vermilion above the median, and black for missing values."""
+    """Return a palette that is blue below the median, vermilion above the median, and black for missing values."""
     below = [
         axis_colours.blend_colours(axis_colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, axis_colours.MINOR)
         for i in range(SHADES)
@@ -92,7 +92,7 @@ PALETTE: Final = _palette()
 
 
 def _rows(taus: int) -> int:
-    """Return the height of one averaging time [pixels]."""
+    """Return the number of pixel rows for each averaging time."""
     return max(1, round(HEIGHT / max(taus, 1)))
 
 

@@ -1,7 +1,7 @@
-"""Viewer for the devices of many daemons, ``imu-monitor view``.
+"""Viewer for the devices of many daemons, for the command ``imu-monitor view``.
 
-The viewer shows a table of all devices and a list of all events. Devices shown in detail also have samples, Allan plots
-and coefficients over time. Samples and Allan deviations are received only for devices shown in detail.
+The viewer shows a table of all devices and a list of all events. For devices shown in detail, the viewer also shows
+samples, Allan plots and coefficients over time. Samples and Allan deviations are received only for these devices.
 """
 
 import threading
@@ -14,17 +14,17 @@ from drivers.zenoh.sample_message import decode_samples
 from monitor.common import topics
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
-from monitor.publishing.remote_devices import DeviceStates, split_device_and_topic
-from monitor.publishing.rerun.panel_text import fleet_text
+from monitor.publishing.remote_devices import RemoteDeviceRegistry, split_device_and_topic
+from monitor.publishing.rerun.panels.panel_text import fleet_text
 from monitor.publishing.rerun.queued_view import RerunView
-from monitor.publishing.result_kinds import DeviceTableText, SampleRows
+from monitor.publishing.result_kinds import AllDevicesTableText, SampleBatch
 from monitor.publishing.terminal.watch import connection_note
-from monitor.publishing.zenoh.subscriber import ReceivedMessage, ZenohSubscriber
+from monitor.publishing.zenoh.subscriber import ReceivedMessageOrLiveliness, ZenohSubscriber
 
 RECEIVE_TIMEOUT_S: Final = 0.1
 TABLE_PERIOD_S: Final = 1.0
 MAX_ROWS: Final = 40
-"""Largest number of rows of the device table, about one screen."""
+"""Largest number of rows of the device table, which fill about one screen."""
 
 
 def full_device_key(device: str, keyexpr: str) -> str:
@@ -36,9 +36,9 @@ def full_device_key(device: str, keyexpr: str) -> str:
     Parameters
     ----------
     device
-        Key of the device, in full or relative.
+                Full key of the device, or the end of the key.
     keyexpr
-        Key expression of the subscription.
+        Pattern of zenoh keys (key expression) of the subscription.
     """
     fixed = []
     for part in keyexpr.split("/"):
@@ -55,9 +55,9 @@ class FleetView:
     Parameters
     ----------
     subscriber
-        Subscriber, including the topics of devices shown in detail.
+                Subscriber that receives the messages of all devices.
     viewer
-        Viewer of the devices shown in detail.
+        Viewer in which the results are drawn.
     detail
         Keys of the devices shown in detail.
     """
@@ -66,8 +66,8 @@ class FleetView:
         self._subscriber = subscriber
         self._viewer = viewer
         self._detail = frozenset(detail)
-        self.board = DeviceStates()
-        self.malformed = 0  # number of messages of devices in detail that could not be decoded
+        self.board = RemoteDeviceRegistry()
+        self.malformed = 0  # number of messages of devices shown in detail that could not be decoded
 
     def run(self, stop: threading.Event, report: Callable[[str], None], duration_s: float | None = None) -> None:
         """Process messages and draw the device table until ``stop`` is set.
@@ -75,11 +75,11 @@ class FleetView:
         Parameters
         ----------
         stop
-            Event that ends the method.
+                        Event that ends the method when it is set.
         report
-            Function that receives the address of the page and the problems after each change.
+            Function that receives the address of the web page and the problems after each change.
         duration_s
-            Longest duration [s], or None for no limit.
+            Longest duration of the call [s], or None for no limit.
         """
         end_s = None if duration_s is None else time.monotonic() + duration_s
         table_s, reported = 0.0, ""
@@ -97,7 +97,7 @@ class FleetView:
                 reported = text
                 report(text)
 
-    def process_message(self, message: ReceivedMessage) -> None:
+    def process_message(self, message: ReceivedMessageOrLiveliness) -> None:
         """Update the device table from a message, and draw the results of a device shown in detail."""
         if message.payload is None:
             self.board.set_liveliness_token(message.key, message.token_exists)
@@ -123,20 +123,20 @@ class FleetView:
         Parameters
         ----------
         wall_s
-            Unix time of the table [s].
+                        Unix time at which the table is shown [s].
         now_s
-            Current time on the clock of the messages [s].
+            Current time [s] on the monotonic clock that gives the age of messages.
         """
-        devices = self.board.sorted_devices(now_s)
+        devices = self.board.devices_with_problems_first(now_s)
         note = connection_note(self.board, self._subscriber)
-        self._viewer.put("", wall_s, DeviceTableText(fleet_text(devices, now_s, MAX_ROWS, note)))
+        self._viewer.put("", wall_s, AllDevicesTableText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
             unix_s = rows.t_ns / 1e9
             if unix_s.size:
-                self._viewer.put(device, float(unix_s[-1]), SampleRows(unix_s, rows.values, rows.temperature_c))
+                self._viewer.put(device, float(unix_s[-1]), SampleBatch(unix_s, rows.values, rows.temperature_c))
         elif topic is topics.ALLAN:
             message, known = decode_message(AllanMessage, payload), self.board.device_coefficients(device)
             if known is not None:

@@ -1,11 +1,11 @@
-"""Live view in Rerun, which draws results of the main loop in a separate thread.
+"""Live display in Rerun, which draws results of the main loop in a separate thread.
 
-``put`` adds a result to a bounded queue and returns at once. If the viewer does not answer, ``state`` reports
-``stalled`` and the queue drops the oldest results. If the viewer is missing, cannot start or was closed, ``state``
-reports the reason and the thread repeats the attempt.
+The method ``put`` adds a result to a bounded queue and returns at once. If the viewer does not answer, the property
+``state`` reports ``stalled`` and the queue drops the oldest results. If the viewer is missing, cannot start or was
+closed, ``state`` reports the reason and the thread tries again to open the viewer.
 
-A logging call of Rerun blocks without limit if the viewer does not read. The exit handler of Rerun may also block and
-is therefore removed. The import of Rerun takes half a second and is therefore done in the thread.
+If the viewer does not read, a logging call of Rerun blocks without limit. The exit handler of Rerun may also block and
+is therefore removed. The thread imports Rerun, because the import takes half a second.
 """
 
 import importlib
@@ -19,28 +19,33 @@ from typing import TYPE_CHECKING, Any, Final
 
 from monitor.history.history_table import HistoryTable
 from monitor.publishing.bounded_queue import BoundedQueue
-from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerClosed, ViewerError, ViewerSettings
+from monitor.publishing.rerun.viewer_settings_and_errors import (
+    ViewerClosed,
+    ViewerDeviceDescription,
+    ViewerError,
+    ViewerSettings,
+)
 from monitor.publishing.result_kinds import RESULT_KINDS, DrawingRule, TimedResult, kind_of
 
 if TYPE_CHECKING:
-    from monitor.publishing.rerun.sinks import RerunOutput, ViewerProcess
-    from monitor.publishing.rerun.viewer_content import Scene
+    from monitor.publishing.rerun.panel_scene import Scene
+    from monitor.publishing.rerun.sinks import RerunStreamWithSink, ViewerProcess
 
-BACKLOG_BYTES: Final = 16_000_000  # holds about 25 s of samples of 16 six-axis devices at 1 kHz
-CONFIRM_PERIOD_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
-PATIENCE_S: Final = 1.0  # timeout of a check for delivery
-STALL_TIMEOUT_S: Final = 2.0  # longest duration of a Rerun call before the viewer is stalled
+BACKLOG_BYTES: Final = 16_000_000  # enough for about 25 s of samples of 16 six-axis devices at 1 kHz
+CONFIRM_PERIOD_S: Final = 1.0  # interval between two checks that the viewer has received the drawn data
+PATIENCE_S: Final = 1.0  # longest duration of such a check
+STALL_TIMEOUT_S: Final = 2.0  # a Rerun call that takes longer shows that the viewer is stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
-PLOTS_PER_S: Final = 8.0  # total rate of Allan plots of all devices
-MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window with a shorter lifetime does not work on this host
+PLOTS_PER_S: Final = 8.0  # number of Allan plots of all devices that are drawn per second
+MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes earlier does not work on this machine
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
 HistorySource = Callable[[str], HistoryTable | None]
-"""Function that returns the stored history of a device, or None."""
+"""Function that returns the stored history of a device, or None if there is none."""
 
 
 class RerunView:
-    """Viewer of all devices. Every call returns at once, and only one thread may use the viewer.
+    """Viewer of all devices, whose methods return at once. Only one thread may call the methods.
 
     Parameters
     ----------
@@ -49,7 +54,7 @@ class RerunView:
     devices
         Devices to show in detail.
     history_source
-        Function that returns the stored history of a device. The viewer thread calls the function.
+                Function that returns the stored history of a device. The thread of the viewer calls this function.
     fleet
         True if the device table also contains devices that are not shown in detail.
     """
@@ -57,7 +62,7 @@ class RerunView:
     def __init__(
         self,
         settings: ViewerSettings,
-        devices: Sequence[DeviceInfo],
+        devices: Sequence[ViewerDeviceDescription],
         history_source: HistorySource = lambda _device: None,
         fleet: bool = False,
     ) -> None:
@@ -77,7 +82,7 @@ class RerunView:
 
     @property
     def state(self) -> str:
-        """``ok``, or a short description of the problem; part of the status message."""
+        """``ok`` or a short description of the problem, for the status message."""
         inside = self._inside_since
         if self._stalled or (inside is not None and time.monotonic() - inside > STALL_TIMEOUT_S):
             return f"stalled ({self._backlog.dropped} dropped)"
@@ -91,12 +96,12 @@ class RerunView:
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
 
-    def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
-        """Set the devices to show in detail. Call this method before the first result of a new device."""
+    def set_detailed_devices(self, devices: Sequence[ViewerDeviceDescription]) -> None:
+        """Set the devices to show in detail. A new device must be set before its first result is queued."""
         self._devices = tuple(devices)
 
     def put(self, device: str, unix_s: float, result: Any) -> None:
-        """Queue a result to be drawn.
+        """Add a result to the queue of results to draw.
 
         Parameters
         ----------
@@ -111,7 +116,7 @@ class RerunView:
             self._backlog.push((device, unix_s, result), kind_of(result).size_bytes(result))
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Draw the remaining data for at most ``timeout_s`` seconds, and close the output."""
+        """Draw the remaining results for at most ``timeout_s`` seconds, and close the viewer or the file."""
         thread, self._thread = self._thread, None
         if thread is None:
             return
@@ -120,7 +125,7 @@ class RerunView:
         thread.join(0.75 * timeout_s)
         child = self._child
         if thread.is_alive() and child is not None:
-            child.kill()  # unblocks the thread if the viewer does not respond
+            child.kill()  # ends a Rerun call that waits for the viewer
         thread.join(0.25 * timeout_s)
         self._phase = "closed"
 
@@ -147,7 +152,7 @@ class RerunView:
     def _wait_and_select_mode(
         self, settings: ViewerSettings, started: float, attempt: int
     ) -> tuple[ViewerSettings, int]:
-        """Wait before the next attempt, and select the web page if windows fail on this host."""
+        """Wait before the next attempt to open a viewer, and select the web page if windows fail on this machine."""
         self._stalled, self._inside_since, self.url = False, None, ""
         lived_s = time.monotonic() - started
         if self._closing.is_set():
@@ -159,8 +164,8 @@ class RerunView:
         return settings, attempt
 
     def _show(self, settings: ViewerSettings) -> None:
+        from monitor.publishing.rerun import panel_scene as rerun_scene
         from monitor.publishing.rerun import sinks
-        from monitor.publishing.rerun import viewer_content as rerun_scene
 
         output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self.url = output.child, output.url
@@ -171,12 +176,14 @@ class RerunView:
             self._child = None
             output.close()
 
-    def _send_layout(self, output: "RerunOutput", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
+    def _send_layout(
+        self, output: "RerunStreamWithSink", scene: "Scene", devices: Sequence[ViewerDeviceDescription]
+    ) -> None:
         from monitor.publishing.rerun import blueprint
 
         layout = blueprint.blueprint(devices, self._fleet)
         output.stream.send_blueprint(layout, make_active=True, make_default=True)
-        scene.set_devices(devices)
+        scene.set_detailed_devices(devices)
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
     def _draw_history(self, scene: "Scene", device: str) -> None:
@@ -186,16 +193,16 @@ class RerunView:
         if past is not None:
             scene.draw_history(device, past)
 
-    def _draw(self, output: "RerunOutput", scene: "Scene") -> None:
+    def _draw(self, output: "RerunStreamWithSink", scene: "Scene") -> None:
         waiting = _WaitingResults()
-        shown: tuple[DeviceInfo, ...] | None = None
+        shown: tuple[ViewerDeviceDescription, ...] | None = None
         begun: set[str] = set()
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
             waiting.add_results(
                 self._backlog.take(0.0)
-            )  # taken before the devices are read, so that the device of each result is known
+            )  # taken before self._devices is read, so that the device of each result is known
             self._inside_since = time.monotonic()
             if self._devices is not shown:
                 shown = self._devices
@@ -212,14 +219,14 @@ class RerunView:
             self._inside_since = None
             if closing:
                 return
-            output.check_viewer()
+            output.raise_if_viewer_ended()
             self._closing.wait(output.flush_every_s)
 
-    def _confirm(self, output: "RerunOutput") -> None:
+    def _confirm(self, output: "RerunStreamWithSink") -> None:
         """Wait until the viewer has received all drawn data, which limits the memory use of Rerun."""
         while not output.confirm_delivery(PATIENCE_S):
             self._stalled = not self._closing.is_set()
-            output.check_viewer()
+            output.raise_if_viewer_ended()
             if self._closing.is_set():
                 return
         self._stalled = False
@@ -227,7 +234,7 @@ class RerunView:
 
 class _WaitingResults:
     def __init__(self) -> None:
-        self.period_factor = 1.0  # factor for the periods of drawings whose rate the devices share
+        self.period_factor = 1.0  # factor for the drawing periods of plots whose rate the devices share
         self._waiting: dict[DrawingRule, dict[str, list[TimedResult]]] = {
             drawing: {} for kind in RESULT_KINDS for drawing in kind.drawings
         }
@@ -249,9 +256,9 @@ class _WaitingResults:
 
 
 def _load_rerun() -> None:
-    """Import Rerun and remove the exit handler of Rerun, which may block without limit.
+    """Import Rerun and remove its exit handler, which may block without limit.
 
-    Rerun reads RUST_LOG at import and would otherwise report every closed viewer as an error.
+    RUST_LOG is set before the import, because Rerun would otherwise report every closed viewer as an error.
     """
     given = os.environ.get("RUST_LOG")
     os.environ["RUST_LOG"] = given or "off"

@@ -1,4 +1,4 @@
-"""Views of a Rerun layout that several panels and reports use. Importing this module imports Rerun."""
+"""Rerun views that several panels and reports use. Importing this module imports Rerun."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -10,7 +10,7 @@ from monitor.publishing.plots import axis_colours
 
 TIMELINE: Final = "sample_time"
 RAW_SAMPLES_S: Final = 30.0
-"""Duration of the raw samples that a view shows [s]."""
+"""Duration of the samples that a view shows [s]."""
 HALF_LABEL_SHARE: Final = 0.08
 """Width of half a tick label, as a share of the width of the plot."""
 
@@ -23,22 +23,22 @@ def time_series_view(
     legend: bool = False,
     styles: Mapping[Any, rr.SeriesLines] | None = None,
 ) -> rrb.TimeSeriesView:
-    """Return a view of time series that ends at the time cursor.
+    """Return a view of time series that ends at the time cursor of the viewer.
 
     Parameters
     ----------
     origin
-        Path of the entity.
+        Path of the entity that the view shows.
     name
         Title of the view.
     contents
-        Entities to show.
+        Paths of the entities to show.
     last_s
         Time range before the cursor [s]. By default, the view begins with the first sample.
     legend
         True to show a legend.
     styles
-        Styles for this view only, by path of the entity.
+                Line styles for this view only, by path of the entity.
     """
     return rrb.TimeSeriesView(
         origin=origin,
@@ -56,13 +56,13 @@ def drawing_view(origin: str, name: str, contents: Any, x_range: Sequence[float]
     Parameters
     ----------
     origin
-        Path of the entity.
+        Path of the entity that the view shows.
     name
         Title of the view.
     contents
-        Entities to show.
+        Paths of the entities to show.
     x_range, y_range
-        Limits of the view.
+        Limits of the view in chart units.
     """
     return rrb.Spatial2DView(
         origin=origin,
@@ -86,17 +86,17 @@ def collapsed_blueprint(root: rrb.Container, timeline: str) -> rrb.Blueprint:
 
 
 def markdown_document(text: str) -> rr.TextDocument:
-    """Return a Markdown document."""
+    """Return a Rerun component with a Markdown text."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
 
 def temperature_view(device: str) -> rrb.TimeSeriesView:
-    """Return the view of the temperature of a device."""
+    """Return a view of the temperature of a device over time."""
     return time_series_view(f"/{device}/temperature", "Temperature, °C")
 
 
 def _before_cursor(seconds: float) -> rrb.TimeAxis:
-    """Return a time axis of the last seconds, with space for a tick label at the cursor."""
+    """Return a time axis for the last seconds before the cursor, with space for a tick label at the cursor."""
     first, last = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-seconds, HALF_LABEL_SHARE * seconds))
     return rrb.TimeAxis(view_range=rr.TimeRange(first, last))
 

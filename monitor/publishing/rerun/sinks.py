@@ -1,11 +1,12 @@
-"""Outputs of a Rerun stream, which are a viewer window, a web page or a file.
+"""Outputs of a Rerun stream: a viewer window, a web page or a file.
 
-A window and a web page use a Rerun server in a separate process, so that viewer data do not use the memory of the
-daemon. The viewer program is started directly, because the Python wrapper would leave the program running when killed.
-The program listens only on the loopback interface and sends no usage statistics.
+A window and a web page use a Rerun server in a separate process, so that the data of the viewer do not use the memory
+of the daemon. The viewer program is started directly, because it would continue to run if its Python wrapper were
+killed. The program listens only on the loopback interface and sends no usage statistics.
 
-Rerun raises no error for a port in use, so ports are checked first. A window joins a Rerun server that already listens
-on the port. If the port of the web page is in use, the next free port is used. Importing this module imports Rerun.
+Rerun raises no error if a port is in use, so ports are checked first. If a Rerun server already listens on the port of
+a window, the daemon connects to this server. If the port of the web page is in use, the next free port is used.
+Importing this module imports Rerun.
 """
 
 import contextlib
@@ -32,25 +33,25 @@ import rerun_cli  # type: ignore[import-untyped]
 
 from drivers.file_access import check_regular_file
 from monitor.common.folder_lock import LOCKS_UNSUPPORTED_ERRNOS
-from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerError, ViewerSettings
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerClosed, ViewerError, ViewerSettings
 
 LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
-START_TIMEOUT_S: Final = 20.0  # the program of 300 MB may start from a slow disk
+START_TIMEOUT_S: Final = 20.0  # loading the program of 300 MB from a slow disk takes time
 PORTS_TRIED: Final = 20
 CLOSED: Final = "viewer was closed: start `rerun` to open it again"
-PROGRAM_MIB: Final = 256  # memory of the viewer without data; an empty window uses 125 to 170 MB
-LIVE_FLUSH_PERIOD_S: Final = 0.2  # each chunk costs about 1 kB in addition to the data
+PROGRAM_MIB: Final = 256  # memory limit of the viewer program without data; an empty window uses 125 to 170 MB
+LIVE_FLUSH_PERIOD_S: Final = 0.2  # each flush sends about 1 kB in addition to the data
 PROBE_METHOD: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
 
 
 def has_desktop() -> bool:
-    """Return True if this host can open a window."""
+    """Return True if this machine can open a window."""
     return sys.platform in ("darwin", "win32") or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
 class ViewerProcess:
-    """Process of the viewer program, with access to the last log line."""
+    """Process that runs the viewer program, whose last log line explains an early end."""
 
     def __init__(self, arguments: list[str]) -> None:
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
@@ -65,7 +66,7 @@ class ViewerProcess:
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Process identifier of the viewer program."""
         return self._process.pid
 
     def exit_reason(self) -> str | None:
@@ -78,9 +79,7 @@ class ViewerProcess:
         return self._process.poll() == 0
 
     def terminate(self, timeout_s: float = 0.5) -> None:
-        """Terminate the process. Kill the process after ``timeout_s`` seconds, because a stopped process ignores
-        SIGTERM.
-        """
+        """Terminate the process, and kill it after ``timeout_s`` seconds, because a stopped process ignores SIGTERM."""
         with contextlib.suppress(OSError):
             self._process.terminate()
         try:
@@ -101,18 +100,18 @@ class ViewerProcess:
 
 
 @dataclass
-class RerunOutput:
-    """Rerun stream with the viewer process or the file that receives the data."""
+class RerunStreamWithSink:
+    """Rerun stream together with the viewer process or the file that receives its data."""
 
     stream: rr.RecordingStream
     flush_every_s: float
-    url: str = ""  # address of the page or of the Rerun server
+    url: str = ""  # address of the web page or of the Rerun server
     child: ViewerProcess | None = None
     port: int | None = None  # port of the Rerun server; None for a file
     note: str = ""  # configured ports that were in use, and the replacement ports
     lock: IO[bytes] | None = None  # lock against other processes that write the file
 
-    def check_viewer(self) -> None:
+    def raise_if_viewer_ended(self) -> None:
         """Raise an exception if the viewer has ended.
 
         Raises
@@ -133,11 +132,12 @@ class RerunOutput:
     def confirm_delivery(self, timeout_s: float) -> bool:
         """Return True if the viewer has received all logged data within ``timeout_s`` seconds.
 
-        A completed send does not prove delivery, because the sockets of a stopped viewer accept two more megabytes.
+        A completed send is no proof of delivery, because the sockets of a stopped viewer accept two more
+        megabytes.
         """
         try:
             self.stream.flush(timeout_sec=timeout_s)
-        except RuntimeError:  # raised by Rerun after a timeout and for a lost connection
+        except RuntimeError:  # Rerun raises this exception after a timeout and if the connection is lost
             return False
         return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", timeout_s) is not None
 
@@ -164,9 +164,9 @@ def viewer_program_path() -> Path:
 
 
 def _death_signal_prefix() -> list[str]:
-    """Return a command prefix that ends a program when the starting thread ends (Linux only).
+    """Return a command prefix with which a program ends as soon as the thread that started it ends (Linux only).
 
-    Without the program ``setpriv`` (util-linux), the viewer outlives a killed daemon.
+    Without the program ``setpriv`` (util-linux), the viewer continues to run after the daemon has been killed.
     """
     setpriv = shutil.which("setpriv") if sys.platform == "linux" else None
     return [] if setpriv is None else [setpriv, "--pdeathsig", "TERM", "--"]
@@ -180,7 +180,7 @@ def is_listening(port: int) -> bool:
 
 
 def is_rerun_server(port: int) -> bool:
-    """Return True if a Rerun server answers on the port.
+    """Return True if a Rerun server listens on a port of the loopback interface.
 
     Other gRPC servers answer a Rerun call with "unimplemented" (status 12).
     """
@@ -189,7 +189,7 @@ def is_rerun_server(port: int) -> bool:
 
 
 def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
-    """Return the headers of the reply to an empty gRPC call, or None without a reply."""
+    """Return the headers of the reply to an empty gRPC call, or None if there is no reply."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
     headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
     try:
@@ -202,14 +202,14 @@ def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
 
 
 def find_free_port(first_port: int, skipped_port: int | None = None) -> int:
-    """Return the first free port, starting at a given port.
+    """Return the first free port that is not less than the given port.
 
     Parameters
     ----------
     first_port
         First port to try.
     skipped_port
-        Port to skip.
+                Port that is not used even if it is free.
 
     Raises
     ------
@@ -233,7 +233,7 @@ def _bindable(port: int) -> bool:
     return True
 
 
-def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
+def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunStreamWithSink:
     """Open the output that the settings select, and wait until the viewer listens.
 
     Parameters
@@ -243,7 +243,7 @@ def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callab
     recording_id
         Identifier of the recording in Rerun.
     should_stop
-        Function that returns True to stop waiting.
+                Function that returns True if the caller no longer waits for the viewer.
 
     Raises
     ------
@@ -259,33 +259,33 @@ def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callab
     return _open_web(settings, recording_id, should_stop)
 
 
-def _open_file(path: Path, recording_id: str) -> RerunOutput:
+def _open_file(path: Path, recording_id: str) -> RerunStreamWithSink:
     try:
         if path.exists():
-            check_regular_file(path)  # opening a FIFO would block until a reader opens it
+            check_regular_file(path)  # opening a FIFO would block until another process reads it
         lock = path.open("ab")
     except OSError as error:
         raise ViewerError(f"cannot write {path}: {error.strerror}") from error
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the system when this process ends
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases the lock when this process ends
     except BlockingIOError:
         lock.close()
         raise ViewerError(f"{path}: another process writes this file; choose another file") from None
-    except OSError as error:  # a file system without locks
+    except OSError as error:  # some file systems do not support locks
         if error.errno not in LOCKS_UNSUPPORTED_ERRNOS:
             lock.close()
             raise ViewerError(f"cannot lock {path}: {error.strerror}") from error
     try:
         stream = _stream(recording_id)
-        # A footer would need memory for every chunk while the daemon runs.
+        # For a footer, Rerun would keep data about every chunk in memory while the daemon runs.
         stream.set_sinks(rr.FileSink(path, write_footer=False))
     except BaseException:
         lock.close()
         raise
-    return RerunOutput(stream, flush_every_s=1.0, lock=lock)
+    return RerunStreamWithSink(stream, flush_every_s=1.0, lock=lock)
 
 
-def _open_native(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
+def _open_native(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunStreamWithSink:
     port = settings.port
     if is_listening(port):
         if not is_rerun_server(port):
@@ -304,7 +304,7 @@ def _open_native(settings: ViewerSettings, recording_id: str, should_stop: Calla
     return _connected(port, recording_id, child=child)
 
 
-def _open_web(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
+def _open_web(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunStreamWithSink:
     port = find_free_port(settings.port)
     web_port = find_free_port(settings.web_port, skipped_port=port)
     child = ViewerProcess([
@@ -322,7 +322,7 @@ def _open_web(settings: ViewerSettings, recording_id: str, should_stop: Callable
 
 
 def _add_program_memory(memory: str) -> str:
-    """Return the memory limit of a viewer window, which is the limit for data plus PROGRAM_MIB.
+    """Return the memory limit of a viewer window, which is the memory limit for data plus PROGRAM_MIB.
 
     >>> _add_program_memory("256MiB"), _add_program_memory("1GiB"), _add_program_memory("25%")
     ('512MiB', '1280MiB', '25%')
@@ -339,17 +339,18 @@ def server_url(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
-def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> RerunOutput:
+def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> RerunStreamWithSink:
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
-    return RerunOutput(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
+    return RerunStreamWithSink(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
 
 
 def _stream(recording_id: str) -> rr.RecordingStream:
     """Create a Rerun stream that is never freed.
 
-    Freeing a stream waits for the viewer while holding a lock that all streams need. If the viewer has ended, the next
-    viewer and the exit of the process would block. The leak costs a few kilobytes for each opened viewer.
+    Freeing a stream waits for the viewer while holding a lock that all streams need. If a stream were freed after the
+    viewer has ended, it would therefore block all other streams and the exit of the process. The stream keeps a few
+    kilobytes of memory for each viewer that was opened.
     """
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
@@ -359,7 +360,7 @@ def _stream(recording_id: str) -> rr.RecordingStream:
 
 
 def _wait_for(port: int, child: ViewerProcess, should_stop: Callable[[], bool]) -> None:
-    """Wait until the viewer listens. Terminate the viewer and raise ViewerError after a timeout."""
+    """Wait until the viewer listens on the port. After a timeout, terminate the viewer and raise ViewerError."""
     end = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < end and not should_stop():
         trouble = child.exit_reason()

@@ -1,1 +1,1 @@
-"""Tables and text for the terminal."""
+"""Results as tables and text for the terminal."""

@@ -7,7 +7,15 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from monitor.common.units import COEFFICIENT_UNITS, KIND_NAMES, KINDS, NO_VALUE, Kind, axes_of, format_duration
+from monitor.common.unit_formatting import (
+    COEFFICIENT_UNITS,
+    KIND_NAMES,
+    KINDS,
+    NO_VALUE,
+    Kind,
+    axes_of,
+    format_duration,
+)
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.publishing.coefficient_cells import (
@@ -20,16 +28,16 @@ from monitor.publishing.remote_devices import DeviceCoefficients
 from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
 
 K_OR_R: Final = "K or R"
-"""Text for K and R if the data cannot distinguish K from R."""
+"""Text that the tables show for K and R if the data cannot distinguish K from R."""
 
 
 def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:
-    """Return the table of noise coefficients with intervals for ``analyze``.
+    """Return the table of noise coefficients with 95 % intervals that ``analyze`` prints.
 
     Parameters
     ----------
     estimate
-        The estimate.
+        Estimate of the noise coefficients.
     axes_of_temperature
         Axes to mark, on which temperature explains most of the slow variance.
     """
@@ -39,12 +47,12 @@ def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()
 def coefficient_tables(
     coefficients: DeviceCoefficients, axes_of_temperature: Collection[str] = ()
 ) -> list[RenderableType]:
-    """Return a legend, and a table of noise coefficients for each kind of sensor.
+    """Return a legend, and tables of the noise coefficients of gyroscopes and accelerometers.
 
     Parameters
     ----------
     coefficients
-        Coefficients of the device.
+        Noise coefficients of the device.
     axes_of_temperature
         Axes to mark, on which temperature explains most of the slow variance.
     """

@@ -6,28 +6,28 @@ import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 
-from monitor.common.units import DEVIATION_UNITS, format_count, format_duration, format_number
+from monitor.common.unit_formatting import DEVIATION_UNITS, format_count, format_duration, format_number
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
-from monitor.drift.compensation.compensation_score import SPANS_S, RestScore
+from monitor.drift.compensation.compensation_score import SPANS_S, RateQualityAtRest
 from monitor.publishing.messages.message import encode_json
 from monitor.publishing.terminal.tables import plain_table, print_notes
 
 SCHEMA: Final = "imu-monitor/compensate/1"
 UNIT: Final = DEVIATION_UNITS["gyro"]
 ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
-"""JSON keys of the ARMA coefficients."""
+"""JSON keys of the coefficients φ₁, φ₂ and θ₁ of the ARMA model."""
 
 
 def print_compensation(result: DriftCompensationResult, console: Console) -> None:
-    """Print the results of a drift compensation.
+    """Print the drift models and errors of a compensated recording.
 
     Parameters
     ----------
     result : DriftCompensationResult
-        Results to print.
+        Results of the drift compensation.
     console : Console
-        Terminal or file.
+        Terminal or file that receives the text.
     """
     learning, evaluated = (format_duration(one) for one in (result.learning_rest_s, result.evaluated_rest_s))
     console.print(
@@ -108,7 +108,7 @@ def _model(model: ArmaModel) -> dict[str, Any]:
     }
 
 
-def _rest(one: RestScore) -> dict[str, Any]:
+def _rest(one: RateQualityAtRest) -> dict[str, Any]:
     return {
         "deviation": one.rms,
         "worst_minute": one.worst_minute,

@@ -1,6 +1,7 @@
 """History of a device as text for the terminal, with tables, sparklines and events.
 
-A sparkline shows bucket means as characters of eight heights. A dot marks an interval in which the device sent no data.
+A sparkline is a small plot on one line of text. Characters of eight heights show the mean value in each time interval,
+and a dot marks an interval without data.
 """
 
 import math
@@ -13,23 +14,23 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.data_types import Floats
-from monitor.common.units import (
+from monitor.common.unit_formatting import (
     KIND_NAMES,
     KINDS,
     NO_VALUE,
     Kind,
     axes_of,
     coefficient_unit,
+    format_duration_in_largest_unit,
     format_number,
     format_utc,
-    format_whole_duration,
 )
-from monitor.history.bucket import COUNTS, STATES
+from monitor.history.history_row import COUNTS, STATES
 from monitor.history.history_table import ColumnStatistics, HistoryTable
 from monitor.publishing.terminal.tables import plain_table
 
 LETTERS: Final = ("N", "B", "K")
-"""Coefficients that the table of all axes shows. The table of a single axis shows all five coefficients."""
+"""Noise coefficients in the table of all axes. The table of a single axis shows all five coefficients."""
 SPARKLINE_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 GAP: Final = "·"
 SPARKLINE_WIDTH: Final = 32
@@ -38,19 +39,21 @@ MAX_EVENTS: Final = 20
 """Largest number of events that are printed."""
 
 
-def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str, ...], console: Console) -> None:
-    """Print a summary of the history with one line for each axis and coefficient, the status and the events.
+def print_history_summary(
+    past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str, ...], console: Console
+) -> None:
+    """Print a line for each axis and coefficient, followed by the status and the events.
 
     Parameters
     ----------
     past
-        The history.
+        Stored history of the device.
     axes
-        Axes to print.
+                Names of the axes to print.
     symbols
-        Coefficients to print.
+        Symbols of the coefficients to print.
     console
-        Destination.
+        Console that receives the output.
     """
     console.print(summary_line(past), highlight=False, soft_wrap=True)
     for kind in KINDS:
@@ -63,18 +66,18 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str,
 
 
 def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], console: Console) -> None:
-    """Print the history of one axis with one line for each time bucket.
+    """Print the history of one axis with one line for each time interval.
 
     Parameters
     ----------
     past
-        The history.
+        Stored history of the device.
     axis
         Axis to print.
     symbols
         Coefficients to print.
     console
-        Destination.
+        Console that receives the output.
     """
     table = plain_table("UTC")
     for symbol in symbols:
@@ -109,13 +112,13 @@ def _print_events(past: HistoryTable, console: Console) -> None:
 
 
 def summary_line(past: HistoryTable) -> str:
-    """Return one line with the device, the time range, the number of rows and the number of samples."""
+    """Return one line that states the device, the time range, the number of rows and the number of samples."""
     samples = int(past.counts[:, COUNTS.index("received")].sum())
     if not len(past):
         return f"{past.device}: no rows between {format_utc(past.span.start_s)} and {format_utc(past.span.end_s)} UTC"
     widths = sorted({int(one) for one in past.width_s})
     rows = (" and " if len(widths) < 3 else " to ").join(
-        format_whole_duration(one) for one in (*widths[:1], *widths[1:][-1:])
+        format_duration_in_largest_unit(one) for one in (*widths[:1], *widths[1:][-1:])
     )
     return (
         f"{past.device}: {format_utc(float(past.start_s[0]))[:16]} to {format_utc(float(past.end_s[-1]))[:16]} UTC, "
@@ -141,7 +144,7 @@ def _temperature_and_loss_lines(past: HistoryTable) -> list[str]:
 
 
 def sparkline(values: Floats, t_s: Floats, range_s: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
-    """Return values between two times as text, with one character for the mean of each time interval.
+    """Return a text in which each character shows the mean value in one time interval.
 
     >>> steps = np.arange(8.0)
     >>> sparkline(steps, 60.0 * steps, (0.0, 480.0), 8)
@@ -154,7 +157,7 @@ def sparkline(values: Floats, t_s: Floats, range_s: tuple[float, float], width: 
     t_s
         Times of the values [s], shape [p].
     range_s
-        Start and end of the sparkline [s].
+        Times at the start and at the end of the sparkline [s].
     width
         Number of characters.
     """

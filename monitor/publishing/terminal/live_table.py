@@ -1,8 +1,8 @@
-"""Live table of devices in the terminal, sorted by problems.
+"""Live table of devices in the terminal, which lists devices with problems first.
 
-The functions return objects of the package rich. The most detailed layout that fits the terminal is used. A device has
-one line at 100 columns or more, and three lines, one for each axis, below 100 columns. Each state has a word and a
-symbol in addition to the colour.
+The functions return objects of the package rich, which renders them. The table uses the most detailed layout that fits
+the terminal. In a terminal with fewer than 100 columns, each device has three lines, one for each axis. In a wider
+terminal, each device has one line. Each state has a word and a symbol in addition to the colour.
 """
 
 import time
@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from monitor.common.units import (
+from monitor.common.unit_formatting import (
     COEFFICIENT_UNITS,
     NO_VALUE,
     Kind,
@@ -30,7 +30,7 @@ from monitor.common.units import (
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import EventMessage
-from monitor.publishing.remote_devices import MAX_DEVICES, MAX_EVENTS, DeviceStates, RemoteDevice
+from monitor.publishing.remote_devices import MAX_DEVICES, MAX_EVENTS, RemoteDevice, RemoteDeviceRegistry
 from monitor.publishing.terminal.coefficient_tables import coefficient_tables
 from monitor.publishing.terminal.tables import plain_table, unwrapped_table_width
 
@@ -48,13 +48,13 @@ STATES: Final = {
     "silent": ("?", "bold red"),
     "ended": ("■", "cyan"),
 }
-"""Symbol and colour of each state."""
+"""Symbol and colour of each device state."""
 UNKNOWN_STATE_STYLE: Final = ("?", "yellow")
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceTableLayout:
-    """Level of detail of the device table."""
+    """Layout of the device table with a certain level of detail."""
 
     digits: int
     full_counts: bool
@@ -73,31 +73,31 @@ NARROW_LAYOUT: Final = DeviceTableLayout(3, False, True, 1)
 class LiveTable:
     """Renderer of the device table for a ``QueuedWriter``.
 
-    On a terminal, the table is redrawn in place. Otherwise, the table is printed once.
+        If the output is a terminal, the table is redrawn in place. Otherwise, the table is printed once.
 
     Parameters
     ----------
     console : Console
-        Width, height and colours of the destination.
-    states : DeviceStates or None
-        State of the devices. If None, only log lines are written.
+                Console with the width, height and colours of the terminal.
+    states : RemoteDeviceRegistry or None
+        State of all devices. If None, only log lines are written.
     """
 
-    def __init__(self, console: Console, states: DeviceStates | None = None) -> None:
+    def __init__(self, console: Console, states: RemoteDeviceRegistry | None = None) -> None:
         self.states = states
         self._console = console
         self._live: Live | None = None
         self._ended = False
 
     def render(self, log_lines: Sequence[str], is_last: bool) -> str:
-        """Return text and control codes that print log lines and redraw the table.
+        """Return text with control codes that prints log lines above the table and redraws the table.
 
         Parameters
         ----------
         log_lines : sequence of str
             Lines of the log, with colours as ANSI codes.
         is_last : bool
-            True to show the cursor again and print the final table.
+                        True to print the final table and make the cursor visible again.
         """
         with self._console.capture() as captured:
             if self.states is not None and self._live is None and self._console.is_terminal and not is_last:
@@ -113,27 +113,27 @@ class LiveTable:
             if log_lines:
                 self._console.print(Text.from_ansi("".join(log_lines)))
             if not is_last and self._live is not None and self.states is not None:
-                self._live.update(device_table(self.states, time.monotonic()), refresh=True)
+                self._live.update(device_overview(self.states, time.monotonic()), refresh=True)
             if is_last and not self._ended:
                 self._ended = True
                 if self._live is not None:
                     self._live.stop()
                 if self.states is not None:
-                    self._console.print(device_table(self.states, time.monotonic()))
+                    self._console.print(device_overview(self.states, time.monotonic()))
         return captured.get()
 
 
-def device_table(states: DeviceStates, now_s: float) -> RenderableType:
-    """Return the summary, the device table, problems and events. A single device also has a table of coefficients.
+def device_overview(states: RemoteDeviceRegistry, now_s: float) -> RenderableType:
+    """Return a summary, the device table, problems and events. For a single device, add a table of coefficients.
 
     Parameters
     ----------
     states
-        State of the devices.
+        State of all devices.
     now_s
-        Current time on the clock of the messages [s].
+                Current time [s] on the clock of ``states``.
     """
-    devices, events = states.sorted_devices(now_s), states.newest_events()
+    devices, events = states.devices_with_problems_first(now_s), states.recent_events_in_time_order()
     names = _display_names([*(one.key for one in devices), *(key for key, _ in events)])
     parts: list[RenderableType] = [_summary(states, devices, now_s)]
     if devices:
@@ -146,7 +146,7 @@ def device_table(states: DeviceStates, now_s: float) -> RenderableType:
 
 
 class _FittedDeviceRows:
-    """Table of devices in the most detailed layout that fits the terminal."""
+    """Device table that chooses the most detailed layout that fits the terminal."""
 
     def __init__(self, devices: list[RemoteDevice], now_s: float) -> None:
         self._devices = devices
@@ -163,7 +163,7 @@ class _FittedDeviceRows:
             yield Text(f"… and {len(self._devices) - count} more with fewer problems", style="dim")
 
     def _visible_rows(self, layout: DeviceTableLayout, console: Console) -> int:
-        """Return the number of visible rows, which is not limited outside a terminal."""
+        """Return the number of rows that fit the terminal. Without a terminal, the number is not limited."""
         if not console.is_terminal:
             return len(self._devices)
         lines = console.size.height - MAX_EVENTS - MAX_PROBLEM_LINES - HEADER_LINES
@@ -188,12 +188,12 @@ def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: DeviceTa
 
 
 def _display_names(keys: Sequence[str]) -> dict[str, str]:
-    """Return the last part of each device key, or the whole keys if the prefixes differ."""
+    """Return the last part of each device key if all keys have the same prefix, and the whole keys otherwise."""
     short = len({key.rpartition("/")[0] for key in keys}) == 1
     return {key: remove_control_characters(key.rpartition("/")[2] if short else key) for key in keys}
 
 
-def _summary(states: DeviceStates, devices: list[RemoteDevice], now_s: float) -> Text:
+def _summary(states: RemoteDeviceRegistry, devices: list[RemoteDevice], now_s: float) -> Text:
     line = Text("imu-monitor", style="bold")
     line.append(f"  {format_count(len(devices), 'device')}", style="not bold")
     for state, count in Counter(one.state(now_s) for one in devices).items():
@@ -277,7 +277,7 @@ def _event_line(name: str, event: EventMessage) -> Text:
 
 
 def _local_time(unix_s: float) -> str:
-    """Format the local time of day, or the seconds if the time is not a valid date."""
+    """Format a Unix time as local time of day, or as seconds if it is not a valid date."""
     try:
         return f"{datetime.fromtimestamp(unix_s).astimezone():%H:%M:%S}"
     except (ValueError, OverflowError, OSError):

@@ -1,11 +1,11 @@
 """Text output to a terminal, a pipe or a file in a separate thread, so that a blocked output delays no other thread.
 
-A write blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) or no program reads a pipe.
-``QueuedWriter`` queues lines, drops the oldest lines of a full queue, and can redraw a table periodically. ``state``
-reports the number of lost lines and frames.
+A write call blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) or no program reads a pipe.
+``QueuedWriter`` queues lines, drops the oldest lines if the queue is full, and can redraw a table periodically. The
+property ``state`` reports the number of lost lines and of lost drawings of the table (frames).
 
-The thread writes to the file descriptor, because a blocked write to ``sys.stdout`` holds the lock of the stream. The
-interpreter aborts at exit if this lock is held.
+The thread writes to the file descriptor and not to ``sys.stdout``, because a blocked write to ``sys.stdout`` holds the
+lock of the stream. If this lock is held, the interpreter aborts at exit.
 """
 
 import contextlib
@@ -19,22 +19,22 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Final, TextIO
 
-from monitor.common.units import format_count
+from monitor.common.unit_formatting import format_count
 from monitor.publishing.bounded_queue import BoundedQueue
 
 MAX_QUEUED_CHARACTERS: Final = 256 * 1024
-"""Maximum length of the queued text, about 2000 log lines."""
+"""Maximum number of characters in the queue, enough for about 2000 log lines."""
 CHUNK_BYTES: Final = 1024
-"""Length of one write call, which is short to distinguish a slow terminal from a blocked terminal."""
+"""Number of bytes per write call. Short calls make it possible to distinguish a slow terminal from a blocked one."""
 BLOCKED_S: Final = 2.0
-"""Longest duration of a write call that is not considered blocked [s]."""
+"""Duration [s] after which a write call counts as blocked."""
 FRAME_DELAY_S: Final = 0.05
-"""Delay before a frame is drawn, which combines simultaneous results in one frame [s]."""
+"""Delay [s] before the table is redrawn, so that simultaneous results appear in one drawing."""
 IDLE_WAIT_S: Final = 1.0
 CLOSE_S: Final = 2.0
 
 Render = Callable[[Sequence[str], bool], str]
-"""Function that converts queued lines to text. The second argument is True for the last call."""
+"""Function that converts queued lines to the text to write. The second argument is True for the last call."""
 
 
 class QueuedWriter:
@@ -43,17 +43,18 @@ class QueuedWriter:
     Parameters
     ----------
     stream : TextIO or None
-        Destination. Text for a stream without a file descriptor is written by the caller. None discards the text.
+                Stream that receives the text, or None to discard the text. A stream without a descriptor may block the
+                caller.
     place : str
-        Name of the destination in messages, such as "standard error".
+        Name of the stream in messages, such as "standard error".
     render : callable, optional
-        Function that converts queued lines to text in the thread. By default, lines are joined.
+                Function that the thread calls to convert queued lines to text. By default, lines are joined.
     period_s : float, optional
-        Interval [s] between calls of ``render`` without queued lines. By default, ``render`` is called only for lines.
+        Interval [s] at which ``render`` is called even if no lines are queued. By default, lines are required.
     limit : int
-        Number of queued characters above which the oldest entries are dropped. The newest entry is always kept.
+        Number of queued characters above which the oldest lines are dropped. The newest line is always kept.
     tell : callable, optional
-        Function that receives a report of dropped lines when the destination accepts text again.
+        Function that receives a report of dropped lines when the stream accepts text again.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class QueuedWriter:
         limit: int = MAX_QUEUED_CHARACTERS,
         tell: Callable[[str], None] | None = None,
     ) -> None:
-        self.error: Exception | None = None  # error of the last write or rendering; None after success
+        self.error: Exception | None = None  # exception of the last write or rendering; None after success
         self._stream = stream
         self._descriptor = descriptor_of(stream)
         self._place = place
@@ -95,7 +96,7 @@ class QueuedWriter:
 
     @property
     def state(self) -> str:
-        """``ok``, or a description of the problem, with the number of lines and frames dropped since the start."""
+        """``ok`` or a description of the problem, with the number of lines and frames dropped since the start."""
         blocked_s = self._blocked_s()
         frames = self._lost_frames + self._frames_in(blocked_s)
         counts = ((frames, "frame"), (self._dropped_lines(), "log line"))
@@ -109,28 +110,27 @@ class QueuedWriter:
         return f"{wrong}; {dropped} dropped" if dropped else wrong
 
     def start(self) -> None:
-        """Start the thread."""
+        """Start the thread that writes the queued text."""
         self._thread.start()
 
     def put(self, text: str) -> None:
-        """Queue whole lines and return at once."""
+        """Add whole lines to the queue and return at once."""
         self._queue.push(text, len(text))
 
     def request_redraw(self) -> None:
-        """Request a call of ``render`` before the end of the period."""
+        """Request a call of ``render`` before the current period ends."""
         self._queue.wake()
 
     def finish_writing(self, stop: threading.Event) -> None:
-        """End the thread, and wait until all queued text is written or ``stop`` is set."""
+        """Wait until the thread has written all queued text and ended, or until ``stop`` is set."""
         self._begin_closing()
         while self._thread.is_alive() and not stop.is_set():
             self._thread.join(0.1)
 
     def close(self, timeout_s: float = CLOSE_S) -> bool:
-        """Write all queued text and end the thread. Return False if the destination is still blocked after
-        ``timeout_s``.
+        """Write all queued text and end the thread. Return False if the output is still blocked after ``timeout_s``.
 
-        A blocked descriptor is replaced with the null device, so that the interpreter cannot block at exit.
+        The null device replaces a blocked file descriptor, so that the interpreter cannot block at exit.
         """
         self._begin_closing()
         if self._thread.is_alive() and not self._given_up:
@@ -144,14 +144,14 @@ class QueuedWriter:
 
     def _run(self) -> None:
         while True:
-            closing = self._closing.is_set()  # read before the queue, so that lines before close() are written
+            closing = self._closing.is_set()  # read before the queue, to write all lines queued before close()
             lines = self._queue.take(0.0 if closing else self._period_s or IDLE_WAIT_S)
             if self._period_s is not None and not closing:
                 self._closing.wait(FRAME_DELAY_S)
                 lines += self._queue.take(0.0)
             self._process_batch([line for line in lines if line], closing)
             if closing:
-                if rest := self._queue.take(0.0):  # the report of dropped lines
+                if rest := self._queue.take(0.0):  # the previous batch may have queued a report of dropped lines
                     self._process_batch(rest, closing)
                 return
 
@@ -162,7 +162,7 @@ class QueuedWriter:
         text, failed = self._rendered(lines, last)
         try:
             self._write(text)
-        except (OSError, ValueError) as error:  # ValueError: the stream was closed
+        except (OSError, ValueError) as error:  # a closed stream raises ValueError
             self._lost_lines += len(lines)
             self._lost_frames += self._period_s is not None
             self._reason = f"{self._place} could not be written: {_reason(error)}"
@@ -201,7 +201,7 @@ class QueuedWriter:
             self._write_since_s = time.monotonic()
 
     def _tell_dropped(self, dropped: int) -> None:
-        """Report dropped lines. The queue was just emptied and has space for the report."""
+        """Report dropped lines. The queue has space for the report, because it has just been emptied."""
         count = dropped - self._told_lines
         if count and self._tell is not None:
             self._told_lines = dropped
@@ -226,7 +226,7 @@ class QueuedWriter:
 
     def _begin_closing(self) -> None:
         self._closing.set()
-        self._queue.push("", 0)  # unlike wake(), an entry also reaches a thread that does not wait yet
+        self._queue.push("", 0)  # wake() would not reach a thread that does not wait yet
 
 
 class QueuedLines(io.TextIOBase):
@@ -236,10 +236,10 @@ class QueuedLines(io.TextIOBase):
         self._writer = writer
         self._terminal = terminal
         self._partial = ""
-        self._lock = threading.RLock()  # a warning during garbage collection may call write() again
+        self._lock = threading.RLock()  # reentrant, because a warning during garbage collection may call write() again
 
     def write(self, text: str) -> int:
-        """Queue complete lines and return at once."""
+        """Pass complete lines to the writer and return at once."""
         with self._lock:
             *lines, self._partial = (self._partial + text).split("\n")
             if len(self._partial) > MAX_QUEUED_CHARACTERS:
@@ -249,7 +249,7 @@ class QueuedLines(io.TextIOBase):
         return len(text)
 
     def isatty(self) -> bool:
-        """Return True if the destination of the lines is a terminal."""
+        """Return True if the lines are written to a terminal."""
         return self._terminal
 
 
@@ -269,7 +269,7 @@ def redirect_to_null_device(stream: TextIO | None) -> None:
         with (
             contextlib.suppress(OSError),
             open(os.devnull, "wb") as null,
-        ):  # without a free descriptor, nothing is changed
+        ):  # if no descriptor is free, the stream is not changed
             os.dup2(null.fileno(), descriptor)
 
 
@@ -279,7 +279,7 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
     Parameters
     ----------
     descriptor : int or None
-        File descriptor; None counts as writable.
+                File descriptor to test. None counts as writable.
     timeout_s : float
         Longest time to wait until a write does not block [s].
     """

@@ -1,8 +1,8 @@
 """Result of a reconciliation as text for the terminal.
 
-The text contains a summary, a table of axes and steps, and the unexplained differences. Each result has a symbol and a
-word in addition to the colour. The comparison of several recordings is a table of axes and recordings with lists of
-noise effects.
+The text begins with the summary. The option ``details`` adds the findings, the axes with their steps, and the
+unexplained differences. Each result has a symbol and a word in addition to the colour. The comparison of several
+recordings is a table of axes and recordings with lists of noise effects.
 """
 
 from typing import Final
@@ -13,12 +13,19 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.data_types import AXES
-from monitor.common.units import format_duration
-from monitor.publishing.reports import comparison_sentences
+from monitor.common.unit_formatting import format_duration
 from monitor.publishing.reports import reconcile_sentences as words
+from monitor.publishing.reports import recording_comparison_sentences
 from monitor.publishing.terminal.tables import plain_table, print_notes
 from monitor.reconcile.result import AddedOrResizedEffect, AxisResult, Reconciliation
-from monitor.reconcile.several_recordings.comparison import Comparison, MatchedEffect
+from monitor.reconcile.several_recordings.comparison import Comparison, EffectInRecordings
+from monitor.reconcile.summary.ranked_findings import rank_findings
+from monitor.reconcile.summary.summary_sentences import (
+    describe_finding,
+    describe_remainder,
+    format_share,
+    summarize,
+)
 
 RESULT_STYLES: Final = {
     "agrees": ("●", "green"),
@@ -26,26 +33,46 @@ RESULT_STYLES: Final = {
     "partly_explained": ("◐", "yellow"),
     "unexplained": ("✖", "bold red"),
 }
-"""Symbol and colour of each result."""
+"""Symbol and colour of each possible result of a reconciliation."""
 
 
-def print_reconciliation(r: Reconciliation, console: Console) -> None:
-    """Print the result of a reconciliation.
+def print_reconciliation(r: Reconciliation, console: Console, *, details: bool = False) -> None:
+    """Print the summary of a reconciliation.
 
     Parameters
     ----------
     r
-        The result.
+        Result of the reconciliation.
     console
-        Destination.
+        Console that receives the output.
+    details
+        If True, the findings, the axes and all steps are listed too.
     """
-    console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
+    console.print(_verdict(r.verdict), Text(" ".join(summarize(r))))
     for finding in r.recording_findings:
         sign = "◐" if finding.corrected else "✖"
         console.print(Text(f"{sign} recording: {finding.sentence}", style="yellow"), soft_wrap=True)
-    console.print(_verdict(r.verdict), Text(words.summarize(r)))
-    console.print(_axes_table(r))
+    if details:
+        console.print(_findings_table(r))
+        console.print(_axes_table(r))
+    console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
     print_notes(r.notes, console)
+
+
+def _findings_table(r: Reconciliation) -> RenderableType:
+    rows = plain_table()
+    rows.add_column("share", justify="right", no_wrap=True)
+    rows.add_column("finding", overflow="fold")
+    rows.add_column("conf.", justify="right", no_wrap=True)
+    rows.add_column("Allan deviation", overflow="fold")
+    ranking = rank_findings(r)
+    for one in ranking.findings:
+        said = Text(describe_finding(one) if one.kind == "absent" else f"{one.kind} {describe_finding(one)}")
+        sure = words.format_probability(one.confidence)
+        rows.add_row(format_share(one.share), said, sure, words.describe_allan_influence(one))
+    for left in ranking.remainders:
+        rows.add_row(format_share(left.share), Text(f"left over: {describe_remainder(left)}", style="yellow"), "", "")
+    return Padding(rows, (1, 0, 0, 0))
 
 
 def _axes_table(r: Reconciliation) -> RenderableType:
@@ -89,11 +116,11 @@ def print_comparison(c: Comparison, console: Console) -> None:
     Parameters
     ----------
     c
-        The comparison.
+        Comparison of several recordings.
     console
-        Destination.
+        Console that receives the output.
     """
-    console.print(_verdict(c.verdict), Text(comparison_sentences.summarize(c)))
+    console.print(_verdict(c.verdict), Text(recording_comparison_sentences.summarize(c)))
     console.print(Padding(_axes_by_runs(c), (1, 0)))
     for title, found in (("common to all", _common(c)), ("in some only", _single(c))):
         if found:
@@ -112,7 +139,7 @@ def _axes_by_runs(c: Comparison) -> Table:
 
 
 def _cell(result: AxisResult | None) -> Text:
-    said = Text(comparison_sentences.describe_finding_counts(result), style="dim")
+    said = Text(recording_comparison_sentences.describe_finding_counts(result), style="dim")
     return (
         said
         if result is None
@@ -137,7 +164,7 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
         for seen in one.common:
             said = _effect(c, axis, seen)
             said.append(
-                f"; {comparison_sentences.describe_size_agreement(seen)}",
+                f"; {recording_comparison_sentences.describe_size_agreement(seen)}",
                 style="yellow" if seen.sizes_agree is False else "",
             )
             found.append((axis, said))
@@ -152,12 +179,13 @@ def _single(c: Comparison) -> list[tuple[str, Text]]:
         found.append((axis, said))
         for absence in seen.absent:
             style = "yellow" if absence.meaning == "contradiction" else "dim"
-            meaning = f"not in {absence.run}: {comparison_sentences.ABSENCE_TEXTS[absence.meaning]}: {absence.because}"
+            meaning = recording_comparison_sentences.ABSENCE_TEXTS[absence.meaning]
+            meaning = f"not in {absence.run}: {meaning}: {absence.because}"
             found.append(("", Text(meaning, style=style)))
     return found
 
 
-def _effect(c: Comparison, axis: str, seen: MatchedEffect) -> Text:
+def _effect(c: Comparison, axis: str, seen: EffectInRecordings) -> Text:
     said = Text(f"{seen.kind} {words.describe_step(seen.step_with_pooled_parameters(), axis, c.baseline)}")
     said.highlight_words([words.readable_name(seen.effect)], "bold")
     return said

@@ -1,4 +1,4 @@
-"""Functions and classes for tables in the terminal."""
+"""Tables and notes in the terminal, based on the package rich."""
 
 from collections.abc import Iterable, Sequence
 
@@ -14,13 +14,13 @@ def plain_table(*headers: str, wrapped_headers: Sequence[str] = (), gap: int = 2
     Parameters
     ----------
     *headers
-        Headers of the first columns, without line wrapping.
+                Headers of the first columns, whose text is not wrapped.
     wrapped_headers
-        Headers of the next columns, with line wrapping.
+        Headers of the following columns, whose text is wrapped.
     gap
         Number of blanks between columns.
     show_header
-        False to omit the headers.
+                False to omit the header line.
     """
     table = Table(box=None, padding=(0, gap, 0, 0), pad_edge=False, header_style="bold", show_header=show_header)
     for head in headers:
@@ -37,20 +37,20 @@ def print_notes(notes: Iterable[str], console: Console) -> None:
 
 
 def unwrapped_table_width(table: Table, console: Console, options: ConsoleOptions) -> int:
-    """Return the width that a table needs without wrapped lines.
+    """Return the width in characters at which no text of a table is wrapped.
 
     Parameters
     ----------
     table
-        The table.
-    console, options
-        Destination.
+        Table whose width is measured.
+        console, options
+        Console and options with which the table is rendered.
     """
     return console.measure(table, options=options.update(max_width=UNLIMITED_WIDTH)).maximum
 
 
 class WidthDependentTable:
-    """Pair of tables, of which the wide table is shown if the wide table fits the terminal."""
+    """Wide table that is replaced by a narrow table if the wide table does not fit the terminal."""
 
     def __init__(self, wide: Table, narrow: Table) -> None:
         self._wide = wide

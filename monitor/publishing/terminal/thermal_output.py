@@ -7,12 +7,12 @@ import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 
-from monitor.common.units import DEVIATION_UNITS, format_axis_value, format_duration, sensor_kind
+from monitor.common.unit_formatting import DEVIATION_UNITS, format_axis_value, format_duration, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
+from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemovalComparison
 from monitor.drift.thermal.thermal_fit import ThermalFit
 from monitor.drift.thermal.thermal_response import ThermalModelForm
-from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalModelComparison, ThermalPredictionReport
+from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalPredictionErrors, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import encode_json
 from monitor.publishing.terminal.tables import plain_table, print_notes
@@ -24,14 +24,14 @@ DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with ti
 
 
 def print_thermal_fit(report: ThermalFitReport, console: Console) -> None:
-    """Print the results of a thermal model fit.
+    """Print the thermal models of all axes and the errors of their fits.
 
     Parameters
     ----------
     report
-        The fitted models.
+        Results of the thermal model fit.
     console
-        Destination.
+        Console that receives the output.
     """
     console.print(_summary_line(report.recording, report.interval_s, report.means), highlight=False)
     if report.fits:
@@ -58,9 +58,9 @@ def print_thermal_prediction(report: ThermalPredictionReport, console: Console) 
     Parameters
     ----------
     report
-        The predictions.
+        Results of the thermal prediction.
     console
-        Destination.
+        Console that receives the output.
     """
     console.print(_summary_line(report.recording, report.interval_s, report.means), highlight=False)
     if report.judged:
@@ -74,8 +74,8 @@ def print_thermal_prediction(report: ThermalPredictionReport, console: Console) 
     _print_notes(report.refused, report.notes, console)
 
 
-def temperature_notes(removal: TemperatureRemoval) -> list[str]:
-    """Return a note for each axis on which temperature explains much of the slow variance, or of K or R."""
+def notes_on_temperature_dependence(removal: TemperatureRemovalComparison) -> list[str]:
+    """Return a note for each axis on which temperature explains much of the slow variance, of K or of R."""
     notes = []
     for axis, one in removal.dependences.items():
         fallen = [
@@ -148,7 +148,7 @@ def encode_thermal_prediction(report: ThermalPredictionReport) -> bytes:
     return _json(PREDICT_SCHEMA, report.recording, report.interval_s, axes, report.refused, report.notes)
 
 
-def _prediction_of_axis(means: IntervalMeans, one: ThermalModelComparison) -> dict[str, Any]:
+def _prediction_of_axis(means: IntervalMeans, one: ThermalPredictionErrors) -> dict[str, Any]:
     return {
         "rms": one.rms,
         "rms_offset_out": one.rms_without_offset,

@@ -1,4 +1,4 @@
-"""Command ``imu-monitor watch``, which shows a table of all devices that daemons publish over zenoh."""
+"""Command ``imu-monitor watch``, which shows a live table of all devices whose results daemons publish over zenoh."""
 
 import contextlib
 import threading
@@ -9,16 +9,16 @@ from typing import Final, TextIO, cast
 
 from rich.console import Console
 
-from monitor.publishing.remote_devices import DeviceStates
-from monitor.publishing.terminal.live_table import LiveTable, device_table
+from monitor.publishing.remote_devices import RemoteDeviceRegistry
+from monitor.publishing.terminal.live_table import LiveTable, device_overview
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.subscriber import KEYEXPR, ZenohSubscriber
 
 REFRESH_PERIOD_S: Final = 0.5
 PLAIN_PERIOD_S: Final = 1.0
-"""Interval between two tables if the output is not a terminal."""
+"""Interval between two tables if the output is not a terminal [s]."""
 SILENCE_NOTE_S: Final = 5.0
-"""Time without messages before a note is shown [s], because access control gives no error."""
+"""Time without messages [s] after which a note is shown, because zenoh reports no error if access is denied."""
 STDOUT: Final = "standard output"
 
 
@@ -37,17 +37,17 @@ def watch(
     Parameters
     ----------
     keyexpr
-        Key expression that selects the devices.
+                Pattern of zenoh keys (key expression) that selects the devices.
     connect
         Endpoints of daemons or routers.
     stop
-        Event that ends the function.
+        Event that ends the function when it is set.
     console
         Console that formats the table.
     once_s
-        Time to collect messages [s] before the table is printed once. By default, the table is updated.
+        Time [s] for which messages are collected before the table is printed once. By default, the table is updated.
     file
-        Configuration file of zenoh.
+        zenoh configuration file.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def watch(
         If standard output cannot be written.
     """
     stop, console = stop or threading.Event(), console or Console()
-    stream, states = cast("TextIO", console.file), DeviceStates()
+    stream, states = cast("TextIO", console.file), RemoteDeviceRegistry()
     with (
         contextlib.closing(ZenohSubscriber(keyexpr, connect, file)) as subscriber,
         contextlib.suppress(KeyboardInterrupt),
@@ -78,11 +78,11 @@ def watch(
                 while not stop.wait(PLAIN_PERIOD_S) and writer.error is None:
                     _receive_messages(states, subscriber)
                     with console.capture() as captured:
-                        console.print(device_table(states, time.monotonic()))
+                        console.print(device_overview(states, time.monotonic()))
                     writer.put(captured.get())
 
 
-def _receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None:
+def _receive_messages(states: RemoteDeviceRegistry, subscriber: ZenohSubscriber) -> None:
     for message in subscriber.take(0.0):
         if message.payload is None:
             states.set_liveliness_token(message.key, message.token_exists)
@@ -91,22 +91,22 @@ def _receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None
     states.note = connection_note(states, subscriber)
 
 
-def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
-    """Describe the problems of the connection to the daemons. Return an empty string if there are none.
+def connection_note(states: RemoteDeviceRegistry, subscriber: ZenohSubscriber) -> str:
+    """Describe problems of the connection to the daemons, or return an empty string if there are none.
 
     Parameters
     ----------
     states
-        State of the devices.
+        State of all devices.
     subscriber
-        Source of the messages.
+        Subscriber that receives the messages.
     """
     state, dropped = subscriber.state, subscriber.dropped
     notes = [state] if state != "ok" else []
     if (
         state == "ok"
-        and subscriber.all_connected_duration_s > SILENCE_NOTE_S
-        and not states.sorted_devices(time.monotonic())
+        and subscriber.time_since_all_connected_s > SILENCE_NOTE_S
+        and not states.devices_with_problems_first(time.monotonic())
     ):
         notes.append("connected, but no messages: no daemon is there, or access control refuses them")
     notes += [f"{dropped:,} messages dropped: this computer is too slow"] if dropped else []

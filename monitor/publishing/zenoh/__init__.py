@@ -1,1 +1,1 @@
-"""Publisher, subscriber and history queries over zenoh."""
+"""Exchange of results over zenoh: the publisher of the daemon, a subscriber, and history queries."""

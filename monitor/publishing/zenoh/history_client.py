@@ -1,7 +1,7 @@
-"""Client that queries daemons for stored histories over zenoh, for ``imu-monitor history --connect``.
+"""Client that requests stored results from daemons over zenoh, for ``imu-monitor history --connect``.
 
-Each query opens a separate session that connects only to the given endpoint. Invalid replies are ignored. Without any
-valid reply, the query raises an error with the reason.
+Each query opens a separate zenoh session that connects only to the given endpoint. Invalid replies are ignored. If no
+reply is valid, the query raises an exception with the reason.
 """
 
 import json
@@ -19,28 +19,28 @@ from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.zenoh.subscriber import client_configurations
 
 PATIENCE_S: Final = 20.0
-"""Timeout of the query."""
+"""Timeout of a history query."""
 ERRORS: Final = {2: ConfigError, 3: NotReady}
-"""Exception for each exit status in an error reply."""
+"""Exception class for each exit status that an error reply contains."""
 
 
 def query_histories(
     endpoint: str | None, device: str, parameters: str, prefix: str = "imu", file: Path | None = None
 ) -> list[HistoryTable]:
-    """Return the histories of all devices that reply, sorted by device.
+    """Return the stored results of all devices that reply, sorted by device.
 
     Parameters
     ----------
     endpoint
-        Endpoint of a daemon or router. By default, the first endpoint in the file is used, or the default endpoint.
+        Endpoint of a daemon or router. By default, the first endpoint in ``file`` is used, or the default endpoint.
     device
-        Name of the device; ``*`` for all devices.
+        Name of the device, or ``*`` for all devices.
     parameters
-        Parameters of the selector, see ``monitor.history.query_parameters``.
+        Parameters of the zenoh selector, which ``monitor.history.query_parameters`` describes.
     prefix
-        Prefix of the daemon's keys.
+        Prefix of the daemon's zenoh keys.
     file
-        Configuration file of zenoh, with certificates or a password.
+        zenoh configuration file with certificates or a password.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def query_histories(
     LinkUnavailable
         If no daemon can be reached, or if no daemon accepts the connection or replies.
     NotReady
-        If the time range contains no results.
+        If no results are stored for the time range.
     """
     import zenoh
 

@@ -1,11 +1,12 @@
 """Publisher of results over zenoh, with liveliness tokens, commands and history queries.
 
-By default, the session is a peer without scouting that listens only on the loopback interface. If the port is in use,
-the session listens on a free port. If the session cannot be opened for another reason, the publisher repeats the
-attempt. Messages are dropped until the session is open. ``put`` never waits, because zenoh queues outgoing messages and
-drops the messages of a slow subscriber. Advanced publishers keep the last values for late subscribers.
+By default, the zenoh session is a peer that listens only on the loopback interface and does not search for other
+programs. If the port is in use, the session listens on a free port. If the session cannot be opened for another reason,
+the publisher repeats the attempt. Messages are dropped until the session is open. ``put`` never waits, because zenoh
+queues outgoing messages and drops messages for a slow subscriber. Advanced publishers of zenoh keep the last values for
+late subscribers.
 
-Each device has a thread that answers history queries, because an answer requires reading a file. A second thread passes
+For each device, one thread answers history queries, because an answer requires reading a file. A second thread passes
 commands to the main loop of the service.
 """
 
@@ -41,14 +42,14 @@ if TYPE_CHECKING:
     from zenoh.ext import AdvancedPublisher
 
 MAX_QUEUED_QUERIES: Final = 64
-"""Capacity of the queue of commands and of each channel of queries."""
+"""Capacity of the command queue and of each zenoh channel that receives queries."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Time for which another program with the same key is reported after the last message [s]."""
+"""Time [s] for which another program with the same key is reported after its last message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Query on ``command/<verb>``. Each command must be answered exactly once with a result or a refusal."""
+    """Query on the key ``command/<verb>``. Each command must be answered exactly once with a result or a refusal."""
 
     device: str
     verb: str
@@ -57,21 +58,21 @@ class Command:
 
 
 HistoryFunction = Callable[[str, str], bytes]
-"""Function that returns the encoded history, given a device name and selector parameters. Without a history, the
-function raises ImuError."""
+"""Function that returns the encoded history for a device name and selector parameters. It raises ImuError if no
+history is stored."""
 
 
 class ZenohPublisher(RetriedSession):
-    """zenoh session of the daemon, with the publishers, queryables and liveliness tokens of all devices.
+    """zenoh session of the daemon, which publishes the results of all devices and answers queries.
 
     Parameters
     ----------
     settings
-        Settings of the session.
+        Settings of the zenoh session.
     devices
         Names of the devices.
     read_history
-        Function that answers history queries, or None if no history is stored.
+        Function that returns the reply to a history query, or None if no history is stored.
     """
 
     def __init__(
@@ -91,13 +92,13 @@ class ZenohPublisher(RetriedSession):
         self._tokens: dict[str, Any] = {}
         self._queryables: dict[str, list[Any]] = {}
         self._duplicates = _DuplicatePublishers(settings.prefix)
-        # The opening thread and the main loop both declare devices.
+        # The thread that opens the session and the main loop both declare the keys of devices.
         self._declaring = threading.Lock()
-        self._token_lock = threading.Lock()  # the opening thread and the main loop declare liveliness tokens
+        self._token_lock = threading.Lock()  # liveliness tokens are declared by the same two threads
 
     @property
     def state(self) -> str:
-        """``ok``, or a description of the problem; part of the status message."""
+        """``ok`` or a description of the problem, for the status message."""
         session = self._session
         if self._unsent or session is None:
             return self._unsent or self._session_state
@@ -112,7 +113,7 @@ class ZenohPublisher(RetriedSession):
         """Open the session in a separate thread, unless the mode is ``none``."""
         if self.settings.mode == "none":
             return
-        # A thread that receives from zenoh at exit would abort the process.
+        # if a thread still receives zenoh messages while Python exits, the process aborts
         atexit.register(self.close)
         super().start()
 
@@ -141,14 +142,14 @@ class ZenohPublisher(RetriedSession):
             self._unsent = ""
 
     def publish_json_return_error(self, key: str, payload: bytes) -> str:
-        """Publish JSON under a user-defined key. Return the reason for a failure, or an empty string after success.
+        """Publish JSON under a user-defined key, and return the reason for a failure or an empty string.
 
         Parameters
         ----------
         key
-            Key expression.
+            zenoh key of the message.
         payload
-            JSON text.
+            JSON text of the message.
         """
         import zenoh
 
@@ -176,7 +177,7 @@ class ZenohPublisher(RetriedSession):
             self._update_token(device)
 
     def add_device(self, device: str) -> None:
-        """Add a device and declare the zenoh keys of the device."""
+        """Add a device and declare its zenoh keys."""
         with self._declaring:
             self._devices += (device,)
             self._alive[device] = False
@@ -185,7 +186,7 @@ class ZenohPublisher(RetriedSession):
                     self._declare(self._session, device)
 
     def remove_device(self, device: str) -> None:
-        """Remove a device and undeclare the zenoh keys of the device."""
+        """Remove a device and undeclare its zenoh keys."""
         self.set_alive(device, False)
         with self._declaring, contextlib.suppress(*zenoh_errors()):  # the session may be closing
             self._devices = tuple(one for one in self._devices if one != device)
@@ -220,8 +221,8 @@ class ZenohPublisher(RetriedSession):
             self._refusal = self._find_refusal() if session is not None and is_unconnected(session) else ""
 
     def _find_refusal(self) -> str:
-        """Return why the endpoints refuse the connection, or an empty string if no program listens."""
-        with contextlib.suppress(*zenoh_errors()):  # zenoh has already reported an invalid file
+        """Return the reason why the endpoints refuse the connection, or an empty string if no program listens there."""
+        with contextlib.suppress(*zenoh_errors()):  # zenoh has already reported an invalid configuration file
             return explain_refusals(self._connect, self._configuration(None))
         return ""
 
@@ -246,7 +247,7 @@ class ZenohPublisher(RetriedSession):
         self._update_token(device)
 
     def _open_on_free_port(self) -> tuple["zenoh.Session", str]:
-        """Open the session on a free port if the configured port is in use."""
+        """Open the session on the configured port, or on a free port if the configured port is in use."""
         import zenoh
 
         listen = self.settings.listen
@@ -262,11 +263,11 @@ class ZenohPublisher(RetriedSession):
             return session, f"ok, but {', '.join(listen)} is busy: listening on {', '.join(free)}"
 
     def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
-        """Merge the defaults, the zenoh file and the settings, in increasing precedence."""
+        """Return the zenoh configuration. The settings override the zenoh file, which overrides the defaults."""
         own = self.settings
         keys: dict[str, Any] = {
             "mode": own.mode,
-            "listen/endpoints": [] if own.mode == "client" else listen,  # a client does not listen
+            "listen/endpoints": [] if own.mode == "client" else listen,  # a zenoh client cannot listen
             "connect/endpoints": own.connect or None,
         }
         defaults = {**DEFAULT_CONFIGURATION, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
@@ -275,7 +276,7 @@ class ZenohPublisher(RetriedSession):
     def _publisher(
         self, session: "zenoh.Session", topic: topics.Topic, key: str
     ) -> "zenoh.Publisher | AdvancedPublisher":
-        """Declare an advanced publisher if the topic keeps values for late subscribers."""
+        """Declare a publisher for a key. It is an advanced publisher if the topic keeps values for late subscribers."""
         import zenoh
         from zenoh import ext
 
@@ -300,7 +301,7 @@ class ZenohPublisher(RetriedSession):
         if session is None:
             return
         key = topics.ALIVE.key(self.settings.prefix, device)
-        # An error means that the session is closing, which also removes the token.
+        # This error occurs only while the session is closing, which also removes the token.
         with self._token_lock, contextlib.suppress(*zenoh_errors()):
             if self._alive[device] and device not in self._tokens:
                 self._tokens[device] = session.liveliness().declare_token(key)
@@ -362,7 +363,7 @@ class _DuplicatePublishers:
         self._subscribers, self._heard_s = {}, {}
 
     def duplicate_publisher_message(self, now_s: float) -> str:
-        """Return a warning if another program published the status of a device within DUPLICATE_REPORT_S."""
+        """Return a warning if another program has published the status of a device in the last DUPLICATE_REPORT_S."""
         for device, one in self._subscribers.items():
             with contextlib.suppress(*zenoh_errors()):  # the session is being closed
                 if one.handler.try_recv() is not None:
@@ -374,7 +375,7 @@ class _DuplicatePublishers:
 
 
 def _reply_functions(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[str], None]]:
-    """Return functions that answer a query with a result or with an error."""
+    """Return two functions that answer a query, one with a result and one with an error."""
     import zenoh
 
     def reply_result(payload: bytes) -> None:
@@ -389,7 +390,7 @@ def _reply_functions(query: Any, key: str) -> tuple[Callable[[bytes], None], Cal
 
 
 def _reply_error(query: Any, error: ImuError) -> None:
-    """Reply with an error message and the exit status of the corresponding command."""
+    """Reply to a query with an error message and the exit status of the corresponding command."""
     import zenoh
 
     status = 3 if isinstance(error, NotReady) else 2 if isinstance(error, ConfigError) else 1
@@ -399,7 +400,7 @@ def _reply_error(query: Any, error: ImuError) -> None:
 
 
 def _free_port(endpoint: str) -> str:
-    """Replace the port of a TCP endpoint with a free port. Other endpoints are not changed."""
+    """Return a TCP endpoint with a free port instead of its own port. Other endpoints are returned unchanged."""
     match = re.fullmatch(r"tcp/\[?([^\]]+?)\]?:\d+", endpoint)
     if match is None:
         return endpoint

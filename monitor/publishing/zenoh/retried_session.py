@@ -1,7 +1,6 @@
 """zenoh session that is opened in a separate thread, so that an unreachable router does not block the caller.
 
-Threads receive messages from zenoh channels, because a Python callback that is registered at exit would block the
-process.
+Threads receive messages by reading zenoh channels. With Python callbacks instead, the process would not exit.
 """
 
 import threading
@@ -13,16 +12,16 @@ if TYPE_CHECKING:
     import zenoh
 
 REFUSAL_CHECK_S: Final = 3.0
-"""Interval between two checks of a refused connection [s]."""
+"""Interval [s] at which the reason for a refused connection is checked."""
 RETRY_S: Final = 1.0
 JOIN_TIMEOUT_S: Final = 2.0
 
 
 class RetriedSession:
-    """Base class of zenoh sessions that repeat failed attempts to connect."""
+    """Base class of zenoh sessions that repeat the attempt to connect until it succeeds."""
 
     close_timeout_s = 2.0
-    """Longest time [s] that ``close`` waits for the opening of a session."""
+    """Longest time [s] that ``close`` waits while the session is being opened."""
 
     def __init__(self, name: str) -> None:
         self.closing = threading.Event()
@@ -42,7 +41,7 @@ class RetriedSession:
         self._close_session()
 
     def _open_session(self) -> None:
-        """Open the session and declare all keys."""
+        """Open the zenoh session and declare all keys."""
         raise NotImplementedError
 
     def _report_failure(self, error: Exception) -> None:
@@ -54,7 +53,7 @@ class RetriedSession:
         raise NotImplementedError
 
     def _keep_open(self) -> None:
-        """Open the session, repeat failed attempts and monitor the connection."""
+        """Open the session, repeat failed attempts, and then monitor the connection."""
         errors: tuple[type[Exception], ...] = (*zenoh_errors(), OSError)
         while not self.closing.is_set():
             try:
@@ -84,7 +83,7 @@ class RetriedSession:
         self._receivers = [*(one for one in self._receivers if one.is_alive()), thread]
 
     def _receive(self, source: Any, process: Callable[[Any], None]) -> None:
-        handler = source.handler  # a source with a waiting thread could not be undeclared
+        handler = source.handler  # keeping only the handler allows zenoh to undeclare the source while a thread waits
         while not self.closing.is_set():
             try:
                 received = handler.recv()

@@ -1,12 +1,12 @@
 """Subscriber to the results of other daemons over zenoh, for ``watch`` and ``view``.
 
-Each endpoint has a separate session in client mode. Client mode is needed because a router does not forward data
-between two peers, and daemons are peers. A separate session is needed because a client stays connected to the first
-endpoint that answers. Samples and Allan deviations are received only for devices shown in detail.
+Each endpoint has a separate zenoh session in client mode. Client mode is necessary because a router does not forward
+data between two peers, and daemons are peers. Separate sessions are necessary because a client stays connected to the
+first endpoint that answers. Samples and Allan deviations are received only for devices shown in detail.
 
-A late subscriber receives the last values and events that daemons keep. After a lost connection, the subscriber also
-receives missed events. Memory is bounded, because zenoh rejects messages above ``MAX_MESSAGE_BYTES`` and the queue
-drops the oldest messages.
+A late subscriber receives the last values and events that daemons keep. After an interruption, the subscriber also
+receives the events that it has missed. Memory use is bounded, because zenoh rejects messages above
+``MAX_MESSAGE_BYTES`` and the queue drops the oldest messages.
 """
 
 import threading
@@ -38,22 +38,22 @@ if TYPE_CHECKING:
 KEYEXPR: Final = "imu/**"
 TOPICS: Final = (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)
 DETAIL_TOPICS: Final = (topics.SAMPLES, topics.ALLAN, topics.GAP)
-"""Topics of devices shown in detail, in addition to TOPICS."""
+"""Additional topics that are received for devices shown in detail."""
 RING_MESSAGES: Final = 4096
 BACKLOG_BYTES: Final = 16_000_000
 MAX_MESSAGE_BYTES: Final = 4_000_000
 """Longest accepted message. The longest messages are sample batches of a fast replay."""
 CONNECTION_CHECK_S: Final = 0.25
-"""Interval between two checks that an endpoint is still connected."""
+"""Interval between two checks that an endpoint is still connected [s]."""
 MAX_TOKENS: Final = 20_000
 """Largest number of stored liveliness tokens for each endpoint."""
 MAX_REMEMBERED_MESSAGES: Final = 20_000
-"""Number of stored messages for the detection of duplicates, for two seconds of 1000 devices at 10 Hz."""
+"""Number of messages that are stored to detect duplicates, enough for two seconds of 1000 devices at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
-class ReceivedMessage:
-    """Received message, or a change of a liveliness token."""
+class ReceivedMessageOrLiveliness:
+    """Message of a device, or notice that a liveliness token has appeared or disappeared."""
 
     key: str
     payload: bytes | None  # None for a liveliness token
@@ -65,14 +65,14 @@ class ZenohSubscriber:
 
     Parameters
     ----------
-    keyexpr
-        Key expression that selects devices or topics, e.g. ``imu/**``, ``imu/bench-1``, ``*/*/status``.
+        keyexpr
+        Pattern of zenoh keys (key expression) that selects devices or topics, such as ``imu/**`` or ``*/*/status``.
     connect
-        Endpoints of daemons or routers. By default, the endpoints in the file or the default endpoint.
+        Endpoints of daemons or routers. By default, the endpoints in ``file`` or the default endpoint.
     file
-        Configuration file of zenoh with TLS, user and password.
+        zenoh configuration file with certificates or a password.
     detail
-        Keys of devices with samples and Allan deviations, such as ``imu/bench-1``.
+        Keys of devices whose samples and Allan deviations are received, such as ``imu/bench-1``.
 
     Raises
     ------
@@ -90,19 +90,19 @@ class ZenohSubscriber:
         keys = {topic: topic_keys(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
         _check_keys(keyexpr, [key for part in keys.values() for key in part])
         keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL_TOPICS}
-        self._backlog: BoundedQueue[ReceivedMessage] = BoundedQueue(BACKLOG_BYTES)
+        self._backlog: BoundedQueue[ReceivedMessageOrLiveliness] = BoundedQueue(BACKLOG_BYTES)
         found = client_configurations(connect, file)
         self._duplicate_filter = _DuplicateFilter() if len(found) > 1 else None
         self._sessions = [_EndpointSession(endpoint, config, keys, self._push) for endpoint, config in found.items()]
 
     @property
     def dropped(self) -> int:
-        """Number of messages that were dropped because ``take`` was not called in time."""
+        """Number of messages that were dropped because ``take`` was called too late."""
         return self._backlog.dropped
 
     @property
     def state(self) -> str:
-        """``ok``, or a description of the endpoints that are not connected."""
+        """``ok`` or a description of the endpoints that are not connected."""
         absent = {session.endpoint: session.refusal for session in self._sessions if not session.is_connected}
         if not absent:
             return "ok"
@@ -114,17 +114,17 @@ class ZenohSubscriber:
         return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
 
     @property
-    def all_connected_duration_s(self) -> float:
-        """Time [s] since all endpoints have been connected, or 0 if any endpoint is not connected."""
+    def time_since_all_connected_s(self) -> float:
+        """Time [s] for which all endpoints have been connected, or 0 if any endpoint is not connected."""
         return min(session.connected_duration_s for session in self._sessions)
 
     def start(self) -> None:
-        """Open the sessions in separate threads and return at once."""
+        """Start the threads that open the sessions, and return at once."""
         for session in self._sessions:
             session.start()
 
-    def take(self, timeout_s: float) -> list[ReceivedMessage]:
-        """Return all messages since the last call. Wait up to ``timeout_s`` seconds for the first message."""
+    def take(self, timeout_s: float) -> list[ReceivedMessageOrLiveliness]:
+        """Return all messages since the last call, after waiting up to ``timeout_s`` seconds for the first message."""
         return self._backlog.take(timeout_s)
 
     def close(self) -> None:
@@ -135,13 +135,13 @@ class ZenohSubscriber:
             session.close()
         self._backlog.wake()
 
-    def _push(self, message: ReceivedMessage, stamp: str) -> None:
+    def _push(self, message: ReceivedMessageOrLiveliness, stamp: str) -> None:
         if self._duplicate_filter is None or self._duplicate_filter.is_unseen(message.key, stamp):
             self._backlog.push(message, 100 + len(message.payload or b""))
 
 
 class _DuplicateFilter:
-    """Filter for messages that several endpoints deliver, identified by key and zenoh timestamp."""
+    """Filter that removes copies of a message from other endpoints, identified by key and zenoh timestamp."""
 
     def __init__(self) -> None:
         self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
@@ -161,7 +161,7 @@ class _DuplicateFilter:
 
 
 class _EndpointSession(RetriedSession):
-    """Client session with one endpoint, which passes messages and token changes to a function."""
+    """Client session with one endpoint, which passes messages and changes of liveliness tokens to a function."""
 
     close_timeout_s = 5.0
 
@@ -170,7 +170,7 @@ class _EndpointSession(RetriedSession):
         endpoint: str,
         config: "zenoh.Config",
         keys: Mapping[topics.Topic, Sequence[str]],
-        push: Callable[[ReceivedMessage, str], None],
+        push: Callable[[ReceivedMessageOrLiveliness, str], None],
     ) -> None:
         self.endpoint = mask_secrets(endpoint)
         super().__init__(self.endpoint)
@@ -203,7 +203,7 @@ class _EndpointSession(RetriedSession):
         self.refusal = explain_refusal(self._endpoint, self._config)
 
     def _monitor_connection(self) -> None:
-        """Report lost liveliness tokens, which zenoh does not report for a lost endpoint."""
+        """Report all liveliness tokens as lost if the endpoint is lost, because zenoh does not report them."""
         checked_s = -REFUSAL_CHECK_S
         while not self.closing.wait(CONNECTION_CHECK_S):
             if self.is_connected:
@@ -211,14 +211,14 @@ class _EndpointSession(RetriedSession):
                 continue
             self._since_s = None
             while self._tokens:
-                self._push(ReceivedMessage(self._tokens.pop(), None, token_exists=False), "")
+                self._push(ReceivedMessageOrLiveliness(self._tokens.pop(), None, token_exists=False), "")
             if time.monotonic() - checked_s >= REFUSAL_CHECK_S:
                 self.refusal = explain_refusal(self._endpoint, self._config)
                 checked_s = time.monotonic()
 
     def _process_message(self, sample: Any) -> None:
         stamp = "" if sample.timestamp is None else str(sample.timestamp)
-        self._push(ReceivedMessage(str(sample.key_expr), bytes(sample.payload)), stamp)
+        self._push(ReceivedMessageOrLiveliness(str(sample.key_expr), bytes(sample.payload)), stamp)
 
     def _process_token(self, sample: Any) -> None:
         import zenoh
@@ -228,13 +228,13 @@ class _EndpointSession(RetriedSession):
             self._tokens.discard(key)
         elif len(self._tokens) < MAX_TOKENS:
             self._tokens.add(key)
-        self._push(ReceivedMessage(key, None, exists), "")
+        self._push(ReceivedMessageOrLiveliness(key, None, exists), "")
 
 
 def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
-    """Return the key expressions for the messages of one topic.
+    """Return the patterns of zenoh keys (key expressions) that select the messages of one topic.
 
-    A key expression that selects a device selects all topics of the device.
+    If the key expression names a device but no topic, the given topic is appended.
 
     >>> topic_keys("imu/**", topics.STATUS), topic_keys("imu/bench-1", topics.STATUS)
     (('imu/**/status',), ('imu/bench-1/**/status',))
@@ -246,7 +246,7 @@ def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
     keyexpr
         Key expression that selects devices or topics.
     topic
-        Topic of interest.
+        Topic whose messages are selected.
     """
     parts = keyexpr.split("/")
     if parts[-1] in {known.name for known in topics.TOPICS}:
@@ -263,9 +263,9 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     Parameters
     ----------
     connect
-        Endpoints of daemons or routers. By default, the endpoints in the file or the default endpoint.
+        Endpoints of daemons or routers. By default, the endpoints in ``file`` or the default endpoint.
     file
-        Configuration file of zenoh.
+        zenoh configuration file.
 
     Raises
     ------

@@ -1,30 +1,38 @@
-"""Null distributions of the diagnostics, estimated from simulated recordings of the noise model.
+"""Null distributions of the diagnostics under a true noise model.
 
-The gap of a diagnostic is √(2 × gain), the size of the strongest departure in standard deviations. Let q be the upper
-quartile of the simulated gains of all axes. Above q, the density of a gain g is modelled as exp(−(g − q)/s). The scale
-s is the mean excess over q, limited to the range from 1 to 1.3, which is typical of the maximum of many χ²/2 variables.
+The gap of a diagnostic is √(2 × gain), the size of the strongest departure in standard deviations. The gain is the
+maximum over many places, such as frequencies or times. If the noise is Gaussian and the noise model is true, the gain
+depends only on the effective number of independent places (``NULL_GAINS``). Let q be the upper quartile of the gain.
+Above q, the density of a gain g is modelled as exp(−(g − q)/s).
 
-If the noise model is true, 1 % of all recordings exceed a threshold in any diagnostic on any axis. An axis with coarse
-or clipped values can have a larger threshold.
+One simulated recording checks that the noise model is Gaussian enough. If a gain is improbably large, more recordings
+are simulated. The gains of all recordings increase the thresholds if they stay improbably large. A model that is not
+Gaussian is always simulated ``SIMULATED_RECORDINGS`` times.
+
+If the noise model is true, 1 % of all recordings exceed a threshold in any diagnostic on any axis.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import log, sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from drivers.data_types import Floats
-from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.result import DiagnosticGap
 
 FALSE_ALARM_PROBABILITY: Final = 0.01
 """Fraction of recordings of a true model with a significant gap in any diagnostic on any axis."""
+SIMULATED_RECORDINGS: Final = 6
+"""Largest number of simulated recordings that determine a null distribution."""
 UPPER_QUANTILE: Final = 0.25
 """Fraction of the largest gains, for which an exponential distribution is assumed."""
 EXCESS_RANGE_NATS: Final = (1.0, 1.3)
+"""Range of the mean excess of simulated gains over the upper quartile."""
+IMPROBABLE: Final = 0.002
+"""Probability of a gain that asks for another simulated recording."""
 AXIS_MARGIN_NATS: Final = 3.0
 """Margin between the largest simulated gain of an axis and the threshold, in nats."""
 
@@ -39,6 +47,47 @@ class NullDistribution:
     null95: float  # 95 % quantile of the gain, nats
     threshold: float  # gain above which a departure is significant, nats
 
+    @property
+    def search_threshold(self) -> float:
+        """Gain above which the search tests the effects one by one, in nats.
+
+        A true model exceeds the mean of both quantiles in about one of six recordings. The penalties of the effects
+        then prevent wrong names.
+        """
+        return 0.5 * (self.null95 + self.threshold)
+
+
+class NullGains(NamedTuple):
+    """Upper quartile and scale of the gain of a diagnostic under a true Gaussian noise model.
+
+    The upper quartile is ``offset`` + ``slope`` × ln(places).
+    """
+
+    offset: float  # nats
+    slope: float  # nats
+    scale: float  # mean excess over the upper quartile, nats
+
+    def quantile(self, places: float, probability: float) -> float:
+        """Return the gain that is exceeded with a small probability."""
+        return self.offset + self.slope * log(max(places, 1.0)) + self.scale * log(UPPER_QUANTILE / probability)
+
+
+NULL_GAINS: Final[Mapping[str, NullGains]] = {
+    "values": NullGains(0.0, 0.0, 1.0),
+    "psd": NullGains(0.9, 1.0, 1.1),
+    "lines": NullGains(2.4, 1.0, 1.2),
+    "autocorrelation": NullGains(4.0, 0.0, 1.0),
+    "level": NullGains(1.3, 0.95, 1.25),
+    "temperature": NullGains(1.5, 0.0, 1.0),
+    "other_axes": NullGains(0.65, 0.73, 1.0),
+    "tails": NullGains(0.4, 0.0, 1.0),
+    "variance": NullGains(1.75, 1.0, 1.1),
+    "spectrogram": NullGains(0.3, 1.0, 1.1),
+}
+"""Null distribution of each diagnostic, fitted to simulated recordings of five models with 8192 to 10⁶ samples.
+
+For the diagnostics ``autocorrelation`` and ``temperature``, the number of places is constant.
+"""
 
 AxisNull = Mapping[str, NullDistribution]
 """Null distributions of all diagnostics on one axis, by the name of the diagnostic."""
@@ -49,27 +98,50 @@ def run_diagnostics(whitened: WhitenedAxis) -> Findings:
     return {name: diagnose(whitened) for name, diagnose in DIAGNOSTICS.items()}
 
 
+def all_simulations_have_improbable_gain(findings: Sequence[Findings]) -> bool:
+    """Return True if a diagnostic has an improbably large gain in all simulated recordings of an axis."""
+    return any(
+        lens not in NULL_GAINS or all(one[lens].gain > _quantile(lens, one[lens], IMPROBABLE) for one in findings)
+        for lens in DIAGNOSTICS
+    )
+
+
 def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> dict[str, AxisNull]:
-    """Estimate the null distributions of each axis from the findings on simulated recordings."""
-    found: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
+    """Estimate the null distributions of each axis from the findings on simulated recordings.
+
+    Parameters
+    ----------
+    simulated : mapping of str to sequence of Findings
+        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. The gains of the axes with all
+        recordings can increase the thresholds of these axes.
+    """
+    chance = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * max(len(simulated), 1))
+    complete = [axis for axis, of in simulated.items() if len(of) >= SIMULATED_RECORDINGS]
+    null: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
     for lens in DIAGNOSTICS:
-        gains = {axis: np.array([one[lens].gain for one in findings]) for axis, findings in simulated.items()}
-        pooled = _tail_quantiles(np.concatenate(list(gains.values())), len(simulated))
-        for axis, own in gains.items():
-            largest = float(own.max(initial=0.0))
-            if largest + AXIS_MARGIN_NATS <= pooled.threshold:
-                found[axis][lens] = pooled
-            else:
-                found[axis][lens] = NullDistribution(max(pooled.null95, largest), largest + AXIS_MARGIN_NATS)
-    return dict(found)
+        pooled = [one[lens].gain for axis in complete for one in simulated[axis]]
+        for axis, of in simulated.items():
+            expected = [_quantile(lens, of[0][lens], p) if lens in NULL_GAINS else 0.0 for p in (0.05, chance)]
+            if axis in complete:
+                own = _simulated_null_distribution(pooled, max(one[lens].gain for one in of), chance)
+                expected = [max(expected[0], own.null95), max(expected[1], own.threshold)]
+            null[axis][lens] = NullDistribution(*expected)
+    return dict(null)
 
 
-def _tail_quantiles(gains: Floats, axis_count: int) -> NullDistribution:
-    quartile = float(np.quantile(gains, 1.0 - UPPER_QUANTILE)) if gains.size else 0.0
-    beyond = gains[gains > quartile] - quartile
-    scale = float(np.clip(beyond.mean() if beyond.size else EXCESS_RANGE_NATS[0], *EXCESS_RANGE_NATS))
-    p = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * axis_count)
-    return NullDistribution(quartile + scale * log(UPPER_QUANTILE / 0.05), quartile + scale * log(UPPER_QUANTILE / p))
+def _simulated_null_distribution(pooled: Sequence[float], largest: float, chance: float) -> NullDistribution:
+    """Return the null distribution from the gains of several axes, unless the largest gain of the axis is larger."""
+    quartile = float(np.quantile(pooled, 1.0 - UPPER_QUANTILE))
+    excess = [gain - quartile for gain in pooled if gain > quartile]
+    scale = float(np.clip(np.mean(excess) if excess else EXCESS_RANGE_NATS[0], *EXCESS_RANGE_NATS))
+    null95, threshold = (quartile + scale * log(UPPER_QUANTILE / p) for p in (0.05, chance))
+    if largest + AXIS_MARGIN_NATS <= threshold:
+        return NullDistribution(null95, threshold)
+    return NullDistribution(max(null95, largest), largest + AXIS_MARGIN_NATS)
+
+
+def _quantile(lens: str, found: Finding, probability: float) -> float:
+    return NULL_GAINS[lens].quantile(found.places, probability)
 
 
 def compute_diagnostic_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:

@@ -13,10 +13,10 @@ from drivers.data_types import Floats, Ints
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 from monitor.noise.spectrum import allan_variance_of_density
-from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, compute_autocorrelation
-from monitor.reconcile.likelihood.whitening import WhitenedAxis, relative_noise_deviation_over_time
+from monitor.reconcile.diagnostics.whiteness_tests import MAX_LAG_SAMPLES, compute_autocorrelation
+from monitor.reconcile.likelihood.whitening import WhitenedAxis, relative_noise_std_over_time
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
-from monitor.reconcile.result import PlotData
+from monitor.reconcile.result import DiagnosticPlotData
 
 SPECTRUM_POINTS: Final = 240
 TIME_BLOCKS: Final = 240
@@ -25,7 +25,7 @@ LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
 """Unit of the samples by the first letter of the axis."""
 
 
-def build_plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
+def build_plot_data(whitened: WhitenedAxis) -> tuple[DiagnosticPlotData, ...]:
     """Build the data of all plots of one whitened axis."""
     fitted = _deterministic_series(whitened)
     plots = [
@@ -44,12 +44,16 @@ def build_plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
 def _deterministic_series(whitened: WhitenedAxis) -> Floats:
     """Return the sum of the fitted deterministic effects, shape (n,), without the mean."""
     repaired = whitened.axis.repaired
+    if not whitened.fit.regressor_slices:
+        return np.zeros(repaired.size)
     return np.asarray(
-        repaired - repaired.mean() - inverse_cosine_transform(whitened.fit.coefficients_without_deterministic_effects())
+        repaired
+        - repaired.mean()
+        - inverse_cosine_transform(whitened.fit.cosine_transform_without_deterministic_effects())
     )
 
 
-def _plot_psd(whitened: WhitenedAxis) -> PlotData:
+def _plot_psd(whitened: WhitenedAxis) -> DiagnosticPlotData:
     bins, tau0_s = whitened.axis.bins, 1.0 / whitened.axis.rate_hz
     used = np.flatnonzero(whitened.axis.used_bins)
     # average neighbouring bins to about SPECTRUM_POINTS points that are evenly spaced in the logarithm of frequency
@@ -63,20 +67,20 @@ def _plot_psd(whitened: WhitenedAxis) -> PlotData:
     lo, hi = _chi2_band(count)
     unit = f"({_level_unit(whitened)})²/Hz"
     names = ("psd", "frequency", "Hz", "spectral density", unit)
-    return PlotData(*names, True, middle, measured, expected, lo * expected, hi * expected)
+    return DiagnosticPlotData(*names, True, middle, measured, expected, lo * expected, hi * expected)
 
 
-def _plot_allan_deviation(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
+def _plot_allan_deviation(whitened: WhitenedAxis, fitted: Floats) -> DiagnosticPlotData:
     axis, tau0_s = whitened.axis, 1.0 / whitened.axis.rate_hz
     m = cluster_sizes(axis.n, axis.rate_hz)
     measured, _ = overlapping_avar_axis(axis.repaired, m)
-    deterministic, _ = overlapping_avar_axis(fitted, m)
+    deterministic = overlapping_avar_axis(fitted, m)[0] if fitted.any() else np.zeros(m.size)
     tau_s = np.asarray(m * tau0_s, np.float64)
     noise = allan_variance_of_density(_density_function(whitened), tau_s, tau0_s, ())
     lo, hi = _chi2_band(_allan_degrees_of_freedom(whitened, m))
     curves = (measured, noise + deterministic, lo * noise + deterministic, hi * noise + deterministic)
     names = ("allan", "averaging time", "s", "Allan deviation", _level_unit(whitened))
-    return PlotData(*names, True, tau_s, *(np.sqrt(avar) for avar in curves))
+    return DiagnosticPlotData(*names, True, tau_s, *(np.sqrt(avar) for avar in curves))
 
 
 def _density_function(whitened: WhitenedAxis) -> Callable[[Floats], Floats]:
@@ -106,14 +110,14 @@ def _allan_degrees_of_freedom(whitened: WhitenedAxis, m: Ints) -> Floats:
     return np.maximum(found, 1.0)
 
 
-def _plot_level(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
+def _plot_level(whitened: WhitenedAxis, fitted: Floats) -> DiagnosticPlotData:
     axis = whitened.axis
     length = max(1, axis.n // TIME_BLOCKS)
     measured, expected = _block_means(axis.repaired, length), _block_means(fitted, length) + axis.repaired.mean()
     spread = _level_spread(whitened, length / axis.rate_hz)
     names = ("level", "time", "s", "level", _level_unit(whitened))
     times_s = _block_times_s(measured.size, length, axis.rate_hz)
-    return PlotData(*names, False, times_s, measured, expected, expected - spread, expected + spread)
+    return DiagnosticPlotData(*names, False, times_s, measured, expected, expected - spread, expected + spread)
 
 
 def _level_spread(whitened: WhitenedAxis, length_s: float) -> float:
@@ -123,19 +127,19 @@ def _level_spread(whitened: WhitenedAxis, length_s: float) -> float:
     return Z95 * float(np.sqrt((bins.count * whitened.fit.whittle.variance * weight).sum() / whitened.axis.n))
 
 
-def _plot_variance(whitened: WhitenedAxis) -> PlotData:
+def _plot_variance(whitened: WhitenedAxis) -> DiagnosticPlotData:
     axis = whitened.axis
     length = max(1, axis.n // TIME_BLOCKS)
-    deviation = relative_noise_deviation_over_time(whitened.fit)
+    deviation = relative_noise_std_over_time(whitened.fit)
     measured = np.sqrt(_block_means((whitened.flat_series * deviation) ** 2, length))
     expected = np.sqrt(_block_means(deviation**2, length))
     lo, hi = np.sqrt(_chi2_band(np.array([float(length)])))
     names = ("variance", "time", "s", "noise over its mean", "1")
     times_s = _block_times_s(measured.size, length, axis.rate_hz)
-    return PlotData(*names, False, times_s, measured, expected, lo * expected, hi * expected)
+    return DiagnosticPlotData(*names, False, times_s, measured, expected, lo * expected, hi * expected)
 
 
-def _plot_tails(whitened: WhitenedAxis) -> PlotData:
+def _plot_tails(whitened: WhitenedAxis) -> DiagnosticPlotData:
     magnitudes = np.sort(np.abs(whitened.flat_series))
     n = magnitudes.size
     x = np.linspace(0.5, max(float(magnitudes[-1]), 4.0), 80)
@@ -146,17 +150,17 @@ def _plot_tails(whitened: WhitenedAxis) -> PlotData:
     hi = np.maximum(expected + spread, 3.0 / n)
     measured, expected, lo = (np.maximum(one, least) for one in (measured, expected, expected - spread))
     names = ("tails", "distance", "σ", "share of samples beyond", "1")
-    return PlotData(*names, True, x, measured, expected, lo, hi)
+    return DiagnosticPlotData(*names, True, x, measured, expected, lo, hi)
 
 
-def _plot_autocorrelation(whitened: WhitenedAxis) -> PlotData:
+def _plot_autocorrelation(whitened: WhitenedAxis) -> DiagnosticPlotData:
     lag_s = np.arange(1, MAX_LAG_SAMPLES + 1) / whitened.axis.rate_hz
-    zero, band = np.zeros(MAX_LAG_SAMPLES), np.full(MAX_LAG_SAMPLES, Z95 / whitened.series.size**0.5)
+    zero, band = np.zeros(MAX_LAG_SAMPLES), np.full(MAX_LAG_SAMPLES, Z95 / whitened.axis.n**0.5)
     names = ("autocorrelation", "lag", "s", "autocorrelation", "1")
-    return PlotData(*names, False, lag_s, compute_autocorrelation(whitened.series), zero, -band, band)
+    return DiagnosticPlotData(*names, False, lag_s, compute_autocorrelation(whitened.periodogram), zero, -band, band)
 
 
-def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, temperature_c: Floats) -> PlotData:
+def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, temperature_c: Floats) -> DiagnosticPlotData:
     axis = whitened.axis
     edges = np.linspace(float(temperature_c.min()), float(temperature_c.max()), TEMPERATURE_BINS + 1)
     cell = np.clip(np.searchsorted(edges, temperature_c, "right") - 1, 0, TEMPERATURE_BINS - 1)
@@ -170,7 +174,7 @@ def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, tempera
     spread = np.array([_level_spread(whitened, length_s) for length_s in count[filled] / axis.rate_hz])
     names = ("temperature", "temperature", "°C", "level", _level_unit(whitened))
     middle = 0.5 * (edges[1:] + edges[:-1])[filled]
-    return PlotData(
+    return DiagnosticPlotData(
         *names, False, middle, temperature_bin_means(axis.repaired), expected, expected - spread, expected + spread
     )
 

@@ -12,29 +12,39 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import AxisLeak, Effect, Source, Transform
+from monitor.noise.effect import AxisLeak, Effect, Source, Transform, WhiteNoiseGain
 from monitor.noise.effects import (
     TRANSFORM_ORDER,
     AngleRandomWalk,
     BandwidthLimit,
-    Bias,
-    NoiseStep,
+    BiasCurve,
     RandomSampleHold,
+    RateRamp,
     Resolution,
     Saturation,
+    Sinusoidal,
+    TemperatureBias,
+    TemperatureLag,
+    TurnOnTransient,
 )
 from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 from monitor.reconcile.likelihood.effect_roles import (
     DETERMINISTIC_SIZE_PARAMETERS,
-    NOISE_SIZE_PARAMETERS,
+    MAX_REGRESSORS,
     build_unit_regressors,
     effect_size,
+    is_noise_effect,
     with_effect_size,
     with_regressor_factors,
 )
 from monitor.reconcile.likelihood.whittle_fit import BinnedProductSums, WhittleFit, maximise_whittle_likelihood
-from monitor.reconcile.preparation.cosine_bins import FrequencyBins, cosine_transform
-from monitor.reconcile.preparation.value_artifacts import Clipping, QuantizationGrid, RepeatedSamples
+from monitor.reconcile.preparation.cosine_bins import (
+    MAX_SMOOTH_COEFFICIENTS,
+    FrequencyBins,
+    cosine_transform,
+    low_frequency_cosine_transform,
+)
+from monitor.reconcile.preparation.value_artifacts import ValueArtifacts
 
 MIN_BIN_POWER_RATIO: Final = 1e-4
 """Smallest power of a bin in the fit, relative to the median bin. The stop band of a filter has less power.
@@ -42,29 +52,24 @@ MIN_BIN_POWER_RATIO: Final = 1e-4
 MIN_STOP_BAND_FRACTION: Final = 0.02
 """Lowest frequency of a stop band, as a fraction of the sample rate.
 """
-MAX_CACHE_BYTES: Final = 1 << 28
-MIN_CACHED_SERIES: Final = 16
-"""Smallest number of cached series. The diagnostics use 16 series."""
-MAX_CACHED_PRODUCTS: Final = 4096
+MAX_CACHE_BYTES: Final = 1 << 26
+MIN_CACHED_SERIES: Final = 8
+"""Smallest number of cached series that are not smooth."""
+MAX_CACHED_SMOOTH_SERIES: Final = 128
+SMOOTH_EFFECTS: Final = (RateRamp, BiasCurve, TemperatureBias, TemperatureLag, TurnOnTransient)
+"""Deterministic effects that change slowly, unless the time constant is short."""
+MIN_BLOCKS_PER_TIME_CONSTANT: Final = 16
+"""Smallest time constant of a smooth effect, in blocks of the smooth transform."""
+WHOLE_RECORDING: Final = slice(None)
+MAX_CACHED_PRODUCTS: Final = 2048
+MAX_CACHED_BASES: Final = 512
+MAX_CACHED_UNIT_EFFECTS: Final = 4096
 INITIAL_FLOOR_RATIO: Final = 1e-3
-"""Starting value of the white noise behind a low-pass filter, relative to the total power."""
-INITIAL_EXTRA_RATIO: Final = 1e-2
-"""Starting value of an additional variance basis, relative to the total power."""
+"""Smallest starting value of the white noise behind a low-pass filter, relative to the total power."""
 Effects = tuple[Effect, ...]
 """Effects of one axis."""
 Regressor = tuple[Effect, int]
-"""Deterministic effect and the index of one of its one or two regressors."""
-CURVATURE: Final[Regressor] = (Bias(value=1.0), 0)
-"""Marker for the regressor t²."""
-
-
-@dataclass(frozen=True, slots=True)
-class ValueArtifacts:
-    """Quantization, clipping and repeated samples of an axis."""
-
-    quantization: QuantizationGrid | None
-    clipping: Clipping | None
-    repeats: RepeatedSamples | None
+"""Deterministic effect and the index of one of its regressors."""
 
 
 class RegressorCache:
@@ -78,23 +83,51 @@ class RegressorCache:
         Sample rate in Hz.
     temperature_c : ndarray of float64, shape (n,), or None
         Temperature in °C.
+    part : slice, optional
+        Samples of the recording that the axes contain. By default, the axes contain the whole recording.
     """
 
-    def __init__(self, n: int, rate_hz: float, temperature_c: Floats | None) -> None:
-        def compute_regressor_transforms(effect: Effect) -> list[Floats]:
-            return [cosine_transform(series) for series in build_unit_regressors(effect, n, rate_hz, temperature_c)]
+    def __init__(self, n: int, rate_hz: float, temperature_c: Floats | None, part: slice = WHOLE_RECORDING) -> None:
+        def build_columns(effect: Effect) -> list[Floats]:
+            return [series[part] for series in build_unit_regressors(effect, n, rate_hz, temperature_c)]
 
-        self.curvature = cosine_transform(np.linspace(-1.0, 1.0, n) ** 2)
-        """Cosine transform of t², shape (n − 1,)."""
-        self.step_power = 0.25 / n / np.sin(0.5 * np.pi * np.arange(1, n) / n) ** 2
+        def compute_transforms(effect: Effect) -> list[Floats]:
+            return [cosine_transform(column) for column in build_columns(effect)]
+
+        def compute_smooth_transforms(effect: Effect) -> list[Floats]:
+            return [low_frequency_cosine_transform(column) for column in build_columns(effect)]
+
+        self._whole = n, rate_hz, temperature_c
+        self.first_sample, end, _ = part.indices(n)
+        """Index in the recording of the first sample of the axes."""
+        size = end - self.first_sample
+        self._parts: dict[tuple[int, int], RegressorCache] = {}
+        self._min_time_constant_s = MIN_BLOCKS_PER_TIME_CONSTANT * size / MAX_SMOOTH_COEFFICIENTS / rate_hz
+        self.step_power = 0.25 / size / np.sin(0.5 * np.pi * np.arange(1, size) / size) ** 2
         """Mean square of each coefficient of a unit step over all step times, shape (n − 1,)."""
-        self._transform_regressors = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * n)))(
-            compute_regressor_transforms
-        )
+        self._transform = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * size)))(compute_transforms)
+        self._transform_smooth = lru_cache(MAX_CACHED_SMOOTH_SERIES)(compute_smooth_transforms)
+
+    def restrict_to_part(self, part: slice) -> "RegressorCache":
+        """Return the cache for a part of the recording, which is kept for the next call.
+
+        The regressors still begin at the start of the recording.
+        """
+        first, end, _ = part.indices(self._whole[0])
+        if (first, end) not in self._parts:
+            self._parts[first, end] = RegressorCache(*self._whole, part)
+        return self._parts[first, end]
 
     def regressor_cosine_transforms(self, effect: Effect) -> list[Floats]:
-        """Return the cosine transforms, each of shape (n − 1,), of the regressors of a deterministic effect."""
-        return self._transform_regressors(with_regressor_factors(effect, np.ones(2)))
+        """Return the cosine transforms of the regressors of a deterministic effect.
+
+        The shape of each transform is (n − 1,). The transform of a smooth regressor can be shorter, because the
+        coefficients at high frequencies are nearly zero.
+        """
+        time_constant_s = getattr(effect, "time_constant", None) or np.inf
+        if isinstance(effect, SMOOTH_EFFECTS) and time_constant_s >= self._min_time_constant_s:
+            return self._transform_smooth(with_regressor_factors(effect, np.ones(MAX_REGRESSORS)))
+        return self._transform(with_regressor_factors(effect, np.ones(MAX_REGRESSORS)))
 
 
 class _NoiseVariances(NamedTuple):
@@ -118,10 +151,14 @@ class Axis:
     value_artifacts: ValueArtifacts
     regressors: RegressorCache  # shared by all axes of a recording and of its simulations
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
-    _products: dict[tuple[object, ...], Floats] = field(init=False, default_factory=dict)
+    cosine_transform_rms: float = field(init=False)  # root mean square of the coefficients, in the unit of the axis
+    _products: dict[frozenset[Regressor | None], Floats] = field(init=False, default_factory=dict)
+    _bases: dict[tuple[object, ...], Floats] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        power = self.bins.sum_over_bins(self.coefficients**2) / self.bins.count
+        sums = self.bins.sum_over_bins(self.coefficients**2)
+        self.cosine_transform_rms = float(np.sqrt(sums.sum() / self.coefficients.size))
+        power = sums / self.bins.count
         slow = self.bins.f_hz < MIN_STOP_BAND_FRACTION * self.bins.rate_hz
         self.used_bins = ((power > MIN_BIN_POWER_RATIO * np.median(power)) | slow).astype(np.float64)
 
@@ -140,28 +177,43 @@ class Axis:
         """Length of the recording in seconds."""
         return self.n / self.rate_hz
 
-    @property
-    def coefficient_rms(self) -> float:
-        """Root mean square of the cosine transform, in the unit of the axis."""
-        return float(np.sqrt(np.mean(self.coefficients**2)))
-
     def with_repaired_samples(self, repaired: Floats) -> "Axis":
-        """Return a copy of the axis with new repaired samples, shape (n,)."""
+        """Return a copy of the axis that uses other repaired samples, shape (n,)."""
         return replace(self, repaired=repaired, coefficients=cosine_transform(repaired))
 
     def regressor_cosine_transforms(self, effect: Effect) -> list[Floats]:
-        """Return the cosine transforms, each of shape (n − 1,), of the regressors of a deterministic effect."""
+        """Return the cosine transforms of the regressors of a deterministic effect, as ``RegressorCache`` does."""
         if isinstance(effect, AxisLeak):
             return [self.leak_sources[effect.source]]
         return self.regressors.regressor_cosine_transforms(effect)
+
+    def clear_cached_sums(self) -> None:
+        """Release the memory of the cached sums over bins, which are computed again on demand."""
+        self._products.clear()
+        self._bases.clear()
+
+    def white_noise_gain_over_time(self, effects: Sequence[Effect]) -> Floats:
+        """Return the gain of the white noise over time, shape (n,)."""
+        gain = np.ones(self.n)
+        for effect in effects:
+            if isinstance(effect, WhiteNoiseGain):
+                started = effect.start_gain(self.rate_hz, np.random.default_rng(0))
+                gain *= started.compute_gain(self.regressors.first_sample, self.n)
+        return gain
+
+    def _mean_noise_power(self, gains: Effects) -> float:
+        """Return the mean square of the gain of the white noise over the recording."""
+        if not gains:
+            return 1.0
+        key = ("gain", gains)
+        if key not in self._bases:
+            self._bases[key] = np.mean(self.white_noise_gain_over_time(gains) ** 2, keepdims=True)
+        return float(self._bases[key][0])
 
     def fit(
         self,
         effects: Sequence[Effect],
         fixed_noise: frozenset[int] = frozenset(),
-        extra_bases: Floats | None = None,
-        curvature: bool = False,
-        noise_floor: bool = True,
     ) -> "AxisFit":
         """Fit the sizes of effects to the axis by maximum likelihood.
 
@@ -171,13 +223,6 @@ class Axis:
             Effects to fit. The sizes are starting values, and the shape parameters stay fixed.
         fixed_noise : frozenset of int, optional
             Indices of the noise effects whose size is fixed.
-        extra_bases : ndarray of float64, shape (r, m), optional
-            Additional variance bases that belong to no effect.
-        curvature : bool, optional
-            If True, t² is an additional regressor.
-        noise_floor : bool, optional
-            If True, white noise is added behind a low-pass filter, because no real sensor is free of noise at half the
-            sample rate.
 
         Returns
         -------
@@ -185,19 +230,14 @@ class Axis:
             Fitted sizes and log-likelihood.
         """
         transforms = _spectral_transforms(effects, self.value_artifacts)
-        noise_floor = noise_floor and any(isinstance(one, BandwidthLimit) for one in transforms)
         noise = self._noise_variances(effects, fixed_noise, transforms)
-        unnamed = [(np.ones_like(noise.constant), INITIAL_FLOOR_RATIO)] if noise_floor else []
-        unnamed += [(row, INITIAL_EXTRA_RATIO) for row in (extra_bases if extra_bases is not None else ())]
-        bases = [*noise.bases, *(basis for basis, _ in unnamed)]
-        start = [*noise.start, *(ratio * self._full_power_theta(basis) for basis, ratio in unnamed)]
         slices, columns = self._regressors_of(effects)
         fitted = maximise_whittle_likelihood(
             self.bins.count * self.used_bins,
-            self.sum_products_over_bins([*columns, CURVATURE] if curvature else columns),
-            np.asarray(bases).reshape(len(bases), self.bins.count.size),
+            self.sum_products_over_bins(columns),
+            np.asarray(noise.bases).reshape(len(noise.bases), self.bins.count.size),
             noise.constant,
-            np.asarray(start, np.float64),
+            np.asarray(noise.start, np.float64),
         )
         return AxisFit(
             self,
@@ -207,7 +247,6 @@ class Axis:
             fitted,
             tuple(noise.fitted),
             slices,
-            float(fitted.theta[len(noise.fitted)]) if noise_floor else 0.0,
         )
 
     def _noise_variances(
@@ -216,25 +255,28 @@ class Axis:
         constant = _density_after(transforms, None, self.bins) / (1.0 / self.rate_hz)
         found = _NoiseVariances([], [], [], constant)
         for at, effect in enumerate(effects):
-            if type(effect) not in NOISE_SIZE_PARAMETERS:
+            if not is_noise_effect(effect):
                 continue
-            basis = self._variance_basis(effect, effects, transforms)
+            basis = self.variance_basis(effect, effects, transforms)
             if at in fixed_noise:
                 constant += effect_size(effect) ** 2 * basis
             else:
                 found.fitted.append(at)
                 found.bases.append(basis)
-                found.start.append(min(effect_size(effect) ** 2, self._full_power_theta(basis)))
+                whole = self._full_power_theta(basis)
+                least = INITIAL_FLOOR_RATIO * whole if isinstance(effect, BandwidthLimit) else 0.0
+                found.start.append(min(max(effect_size(effect) ** 2, least), whole))
         return found
 
     def sum_products_over_bins(self, regressors: Sequence[Regressor]) -> BinnedProductSums:
         """Sum the products of axis and regressors over each frequency bin."""
         q, m = len(regressors), self.bins.count.size
         cross, gram = np.empty((q, m)), np.empty((q, q, m))
-        for i, column in enumerate(regressors):
+        unit = [_with_unit_size(one) for one in regressors]
+        for i, column in enumerate(unit):
             cross[i] = self._binned_product(column, None)
             for j in range(i + 1):
-                gram[i, j] = gram[j, i] = self._binned_product(column, regressors[j])
+                gram[i, j] = gram[j, i] = self._binned_product(column, unit[j])
         return BinnedProductSums(self._binned_product(None, None), cross, gram)
 
     def _regressors_of(self, effects: Sequence[Effect]) -> tuple[tuple[tuple[int, slice], ...], list[Regressor]]:
@@ -247,19 +289,33 @@ class Axis:
                 columns += [(effect, i) for i in range(count)]
         return tuple(slices), columns
 
-    def _variance_basis(self, effect: Effect, effects: Sequence[Effect], transforms: Sequence[Transform]) -> Floats:
+    def variance_basis(self, effect: Effect, effects: Sequence[Effect], transforms: Sequence[Transform]) -> Floats:
         """Return the variance that a noise effect of size one adds to each frequency bin, shape (m,)."""
-        factor = 1.0
-        if isinstance(effect, AngleRandomWalk):
-            for other in effects:
-                if isinstance(other, NoiseStep):
-                    later = 1.0 - min(other.time * self.rate_hz / self.n, 1.0)
-                    factor *= 1.0 + later * (other.ratio**2 - 1.0)  # mean variance over the recording
-        tau0_s, unit = 1.0 / self.rate_hz, with_effect_size(effect, 1.0)
-        assert isinstance(unit, Source)
-        source = Spectrum(lambda f: factor * unit.two_sided_psd(f, tau0_s), None, tau0_s)
+        gains = tuple(one for one in effects if isinstance(one, WhiteNoiseGain))
+        key = (_with_unit_noise_size(effect), gains if isinstance(effect, AngleRandomWalk) else (), *transforms)
+        if key not in self._bases:
+            if len(self._bases) > MAX_CACHED_BASES:
+                self._bases.clear()
+            self._bases[key] = self._compute_variance_basis(effect, gains, transforms)
+        return self._bases[key]
+
+    def _compute_variance_basis(self, effect: Effect, gains: Effects, transforms: Sequence[Transform]) -> Floats:
+        tau0_s = 1.0 / self.rate_hz
+        if isinstance(effect, BandwidthLimit):  # the floor is white noise behind the filter
+            transforms = transforms[transforms.index(replace(effect, floor=None)) + 1 :]
+            source = white_noise_spectrum(1.0 / tau0_s, tau0_s)
+        else:
+            source = self._unit_spectrum(effect, gains)
         density = _density_after(transforms, source, self.bins) - _density_after(transforms, None, self.bins)
         return np.asarray(density / tau0_s)
+
+    def _unit_spectrum(self, effect: Effect, gains: Effects) -> Spectrum:
+        """Return the spectrum of a noise effect of size one before the transforms."""
+        tau0_s = 1.0 / self.rate_hz
+        factor = self._mean_noise_power(gains) if isinstance(effect, AngleRandomWalk) else 1.0
+        unit = with_effect_size(effect, 1.0)
+        assert isinstance(unit, Source)
+        return Spectrum(lambda f: factor * unit.two_sided_psd(f, tau0_s), None, tau0_s)
 
     def _full_power_theta(self, basis: Floats) -> float:
         """Return the squared size for which a noise effect alone would explain the total power of the axis."""
@@ -267,21 +323,20 @@ class Axis:
         return float(power / max((self.bins.count * self.used_bins * basis).sum(), 1e-300))
 
     def _binned_product(self, a: Regressor | None, b: Regressor | None) -> Floats:
-        key = (_regressor_key(a), _regressor_key(b))
+        """Return the sums of products of two regressors of size one, shape (m,). None stands for the axis."""
+        key = frozenset((a, b))
         if key not in self._products:
             if len(self._products) > MAX_CACHED_PRODUCTS:
                 self._products.clear()
-            self._products[key] = self.bins.sum_over_bins(self._column(a) * self._column(b)) * self.used_bins
+            first, second = self._column(a), self._column(b)
+            size = min(first.size, second.size)
+            self._products[key] = self.bins.sum_over_bins(first[:size] * second[:size]) * self.used_bins
         return self._products[key]
 
     def _column(self, regressor: Regressor | None) -> Floats:
         if regressor is None:
             return self.coefficients
-        return (
-            self.regressors.curvature
-            if regressor is CURVATURE
-            else self.regressor_cosine_transforms(regressor[0])[regressor[1]]
-        )
+        return self.regressor_cosine_transforms(regressor[0])[regressor[1]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,7 +350,6 @@ class AxisFit:
     whittle: WhittleFit
     fitted_noise: tuple[int, ...]  # index in ``effects`` of each fitted θ
     regressor_slices: tuple[tuple[int, slice], ...]  # index in ``effects`` and slice of β of each deterministic effect
-    noise_floor_variance: float = 0.0  # variance of a coefficient due to the white noise floor after a low-pass filter
 
     def size_standard_error(self, effect_index: int) -> float:
         """Return the standard error of the size of an effect, or NaN if the size was not fitted."""
@@ -305,9 +359,18 @@ class AxisFit:
             theta = float(self.whittle.theta[noise])
             return 0.5 * float(np.sqrt(covariance[noise, noise] / theta)) if theta > 0.0 else float("nan")
         for at, place in self.regressor_slices:
-            if at == effect_index:  # the two regressors of a sinusoid have equal errors
-                return float(np.sqrt(np.diag(self.whittle.beta_covariance)[place].mean()))
+            if at == effect_index:
+                variances = np.diag(self.whittle.beta_covariance)[place]
+                # the two regressors of a sinusoid have equal errors
+                sinusoid = isinstance(self.effects[at], Sinusoidal)
+                return float(np.sqrt(variances.mean() if sinusoid else variances[0]))
         return float("nan")
+
+    def noise_variance(self, effect_index: int) -> Floats:
+        """Return the variance that a noise effect adds to each frequency bin, shape (m,)."""
+        effect = self.effects[effect_index]
+        transforms = _spectral_transforms(self.effects, self.axis.value_artifacts)
+        return effect_size(effect) ** 2 * self.axis.variance_basis(effect, self.effects, transforms)
 
     def with_regressor_sizes(self, beta: Floats) -> "AxisFit":
         """Return a copy of the fit with new regressor sizes, shape (q,), and the same noise."""
@@ -321,24 +384,48 @@ class AxisFit:
         changed = replace(whittle, beta=beta, residual=np.maximum(residual, 0.0), log_likelihood=value)
         return replace(self, whittle=changed, log_likelihood=value)
 
-    def coefficients_without_deterministic_effects(self) -> Floats:
+    def sum_residual_products_over_bins(self, regressors: Sequence[Regressor]) -> tuple[Floats, Floats]:
+        """Sum the products of residual and regressors over each frequency bin.
+
+        Parameters
+        ----------
+        regressors : sequence of Regressor
+            Regressors that need not belong to the fitted effects.
+
+        Returns
+        -------
+        cross : ndarray of float64, shape (q, m)
+            Products of each regressor with the axis less all fitted deterministic effects.
+        gram : ndarray of float64, shape (q, q, m)
+            Products of each pair of regressors.
+        """
+        fitted = [(self.effects[at], i) for at, p in self.regressor_slices for i in range(p.stop - p.start)]
+        sums = self.axis.sum_products_over_bins([*regressors, *fitted])
+        q = len(regressors)
+        cross = sums.cross[:q] - np.einsum("j,ijb->ib", self.whittle.beta, sums.gram[:q, q:])
+        return cross, sums.gram[:q, :q]
+
+    def cosine_transform_without_deterministic_effects(self) -> Floats:
         """Return the cosine transform, shape (n − 1,), of the axis less all fitted deterministic effects."""
         left = self.axis.coefficients.copy()
         for at, place in self.regressor_slices:
             for factor, column in zip(
                 self.whittle.beta[place], self.axis.regressor_cosine_transforms(self.effects[at]), strict=True
             ):
-                left -= factor * column
+                left[: column.size] -= factor * column
         return left
 
 
 def _spectral_transforms(effects: Sequence[Effect], statistics: ValueArtifacts) -> list[Transform]:
-    """Return the effects that filter or alter the spectrum, in the order of the signal chain."""
-    replaced = statistics.repeats is not None and bool(statistics.repeats.mask.any())
+    """Return the effects that filter or alter the spectrum, in the order of the signal chain.
+
+    The floors of low-pass filters are omitted, because a floor is fitted as a noise effect.
+    """
     found = [
-        effect
+        replace(effect, floor=None) if isinstance(effect, BandwidthLimit) else effect
         for effect in effects
-        if isinstance(effect, Transform) and not (replaced and isinstance(effect, RandomSampleHold))
+        if isinstance(effect, Transform)
+        and not (isinstance(effect, RandomSampleHold) and statistics.repeats and statistics.repeats.mask.any())
     ]
     return sorted(found, key=lambda effect: TRANSFORM_ORDER.index(type(effect)))
 
@@ -347,7 +434,7 @@ def _with_fitted_sizes(
     effects: Sequence[Effect], noises: Sequence[int], slices: Sequence[tuple[int, slice]], fitted: WhittleFit
 ) -> Effects:
     found = list(effects)
-    for theta, at in zip(fitted.theta, noises, strict=False):  # additional bases follow the bases of the effects
+    for theta, at in zip(fitted.theta, noises, strict=True):
         found[at] = with_effect_size(found[at], float(theta) ** 0.5)
     for at, place in slices:
         found[at] = with_regressor_factors(found[at], fitted.beta[place])
@@ -369,12 +456,14 @@ def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bin
     return spectrum.density(bins.f_hz)
 
 
-def _regressor_key(regressor: Regressor | None) -> tuple[object, int] | None:
-    """Return a cache key that does not depend on the size of the effect."""
-    if regressor is None or regressor is CURVATURE:
-        return regressor
+@lru_cache(MAX_CACHED_UNIT_EFFECTS)
+def _with_unit_noise_size(effect: Effect) -> Effect:
+    """Return a noise effect with the size one, as a part of a key of the cache."""
+    return with_effect_size(effect, 1.0)
+
+
+@lru_cache(MAX_CACHED_UNIT_EFFECTS)
+def _with_unit_size(regressor: Regressor) -> Regressor:
+    """Return a regressor whose effect has the size one, as a key of the cache."""
     effect, at = regressor
-    return (
-        with_effect_size(effect, 1.0) if isinstance(effect, AxisLeak) else with_regressor_factors(effect, np.ones(2)),
-        at,
-    )
+    return with_regressor_factors(effect, np.ones(MAX_REGRESSORS)), at

@@ -5,8 +5,9 @@ adds variance to each frequency bin, proportional to the square of the size. A d
 is the product of size and **regressor**. The regressor of an ``AxisLeak`` is another axis.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
-from math import atan2, hypot, pi
+from math import atan2, copysign, hypot, pi
 from typing import Any, Final
 
 import numpy as np
@@ -15,19 +16,29 @@ from drivers.data_types import Floats
 from monitor.noise.effect import AxisLeak, Effect, SampleBlockContext, Source
 from monitor.noise.effects import (
     AngleRandomWalk,
+    BandwidthLimit,
+    BiasCurve,
     BiasInstability,
     BiasStep,
+    CommonVibration,
+    ConstantBias,
     CrossAxis,
     ExponentiallyCorrelated,
     GSensitivity,
     Narrowband,
     PoissonSteps,
+    PowerLaw,
+    PulseTrain,
     QuantizationNoise,
     RandomTelegraph,
     RateRamp,
     RateRandomWalk,
+    Resolution,
+    SampleRateError,
+    ScaleFactor,
     Sinusoidal,
     TemperatureBias,
+    TemperatureHysteresis,
     TemperatureLag,
     TurnOnTransient,
 )
@@ -39,16 +50,25 @@ NOISE_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
     RateRandomWalk: "K",
     ExponentiallyCorrelated: "sigma",
     Narrowband: "sigma",
+    CommonVibration: "gain",
     RandomTelegraph: "amplitude",
     PoissonSteps: "height",
+    BandwidthLimit: "floor",
+    PowerLaw: "density",
 }
-"""For each noise effect, the name of the size parameter."""
+"""For each noise effect, the name of the size parameter.
+
+A low-pass filter is a noise effect if the parameter ``floor`` is present, even if the floor is 0.
+"""
 
 DETERMINISTIC_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
     RateRamp: "R",
     Sinusoidal: "amplitude",
     TemperatureBias: "coefficient",
     TemperatureLag: "coefficient",
+    TemperatureHysteresis: "height",
+    PulseTrain: "height",
+    BiasCurve: "slope",
     TurnOnTransient: "amplitude",
     BiasStep: "height",
     GSensitivity: "coefficient",
@@ -56,38 +76,72 @@ DETERMINISTIC_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
 }
 """For each deterministic effect, the name of the size parameter."""
 
+COEFFICIENTS: Final[dict[type[Effect], tuple[str, ...]]] = {
+    TemperatureBias: ("coefficient", "quadratic", "cubic"),
+    BiasCurve: ("slope", "curvature", "logarithmic"),
+}
+"""For each effect with several linear coefficients, the names of the coefficients. A coefficient may be absent."""
+
 SIZE_PARAMETERS: Final = NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS
 """For each effect with a size, the name of the size parameter."""
 
-ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
+MAX_REGRESSORS: Final = 3
+"""Largest number of regressors of an effect."""
+
+NON_GAUSSIAN_NOISES: Final = (PoissonSteps, RandomTelegraph)
+GAUSSIAN_TRANSFORMS: Final = (BandwidthLimit, ConstantBias, Resolution, SampleRateError, ScaleFactor)
+"""Effects without a size that keep Gaussian noise Gaussian and stationary. Quantization does so if the step is fine."""
+
+ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient", "bias_curve"})
 """Names of the effects that happen at most once in a recording."""
 
 _EFFECTS_BY_DIAGNOSTIC: Final = {
     "psd": (
         *("quantization_noise", "angle_random_walk", "bias_instability", "rate_random_walk"),
-        *("exponentially_correlated", "scale_factor", "narrowband", "bandwidth_limit"),
+        *("exponentially_correlated", "scale_factor", "narrowband", "bandwidth_limit", "power_law"),
     ),
-    "lines": ("sinusoidal",),
-    "temperature": ("temperature_bias", "temperature_lag"),
-    "other_axes": ("g_sensitivity", "cross_axis"),
-    "level": ("bias_step", "rate_ramp", "turn_on_transient"),
-    "tails": ("outliers",),
-    "variance": ("noise_step",),
+    "lines": ("sinusoidal", "pulse_train"),
+    "temperature": ("temperature_bias", "temperature_lag", "temperature_hysteresis"),
+    "other_axes": ("g_sensitivity", "cross_axis", "common_vibration"),
+    "level": ("bias_step", "rate_ramp", "turn_on_transient", "bias_curve"),
+    "tails": ("outliers", "heavy_tails"),
+    "variance": ("noise_step", "variance_modulation"),
     "values": ("resolution", "saturation", "sample_hold"),
 }
 MOST_DIRECT_DIAGNOSTIC: Final = {effect: lens for lens, effects in _EFFECTS_BY_DIAGNOSTIC.items() for effect in effects}
 """Diagnostic that is most sensitive to each effect."""
 
 
+def linear_coefficient_names(effect: Effect) -> tuple[str, ...]:
+    """Return the names of the linear coefficients of a deterministic effect, beginning with the size."""
+    names = COEFFICIENTS.get(type(effect), (SIZE_PARAMETERS[type(effect)],))
+    return tuple(name for name in names if getattr(effect, name) is not None)
+
+
+def is_noise_effect(effect: Effect) -> bool:
+    """Return True if an effect adds noise, whose size is a parameter of the effect."""
+    return getattr(effect, NOISE_SIZE_PARAMETERS.get(type(effect), ""), None) is not None
+
+
+def is_stationary_gaussian(effects: Sequence[Effect]) -> bool:
+    """Return True if the sum of all effects is stationary Gaussian noise with a known mean."""
+    return not any(
+        isinstance(effect, NON_GAUSSIAN_NOISES)
+        or not (type(effect) in SIZE_PARAMETERS or isinstance(effect, GAUSSIAN_TRANSFORMS))
+        for effect in effects
+    )
+
+
 def effect_size(effect: Effect) -> float:
-    """Return the size parameter of a noise effect or a deterministic effect."""
-    return float(getattr(effect, SIZE_PARAMETERS[type(effect)]))
+    """Return the size parameter of a noise effect or a deterministic effect. A noise effect has no sign."""
+    size = float(getattr(effect, SIZE_PARAMETERS[type(effect)]))
+    return abs(size) if type(effect) in NOISE_SIZE_PARAMETERS else size
 
 
 def with_effect_size(effect: Effect, size: float) -> Effect:
     """Return a copy of an effect with a new size.
 
-    The sizes of noise effects, ramps and sinusoids are never negative.
+    The sizes of noise effects, ramps and sinusoids are never negative. A common vibration keeps its sign.
 
     Parameters
     ----------
@@ -97,6 +151,8 @@ def with_effect_size(effect: Effect, size: float) -> Effect:
         New size, in the unit of the size parameter.
     """
     name = SIZE_PARAMETERS[type(effect)]
+    if isinstance(effect, CommonVibration):
+        return replace(effect, gain=copysign(size, effect.gain))
     unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or type(effect) in NOISE_SIZE_PARAMETERS
     return replace(effect, **{name: abs(size) if unsigned else size})  # type: ignore[type-var]
 
@@ -104,8 +160,8 @@ def with_effect_size(effect: Effect, size: float) -> Effect:
 def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
     """Build the regressors of a deterministic effect.
 
-    A sinusoid has a regressor for each of two phases. A quadratic temperature effect has a linear and a quadratic
-    regressor. Other effects have one regressor.
+    A sinusoid has a regressor for each of two phases. An effect in ``COEFFICIENTS`` has a regressor for each
+    coefficient. Other effects have one regressor.
 
     Parameters
     ----------
@@ -121,7 +177,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     Returns
     -------
     list of ndarray of float64, shape (n,)
-        One or two series.
+        One to three series.
 
     Raises
     ------
@@ -133,13 +189,9 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     variants: list[Any]
     if isinstance(effect, Sinusoidal):
         variants = [replace(effect, amplitude=1.0, phase=phase) for phase in (0.0, 0.5 * pi)]
-    elif isinstance(effect, TemperatureBias) and effect.quadratic is not None:
-        variants = [
-            replace(effect, coefficient=1.0, quadratic=0.0),
-            replace(effect, coefficient=0.0, quadratic=1.0),
-        ]
     else:
-        variants = [with_effect_size(effect, 1.0)]
+        count = len(linear_coefficient_names(effect))
+        variants = [with_regressor_factors(effect, unit) for unit in np.eye(count)]
     return [_series_of(one, n, rate_hz, temperature_c) for one in variants]
 
 
@@ -150,19 +202,20 @@ def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
     ----------
     effect : Effect
         Deterministic effect.
-    factors : ndarray of float64, shape (1,) or (2,)
-        Factor for each regressor.
+    factors : ndarray of float64, shape (q,)
+        Factor for each regressor. Further factors are ignored.
     """
     if isinstance(effect, Sinusoidal):
-        return replace(effect, amplitude=hypot(*factors), phase=atan2(factors[1], factors[0]) % (2.0 * pi))
-    if isinstance(effect, TemperatureBias) and effect.quadratic is not None:
-        return replace(effect, coefficient=float(factors[0]), quadratic=float(factors[1]))
+        return replace(effect, amplitude=hypot(*factors[:2]), phase=atan2(factors[1], factors[0]) % (2.0 * pi))
+    if type(effect) in COEFFICIENTS:
+        changed: dict[str, Any] = dict(zip(linear_coefficient_names(effect), map(float, factors), strict=False))
+        return replace(effect, **changed)  # type: ignore[type-var]
     return with_effect_size(effect, float(factors[0]))
 
 
 def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:
     values = np.zeros(n)
-    known_c = np.full(n, np.nan) if temperature_c is None else temperature_c
+    known_c = np.broadcast_to(np.nan, n) if temperature_c is None else temperature_c
     # a deterministic effect draws no random numbers, but the interface requires a generator
     effect.start_series(rate_hz, np.random.default_rng(0)).add_next_samples(
         values, SampleBlockContext(0, known_c, np.empty(n))

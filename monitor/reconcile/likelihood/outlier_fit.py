@@ -1,8 +1,8 @@
-"""Fit of outliers to white residuals, and comparison with other causes of heavy tails.
+"""Fit of outliers and of heavy tails to white residuals.
 
 The magnitudes of the residuals are fitted by a Gaussian, Student's t and a mixture of two Gaussians (Tukey 1960). The
 mixture is (1−f) N(0, s²) + f N(0, s² + scale²) with the outlier fraction f. True outliers fit the mixture best and are
-equally likely at all times.
+equally likely at all times. Heavy tails fit Student's t best, and large magnitudes are equally likely at all times.
 
 The magnitudes are collected in bins, so that the fit time does not grow with the recording length.
 """
@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc
+from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc, stdtr
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
@@ -39,6 +39,7 @@ NEIGHBOUR_SAMPLES: Final = 4
 """Largest distance, in samples, between neighbouring outliers."""
 STUDENT_FREEDOMS: Final = np.geomspace(1.0, 300.0, 40)
 MIN_MIXTURE_GAIN_NATS: Final = 0.01
+MIN_PROBABILITY: Final = 1e-300
 MAX_Z: Final = 37.0
 """z value of a probability that underflows in 64 bits."""
 
@@ -55,6 +56,16 @@ class OutlierFit:
     gain_over_student: float  # log-likelihood gain over Student's t, nats; the mixture has one more parameter
     clustering_z: float  # z of the clustering of outliers, corrected for the number of tests
     misfit_z: float  # z of the misfit between the magnitudes and the mixture
+    student: "StudentFit"
+
+
+@dataclass(frozen=True, slots=True)
+class StudentFit:
+    """Fit of Student's t distribution to white residuals."""
+
+    nu: ValueWithInterval  # degrees of freedom
+    scale: float  # scale of the distribution
+    log_likelihood: float
 
 
 def fit_outliers(residuals: Floats) -> OutlierFit | None:
@@ -89,7 +100,9 @@ def fit_outliers(residuals: Floats) -> OutlierFit | None:
     kept = np.flatnonzero(counts)
     counts, squares = counts[kept], squares[kept] / counts[kept]
     narrow, wide, share, best = _fit_mixture(counts, squares, START_WIDTHS)
+    mixture = (1.0 - share) * ndtr(BIN_EDGES / narrow**0.5) + share * ndtr(BIN_EDGES / wide**0.5)
     gain = best - _gaussian_log_likelihood(counts, squares)
+    student = _fit_student(counts, squares, unit)
     if not (gain > MIN_MIXTURE_GAIN_NATS and wide > narrow):
         return None
     far = _outlier_threshold(narrow, wide, share)
@@ -105,10 +118,46 @@ def fit_outliers(residuals: Floats) -> OutlierFit | None:
         mask=mask,
         count=int(mask.sum()),
         gain=float(gain),
-        gain_over_student=float(best - _student_log_likelihood(counts, squares)),
+        gain_over_student=float(best - student.log_likelihood),
         clustering_z=_clustering_z(np.flatnonzero(mask), residuals.size),
-        misfit_z=_misfit_z(counts, kept, narrow, wide, share),
+        misfit_z=_misfit_z(counts, kept, mixture),
+        student=student,
     )
+
+
+def student_misfit_z(residuals: Floats, fit: StudentFit) -> float:
+    """Return the z value of a χ² goodness-of-fit test of a fitted Student's t distribution.
+
+    Parameters
+    ----------
+    residuals : ndarray of float64, shape (n,)
+        White residuals. NaN values are ignored.
+    fit : StudentFit
+        Fit of the residuals.
+    """
+    counts, _ = _bin_magnitudes(residuals, fit.scale)
+    kept = np.flatnonzero(counts)
+    return _misfit_z(counts[kept], kept, stdtr(fit.nu.value, BIN_EDGES))
+
+
+def convert_student_to_gaussian(values: Floats, nu: float) -> Floats:
+    """Convert values with Student's t distribution to values with a standard normal distribution.
+
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n,)
+        Values with a variance of 1.
+    nu : float
+        Degrees of freedom, above 2.
+
+    Examples
+    --------
+    >>> t = np.random.default_rng(0).standard_t(4.0, 100_000) / 2.0**0.5
+    >>> print(f"{np.mean(convert_student_to_gaussian(t, 4.0) ** 4):.1f}")
+    3.0
+    """
+    below = stdtr(nu, -np.abs(values) * (nu / (nu - 2.0)) ** 0.5)
+    return np.asarray(np.copysign(ndtri(np.maximum(below, MIN_PROBABILITY)), values))
 
 
 @compiled
@@ -193,30 +242,39 @@ def _mixture_log_density(squares: Floats, narrow: float, wide: float, share: flo
     return np.asarray(np.logaddexp(inside, outside))
 
 
-def _student_log_likelihood(counts: Floats, squares: Floats) -> float:
-    """Return the largest log-likelihood of Student's t distribution.
+def _fit_student(counts: Floats, squares: Floats, unit: float) -> StudentFit:
+    """Fit Student's t distribution to magnitudes in ``unit``.
 
     The EM algorithm fits the scale s with the weights (ν+1)/(ν + x²/s²) (Lange, Little & Taylor 1989) for all degrees
     of freedom ν.
     """
-    nu = STUDENT_FREEDOMS[:, None]
-    scale = np.ones_like(nu)
+    column = STUDENT_FREEDOMS[:, None]
+    scale = np.ones_like(column)
     for _ in range(30):
-        weights = (nu + 1.0) / (nu + squares / scale)
+        weights = (column + 1.0) / (column + squares / scale)
         scale = ((weights * squares) @ counts / (weights @ counts))[:, None]
     each = (
-        gammaln(0.5 * (nu + 1.0))
-        - gammaln(0.5 * nu)
-        - 0.5 * np.log(np.pi * nu * scale)
-        - 0.5 * (nu + 1.0) * np.log1p(squares / (nu * scale))
+        gammaln(0.5 * (column + 1.0))
+        - gammaln(0.5 * column)
+        - 0.5 * np.log(np.pi * column * scale)
+        - 0.5 * (column + 1.0) * np.log1p(squares / (column * scale))
     )
     likes = each @ counts
     best = int(likes.argmax())
-    top = float(likes[best])
-    if 0 < best < STUDENT_FREEDOMS.size - 1:  # maximum of the parabola through the best three values
-        left, right = top - likes[best - 1], top - likes[best + 1]
-        top += 0.125 * float((left - right) ** 2 / (left + right)) if left + right > 0.0 else 0.0
-    return top
+    top, apart = float(likes[best]), 0.0
+    spacing = float(np.log(STUDENT_FREEDOMS[1] / STUDENT_FREEDOMS[0]))
+    if not 0 < best < STUDENT_FREEDOMS.size - 1:
+        value = float(STUDENT_FREEDOMS[best])
+        return StudentFit(ValueWithInterval(value, value, value), unit * float(scale[best, 0]) ** 0.5, top)
+    # maximum of the parabola through the best three values
+    left, right = top - float(likes[best - 1]), top - float(likes[best + 1])
+    curvature = max(left + right, 1e-9)
+    apart = 0.5 * (left - right) / curvature
+    nu = float(STUDENT_FREEDOMS[best] * np.exp(apart * spacing))
+    half = float(np.exp(Z95 * spacing / curvature**0.5))
+    width = np.interp(best + apart, np.arange(STUDENT_FREEDOMS.size), scale[:, 0]) ** 0.5
+    top += 0.125 * (left - right) ** 2 / curvature
+    return StudentFit(ValueWithInterval(nu, nu / half, nu * half), unit * float(width), top)
 
 
 def _outlier_threshold(narrow: float, wide: float, share: float) -> float:
@@ -289,9 +347,8 @@ def _z_of_probability(probability: float) -> float:
     return -float(ndtri(probability)) if probability > 1e-300 else MAX_Z
 
 
-def _misfit_z(counts: Floats, kept: NDArray[np.intp], narrow: float, wide: float, share: float) -> float:
-    """Return the z value of a χ² goodness-of-fit test of the fitted mixture."""
-    below = (1.0 - share) * ndtr(BIN_EDGES / narrow**0.5) + share * ndtr(BIN_EDGES / wide**0.5)
+def _misfit_z(counts: Floats, kept: NDArray[np.intp], below: Floats) -> float:
+    """Return the z value of a χ² goodness-of-fit test of a distribution function at the edges of the bins."""
     total = counts.sum()
     expected = 2.0 * total * np.diff(below)
     seen = np.zeros(TOTAL_BINS)

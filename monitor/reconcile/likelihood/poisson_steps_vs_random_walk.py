@@ -25,11 +25,11 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     StateSpaceNoise,
     build_state_space_noise,
     compute_block_means,
+    difference_from_predicted_block_mean,
     fit_event_process,
     initial_state_covariance,
-    innovation_of_block,
     kalman_log_likelihood,
-    maximise_log_likelihood,
+    maximise_over_log_parameters,
     predict_block_mean_variance,
     prior_level_variance,
 )
@@ -81,7 +81,7 @@ def compare_poisson_with_random_walk(
         return float(kalman_log_likelihood(means, noise, level_variance))
 
     return fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
-        maximise_log_likelihood(random_walk_log_likelihood, (K,))[0]
+        maximise_over_log_parameters(random_walk_log_likelihood, (K,))[0]
     )
 
 
@@ -196,7 +196,7 @@ def _branch(
     d = table.shape[0]
     covariance, state_covariance = by_age.covariance[age], np.empty(d)
     variance = predict_block_mean_variance(noise, covariance, state_covariance)
-    innovation = innovation_of_block(block_mean, noise, by_age.mean[age])
+    innovation = difference_from_predicted_block_mean(block_mean, noise, by_age.mean[age])
     for jump in range(2):
         to, chance = (JUMP_AGES + age, jumps.some) if jump else (age, jumps.none)
         if jump:

@@ -212,7 +212,7 @@ def _flicker_processes(background: BackgroundNoise, block_s: float, duration_s: 
     return [(sigma, slowest * exp(-k * spacing)) for k in range(count)]
 
 
-def maximise_log_likelihood(
+def maximise_over_log_parameters(
     log_likelihood: Callable[..., float], start_values: Sequence[float]
 ) -> tuple[float, Floats]:
     """Maximise a log-likelihood over the logarithms of positive parameters by the Nelder-Mead method.
@@ -264,7 +264,7 @@ def fit_event_process(
     start_values : mapping of str to float
         Names and starting values of the two parameters.
     """
-    height, at = maximise_log_likelihood(lambda a, b: log_likelihood(a, b, 1.0), list(start_values.values()))
+    height, at = maximise_over_log_parameters(lambda a, b: log_likelihood(a, b, 1.0), list(start_values.values()))
     deviations = _log_deviations(lambda x: log_likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height)
     first, second = np.exp(at).tolist()
     events = (log_likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
@@ -334,7 +334,7 @@ def predict_block_mean_variance(noise: StateSpaceNoise, covariance: Floats, stat
 
 
 @compiled
-def innovation_of_block(block_mean: float, noise: StateSpaceNoise, state: Floats) -> float:
+def difference_from_predicted_block_mean(block_mean: float, noise: StateSpaceNoise, state: Floats) -> float:
     """Return the difference between a block mean and the prediction from the state, shape (d,)."""
     innovation = block_mean
     for i in range(noise.table.shape[0]):
@@ -374,7 +374,7 @@ def innovations_of_series(
     d = table.shape[0]
     state, innovations = np.zeros(d), np.empty(series.size)
     for k in range(series.size):
-        innovations[k] = innovation_of_block(series[k], noise, state)
+        innovations[k] = difference_from_predicted_block_mean(series[k], noise, state)
         for i in range(d):
             state[i] = table[i, 0] * state[i] + state_covariances[k, i] * innovations[k] / variances[k]
     return innovations

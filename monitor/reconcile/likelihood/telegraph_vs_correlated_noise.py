@@ -22,11 +22,11 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     build_state_space_noise,
     compute_block_means,
     correlated_noise_of_block_means,
+    difference_from_predicted_block_mean,
     fit_event_process,
     initial_state_covariance,
-    innovation_of_block,
     kalman_log_likelihood,
-    maximise_log_likelihood,
+    maximise_over_log_parameters,
     predict_block_mean_variance,
     prior_level_variance,
 )
@@ -91,7 +91,7 @@ def compare_telegraph_with_correlated_noise(
 
     telegraph = _fit_telegraph(means, block_s, noise, sigma, correlation_time)
     return telegraph.compare_with_other_effect(
-        maximise_log_likelihood(correlated_noise_log_likelihood, (sigma, correlation_time))[0]
+        maximise_over_log_parameters(correlated_noise_log_likelihood, (sigma, correlation_time))[0]
     )
 
 
@@ -179,7 +179,8 @@ def _switching_log_likelihood(
     """Return the log-likelihood of a random telegraph, and update the filter state in place.
 
     Each row of ``cases``, shape (3, 3), contains the probability of a case, and the mean and variance that the
-    telegraph adds to a block mean. The means apply to a block that starts in the upper level.
+    telegraph adds to a block mean. The mean is given for a block whose first sample is at the
+    upper level.
     """
     d = noise.table.shape[0]
     update = _BlockFilterUpdate(np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, d)))
@@ -207,7 +208,7 @@ def _weigh_cases(
     weight, pull, known = update.weight, update.scaled_innovation, update.inverse_variance
     for level in range(2):
         variance = predict_block_mean_variance(noise, state.covariance[level], update.state_covariance[level])
-        innovation = innovation_of_block(block_mean, noise, state.mean[level])
+        innovation = difference_from_predicted_block_mean(block_mean, noise, state.mean[level])
         sign = 1.0 - 2.0 * level
         for k in range(3):
             apart = innovation - sign * cases[k, 1]

@@ -1,7 +1,7 @@
 """Changes of the variance of white residuals over time, in the whole spectrum and in frequency bands.
 
-``fit_variance_changes`` fits a step, a trend, a periodic variation and a slow random variation of the variance.
-``find_spectrogram_change`` searches the spectrogram for a change of power.
+``compare_variance_change_forms`` fits a step, a trend, a periodic variation and a slow random variation of the
+variance. ``find_spectrogram_change`` searches the spectrogram for a change of power.
 
 The spectrogram consists of Fourier transforms of short pieces of the recording. A **tile** is a rectangle of 2^a pieces
 by 2^b frequencies, and a **row** contains all tiles of the same frequencies. Each tile is compared with the other tiles
@@ -54,18 +54,28 @@ class VarianceStep:
 
 
 @dataclass(frozen=True, slots=True)
-class VarianceChangeFit:
+class PeriodicVariation:
+    """Periodic variation of the noise variance σ² (1 + depth sin(2πt/period + phase))."""
+
+    gain: float  # of ln σ² = a + b cos(2πft) + c sin(2πft) over a constant variance, nats
+    depth: ValueWithInterval
+    period: ValueWithInterval  # s
+    phase: float  # rad
+
+
+@dataclass(frozen=True, slots=True)
+class VarianceChangeGains:
     """Log-likelihood gains of a step and of three other changes over a constant variance."""
 
     step: VarianceStep
     trend_gain: float  # of ln σ² = a + b t + c t², nats
-    periodic_gain: float  # of ln σ² = a + b cos(2πft) + c sin(2πft), nats
+    periodic: PeriodicVariation
     slow_variation_gain: float  # of a slow random variation, nats
 
     @property
-    def largest_alternative_gain(self) -> float:
+    def largest_gain_other_than_step(self) -> float:
         """Largest log-likelihood gain of the three changes other than a step, in nats."""
-        return max(self.trend_gain, self.periodic_gain, self.slow_variation_gain)
+        return max(self.trend_gain, self.periodic.gain, self.slow_variation_gain)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +89,7 @@ class SpectrogramChange:
     row: tuple[float, float]  # frequency range of the row, Hz
 
 
-def fit_variance_changes(residuals: Floats, tau0_s: float) -> VarianceChangeFit:
+def compare_variance_change_forms(residuals: Floats, tau0_s: float) -> VarianceChangeGains:
     """Fit a step and three other changes of the variance to white residuals.
 
     Parameters
@@ -99,23 +109,28 @@ def fit_variance_changes(residuals: Floats, tau0_s: float) -> VarianceChangeFit:
     >>> rng = np.random.default_rng(0)
     >>> w = rng.standard_normal(60_000)
     >>> w[20_000:] *= 1.2
-    >>> found = fit_variance_changes(w, 0.01)
+    >>> found = compare_variance_change_forms(w, 0.01)
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
     _check_sample_count(residuals, MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES)
     squares = residuals * residuals
-    length = max(MIN_BLOCK_SAMPLES, -(-residuals.size // MAX_VARIANCE_BLOCKS))
-    count = residuals.size // length
+    count = count_variance_blocks(residuals.size)
+    length = residuals.size // count
     energy = squares[: count * length].reshape(count, length).mean(axis=1)
     scores = energy / energy.mean() - 1.0
     time = np.linspace(-1.0, 1.0, count)
-    return VarianceChangeFit(
+    return VarianceChangeGains(
         step=_best_step(squares, tau0_s),
         trend_gain=_log_linear_gain(energy, length, np.stack([time, time**2 - 1.0 / 3.0])),
-        periodic_gain=_periodic_gain(energy, scores, length),
+        periodic=_fit_periodic_variation(energy, scores, length, tau0_s),
         slow_variation_gain=_slow_variation_gain(scores, length),
     )
+
+
+def count_variance_blocks(sample_count: int) -> int:
+    """Return the number of blocks in which the variance is computed."""
+    return sample_count // max(MIN_BLOCK_SAMPLES, -(-sample_count // MAX_VARIANCE_BLOCKS))
 
 
 def find_spectrogram_change(residuals: Floats, tau0_s: float) -> SpectrogramChange:
@@ -212,16 +227,43 @@ def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
     return max(0.5 * length * float(constant - (level + energy * np.exp(-level)).sum()), 0.0)
 
 
-def _periodic_gain(energy: Floats, scores: Floats, length: int) -> float:
-    """Return the log-likelihood gain of a periodic variance at the strongest frequency."""
+def _fit_periodic_variation(energy: Floats, scores: Floats, length: int, tau0_s: float) -> PeriodicVariation:
+    """Fit a periodic variance at the strongest frequency.
+
+    The errors are those of a sinusoid in white noise (Rife & Boorstyn 1974). The squares have the relative variance 2.
+    """
     power = np.abs(np.fft.rfft(scores, 2 * scores.size)) ** 2
     power[: 2 * MIN_CYCLES] = 0.0
     best = int(power[:-1].argmax())
     first = max(8 * best - 8, 16 * MIN_CYCLES)
     around = np.fft.rfft(scores, 16 * scores.size)[first : 8 * best + 9]
     frequency = (first + int(np.abs(around).argmax())) / (16.0 * scores.size)  # cycles per block
-    angle = 2.0 * np.pi * frequency * np.arange(scores.size)
-    return _log_linear_gain(energy, length, np.stack([np.cos(angle), np.sin(angle)]))
+    angle = 2.0 * np.pi * frequency * np.arange(scores.size, dtype=np.float64)
+    gain = _log_linear_gain(energy, length, np.stack([np.cos(angle), np.sin(angle)]))
+    sine, cosine = _fit_modulation(energy, angle) / np.sinc(frequency)  # the blocks average over their length
+    depth, error = float(np.hypot(sine, cosine)), 2.0 / float(energy.size * length) ** 0.5
+    period_s = length * tau0_s / frequency
+    # the phase at the first sample; the first block is centred at half its length
+    phase = float(np.arctan2(cosine, sine) - np.pi * frequency * (length - 1) / length)
+    relative = 3.0**0.5 * error / (np.pi * max(depth, error) * frequency * energy.size)
+    return PeriodicVariation(
+        gain,
+        ValueWithInterval(min(depth, 1.0), max(depth - Z95 * error, 0.0), depth + Z95 * error),
+        ValueWithInterval(period_s, period_s * (1.0 - Z95 * relative), period_s * (1.0 + Z95 * relative)),
+        phase % (2.0 * np.pi),
+    )
+
+
+def _fit_modulation(energy: Floats, angle: Floats) -> Floats:
+    """Return b/a and c/a of the variance model a + b sin + c cos, by iteratively weighted least squares."""
+    x = np.stack([np.ones(angle.size), np.sin(angle), np.cos(angle)])
+    level = np.full(angle.size, energy.mean())
+    beta = np.zeros(3)
+    for _ in range(8):
+        weight = 1.0 / level**2
+        beta = np.linalg.solve((x * weight) @ x.T, (x * weight) @ energy)
+        level = np.maximum(beta @ x, 0.05 * beta[0])
+    return np.asarray(beta[1:] / beta[0])
 
 
 def _slow_variation_gain(scores: Floats, length: int) -> float:
@@ -259,10 +301,19 @@ class _TileScore(NamedTuple):
 
 
 def _piece_spectra(w: Floats, piece: int) -> Floats:
-    """Return the powers, shape (pieces, piece/2), of all pieces at the frequencies (k + ½)/piece."""
-    half = np.exp(-1j * np.pi / piece * np.arange(piece))
-    lines = fft(w[: w.size // piece * piece].reshape(-1, piece) * half, axis=1)[:, : piece // 2]
-    return np.asarray(lines.real**2 + lines.imag**2)
+    """Return the powers, shape (pieces, piece/2), of all pieces at the frequencies (k + ½)/piece.
+
+    With N samples x_j in a piece, the Fourier transform of (x_j − i x_{j+N/2}) exp(−iπj/N), j < N/2, contains the
+    frequencies with even k from 0 to N − 2. The power at an odd k equals the power at N − 1 − k.
+    """
+    half = piece // 2
+    parts = w[: w.size // piece * piece].astype(np.float32).reshape(-1, piece)
+    turned = np.exp(-1j * np.pi / piece * np.arange(half)).astype(np.complex64)
+    lines = fft((parts[:, :half] - 1j * parts[:, half:]) * turned, axis=1, overwrite_x=True)
+    power = np.empty(lines.shape)
+    for first, part in ((0, lines[:, : half // 2]), (1, lines[:, : half // 2 - 1 : -1])):
+        power[:, first::2] = part.real**2 + part.imag**2
+    return power
 
 
 def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:

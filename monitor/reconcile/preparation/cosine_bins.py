@@ -22,10 +22,18 @@ BINS_PER_OCTAVE: Final = 16
 MAX_BIN_WIDTH_HZ: Final = 0.1
 MAX_BIN_WIDTH_FRACTION: Final = 0.002
 """Largest width of a bin as a fraction of the frequency range."""
+MAX_SMOOTH_COEFFICIENTS: Final = 1 << 15
+"""Number of block means that represent a smooth series in a long recording."""
 BINS_PER_PEAK_SIDE: Final = 24
 """Number of bins on each side of a narrow peak."""
 PEAK_REACH_HALF_WIDTHS: Final = 30.0
 """Distance from a narrow peak, in half widths, up to which the bins are finer."""
+
+MIN_COEFFICIENTS_PER_BIN: Final = 64
+"""Smallest number of coefficients in a bin whose power is not smoothed. The standard error is 18 %.
+"""
+SMOOTHING_BINS: Final = 9
+"""Number of neighbouring bins over which the power of a small bin is averaged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +46,23 @@ class FrequencyBins:
     rate_hz: float
 
     def sum_over_bins(self, products: Floats) -> Floats:
-        """Sum coefficient values, shape (n − 1,), over each bin, shape (m,)."""
-        return np.asarray(np.add.reduceat(products, self.first))
+        """Sum coefficient values over each bin, shape (m,).
+
+        The values have the shape (n − 1,). In a shorter array, the missing values at high frequencies are zero.
+        """
+        sums = np.zeros(self.first.size)
+        used = int(np.searchsorted(self.first, products.size))
+        sums[:used] = np.add.reduceat(products, self.first[:used])
+        return sums
+
+    def smoothed_mean_square(self, coefficients: Floats) -> Floats:
+        """Return the mean square of coefficients, shape (n − 1,), in each bin, shape (m,).
+
+        If a bin has few coefficients, the mean includes neighbouring bins.
+        """
+        sums, window = self.sum_over_bins(coefficients**2), np.ones(SMOOTHING_BINS)
+        smoothed = np.convolve(sums, window, "same") / np.convolve(self.count, window, "same")
+        return np.where(self.count >= MIN_COEFFICIENTS_PER_BIN, sums / self.count, smoothed)
 
     def expand_to_coefficients(self, bin_values: Floats) -> Floats:
         """Repeat the value of each bin, shape (m,), for all coefficients of the bin, shape (n − 1,)."""
@@ -103,6 +126,35 @@ def cosine_transform(y: Floats) -> Floats:
         Coefficients in the unit of ``y``.
     """
     return np.asarray(dct(y - y.mean(), norm="ortho")[1:])
+
+
+def low_frequency_cosine_transform(y: Floats) -> Floats:
+    """Compute the coefficients of a smooth series at low frequencies from block means.
+
+    A short series is transformed completely.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series that changes little within n/32768 samples.
+
+    Returns
+    -------
+    ndarray of float64, shape (min(n, 32768) − 1,) or (n − 1,)
+        First coefficients of ``cosine_transform(y)``. The other coefficients are nearly zero.
+
+    Examples
+    --------
+    >>> y = np.exp(-np.arange(100_000) / 2e4)
+    >>> found, exact = low_frequency_cosine_transform(y), cosine_transform(y)
+    >>> found.size, bool(np.abs(found - exact[: found.size]).max() < 1e-5 * exact.max())
+    (32767, True)
+    """
+    if y.size < 2 * MAX_SMOOTH_COEFFICIENTS:
+        return cosine_transform(y)
+    edges = np.rint(np.linspace(0.0, y.size, MAX_SMOOTH_COEFFICIENTS + 1)).astype(np.int64)
+    means = np.add.reduceat(y, edges[:-1]) / np.diff(edges)
+    return np.asarray((y.size / MAX_SMOOTH_COEFFICIENTS) ** 0.5 * cosine_transform(means))
 
 
 def inverse_cosine_transform(coefficients: Floats) -> Floats:

@@ -32,7 +32,9 @@ class Recording:
         return next(iter(self.values.values())).size
 
 
-def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[Recording, tuple[str, ...]]:
+def select_axes_and_smooth_temperature(
+    recording: Recording, model: NoiseModel | None
+) -> tuple[Recording, tuple[str, ...]]:
     """Select the axes that can be compared with a noise model, and smooth the temperature.
 
     Parameters

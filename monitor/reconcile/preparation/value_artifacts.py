@@ -9,6 +9,7 @@ noise. Clipping cannot be detected if the step exceeds two standard deviations.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -85,6 +86,39 @@ class RepeatedSamples:
     gain: float  # log-likelihood gain over chance, nats
 
 
+class ValueArtifacts:
+    """Quantization, clipping and repeated samples of an axis, detected on first use.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Measured values in the unit of the axis. NaN marks a missing sample.
+    """
+
+    def __init__(self, y: Floats) -> None:
+        self._y = y
+
+    @cached_property
+    def quantization(self) -> QuantizationGrid | None:
+        """Quantization grid, or None if no grid is detected."""
+        return detect_quantization(self._y)
+
+    @cached_property
+    def clipping(self) -> Clipping | None:
+        """Clipping, or None if no clipping is detected."""
+        return detect_clipping(self._y, self._step)
+
+    @cached_property
+    def repeats(self) -> RepeatedSamples | None:
+        """Repeated samples, or None if no repeats are detected."""
+        ends = self.clipping
+        return detect_repeats(self._y, self._step, ends.limit.value if ends and ends.symmetric else np.inf)
+
+    @property
+    def _step(self) -> float:
+        return self.quantization.step.value if self.quantization else 0.0
+
+
 def detect_quantization(y: Floats) -> QuantizationGrid | None:
     """Detect the quantization grid of the values.
 
@@ -116,10 +150,11 @@ def detect_quantization(y: Floats) -> QuantizationGrid | None:
     if part.size < MIN_SAMPLES:
         part = np.unique(values)
     rounding, last = _float_spacing(part), _last_decimal(part)
+    gaps = np.unique(np.diff(part))
     for blur, own in ((rounding, max(rounding, last)), (0.5 * last, last)):
-        step = _common_divisor(np.unique(np.diff(part)), blur) if blur > 0.0 else None
+        step = _common_divisor(gaps, blur) if blur > 0.0 else None
         if step is not None and (step > 1.5 * own or step >= MIN_STEP_TO_NOISE * noise):
-            return _fit_grid(values, step, blur)
+            return _fit_coarser_grid(values, gaps, step) or _fit_grid(values, step, blur)
     return None
 
 
@@ -278,6 +313,12 @@ def _common_divisor(gaps: Floats, blur: float) -> float | None:
     return None
 
 
+def _fit_coarser_grid(values: Floats, gaps: Floats, step: float) -> QuantizationGrid | None:
+    """Fit a coarser grid whose levels were rounded to multiples of ``step``, as in a text file."""
+    coarser = _common_divisor(gaps, 0.5 * step)
+    return None if coarser is None else _fit_grid(values, coarser, 0.5 * step)
+
+
 def _fit_grid(values: Floats, step: float, blur: float) -> QuantizationGrid | None:
     middle = float(values[values.size // 2])
     for _ in range(2):  # the second pass uses the step derived from the two extreme values
@@ -330,7 +371,8 @@ def _stepped_clipping_gain(values: Floats, end: float, step: float, noise: float
     """
     if noise < MIN_NOISE_TO_STEP_CLIPPING * step:
         return 0.0
-    counts = np.array([np.count_nonzero(np.abs(values - end + k * step) < 0.5 * step) for k in range(4)], dtype=float)
+    high = values[values > end - 4.0 * step]
+    counts = np.array([np.count_nonzero(np.abs(high - end + k * step) < 0.5 * step) for k in range(4)], dtype=float)
     pile = max(_excess_over_parabola(counts), _count_difference_gain(counts[0], counts[1]))
     if not pile > 0.0:
         return 0.0
@@ -355,7 +397,8 @@ def _count_difference_gain(one: float, other: float) -> float:
 def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
     """Return a linear prediction of every sample from neighbouring samples, and the standard deviation of the error."""
     z = values - values.mean()
-    lags = np.array([np.dot(z[: z.size - k], z[k:]) for k in range(2 * PREDICTOR_TAPS + 1)]) / z.size
+    # einsum runs in one thread, and threads of np.dot would wait for each other
+    lags = np.array([np.einsum("i,i->", z[: z.size - k], z[k:]) for k in range(2 * PREDICTOR_TAPS + 1)]) / z.size
     k = np.arange(1, PREDICTOR_TAPS + 1)
     both = 2.0 * (lags[np.abs(k[:, None] - k)] + lags[k[:, None] + k])
     weights = np.linalg.lstsq(both, 2.0 * lags[k], rcond=1e-10)[0]

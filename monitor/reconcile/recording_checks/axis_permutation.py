@@ -17,7 +17,7 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband
-from monitor.reconcile.recording_checks.block_spectra import BlockSpectrum
+from monitor.reconcile.recording_checks.median_block_spectrum import RobustBandSpectrum
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 LEVEL_LOG_SIGMA: Final = 0.12
@@ -52,13 +52,15 @@ class TriadOrder:
 
 
 def find_axis_order(
-    recorded: Sequence[BlockSpectrum], simulated: Sequence[BlockSpectrum], peaks: Sequence[tuple[float, float]] = ()
+    recorded: Sequence[RobustBandSpectrum],
+    simulated: Sequence[RobustBandSpectrum],
+    peaks: Sequence[tuple[float, float]] = (),
 ) -> TriadOrder:
     """Find the best assignment of the recorded axes of a triad to the axes of the model.
 
     Parameters
     ----------
-    recorded, simulated : sequence of BlockSpectrum
+    recorded, simulated : sequence of RobustBandSpectrum
         Spectra of the three recorded axes and of the three axes of a simulation, in the order of their columns.
     peaks : sequence of tuple of float
         Frequency in Hz, and variance of the logarithm of the power, of each resonance of the model.
@@ -76,7 +78,7 @@ def find_axis_order(
     return TriadOrder(best, gain, 0.5 * levels, 0.5 * LEVEL_LOG_SIGMA / float(np.sqrt(3.0)))
 
 
-def compute_resonance_variances(effects: Iterable[Effect], duration_s: float) -> list[tuple[float, float]]:
+def compute_resonance_log_power_variances(effects: Iterable[Effect], duration_s: float) -> list[tuple[float, float]]:
     """Return the frequency in Hz of each resonance, and the variance of the logarithm of the resonance power.
 
     The power of a resonance of bandwidth b changes about π b times per second. In a recording of length T, the power
@@ -97,7 +99,7 @@ def compute_resonance_variances(effects: Iterable[Effect], duration_s: float) ->
 
 
 def _compare_spectra(
-    recorded: BlockSpectrum, simulated: BlockSpectrum, peaks: Sequence[tuple[float, float]]
+    recorded: RobustBandSpectrum, simulated: RobustBandSpectrum, peaks: Sequence[tuple[float, float]]
 ) -> tuple[float, float]:
     """Return the logarithm of the ratio of the powers of two axes, and the cost in nats of their different shapes."""
     ratio = recorded.log_power - simulated.log_power

@@ -15,20 +15,20 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.preparation.reconcile_input import MIN_SAMPLES, Recording
 from monitor.reconcile.recording_checks.axis_permutation import (
     TriadOrder,
-    compute_resonance_variances,
+    compute_resonance_log_power_variances,
     describe_axis_order,
     find_axis_order,
     reorder_axes,
 )
-from monitor.reconcile.recording_checks.block_spectra import compute_block_spectrum
 from monitor.reconcile.recording_checks.corrupt_rows import check_corrupt_rows
+from monitor.reconcile.recording_checks.median_block_spectrum import compute_robust_spectrum
 from monitor.reconcile.recording_checks.missing_rows import check_missing_rows
 from monitor.reconcile.recording_checks.motion import check_motion
 from monitor.reconcile.recording_checks.repeated_rows import check_repeated_rows
 from monitor.reconcile.recording_checks.sample_rate_from_features import correct_impossible_sample_rate
-from monitor.reconcile.recording_checks.slow_terms import check_slow_terms
 from monitor.reconcile.recording_checks.stuck_values import check_stuck_values
 from monitor.reconcile.recording_checks.unit_error import collect_triad_evidence, find_unit_error
+from monitor.reconcile.recording_checks.untestable_slow_terms import check_slow_terms
 from monitor.reconcile.result import FindingKind, RecordingFinding
 
 TRIADS: Final = (AXES[:3], AXES[3:])
@@ -105,11 +105,11 @@ def _check_triad(
     findings: list[RecordingFinding] = []
     corrected = dict(values)
     if simulated is not None and model is not None:
-        recorded = [compute_block_spectrum(values[axis], rate_hz) for axis in triad]
-        expected = [compute_block_spectrum(simulated[axis], rate_hz) for axis in triad]
+        recorded = [compute_robust_spectrum(values[axis], rate_hz) for axis in triad]
+        expected = [compute_robust_spectrum(simulated[axis], rate_hz) for axis in triad]
         if not all(recorded) or not all(expected):
             return corrected, []
-        peaks = compute_resonance_variances((effect for _, effect in model), values[triad[0]].size / rate_hz)
+        peaks = compute_resonance_log_power_variances((effect for _, effect in model), values[triad[0]].size / rate_hz)
         order = find_axis_order([one for one in recorded if one], [one for one in expected if one], peaks)
         described = describe_axis_order(triad, order)
         if described is not None:

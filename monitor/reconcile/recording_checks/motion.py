@@ -13,8 +13,8 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from monitor.common.distributions import NORMAL_QUARTILE
-from monitor.common.units import format_axis_value
-from monitor.estimation.detection.motion_detection import Motion, detect_motion, samples_per_block
+from monitor.common.unit_formatting import format_axis_value
+from monitor.estimation.detection.motion_detection import MotionEpisode, detect_motion, samples_per_block
 from monitor.noise.effects import BiasStep, NoiseStep, PoissonSteps, RandomTelegraph, TurnOnTransient
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
@@ -75,7 +75,7 @@ def check_motion(
 
 def find_motion(
     values: Mapping[str, Floats], rate_hz: float, min_axes: int = MIN_MOVING_AXES
-) -> list[tuple[Motion, tuple[str, ...]]]:
+) -> list[tuple[MotionEpisode, tuple[str, ...]]]:
     """Find episodes of motion with increased variance on several axes, and return each episode with the moving axes.
 
     Parameters
@@ -128,7 +128,7 @@ def _standard_deviation_at_rest(x: Floats) -> float:
 
 
 def _describe(
-    episodes: list[tuple[Motion, tuple[str, ...]]], share: float, removed: bool, rate_hz: float
+    episodes: list[tuple[MotionEpisode, tuple[str, ...]]], share: float, removed: bool, rate_hz: float
 ) -> RecordingFinding:
     axes = tuple(axis for axis in AXES if any(axis in of for _, of in episodes))
     largest = sorted(episodes, key=lambda one: one[0].until - one[0].since, reverse=True)[:MAX_LISTED_EPISODES]

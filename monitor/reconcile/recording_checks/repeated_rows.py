@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from monitor.estimation.detection.repeated_share import estimate_repeated_row_share
+from monitor.estimation.detection.repeated_share import estimate_stale_sample_share
 from monitor.noise.effects import RandomSampleHold
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
@@ -46,7 +46,7 @@ def check_repeated_rows(
     by_chance = float(np.prod([np.mean(y[1:] == y[:-1]) for y in varying]))
     if by_chance > MAX_CHANCE_SHARE:
         return []
-    share = estimate_repeated_row_share(np.column_stack(varying))
+    share = estimate_stale_sample_share(np.column_stack(varying))
     if share < MIN_SHARE:
         return []
     n = varying[0].size

@@ -107,7 +107,7 @@ def estimate_sample_rate_error(
     by_likelihood : SampleRateErrorEstimate or None
         Estimate from the likelihood of all axes.
     """
-    groups = group_features(coefficients, rate_hz, effects)
+    groups = group_features_with_gains(coefficients, rate_hz, effects)
     if not groups:
         return by_likelihood
     if model_rate_hz is not None:
@@ -145,7 +145,7 @@ def correct_impossible_sample_rate(
         for axis, y in recording.values.items()
         if np.isfinite(y).any()
     }
-    groups = group_features(coefficients, rate_hz, model.effects)
+    groups = group_features_with_gains(coefficients, rate_hz, model.effects)
     gain = sum(_max_gain_near(group.gains, 0.0, MAX_STATED_FREQUENCY_DRIFT) for group in groups)
     if gain < MIN_STATED_GAIN_NATS:
         return None
@@ -183,7 +183,7 @@ def describe_sample_rate_error(error: SampleRateErrorEstimate, rate_hz: float) -
     )
 
 
-def group_features(
+def group_features_with_gains(
     coefficients: Mapping[str, Floats], rate_hz: float, effects: Mapping[str, Effects]
 ) -> list[FeatureGroup]:
     """Group the lines and resonances of the model, and compute the gains of the groups in the recording.
@@ -205,7 +205,7 @@ def group_features(
     )
     groups: list[list[tuple[float, str, Floats]]] = []
     for f_hz, width_hz, axis in features:
-        one = (f_hz, axis, compute_peak_gains(coefficients[axis], rate_hz, f_hz, width_hz))
+        one = (f_hz, axis, compute_peak_gains_by_ratio(coefficients[axis], rate_hz, f_hz, width_hz))
         home = next((group for group in groups if any(_is_related(f_hz, other) for other, _, _ in group)), None)
         if home is None:
             groups.append([one])
@@ -219,7 +219,7 @@ def group_features(
     return found
 
 
-def compute_peak_gains(coefficients: Floats, rate_hz: float, f_hz: float, width_hz: float) -> Floats:
+def compute_peak_gains_by_ratio(coefficients: Floats, rate_hz: float, f_hz: float, width_hz: float) -> Floats:
     """Compute the gain in nats of a peak at the model frequency divided by each ratio of ``LOG_RATIOS``.
 
     Parameters
@@ -237,7 +237,7 @@ def compute_peak_gains(coefficients: Floats, rate_hz: float, f_hz: float, width_
     --------
     >>> t = np.arange(20_000) / 100.0
     >>> y = np.random.default_rng(0).standard_normal(t.size) + 0.3 * np.sin(2.0 * np.pi * 10.0 * t)
-    >>> gains = compute_peak_gains(cosine_transform(y), 100.0, 10.5, 0.0)
+    >>> gains = compute_peak_gains_by_ratio(cosine_transform(y), 100.0, 10.5, 0.0)
     >>> print(f"{np.exp(LOG_RATIOS[gains.argmax()]):.3f}")
     1.050
     """

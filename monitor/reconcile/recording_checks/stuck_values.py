@@ -60,7 +60,7 @@ def check_stuck_values(
         for run in together:
             y = marked[run.axis].copy()
             y[run.first + 1 : run.last] = np.nan
-            if run.last - run.first < y.size:  # ``select_usable_axes`` excludes a constant axis
+            if run.last - run.first < y.size:  # ``select_axes_and_smooth_temperature`` excludes a constant axis
                 marked[run.axis] = y
     return marked, findings
 
@@ -77,11 +77,11 @@ def find_stuck_run(axis: str, y: Floats, simulated: Mapping[str, Floats] | None)
     simulated : mapping of str to ndarray or None
         Simulation of the model under test.
     """
-    first, last = find_longest_run(y)
+    first, last = find_longest_run_bounds(y)
     length = last - first
     least = float(MIN_RUN_SAMPLES)
     if simulated is not None and axis in simulated:
-        begin, end = find_longest_run(simulated[axis])
+        begin, end = find_longest_run_bounds(simulated[axis])
         least = max(least, MIN_SIMULATED_RATIO * (end - begin))
     if length < least:
         return None
@@ -97,12 +97,12 @@ def find_stuck_run(axis: str, y: Floats, simulated: Mapping[str, Floats] | None)
     return Run(axis, first, last, chance_log) if chance_log < log(MAX_CHANCE) else None
 
 
-def find_longest_run(y: Floats) -> tuple[int, int]:
+def find_longest_run_bounds(y: Floats) -> tuple[int, int]:
     """Return the first index and the index after the last index of the longest run of equal values.
 
     Examples
     --------
-    >>> find_longest_run(np.array([1.0, 2.0, 2.0, 2.0, 3.0]))
+    >>> find_longest_run_bounds(np.array([1.0, 2.0, 2.0, 2.0, 3.0]))
     (1, 4)
     """
     changes = np.flatnonzero(~(y[1:] == y[:-1])) + 1

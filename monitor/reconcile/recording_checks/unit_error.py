@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.distributions import Z95
-from monitor.noise.effects import Bias, Resolution
+from monitor.noise.effects import ConstantBias, Resolution
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.recording_checks.axis_permutation import TriadOrder
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
@@ -195,7 +195,11 @@ def _gravity_ratio(values: Mapping[str, Floats], triad: Sequence[str], model: No
     norm = float(np.linalg.norm(means))
     if not norm > MIN_GRAVITY_M_S2:
         return None
-    biases = [] if model is None else [e.value for a in triad for e in model.effects.get(a, ()) if isinstance(e, Bias)]
+    biases = (
+        []
+        if model is None
+        else [e.value for a in triad for e in model.effects.get(a, ()) if isinstance(e, ConstantBias)]
+    )
     expected = float(np.linalg.norm(biases))
     return norm / (expected if expected > MIN_GRAVITY_M_S2 else GRAVITY)
 

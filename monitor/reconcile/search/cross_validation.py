@@ -14,20 +14,33 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.noise.effect import Effect
-from monitor.noise.effects import Outliers, RandomSampleHold, Resolution, Saturation, Sinusoidal
-from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
+from monitor.noise.effects import (
+    HeavyTails,
+    Outliers,
+    RandomSampleHold,
+    Resolution,
+    Saturation,
+    Sinusoidal,
+    VarianceModulation,
+)
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
-from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects, RegressorCache
-from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, ONE_TIME_EFFECTS, effect_size
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, noise_effect_indices
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
+from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
+from monitor.reconcile.likelihood.effect_roles import (
+    DETERMINISTIC_SIZE_PARAMETERS,
+    ONE_TIME_EFFECTS,
+    linear_coefficient_names,
+)
+from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
-from monitor.reconcile.search.axis_repair import detect_value_artifacts, repair_axis_again
+from monitor.reconcile.preparation.value_artifacts import ValueArtifacts
+from monitor.reconcile.search.repaired_axes import repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest log-likelihood gain of an effect in one half of the recording, in nats."""
-SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers)
-"""Effects that alter single samples."""
+SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers, HeavyTails, VarianceModulation)
+"""Effects that do not change the Whittle likelihood. They are validated by the gap of the diagnostic."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
 
 
@@ -71,11 +84,14 @@ def cross_validate(
     """
     if added_effect is not None and added_effect.name in ONE_TIME_EFFECTS:
         return accept_without_validation("the effect happens only once")
+    alters_samples = isinstance(added_effect, SAMPLE_EFFECTS)
+    if not alters_samples and after.fit.log_likelihood - before.fit.log_likelihood < 4.0 * MIN_HALF_GAIN_NATS:
+        return accept_without_validation(TOO_LITTLE_EVIDENCE)
     n = after.axis.n
     parts = [slice(0, n // 2), slice(n - n // 2, n)]
     sources = {getattr(effect, "source", "") for effect in (*before.effects, *after.effects)}
     repaired = [_half_axis(after.axis, part, after.effects, sources, rng) for part in parts]
-    if isinstance(added_effect, SAMPLE_EFFECTS):
+    if alters_samples:
         halves = [_half_axis(after.axis, part, before.effects, sources, rng) for part in parts]
         gap_before, gap_after = _summed_gap(halves, before, diagnostic), _summed_gap(repaired, after, diagnostic)
         return CrossValidationResult(gap_before, gap_after, gap_after < gap_before, "")
@@ -83,8 +99,6 @@ def cross_validate(
         gains = [_expected_gain(_fit_half(half, after), after.effects[-1]) for half in repaired]
         if min(gains) < MIN_HALF_GAIN_NATS:
             return accept_without_validation(TOO_LITTLE_EVIDENCE)
-    if after.fit.log_likelihood - before.fit.log_likelihood < 4.0 * MIN_HALF_GAIN_NATS:
-        return accept_without_validation(TOO_LITTLE_EVIDENCE)
     return _exchange_halves(repaired, before, after, diagnostic, null)
 
 
@@ -128,8 +142,8 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
         build_frequency_bins(raw.size, axis.rate_hz),
         others,
         temperature_c,
-        detect_value_artifacts(raw),
-        RegressorCache(raw.size, axis.rate_hz, temperature_c),
+        ValueArtifacts(raw),
+        axis.regressors.restrict_to_part(part),
     )
     return repair_axis_again(half, effects, rng)
 
@@ -141,11 +155,11 @@ def _expected_gain(fit: AxisFit, effect: Effect) -> float:
     """
     half = fit.axis
     columns = half.regressor_cosine_transforms(effect)
-    weight = half.bins.expand_to_coefficients(half.used_bins / fit.whittle.variance)
+    weight = half.bins.expand_to_coefficients(half.used_bins / fit.whittle.variance)[: columns[0].size]
     if isinstance(effect, Sinusoidal):
         return 0.5 * effect.amplitude**2 * float((columns[0] ** 2 * weight).sum())
-    quadratic = getattr(effect, "quadratic", None)
-    made = effect_size(effect) * columns[0] + (quadratic * columns[1] if quadratic is not None else 0.0)
+    factors = [getattr(effect, name) for name in linear_coefficient_names(effect)]
+    made = sum(factor * column for factor, column in zip(factors, columns, strict=True))
     return 0.5 * float((made**2 * weight).sum())
 
 

@@ -20,14 +20,14 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.likelihood.axis_fit import AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size
-from monitor.reconcile.likelihood.hypothesis import Hypothesis
+from monitor.reconcile.likelihood.hypothesis_fit import RESIZE_PENALTY_NATS, Hypothesis
 from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
 from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
 from monitor.reconcile.likelihood.state_space_comparison import BackgroundNoise
 from monitor.reconcile.likelihood.telegraph_vs_correlated_noise import compare_telegraph_with_correlated_noise
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.search.candidates import PENALTY_NATS, fit_correlated_noise
+from monitor.reconcile.search.candidate_effects import PENALTY_NATS, fit_correlated_noise, initial_effect_size
 from monitor.reconcile.search.trials import Trial
 
 MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0
@@ -62,19 +62,24 @@ class NonGaussianAlternative:
     )
     runner_up: "NonGaussianAlternative | None" = None  # alternative that fits second best
 
-    def as_trials(self, replaced_score: float) -> tuple[Trial, ...]:
+    def as_trials(self, replaced: Trial) -> tuple[Trial, ...]:
         """Convert the alternative and the runner-up to trials.
 
-        ``replaced_score`` is the score of the replaced effect, in nats.
+        ``replaced`` is the trial of the replaced effect.
         """
         effect = self.added[-1]
         trial = Trial(
-            effect.name, effect, replaced_score + self.gain, intervals=self.intervals, event_count=self.event_count
+            effect.name,
+            effect,
+            replaced.score + self.gain,
+            slow_noise_score=replaced.slow_noise_score,
+            intervals=self.intervals,
+            event_count=self.event_count,
         )
-        return (trial, *(self.runner_up.as_trials(replaced_score) if self.runner_up else ()))
+        return (trial, *(self.runner_up.as_trials(replaced) if self.runner_up else ()))
 
 
-def choose_distribution(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
+def replace_by_likelier_alternative(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
     """Replace a new effect by a more likely alternative with the same spectrum.
 
     Parameters
@@ -95,16 +100,16 @@ def choose_distribution(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hy
     if isinstance(new, ExponentiallyCorrelated) and isinstance(hypothesis.effects[-1], ExponentiallyCorrelated):
         alternative = fit_telegraph_alternative(hypothesis, len(hypothesis.effects) - 1)
     elif isinstance(new, BiasStep):
-        alternative = compare_jump_processes(hypothesis)
+        alternative = choose_poisson_steps_or_telegraph(hypothesis)
     if alternative is None:
         return hypothesis, trials
-    added = alternative.as_trials(trials[0].score)
+    added = alternative.as_trials(trials[0])
     if alternative.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return hypothesis, [trials[0], *added, *trials[1:]]
-    return hypothesis.refit_with_added_effects(alternative.added), [*added, *trials]
+    return hypothesis.refit_with_other_added_effects(alternative.added), [*added, *trials]
 
 
-def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
+def choose_poisson_steps_or_telegraph(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
     """Return the more likely of Poisson steps and a slow random telegraph, or None if neither process applies."""
     steps = fit_poisson_alternative(hypothesis)
     if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
@@ -198,8 +203,34 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
     )
 
 
+def compare_poisson_with_added_noise(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
+    """Compare Poisson steps with added correlated noise, or with an increased bias instability.
+
+    The hypothesis with Poisson steps has the original bias instability and random walk, and neither correlated noise
+    nor single steps. Return None if the hypothesis contains neither correlated noise nor a resized bias instability.
+    """
+    replaced = [effect for effect in hypothesis.added if isinstance(effect, (ExponentiallyCorrelated, *WALK_EFFECTS))]
+    resized = [at for at in hypothesis.fit.fitted_noise if at < hypothesis.given_count]
+    slow = {at for at in resized if isinstance(hypothesis.effects[at], (BiasInstability, RateRandomWalk))}
+    if not any(isinstance(effect, ExponentiallyCorrelated) for effect in replaced) and not any(
+        isinstance(hypothesis.effects[at], BiasInstability) for at in slow
+    ):
+        return None
+    known = [hypothesis.model[at] if at in slow else hypothesis.effects[at] for at in range(hypothesis.given_count)]
+    others = [effect for effect in hypothesis.added if effect not in replaced]
+    walk = RateRandomWalk(K=initial_effect_size(hypothesis.axis))
+    fit = hypothesis.axis.fit((*known, *others, walk), hypothesis.fit.fixed_noise | slow)
+    jumps = fit_poisson_alternative(Hypothesis(hypothesis.model, fit))
+    if jumps is None:
+        return None
+    score = jumps.poisson_log_likelihood - PENALTY_NATS["poisson_steps"]
+    score -= RESIZE_PENALTY_NATS * (len(resized) - len(slow))
+    present = hypothesis.penalised_log_likelihood - sum(PENALTY_NATS[effect.name] for effect in replaced)
+    return replace(jumps, gain=score - present)
+
+
 def _residual_series(fit: AxisFit) -> Floats:
-    return inverse_cosine_transform(fit.coefficients_without_deterministic_effects())
+    return inverse_cosine_transform(fit.cosine_transform_without_deterministic_effects())
 
 
 def build_background_noise(effects: Effects) -> BackgroundNoise:

@@ -15,13 +15,12 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.common.distributions import HALF_CHI2_95
 from monitor.noise.effect import Effect
-from monitor.noise.effects import Narrowband, Sinusoidal
-from monitor.reconcile.diagnostics.diagnostics import compute_periodogram
+from monitor.noise.effects import Narrowband, PowerLaw, Sinusoidal
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
-from monitor.reconcile.likelihood.hypothesis import find_maximum_by_golden_section, fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import find_maximum_by_golden_section, fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.search.candidates import find_spectral_peaks
+from monitor.reconcile.search.candidate_effects import find_broad_spectral_peaks
 
 MAX_LOG_RATIO: Final = 0.15
 """Largest absolute logarithm of the ratio of sample rates."""
@@ -36,6 +35,7 @@ SEARCH_ITERATIONS: Final = 18
 RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "Q": 1.0,
     "N": 0.5,
+    "floor": 0.5,
     "K": -0.5,
     "R": -1.0,
     "frequency": -1.0,
@@ -45,6 +45,11 @@ RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "dwell_time": 1.0,
     "time_constant": 1.0,
     "time": 1.0,
+    "period": 1.0,
+    "width": 1.0,
+    "delay": 1.0,
+    "slope": -1.0,
+    "curvature": -2.0,
     "rate": -1.0,
 }
 """Exponent of each parameter in the conversion from true time to stated time.
@@ -65,7 +70,7 @@ class SampleRateErrorEstimate:
     frequency: tuple[float, float]  # frequency of the feature in the model and in the recording, Hz
 
 
-def rescale_effect_time(effect: Effect, rate_ratio: float) -> Effect:
+def convert_effect_to_stated_time(effect: Effect, rate_ratio: float) -> Effect:
     """Convert an effect from true time to the time scale of a recording with a wrong sample rate.
 
     Parameters
@@ -77,7 +82,7 @@ def rescale_effect_time(effect: Effect, rate_ratio: float) -> Effect:
 
     Examples
     --------
-    >>> rescale_effect_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
+    >>> convert_effect_to_stated_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
     10.0
     """
     changed: dict[str, Any] = {
@@ -85,6 +90,8 @@ def rescale_effect_time(effect: Effect, rate_ratio: float) -> Effect:
         for name, power in RATIO_EXPONENTS.items()
         if getattr(effect, name, None)
     }
+    if isinstance(effect, PowerLaw):
+        changed["density"] = effect.density * rate_ratio ** (0.5 * (1.0 - effect.exponent))
     return replace(effect, **changed) if changed else effect  # type: ignore[type-var]
 
 
@@ -112,7 +119,8 @@ def detect_sample_rate_error(
 
     def gain_by_axis(log_ratio: float) -> dict[str, float]:
         changed = {
-            name: tuple(rescale_effect_time(effect, exp(log_ratio)) for effect in effects[name]) for name in axes
+            name: tuple(convert_effect_to_stated_time(effect, exp(log_ratio)) for effect in effects[name])
+            for name in axes
         }
         return {name: _log_likelihood(axes[name], changed[name]) - before[name] for name in axes}
 
@@ -159,7 +167,9 @@ def _gain_per_feature(
     for group in groups:
         gain = 0.0
         for name, of in effects.items():
-            moved = tuple(rescale_effect_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
+            moved = tuple(
+                convert_effect_to_stated_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of
+            )
             if moved != of:
                 gain += _log_likelihood(axes[name], moved) - before[name]
         gains.append(gain)
@@ -189,7 +199,7 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
 def _line_power(whitened: WhitenedAxis, features: list[Feature], factors: Floats) -> Floats:
     """Return, for each factor, the total power at all line frequencies times the factor."""
     power = np.zeros(factors.size)
-    spectrum = compute_periodogram(whitened.series)
+    spectrum = whitened.periodogram
     spacing_hz = whitened.axis.rate_hz / (2 * (spectrum.size - 1))
     for line in features:
         if isinstance(line, Sinusoidal):
@@ -203,7 +213,7 @@ def _resonance_ratios(whitened: WhitenedAxis, features: list[Feature]) -> list[t
         (feature.frequency / peak_hz, 2.0 * feature.bandwidth / feature.frequency)
         for feature in features
         if isinstance(feature, Narrowband)
-        for peak_hz, _ in find_spectral_peaks(whitened, 4)
+        for peak_hz, _ in find_broad_spectral_peaks(whitened, 4)
         if abs(log(feature.frequency / peak_hz)) < MAX_LOG_RATIO
     ]
 

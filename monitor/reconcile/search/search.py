@@ -10,33 +10,48 @@ from typing import Final
 
 import numpy as np
 
-from monitor.noise.effect import AxisLeak, Effect
-from monitor.noise.effects import BiasStep, Outliers, RandomSampleHold, Saturation
-from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
+from monitor.noise.effect import AxisLeak, Effect, Source
+from monitor.noise.effects import (
+    BiasCurve,
+    BiasStep,
+    ExponentiallyCorrelated,
+    Outliers,
+    PulseTrain,
+    RandomSampleHold,
+    RateRandomWalk,
+    Saturation,
+)
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
 from monitor.reconcile.diagnostics.plot_data import build_plot_data
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.effect_roles import (
     MOST_DIRECT_DIAGNOSTIC,
-    NOISE_SIZE_PARAMETERS,
     ONE_TIME_EFFECTS,
     SIZE_PARAMETERS,
     effect_size,
+    is_noise_effect,
 )
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, fit_with_fewest_changes, fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import (
+    Hypothesis,
+    fit_with_fewest_changes,
+    fit_with_fixed_noise,
+    refit_correlation_times,
+)
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins
-from monitor.reconcile.result import PlotData
-from monitor.reconcile.search.axis_repair import repair_axis_again
-from monitor.reconcile.search.candidates import PENALTY_NATS, find_spectral_peaks
+from monitor.reconcile.result import DiagnosticPlotData
+from monitor.reconcile.search.candidate_effects import PENALTY_NATS, find_broad_spectral_peaks
 from monitor.reconcile.search.cross_validation import CrossValidationResult, accept_without_validation, cross_validate
 from monitor.reconcile.search.non_gaussian_alternatives import (
     MIN_ALTERNATIVE_GAIN_NATS,
-    choose_distribution,
-    compare_jump_processes,
+    choose_poisson_steps_or_telegraph,
+    compare_poisson_with_added_noise,
+    replace_by_likelier_alternative,
 )
-from monitor.reconcile.search.trials import UNNAMED, Trial, generate_trial_groups, try_alternatives_to_resizing
-from monitor.reconcile.search.withdrawal import SMOOTH_SPECTRA, keep_supported_effects
+from monitor.reconcile.search.repaired_axes import repair_axis_again
+from monitor.reconcile.search.trials import Trial, generate_trial_groups, try_alternatives_to_slow_noise
+from monitor.reconcile.search.withdrawal_of_contradicted_effects import SMOOTH_SPECTRA, keep_uncontradicted_effects
 
 MAX_ROUNDS: Final = 8
 MAX_VALIDATION_ATTEMPTS: Final = 3
@@ -50,21 +65,22 @@ DISTRIBUTION_DIAGNOSTICS: Final = ("tails", "variance")
 
 
 @dataclass(frozen=True, slots=True)
-class AxisDiagnostics:
+class HypothesisDiagnostics:
     """Findings and plots of an axis for one hypothesis."""
 
     findings: Findings
-    plots: tuple[PlotData, ...]
+    plots: tuple[DiagnosticPlotData, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class SearchRound:
     """Search round that added an effect or changed sizes of the noise model."""
 
-    before: AxisDiagnostics
+    before: HypothesisDiagnostics
     trials: tuple[Trial, ...]  # the selected trial, then the other trials in descending order of the score
     hypothesis: Hypothesis  # after the round
     validation: CrossValidationResult
+    replaces_effects: bool = False  # True if the effect of the round replaces effects of earlier rounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +89,8 @@ class AxisSearchResult:
 
     rounds: tuple[SearchRound, ...]
     hypothesis: Hypothesis
-    final: AxisDiagnostics
-    before_withdrawal: AxisDiagnostics | None  # None if no effect was withdrawn
+    final: HypothesisDiagnostics
+    before_withdrawal: HypothesisDiagnostics | None  # None if no effect was withdrawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +99,13 @@ class _DiagnosedHypothesis:
     whitened: WhitenedAxis
     findings: Findings
 
-    def findings_and_plots(self) -> AxisDiagnostics:
+    def findings_and_plots(self) -> HypothesisDiagnostics:
         """Return the findings and the plots."""
-        return AxisDiagnostics(self.findings, build_plot_data(self.whitened))
+        return HypothesisDiagnostics(self.findings, build_plot_data(self.whitened))
+
+
+_CompletedRound = tuple[SearchRound, _DiagnosedHypothesis]
+"""Search round and the diagnosed hypothesis after the round."""
 
 
 def search_missing_effects(axis: Axis, model: Effects, null: AxisNull, rng: np.random.Generator) -> AxisSearchResult:
@@ -105,100 +125,137 @@ def search_missing_effects(axis: Axis, model: Effects, null: AxisNull, rng: np.r
     current = _diagnose(fit_with_fixed_noise(axis, model))
     rounds: list[SearchRound] = []
     while len(rounds) < MAX_ROUNDS:
-        current, done = _next_round(current, bool(rounds), null, rng)
-        if done is None:
+        current, completed = _next_round(current, bool(rounds), null, rng)
+        if completed is None:
             break
+        done, current = completed
         rounds.append(done)
-        current = _diagnose(done.hypothesis)
-    kept = keep_supported_effects(current.hypothesis.added, _gains_by_type(rounds), current.findings, null)
+    kept = keep_uncontradicted_effects(current.hypothesis.added, _gains_by_type(rounds), current.findings, null)
     kept, before_withdrawal = _without_zero_sizes(kept), None
     while kept != current.hypothesis.added:
         before_withdrawal = before_withdrawal or current.findings_and_plots()
-        current = _diagnose(current.hypothesis.refit_with_added_effects(kept))
+        current = _diagnose(current.hypothesis.refit_with_other_added_effects(kept))
         kept = _without_zero_sizes(current.hypothesis.added)
+    for one in rounds:
+        if one.hypothesis.axis is not current.hypothesis.axis:
+            one.hypothesis.axis.clear_cached_sums()
     return AxisSearchResult(tuple(rounds), current.hypothesis, current.findings_and_plots(), before_withdrawal)
 
 
-def _diagnose(hypothesis: Hypothesis) -> _DiagnosedHypothesis:
-    whitened = whiten_axis(hypothesis.fit)
+def _diagnose(hypothesis: Hypothesis, whitened: WhitenedAxis | None = None) -> _DiagnosedHypothesis:
+    whitened = whitened or whiten_axis(hypothesis.fit)
     return _DiagnosedHypothesis(hypothesis, whitened, run_diagnostics(whitened))
 
 
 def _next_round(
     current: _DiagnosedHypothesis, later: bool, null: AxisNull, rng: np.random.Generator
-) -> tuple[_DiagnosedHypothesis, SearchRound | None]:
-    """Run one search round. Return the hypothesis before the round, and the round, which is None at the end of the
-    search.
+) -> tuple[_DiagnosedHypothesis, _CompletedRound | None]:
+    """Run one search round. Return the hypothesis before the round, and the completed round, which is None at the end
+    of the search.
     """
     hypothesis, whitened = current.hypothesis, current.whitened
     agrees = not any(one.gain > null[lens].threshold for lens, one in current.findings.items())
-    better = try_alternatives_to_resizing(hypothesis, whitened) if agrees and hypothesis.refitted_size_count else []
-    if agrees and not better:
-        return current, _replace_random_walk(current) if later and _is_gaussian_and_stationary(whitened, null) else None
+    better = (
+        try_alternatives_to_slow_noise(hypothesis, whitened) if agrees and _has_fitted_slow_noise(hypothesis) else []
+    )
+    conspicuous = any(one.gain > null[lens].search_threshold for lens, one in current.findings.items())
+    completed = None
+    if better or conspicuous:
+        current, completed = _try_groups(current, better, agrees, null, rng)
+    if completed is None and agrees and later and _is_gaussian_and_stationary(whitened, null):
+        completed = _replace_slow_noise(current)
+    return current, completed
+
+
+def _has_fitted_slow_noise(hypothesis: Hypothesis) -> bool:
+    """Return True if a noise of the model was resized, or if correlated noise or a random walk was added."""
+    slow = (ExponentiallyCorrelated, RateRandomWalk)
+    return hypothesis.resized_model_effect_count > 0 or any(isinstance(effect, slow) for effect in hypothesis.added)
+
+
+def _try_groups(
+    current: _DiagnosedHypothesis, better: list[Trial], agrees: bool, null: AxisNull, rng: np.random.Generator
+) -> tuple[_DiagnosedHypothesis, _CompletedRound | None]:
+    """Select the first acceptable trial. If all diagnostics agree, only an effect with a name is acceptable."""
     current = _with_finer_bins(current)
     for trials in [better] if better else generate_trial_groups(current.hypothesis, current.whitened):
-        done = _select_trial(current, trials, null, rng)
-        if done is not None:
-            return current, done
-        if trials and trials[0].name == UNNAMED:
-            break
+        if agrees and trials and trials[0].effect is None:
+            continue
+        completed = _select_trial(current, trials, null, rng)
+        if completed is not None:
+            return current, completed
     return current, None
 
 
-def _replace_random_walk(current: _DiagnosedHypothesis) -> SearchRound | None:
-    """Replace a random walk or single steps by a more likely jump process, or return None."""
-    jumps = compare_jump_processes(current.hypothesis)
+def _replace_slow_noise(current: _DiagnosedHypothesis) -> _CompletedRound | None:
+    """Replace slow noise or single steps by a more likely jump process, or return None."""
+    compared = (
+        choose_poisson_steps_or_telegraph(current.hypothesis),
+        compare_poisson_with_added_noise(current.hypothesis),
+    )
+    jumps = max((one for one in compared if one is not None), key=lambda one: one.gain, default=None)
     if jumps is None or jumps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return None
     validation = accept_without_validation("the replaced effect has the same spectrum and was validated")
-    hypothesis = current.hypothesis.refit_with_added_effects(jumps.added)
-    return SearchRound(current.findings_and_plots(), jumps.as_trials(0.0), hypothesis, validation)
+    hypothesis = current.hypothesis.refit_with_other_added_effects(jumps.added)
+    trials = jumps.as_trials(Trial("", None, 0.0))
+    return SearchRound(current.findings_and_plots(), trials, hypothesis, validation), _diagnose(hypothesis)
 
 
 def _with_finer_bins(current: _DiagnosedHypothesis) -> _DiagnosedHypothesis:
     """Return the hypothesis fitted with finer bins around narrow peaks, and the same findings."""
     axis, hypothesis = current.hypothesis.axis, current.hypothesis
-    finer = build_frequency_bins(axis.n, axis.rate_hz, find_spectral_peaks(current.whitened))
+    finer = build_frequency_bins(axis.n, axis.rate_hz, find_broad_spectral_peaks(current.whitened))
     if finer.count.size <= axis.bins.count.size + MIN_FINER_BINS:
         return current
     hypothesis = Hypothesis(
         hypothesis.model, replace(axis, bins=finer).fit(hypothesis.effects, hypothesis.fit.fixed_noise)
     )
+    axis.clear_cached_sums()
     return _DiagnosedHypothesis(hypothesis, whiten_axis(hypothesis.fit), current.findings)
 
 
 def _select_trial(
     current: _DiagnosedHypothesis, trials: list[Trial], null: AxisNull, rng: np.random.Generator
-) -> SearchRound | None:
+) -> _CompletedRound | None:
     """Return the round that adds the first trial effect that passes all tests, or None."""
     findings = current.findings
     strongest = max(findings, key=lambda name: findings[name].gain - null[name].threshold)
     for at, trial in enumerate(trials[:MAX_VALIDATION_ATTEMPTS]):
-        if trial.score <= 0.0 or trial.name == UNNAMED:
+        if trial.score <= 0.0 or trial.is_rival_only:
             return None
         lens = MOST_DIRECT_DIAGNOSTIC.get(trial.name, strongest)
         after = _add_effect(current.hypothesis, trial, rng)
-        added = None if trial.effect is None else after.added[-1]
+        added = None if trial.effect is None or trial.moved is not None else after.added[-1]
         if added is not None and _has_zero_size(added):
             continue
         whitened = whiten_axis(after.fit)
         if trial.name in ONE_TIME_EFFECTS and DIAGNOSTICS[lens](whitened).gain >= findings[lens].gain:
             continue
-        tried = trials[at:]
+        tried = [trial, *trials[:at], *trials[at + 1 :]]  # a rejected trial still reduces the confidence
         if _is_gaussian_and_stationary(whitened, null):
-            after, tried = choose_distribution(after, tried)
+            after, tried = replace_by_likelier_alternative(after, tried)
+            whitened = whitened if after.fit is whitened.fit else whiten_axis(after.fit)
         validation = cross_validate(current.hypothesis, after, added, lens, null[lens], rng)
         if validation.kept:
-            return SearchRound(current.findings_and_plots(), tuple(tried), after, validation)
+            done = SearchRound(current.findings_and_plots(), tuple(tried), after, validation)
+            return done, _diagnose(after, whitened)
     return None
 
 
 def _add_effect(hypothesis: Hypothesis, trial: Trial, rng: np.random.Generator) -> Hypothesis:
-    """Add the effect of a trial to the hypothesis. If the effect alters samples, the axis is repaired again first."""
+    """Add the effect of a trial to the hypothesis, or move an effect of the model to another frequency.
+
+    If the effect alters samples, the axis is repaired again first.
+    """
+    if trial.moved is not None and trial.effect is not None:
+        model = (*hypothesis.model[: trial.moved], trial.effect, *hypothesis.model[trial.moved + 1 :])
+        return drop_unneeded_effects(fit_with_fewest_changes(hypothesis.axis, hypothesis.added, model))
     added = hypothesis.added if trial.effect is None else (*hypothesis.added, trial.effect)
     axis = hypothesis.axis
     if type(trial.effect) in REPAIRED_EFFECTS:
         axis = repair_axis_again(axis, (*hypothesis.model, *added), rng)
+    added = refit_correlation_times(axis, added, hypothesis.model)
     return drop_unneeded_effects(fit_with_fewest_changes(axis, added, hypothesis.model))
 
 
@@ -213,7 +270,7 @@ def drop_unneeded_effects(hypothesis: Hypothesis) -> Hypothesis:
         effect = hypothesis.added[at]
         if type(effect) not in SIZE_PARAMETERS:
             continue
-        less = hypothesis.refit_with_added_effects(hypothesis.added[:at] + hypothesis.added[at + 1 :])
+        less = hypothesis.refit_with_other_added_effects(hypothesis.added[:at] + hypothesis.added[at + 1 :])
         if hypothesis.penalised_log_likelihood - less.penalised_log_likelihood < 0.5 * PENALTY_NATS.get(
             effect.name, 0.0
         ):
@@ -224,13 +281,13 @@ def drop_unneeded_effects(hypothesis: Hypothesis) -> Hypothesis:
 def _gains_by_type(rounds: list[SearchRound]) -> dict[type[Effect], float]:
     """Return, for each type of added effect, the largest gain of a diagnostic before the effect was added.
 
-    For leaks, steps and smooth spectra, only the most sensitive diagnostic is used.
+    For leaks, steps, curves, pulses and smooth spectra, only the most sensitive diagnostic is used.
     """
     found: dict[type[Effect], float] = {}
     for one in rounds:
         if one.hypothesis.added:
             kind = type(one.hypothesis.added[-1])
-            most_direct_only = issubclass(kind, (AxisLeak, BiasStep, *SMOOTH_SPECTRA))
+            most_direct_only = issubclass(kind, (AxisLeak, BiasStep, BiasCurve, PulseTrain, *SMOOTH_SPECTRA))
             lenses = (MOST_DIRECT_DIAGNOSTIC[kind.name],) if most_direct_only else tuple(one.before.findings)
             found[kind] = max(found.get(kind, 0.0), *(one.before.findings[lens].gain for lens in lenses))
     return found
@@ -241,4 +298,4 @@ def _without_zero_sizes(effects: Effects) -> Effects:
 
 
 def _has_zero_size(effect: Effect) -> bool:
-    return type(effect) in NOISE_SIZE_PARAMETERS and effect_size(effect) == 0.0
+    return isinstance(effect, Source) and is_noise_effect(effect) and effect_size(effect) == 0.0

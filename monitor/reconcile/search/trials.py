@@ -4,16 +4,14 @@ The **score** of a trial is the gain in log-likelihood less the penalties. ``gen
 in this order:
 
 1. Quantization, clipping and repeated samples.
-2. Outliers and a step of the noise.
+2. Outliers, and a step or a periodic variation of the noise.
 3. Deterministic effects, with the gain over the best slow noise. Slow noise can resemble a deterministic effect.
 4. Noise effects and a common factor for all noise effects of the model.
 
-A power law competes with the noise effects, and a curved drift competes with the deterministic effects. If the power
-law or the curved drift has the largest score, no effect is added.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -23,74 +21,103 @@ from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
     ExponentiallyCorrelated,
+    HeavyTails,
+    Narrowband,
     NoiseStep,
     Outliers,
+    PowerLaw,
     RandomSampleHold,
-    RateRamp,
     RateRandomWalk,
     Resolution,
     Saturation,
     ScaleFactor,
+    Sinusoidal,
+    VarianceModulation,
 )
-from monitor.reconcile.diagnostics.diagnostics import STEP_MARGIN_FRACTION
+from monitor.noise.effects.disturbances.heavy_tails import DEGREES_OF_FREEDOM
+from monitor.reconcile.diagnostics.whiteness_tests import STEP_MARGIN_FRACTION
 from monitor.reconcile.likelihood.axis_fit import Effects
-from monitor.reconcile.likelihood.hypothesis import (
+from monitor.reconcile.likelihood.effect_roles import effect_size, linear_coefficient_names
+from monitor.reconcile.likelihood.hypothesis_fit import (
     Hypothesis,
     find_maximum_by_golden_section,
+    fit_with_fewest_changes,
     noise_effect_indices,
+    refit_correlation_times,
 )
+from monitor.reconcile.likelihood.outlier_fit import convert_student_to_gaussian, student_misfit_z
+from monitor.reconcile.likelihood.variance_history import compare_variance_change_forms
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.value_artifacts import ValueWithInterval
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.search.candidates import (
+from monitor.reconcile.search.candidate_effects import (
     DETERMINISTIC_CANDIDATES,
     NOISE_CANDIDATES,
     PENALTY_NATS,
     initial_effect_size,
     propose_correlated_noise,
+    propose_power_law,
+    propose_pulse_trains,
 )
 
-UNNAMED: Final = "power_law"
-"""Name of a trial without a known effect."""
 RETUNE: Final = "retuned"
 """Name of a trial that only changes sizes of the noise model."""
-EXPONENTS: Final = (0.5, 1.5, 2.5, 3.0)
+SLOW_NOISE_EXPONENTS: Final = (0.5, 1.5, 2.5, 2.9)
 MIN_RESIZE_GAIN_NATS: Final = 1.0
 SCALE_FACTOR_MARGIN_NATS: Final = 3.0
-"""Largest advantage of separate sizes over a common factor, in nats."""
+"""Smallest advantage of separate sizes over a common factor, in nats."""
+SINGLE_SIZE_MARGIN_NATS: Final = 1.5
+"""Smallest advantage of a common factor over one new size, in nats. One size differs more often than all sizes."""
 SCALE_SEARCH_ITERATIONS: Final = 16
 FREQUENCY_BANDS: Final = 8
 """Number of frequency bands in the test for a constant leak coefficient."""
 MIN_LEAK_PROBABILITY: Final = 1e-5
 """Smallest probability of the scatter of a leak coefficient between frequency bands.
 """
-QUADRATIC_PENALTY_NATS: Final = 2.5
+COEFFICIENT_PENALTY_NATS: Final = 3.3
+"""Penalty for each further coefficient of a polynomial, in nats. By chance, 1 % of all coefficients gain more (χ²)."""
 MIN_STUDENT_GAIN_NATS: Final = 2.0
 """Smallest log-likelihood gain of outliers over Student's t, in nats."""
 MAX_OUTLIER_Z: Final = 4.0
-"""Largest z value of outlier clusters and of the misfit."""
+"""Largest z value of clusters of large samples and of the misfit."""
+MIN_DISTANT_SCALE: Final = 4.0
+"""Smallest standard deviation of distant outliers, relative to the noise. Other heavy tails have a smaller ratio."""
+MAX_MISFIT_SHARE: Final = 0.1
+"""Largest misfit of distant outliers, relative to the gain. The misfit remains without a name."""
+MAX_VARIANCE_SHARE: Final = 0.3
+"""Largest gain of a variance change after heavy tails are removed, relative to the gain of the heavy tails."""
 ALTERNATIVE_MARGIN_NATS: Final = 1.0
 """Largest advantage of another variance change over a step of the noise, in nats."""
 MAX_BAND_FRACTION: Final = 0.25
 """Largest width of a narrow frequency band, as a fraction of the sample rate."""
+MOVE_ADVANTAGE_NATS: Final = 4.0
+"""Advantage in nats of a line that has moved over an additional line, which has two more fitted sizes."""
+MAX_MOVED_SIZE_RATIO: Final = 3.0
+"""Largest ratio of the sizes of a line before and after a change of the frequency."""
 NOISE_PRIORITY_NATS: Final = 5.0
 """Score advantage, in nats, with which noise effects are tried before deterministic effects."""
-UNNAMED_MARGIN_NATS: Final = 2.0
-"""Score advantage, in nats, with which a power law or a curved drift is preferred."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
     """Candidate effect with the score of the fit."""
 
-    name: str  # name of the effect, ``UNNAMED`` or ``RETUNE``
+    name: str  # name of the effect, or ``RETUNE``
     effect: Effect | None  # None if no effect is added
     score: float  # log-likelihood gain less penalties, nats; for a deterministic effect, the gain over slow noise
     score_without_slow_noise: float = 0.0  # of a deterministic effect, nats
+    slow_noise_score: float = 0.0  # score of the best slow noise, which ``score`` of a deterministic effect excludes
+    is_rival_only: bool = False  # True if the trial belongs to another group and only affects the confidence
     intervals: Mapping[str, ParameterInterval] = field(
         default_factory=dict
     )  # parameters that the fit does not determine
     event_count: int = 0  # number of events that were detected
+    moved: int | None = None  # index of the model effect that ``effect`` replaces; None for an additional effect
+
+    @property
+    def total_score(self) -> float:
+        """Score over the hypothesis before the round, comparable between all trials of the round, in nats."""
+        return self.score + self.slow_noise_score
 
 
 def generate_trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[list[Trial]]:
@@ -104,19 +131,35 @@ def generate_trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Ite
         Axis whitened by ``hypothesis``.
     """
     yield _value_trials(whitened)
-    yield _best_first(_outlier_trial(hypothesis, whitened) + _noise_step_trial(whitened))
+    samples = _outlier_trial(hypothesis, whitened) + _heavy_tails_trial(whitened)
+    samples = _best_first(samples + _noise_step_trial(whitened) + _variance_modulation_trial(whitened))
+    # short pulses have heavy tails and a periodic variance too, and are tried with the noise effects
+    pulses = [_noise_trial(hypothesis, effect) for effect in propose_pulse_trains(whitened)] if samples else []
+    yield [] if any(one.score > samples[0].score for one in pulses) else samples
     deterministic, noises = _deterministic_trials(hypothesis, whitened), _noise_trials(hypothesis, whitened)
-    # with a wrong spectrum, the residuals contain apparent steps and slopes; a much better noise effect is tried first
-    if deterministic and deterministic[0].score_without_slow_noise > noises[0].score - NOISE_PRIORITY_NATS:
-        yield deterministic
-        yield noises
-    else:
-        yield noises
-        yield deterministic
+    groups = [noises + _as_rivals_of_noise(deterministic), deterministic + _as_rivals(noises)]
+    if deterministic and deterministic[0].slow_noise_score > noises[0].score:  # the best slow noise is a power law
+        rival = Trial("power_law", None, 0.0, slow_noise_score=deterministic[0].slow_noise_score, is_rival_only=True)
+        groups[1].append(rival)
+    yield from reversed(groups) if _is_deterministic_first(deterministic, noises) else groups
 
 
-def try_alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Return the trials of effects that explain the data better than new sizes of the noise model.
+def _is_deterministic_first(deterministic: Sequence[Trial], noises: Sequence[Trial]) -> bool:
+    """Return True if the deterministic effects are tried before the noise effects.
+
+    With a wrong spectrum, the residuals contain apparent steps and slopes. A much better noise effect is therefore
+    tried first. New sizes alone are not tried first if a deterministic effect together with slow noise is more likely.
+    """
+    if not deterministic:
+        return False
+    best, noise = deterministic[0], noises[0]
+    if best.score_without_slow_noise > noise.score - NOISE_PRIORITY_NATS:
+        return True
+    return noise.name == RETUNE and best.score > 0.0 and best.total_score > noise.score
+
+
+def try_alternatives_to_slow_noise(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
+    """Return the trials of effects that explain the data better than the fitted sizes of slow noise.
 
     Parameters
     ----------
@@ -126,12 +169,25 @@ def try_alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis)
         Axis whitened by ``hypothesis``.
     """
     trials = [one for one in _deterministic_trials(hypothesis, whitened) if one.score_without_slow_noise > 0.0]
-    trials += [_noise_trial(hypothesis, effect) for effect in propose_correlated_noise(whitened)]
+    slow = [*propose_correlated_noise(whitened), *propose_power_law(whitened)]
+    trials += [_noise_trial(hypothesis, effect) for effect in slow]
     return _best_first([one for one in trials if one.score > 0.0])
 
 
 def _best_first(trials: Sequence[Trial]) -> list[Trial]:
     return sorted(trials, key=lambda one: -one.score)
+
+
+def _as_rivals(trials: Sequence[Trial]) -> list[Trial]:
+    return [replace(one, is_rival_only=True) for one in trials]
+
+
+def _as_rivals_of_noise(deterministic: Sequence[Trial]) -> list[Trial]:
+    """Return the rivals of a noise effect: the deterministic effects without additional slow noise."""
+    return [
+        replace(one, score=one.score_without_slow_noise, slow_noise_score=0.0, is_rival_only=True)
+        for one in deterministic
+    ]
 
 
 def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
@@ -158,12 +214,49 @@ def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial
     far = whitened.outlier_fit
     if far is None or Outliers in whitened.effect_types or far.gain_over_student <= MIN_STUDENT_GAIN_NATS:
         return []
-    if max(far.clustering_z, far.misfit_z) >= MAX_OUTLIER_Z:
+    misfit_nats = 0.5 * (far.clustering_z**2 + far.misfit_z**2)
+    core = np.sqrt(max(1.0 - far.fraction.value * far.scale.value**2, 1e-3))  # standard deviation without outliers
+    is_distant = far.scale.value > MIN_DISTANT_SCALE * core and misfit_nats < MAX_MISFIT_SHARE * far.gain
+    if max(far.clustering_z, far.misfit_z) >= MAX_OUTLIER_Z and not is_distant:
         return []
     unit = _whitened_unit(hypothesis)
     effect = Outliers(fraction=min(far.fraction.value, 1.0), scale=unit * far.scale.value)
     intervals = {"fraction": _scaled_bounds(far.fraction), "scale": _scaled_bounds(far.scale, unit)}
     return [_penalised_trial(effect, far.gain, intervals, far.count)]
+
+
+def _variance_modulation_trial(whitened: WhitenedAxis) -> list[Trial]:
+    """Try a periodic variance, if no other change of the variance is as likely."""
+    changes, found = whitened.variance_changes, whitened.variance_changes.periodic
+    if AngleRandomWalk not in whitened.effect_types or VarianceModulation in whitened.effect_types:
+        return []
+    if found.gain <= max(changes.step.gain, changes.trend_gain, changes.slow_variation_gain, _band_gain(whitened)):
+        return []
+    effect = VarianceModulation(depth=found.depth.value, period=found.period.value, phase=found.phase)
+    intervals = {
+        "depth": _scaled_bounds(found.depth),
+        "period": _scaled_bounds(found.period),
+        "phase": ParameterInterval(found.phase),
+    }
+    return [_penalised_trial(effect, found.gain, intervals)]
+
+
+def _heavy_tails_trial(whitened: WhitenedAxis) -> list[Trial]:
+    """Try Student's t distribution, unless outliers or a changing variance are as likely a cause."""
+    far = whitened.outlier_fit
+    if far is None or {HeavyTails, Outliers} & whitened.effect_types or AngleRandomWalk not in whitened.effect_types:
+        return []
+    nu = far.student.nu
+    if far.gain_over_student >= 0.0 or far.clustering_z >= MAX_OUTLIER_Z or not DEGREES_OF_FREEDOM.supports(nu.value):
+        return []
+    if student_misfit_z(whitened.flat_series, far.student) >= MAX_OUTLIER_Z:
+        return []
+    gain = far.gain - far.gain_over_student
+    gaussian = convert_student_to_gaussian(whitened.flat_series, nu.value)
+    changes = compare_variance_change_forms(gaussian, 1.0 / whitened.axis.rate_hz)
+    if max(changes.step.gain, changes.largest_gain_other_than_step) > MAX_VARIANCE_SHARE * gain:
+        return []
+    return [_penalised_trial(HeavyTails(nu=nu.value), gain, {"nu": _scaled_bounds(nu)})]
 
 
 def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
@@ -173,7 +266,7 @@ def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
     inside = STEP_MARGIN_FRACTION * length_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
     if AngleRandomWalk not in whitened.effect_types or not inside:
         return []
-    if step.gain <= max(changes.largest_alternative_gain, _band_gain(whitened)) - ALTERNATIVE_MARGIN_NATS:
+    if step.gain <= max(changes.largest_gain_other_than_step, _band_gain(whitened)) - ALTERNATIVE_MARGIN_NATS:
         return []
     intervals = {"time": _scaled_bounds(step.time), "ratio": _scaled_bounds(step.ratio)}
     return [_penalised_trial(NoiseStep(time=step.time.value, ratio=step.ratio.value), step.gain, intervals)]
@@ -184,7 +277,7 @@ def _band_gain(whitened: WhitenedAxis) -> float:
 
     A step of white noise changes the power at all frequencies.
     """
-    found = whitened.spectrogram_change
+    found = whitened.unexplained_spectrogram_change
     return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * whitened.axis.rate_hz else 0.0
 
 
@@ -206,44 +299,57 @@ def _scaled_bounds(found: ValueWithInterval, unit: float = 1.0) -> ParameterInte
 
 
 def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
-    score = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).penalised_log_likelihood
+    score = hypothesis.refit_with_other_added_effects((*hypothesis.added, effect)).penalised_log_likelihood
     return Trial(effect.name, effect, score - hypothesis.penalised_log_likelihood - PENALTY_NATS[effect.name])
 
 
 def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try noise effects, new sizes of the noise model, a common factor, and a power law."""
-    resized = hypothesis.refit_with_added_effects(hypothesis.added)
+    """Try noise effects, new sizes of the noise model, and a common factor."""
+    resized = hypothesis.refit_with_other_added_effects(hypothesis.added)
     found = [
         Trial(
             RETUNE, None, resized.penalised_log_likelihood - hypothesis.penalised_log_likelihood - MIN_RESIZE_GAIN_NATS
         )
     ]
     found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
+    found += _moved_feature_trials(hypothesis, found)
     found = _best_first([*found, _scale_factor_trial(hypothesis, resized)])
-    value = (
-        max(_score_with_power_law(hypothesis, hypothesis.effects, one) for one in EXPONENTS)
-        - hypothesis.penalised_log_likelihood
-    )
-    if value > max(found[0].score, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in POWER_LAW_RIVALS:
-        return [Trial(UNNAMED, None, value), *found]
+    return _prefer_single_size(found) if resized.resized_model_effect_count == 1 else found
+
+
+def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> list[Trial]:
+    """Try lines and resonances of the model at the frequencies of new lines and resonances of similar size.
+
+    A line that has moved has nearly the same likelihood as an additional line beside a line without amplitude.
+    """
+    found: list[Trial] = []
+    for new in (trial.effect for trial in trials if trial.score > 0.0):
+        for at, known in enumerate(hypothesis.model):
+            if not isinstance(new, Sinusoidal | Narrowband) or type(known) is not type(new):
+                continue
+            effect: Effect = replace(known, frequency=new.frequency)
+            model = (*hypothesis.model[:at], effect, *hypothesis.model[at + 1 :])
+            moved = fit_with_fewest_changes(hypothesis.axis, hypothesis.added, model)
+            size_ratio = effect_size(moved.effects[at]) / max(effect_size(known), 1e-300)
+            if not 1.0 / MAX_MOVED_SIZE_RATIO < size_ratio < MAX_MOVED_SIZE_RATIO:
+                continue
+            gain = moved.penalised_log_likelihood - hypothesis.penalised_log_likelihood
+            distance = abs(float(np.log(new.frequency / known.frequency)))
+            score = gain - PENALTY_NATS[new.name] + MOVE_ADVANTAGE_NATS - distance
+            found.append(Trial(new.name, effect, score, moved=at))
     return found
 
 
-POWER_LAW_RIVALS: Final = frozenset(
-    {
-        "quantization_noise",
-        "angle_random_walk",
-        "bias_instability",
-        "rate_random_walk",
-        "exponentially_correlated",
-        "scale_factor",
-    }
-)
-"""Names of the effects that compete with a power law."""
+def _prefer_single_size(trials: list[Trial]) -> list[Trial]:
+    """Move one new size before a common factor that is hardly better."""
+    size = next(one for one in trials if one.name == RETUNE)
+    if trials[0].name != "scale_factor" or trials[0].score >= size.score + SINGLE_SIZE_MARGIN_NATS:
+        return trials
+    return [size, *(one for one in trials if one is not size)]
 
 
 def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try effects that depend on time, temperature or another axis, and a curved drift."""
+    """Try effects that depend on time, temperature or another axis."""
     free = hypothesis.axis.fit(hypothesis.effects).log_likelihood
     proposed = [effect for propose in DETERMINISTIC_CANDIDATES for effect in propose(whitened)]
     kept = [
@@ -255,20 +361,18 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
     if not kept:
         return []
     slow_noises = _slow_noise_scores(hypothesis)
-    resized = hypothesis.refit_with_added_effects(hypothesis.added)
+    resized = hypothesis.refit_with_other_added_effects(hypothesis.added)
     without = max(resized.penalised_log_likelihood, *(score(hypothesis.effects) for score in slow_noises))
+    baseline = without - hypothesis.penalised_log_likelihood
     trials = []
     for effect in kept:
-        alone = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).penalised_log_likelihood
+        added = refit_correlation_times(hypothesis.axis, (*hypothesis.added, effect), hypothesis.model)
+        alone = hypothesis.refit_with_other_added_effects(added).penalised_log_likelihood
         gain = max(alone, *(score((*hypothesis.effects, effect)) for score in slow_noises)) - without
-        quadratic = getattr(effect, "quadratic", None) is not None
-        penalty = PENALTY_NATS[effect.name] + (QUADRATIC_PENALTY_NATS if quadratic else 0.0)
-        trials.append(Trial(effect.name, effect, gain - penalty, alone - hypothesis.penalised_log_likelihood - penalty))
-    trials = _best_first(trials)
-    curved = _curved_drift_score(hypothesis) - without
-    if curved > max(0.0, trials[0].score) + UNNAMED_MARGIN_NATS:
-        return [Trial(UNNAMED, None, curved, curved + without - hypothesis.penalised_log_likelihood), *trials]
-    return trials
+        penalty = PENALTY_NATS[effect.name] + COEFFICIENT_PENALTY_NATS * (len(linear_coefficient_names(effect)) - 1)
+        score_alone = alone - hypothesis.penalised_log_likelihood - penalty
+        trials.append(Trial(effect.name, effect, gain - penalty, score_alone, baseline))
+    return _best_first(trials)
 
 
 def _has_flat_coefficient(whitened: WhitenedAxis, leak: AxisLeak) -> bool:
@@ -286,13 +390,6 @@ def _has_flat_coefficient(whitened: WhitenedAxis, leak: AxisLeak) -> bool:
     return bool(chdtrc(FREQUENCY_BANDS - 1, scatter) > MIN_LEAK_PROBABILITY)
 
 
-def _curved_drift_score(hypothesis: Hypothesis) -> float:
-    """Return the penalised log-likelihood of the hypothesis with an additional quadratic drift."""
-    effects = (*hypothesis.effects, RateRamp(R=initial_effect_size(hypothesis.axis)))
-    fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, curvature=True)
-    return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS["rate_ramp"] - QUADRATIC_PENALTY_NATS
-
-
 def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float]]:
     """Return functions that compute the score of given effects with an additional slow noise."""
     axis, small = hypothesis.axis, initial_effect_size(hypothesis.axis)
@@ -301,21 +398,12 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     def make_noise_score(noise: Effect) -> Callable[[Effects], float]:
         return lambda effects: axis.fit((*effects, noise), fixed_noise).log_likelihood - cost - PENALTY_NATS[noise.name]
 
-    def make_power_law_score(exponent: float) -> Callable[[Effects], float]:
-        return lambda effects: _score_with_power_law(hypothesis, effects, exponent)
-
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
     noises: list[Effect] = [ExponentiallyCorrelated(sigma=small, correlation_time=float(t)) for t in times_s]
     if not any(isinstance(effect, RateRandomWalk) for effect in hypothesis.effects):
         noises.append(RateRandomWalk(K=small))
-    return [*(make_noise_score(one) for one in noises), *(make_power_law_score(exponent) for exponent in EXPONENTS)]
-
-
-def _score_with_power_law(hypothesis: Hypothesis, effects: Effects, exponent: float) -> float:
-    f_hz = hypothesis.axis.bins.f_hz
-    basis = np.asarray((f_hz / f_hz[0]) ** -exponent)[None, :]
-    fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, basis)
-    return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS[UNNAMED]
+    noises += [PowerLaw(density=small, exponent=exponent) for exponent in SLOW_NOISE_EXPONENTS]
+    return [make_noise_score(one) for one in noises]
 
 
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
@@ -334,7 +422,7 @@ def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     x = find_maximum_by_golden_section(log_likelihood_with_factor, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS)
     gain = log_likelihood_with_factor(x) - hypothesis.penalised_log_likelihood - PENALTY_NATS["scale_factor"]
     if (
-        resized.refitted_size_count > 1
+        resized.resized_model_effect_count > 1
         and log_likelihood_with_factor(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS
     ):
         gain = max(gain, resized.penalised_log_likelihood - hypothesis.penalised_log_likelihood)

@@ -24,7 +24,7 @@ Meaning = Literal["contradiction", "too_faint", "other_name", "unnamed", "may_di
 MIN_EXCESS_SIGMA: Final = 2.0
 """Smallest excess of the expected gap over the threshold for a contradiction, in standard deviations."""
 LEAK_EFFECTS: Final = ("g_sensitivity", "cross_axis")
-TEMPERATURE_EFFECTS: Final = ("temperature_bias", "temperature_lag")
+TEMPERATURE_EFFECTS: Final = ("temperature_bias", "temperature_lag", "temperature_hysteresis")
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,11 +26,11 @@ from monitor.reconcile.result import (
 from monitor.reconcile.several_recordings.absence import Absence, ClearestOccurrence, explain_absence
 from monitor.reconcile.several_recordings.effect_matching import (
     SAMPLE_RATE_EFFECT,
+    distance_if_parameters_match,
     effect_parameters,
     find_closest_effect,
     find_effect_of_step,
     find_identifying_parameter,
-    identifying_parameter_distance,
     identifying_parameter_name,
 )
 from monitor.reconcile.several_recordings.pooled_parameters import (
@@ -41,7 +41,7 @@ from monitor.reconcile.several_recordings.pooled_parameters import (
     pool_parameter,
 )
 
-NON_SIZE_PARAMETERS: Final = ("phase", "reference", "order")
+NON_SIZE_PARAMETERS: Final = ("phase", "reference", "order", "kind")
 """Parameters that are excluded from the comparison of sizes."""
 
 
@@ -54,7 +54,7 @@ class NamedResult:
 
 
 @dataclass(frozen=True, slots=True)
-class MatchedEffect:
+class EffectInRecordings:
     """Effect that one or more recordings show on one axis."""
 
     effect: str
@@ -81,8 +81,8 @@ class AxisComparison:
 
     axis: str
     results: Mapping[str, AxisResult]  # by name of the recording
-    common: tuple[MatchedEffect, ...]
-    single: tuple[MatchedEffect, ...]
+    common: tuple[EffectInRecordings, ...]
+    single: tuple[EffectInRecordings, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ def _add_common_effects(
     return NoiseModel(effects, baseline.sample_rate_hz, baseline.temperature)
 
 
-def _with_pooled_parameters(effect: Effect, matched: MatchedEffect) -> Effect:
+def _with_pooled_parameters(effect: Effect, matched: EffectInRecordings) -> Effect:
     """Return an effect with the pooled parameters. The phase of a sinusoid becomes random."""
     known = {name: one.bounds.value for name, one in matched.parameters.items() if one.bounds.lo is not None}
     made: Effect = replace(effect, **known)  # type: ignore[type-var]
@@ -178,7 +178,7 @@ def _sample_rate_steps(run: NamedResult) -> list[AddedOrResizedEffect]:
 
 
 def _sample_rate_axis(runs: Sequence[NamedResult]) -> str:
-    """Return the first axis with a sample rate error in any recording, or an empty string."""
+    """Return the first axis for which one of the recordings has a sample rate error, or an empty string."""
     results = [(axis, run.result.axes.get(axis)) for axis in AXES for run in runs]
     return next((axis for axis, one in results if one and any(s.effect == SAMPLE_RATE_EFFECT for s in one.steps)), "")
 
@@ -198,9 +198,7 @@ def _add_to_group(
         other, first = next(iter(group.items()))
         if run in group or (first.effect, first.kind) != (step.effect, step.kind):
             continue
-        apart = identifying_parameter_distance(
-            step.effect, here, find_identifying_parameter(first, axis, models[other])
-        )
+        apart = distance_if_parameters_match(step.effect, here, find_identifying_parameter(first, axis, models[other]))
         if apart is not None and (best is None or apart < best[0]):
             best = apart, group
     if best is None:
@@ -211,7 +209,7 @@ def _add_to_group(
 
 def _summarise_group(
     group: Mapping[str, AddedOrResizedEffect], axis: str, runs: Sequence[NamedResult]
-) -> MatchedEffect:
+) -> EffectInRecordings:
     first = next(iter(group.values()))
     parameters = _pool_parameters(group)
     sizes = [
@@ -229,7 +227,7 @@ def _summarise_group(
     )
     p = agreement_probability(sizes or parameters.values())  # an effect without a size: compare all parameters
     absent = tuple(Absence(run.name, *explain_absence(shown, run.result)) for run in having if run.name not in group)
-    return MatchedEffect(first.effect, first.kind, dict(group), parameters, p, absent)
+    return EffectInRecordings(first.effect, first.kind, dict(group), parameters, p, absent)
 
 
 def _gap_of_effect(step: AddedOrResizedEffect, axis: str, result: Reconciliation) -> float:
@@ -251,21 +249,27 @@ def _pool_parameters(group: Mapping[str, AddedOrResizedEffect]) -> dict[str, Poo
 
 
 def _at_common_reference(step: AddedOrResizedEffect, first: AddedOrResizedEffect) -> AddedOrResizedEffect:
-    """Convert a quadratic temperature effect to the reference temperature T₁ of the first recording.
+    """Convert a polynomial of the temperature to the reference temperature T₁ of the first recording.
 
-    With the quadratic coefficient q, the linear coefficient c at the reference T₀ becomes c + 2 q (T₁ − T₀).
+    With Δ = T₁ − T₀, the coefficients c, q and k at the reference T₀ become c + 2qΔ + 3kΔ², q + 3kΔ and k.
     """
     own = step.parameters
     if "quadratic" not in own or "reference" not in first.parameters:
         return step
-    twice = 2.0 * (_numerical_value(first.parameters["reference"]) - _numerical_value(own["reference"]))
-    value = _numerical_value(own["coefficient"]) + twice * _numerical_value(own["quadratic"])
-    half = hypot(_half_width(own["coefficient"]), twice * _half_width(own["quadratic"]))
+    away = _numerical_value(first.parameters["reference"]) - _numerical_value(own["reference"])
+    cubic = own.get("cubic", ParameterInterval(0.0, 0.0, 0.0))
     moved = {
-        "coefficient": ParameterInterval(value, value - half, value + half),
+        "coefficient": _weighted_sum((1.0, own["coefficient"]), (2.0 * away, own["quadratic"]), (3.0 * away**2, cubic)),
+        "quadratic": _weighted_sum((1.0, own["quadratic"]), (3.0 * away, cubic)),
         "reference": first.parameters["reference"],
     }
     return replace(step, parameters={**own, **moved})
+
+
+def _weighted_sum(*terms: tuple[float, ParameterInterval]) -> ParameterInterval:
+    value = sum(weight * _numerical_value(one) for weight, one in terms)
+    half = hypot(*(weight * _half_width(one) for weight, one in terms))
+    return ParameterInterval(value, value - half, value + half)
 
 
 def _numerical_value(bounds: ParameterInterval) -> float:

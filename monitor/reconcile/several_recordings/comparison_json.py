@@ -11,7 +11,7 @@ import msgspec
 
 from monitor.reconcile.json_report import finite_or_none, parameter_entry
 from monitor.reconcile.result import AddedOrResizedEffect
-from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, MatchedEffect, NamedResult
+from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, EffectInRecordings, NamedResult
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
 
@@ -59,7 +59,7 @@ def _axis_entry(one: AxisComparison) -> dict[str, Any]:
     }
 
 
-def _effect_entry(matched: MatchedEffect) -> dict[str, Any]:
+def _effect_entry(matched: EffectInRecordings) -> dict[str, Any]:
     return {
         "effect": matched.effect,
         "kind": matched.kind,

@@ -16,15 +16,20 @@ from monitor.reconcile.result import AddedOrResizedEffect, ParameterInterval
 IDENTIFYING_PARAMETERS: Final[Mapping[str, tuple[str, float]]] = {
     "sinusoidal": ("frequency", 0.005),
     "narrowband": ("frequency", 0.05),
+    "common_vibration": ("source_number", 0.0),
     "exponentially_correlated": ("correlation_time", 1 / 3),
     "random_telegraph": ("dwell_time", 1 / 3),
     "temperature_lag": ("time_constant", 1 / 3),
+    "temperature_hysteresis": ("reversal", 1 / 3),
+    "pulse_train": ("period", 0.005),
+    "variance_modulation": ("period", 0.05),
     "turn_on_transient": ("time_constant", 1 / 3),
     "bandwidth_limit": ("cutoff", 0.1),
     "bias_step": ("time", 0.01),
     "noise_step": ("time", 0.01),
     "g_sensitivity": ("source", 0.0),
     "cross_axis": ("source", 0.0),
+    "power_law": ("exponent", 0.1),
 }
 """Identifying parameter of each effect, and the relative amount by which the interval is widened on both sides.
 """
@@ -61,9 +66,7 @@ def find_identifying_parameter(step: AddedOrResizedEffect, axis: str, model: Noi
     )
 
 
-def identifying_parameter_distance(
-    effect: str, a: ParameterInterval | None, b: ParameterInterval | None
-) -> float | None:
+def distance_if_parameters_match(effect: str, a: ParameterInterval | None, b: ParameterInterval | None) -> float | None:
     """Return the relative distance of two identifying parameters, or None if the parameters do not match.
 
     The distance is 0 if one of the parameters is None.
@@ -77,9 +80,9 @@ def identifying_parameter_distance(
 
     Examples
     --------
-    >>> identifying_parameter_distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.30))
+    >>> distance_if_parameters_match("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.30))
     0.0
-    >>> identifying_parameter_distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(19.00))
+    >>> distance_if_parameters_match("sinusoidal", ParameterInterval(17.30), ParameterInterval(19.00))
     """
     if a is None or b is None:
         return 0.0

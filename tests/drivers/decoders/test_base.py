@@ -77,7 +77,7 @@ def test_what_comes_before_the_first_frame_is_not_counted() -> None:
 def test_reset_forgets_half_a_frame_and_the_hole() -> None:
     buffer = FrameBuffer(b"\xaa", match, 5)
     buffer.feed([Chunk(FRAMES[0] + b"\x00" * 50 + FRAMES[1][:3], 1)])
-    buffer.reset()
+    buffer.forget_stream_state()
     after = buffer.feed([Chunk(FRAMES[1][3:] + FRAMES[2], 2)])
     assert after.data == [FRAMES[2]]
     assert after.bad_before.tolist() == [0]
@@ -172,7 +172,7 @@ def test_rows_all_bad_and_rows_none_carry_over() -> None:
     assert [b.lost for b in collected.build_plausible_blocks(*rows(2), np.array([0, 0]))] == [5]
     assert collected.bad == 5
     collected.build_plausible_blocks(empty, np.empty((0, 6)), np.empty(0), empty, empty, 2)
-    collected.forget_rejected_frames()
+    collected.forget_missing_samples()
     assert [b.lost for b in collected.build_plausible_blocks(*rows(2), np.array([0, 0]))] == [0]
 
 

@@ -24,7 +24,7 @@ from drivers.data_types import (
 )
 from drivers.decoders import dbc
 from drivers.decoders.dbc.database import SHIPPED
-from drivers.decoders.dbc.signal_bits import SignalBits
+from drivers.decoders.dbc.signal_bits import SignalCodec
 from drivers.errors import ConfigError, LinkEnded
 from drivers.links import replay_link
 from drivers.units import DEGREE, G0
@@ -195,7 +195,7 @@ def test_floats_on_the_wire(tmp_path: Path, length: int, kind: int, code: str, b
 
 @given(st.integers(1, 64), st.booleans(), st.floats(-1e30, 1e30))
 def test_what_does_not_fit_is_limited(length: int, signed: bool, value: float) -> None:
-    bits = SignalBits(0, length, False, signed, False, 1.0, 0.0, False)
+    bits = SignalCodec(0, length, False, signed, False, 1.0, 0.0, False)
     frames = np.zeros((1, 8), np.uint8)
     bits.insert_values(frames, np.array([value]))
     low = -(2 ** (length - 1)) if signed else 0
@@ -519,7 +519,7 @@ def test_reset_forgets_a_half_sample() -> None:
     decoder = build("j1939_imu", SAE)
     frames = pairs(2)
     decoder.feed(frames[:1])
-    decoder.reset()
+    decoder.forget_stream_state()
     assert counts(decoder.feed([frames[3], frames[2]])) == [(1, 1)]
     assert decoder.bad == 0
 
@@ -536,7 +536,7 @@ def test_reset_forgets_a_half_sample() -> None:
 )
 def test_noise_raises_nothing(frames: list[tuple[int, bytes]]) -> None:
     decoder = DECODERS[0]
-    decoder.reset()
+    decoder.forget_stream_state()
     before = decoder.bad
     for got in decoder.feed([chunk(a, d, i) for i, (a, d) in enumerate(frames)]):
         assert len(got) >= 1
@@ -615,7 +615,7 @@ def test_recorded_frames_give_the_recorded_samples(name: str) -> None:
     ended = False
     while not ended:
         try:
-            chunks = link.poll_chunks(1.0) or []
+            chunks = link.wait_for_chunks_or_timeout(1.0) or []
         except LinkEnded:
             ended = True
         else:

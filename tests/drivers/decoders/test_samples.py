@@ -38,7 +38,7 @@ def test_a_publisher_started_anew_is_no_loss() -> None:
 def test_a_link_opened_anew_is_no_loss_of_messages() -> None:
     decoder = samples.build(samples.Settings())
     decoder.feed([message(10)])
-    decoder.reset()
+    decoder.forget_stream_state()
     assert [b.lost for b in decoder.feed([message(500)])] == [0]
 
 

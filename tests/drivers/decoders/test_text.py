@@ -111,7 +111,7 @@ def test_the_first_line_is_left_out_unless_it_is_known_to_be_whole() -> None:
     decoder = build(Settings(columns=SIX))
     decoder.feed([Chunk(b"5,6\n" + LINE, 0)])
     assert decoder.bad == 0
-    decoder.reset()
+    decoder.forget_stream_state()
     assert decoder.feed([Chunk(LINE, 0)]) == []
     assert decoder.bad == 0
 
@@ -198,5 +198,5 @@ def test_all_wrong_settings_are_told_at_once() -> None:
     settings = {"columns": ["gx", "gx", "qz"], "gyro_unit": "LSB", "scale": {"gw": 1.0, "gx": 0.0}, "delimiter": ""}
     with pytest.raises(ConfigError) as caught:
         read_settings(Settings, settings)
-    keys = [line.partition(": ")[0] for line in caught.value.lines]
+    keys = [line.partition(": ")[0] for line in caught.value.mistake_lines]
     assert sorted(keys) == ["columns", "columns", "delimiter", "gyro_unit", "scale.gw", "scale.gx"]

@@ -68,7 +68,7 @@ def test_reset_lets_auto_choose_anew() -> None:
     decoder = build(Settings())
     decoder.feed([Chunk(YMR, 0)])
     assert decoder.feed([Chunk(IMU, 0)]) == []
-    decoder.reset()
+    decoder.forget_stream_state()
     assert len(decoder.feed([Chunk(IMU, 0)])) == 1
 
 

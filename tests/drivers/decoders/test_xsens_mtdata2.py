@@ -121,7 +121,7 @@ def test_a_slow_temperature_is_held() -> None:
     assert [(len(b), b.lost) for b in blocks] == [(4, 0)]
     np.testing.assert_array_equal(blocks[0].temperature_c, [np.nan, 25.5, 25.5, 26.0])
     assert decoder.feed([Chunk(sample(4), 0)])[0].temperature_c.tolist() == [26.0]
-    decoder.reset()
+    decoder.forget_stream_state()
     assert np.isnan(decoder.feed([Chunk(sample(5), 0)])[0].temperature_c).all()
     assert decoder.bad == 0
 

@@ -53,7 +53,7 @@ def message(identifier: int, extended: bool = False, **keys: Any) -> can.Message
 def collect(link: CanLink) -> list[Chunk]:
     """All that is there: a read on a busy computer may give it in parts."""
     chunks: list[Chunk] = []
-    while more := link.poll_chunks(0.2):
+    while more := link.wait_for_chunks_or_timeout(0.2):
         chunks += more
     return chunks
 
@@ -76,7 +76,7 @@ def test_a_read_is_never_without_end(peer: can.BusABC, channel: str) -> None:
         peer.send(message(1))
     sizes = []
     while sum(sizes) < can_link.MAX_FRAMES + 5:
-        sizes.append(len(link.poll_chunks(0.1) or ()))
+        sizes.append(len(link.wait_for_chunks_or_timeout(0.1) or ()))
     link.close()
     assert max(sizes) <= can_link.MAX_FRAMES
     assert sum(sizes) == can_link.MAX_FRAMES + 5
@@ -148,7 +148,7 @@ def test_accepting_nothing_in_particular_is_accepting_all(peer: can.BusABC, chan
     link.set_address_filter([])
     link.open()
     peer.send(message(0x55))
-    assert link.poll_chunks(1.0)
+    assert link.wait_for_chunks_or_timeout(1.0)
     link.close()
 
 
@@ -160,7 +160,7 @@ def test_error_and_remote_frames_are_left_aside(peer: can.BusABC, channel: str) 
     peer.send(message(7))
     got: list[Chunk] = []
     for _ in range(10):
-        got += link.poll_chunks(0.05) or []
+        got += link.wait_for_chunks_or_timeout(0.05) or []
     link.close()
     assert [c.address for c in got] == [7]
     assert link.error_frames == 1
@@ -198,10 +198,10 @@ def test_losing_the_bus(monkeypatch: pytest.MonkeyPatch, answer: Any, says: str)
     link = build(channel="can0")
     link.open()
     with pytest.raises(LinkLost, match=says):
-        link.poll_chunks(1.0)
+        link.wait_for_chunks_or_timeout(1.0)
     assert bus.closed
     with pytest.raises(LinkLost, match="closed"):
-        link.poll_chunks(0.0)
+        link.wait_for_chunks_or_timeout(0.0)
 
 
 @pytest.mark.parametrize(
@@ -289,14 +289,14 @@ def test_an_adapter_that_garbles_a_line_goes_on() -> None:
     link.open()
     os.write(master, b"\xff\xfe\r")
     for _ in range(5):
-        link.poll_chunks(0.05)
+        link.wait_for_chunks_or_timeout(0.05)
     os.write(master, b"t00z2aabb\r")
     for _ in range(5):
-        link.poll_chunks(0.05)
+        link.wait_for_chunks_or_timeout(0.05)
     os.write(master, b"t0092aabb\r")
     chunks: list[Chunk] = []
     for _ in range(20):
-        chunks += link.poll_chunks(0.05) or []
+        chunks += link.wait_for_chunks_or_timeout(0.05) or []
     link.close()
     os.close(master)
     os.close(slave)

@@ -29,7 +29,7 @@ def read_all(link: Link) -> tuple[list[Chunk], str]:
     link.open()
     try:
         for _ in range(10_000):
-            chunks += link.poll_chunks(1.0) or []
+            chunks += link.wait_for_chunks_or_timeout(1.0) or []
     except LinkEnded as end:
         return chunks, str(end)
     finally:
@@ -87,7 +87,7 @@ def test_no_read_brings_hours_at_once(tmp_path: Path) -> None:
     link.open()
     sizes = []
     while sum(sizes) < 8_000_000:
-        sizes.append(sum(len(chunk.data) for chunk in link.poll_chunks(1.0) or []))
+        sizes.append(sum(len(chunk.data) for chunk in link.wait_for_chunks_or_timeout(1.0) or []))
     link.close()
     assert max(sizes) < 1_300_000  # 56 bytes a sample, 4096 samples a message
 

@@ -39,7 +39,7 @@ def read_all(link: Link, n: int) -> bytes:
     got = bytearray()
 
     def read() -> bool:
-        got.extend(b"".join(c.data for c in link.poll_chunks(0.2) or ()))
+        got.extend(b"".join(c.data for c in link.wait_for_chunks_or_timeout(0.2) or ()))
         return len(got) >= n
 
     wait_for(read, lambda: f"{n} bytes, {len(got)} came")
@@ -80,7 +80,7 @@ def test_a_flow_faster_than_the_buffer_is_not_held_up(pty: tuple[int, str], monk
     got = b""
     for _ in range(5):
         wait_for(lambda: link._port is not None and link._port.in_waiting > serial_link.READ_BYTES // 2 + 1)
-        got += b"".join(chunk.data for chunk in link.poll_chunks(1.0) or ())
+        got += b"".join(chunk.data for chunk in link.wait_for_chunks_or_timeout(1.0) or ())
     assert len(waits) == 1
     got += read_all(link, len(sent) - len(got))
     assert got == sent
@@ -93,7 +93,7 @@ def test_bytes_do_not_wait_for_the_timeout_of_the_reader(pty: tuple[int, str]) -
     link = build(port=port)
     link.open()
     os.write(master, b"x")
-    assert link.poll_chunks(FOREVER_S)
+    assert link.wait_for_chunks_or_timeout(FOREVER_S)
     link.close()
 
 
@@ -110,7 +110,7 @@ def test_a_steady_flow_is_handed_over_at_the_port_timeout(pty: tuple[int, str]) 
     writer = threading.Thread(target=flow)
     writer.start()
     for _ in range(10):
-        assert link.poll_chunks(FOREVER_S)  # returns, although the flow never pauses
+        assert link.wait_for_chunks_or_timeout(FOREVER_S)  # returns, although the flow never pauses
     stop.set()
     writer.join()
     link.close()
@@ -129,7 +129,7 @@ def test_loop_and_socket_urls() -> None:
         link.close()
     link = build(port="loop://")
     link.open()
-    assert link.poll_chunks(0.05) is None
+    assert link.wait_for_chunks_or_timeout(0.05) is None
     link.close()
 
 
@@ -155,7 +155,7 @@ def test_not_exclusive_lets_others_read(pty: tuple[int, str]) -> None:
     for link in pair:
         link.open()
     os.write(pty[0], b"abc")
-    assert b"c" in b"".join(chunk.data for link in pair for chunk in link.poll_chunks(0.3) or ())
+    assert b"c" in b"".join(chunk.data for link in pair for chunk in link.wait_for_chunks_or_timeout(0.3) or ())
     for link in pair:
         link.close()
 
@@ -221,6 +221,6 @@ def test_unplugging_is_noticed_while_waiting(pty: tuple[int, str]) -> None:
     link.open()
     threading.Timer(0.1, os.close, (master,)).start()
     with pytest.raises(LinkLost, match="gone"):
-        link.poll_chunks(FOREVER_S)
+        link.wait_for_chunks_or_timeout(FOREVER_S)
     with pytest.raises(LinkLost):
-        link.poll_chunks(0.1)
+        link.wait_for_chunks_or_timeout(0.1)

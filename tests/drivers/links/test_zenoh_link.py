@@ -39,7 +39,7 @@ def router(endpoint: str) -> Iterator[Any]:
 
 
 def until_it_comes(link: Link, put: Any) -> list[Chunk]:
-    return wait_for(lambda: put() or link.poll_chunks(0.05), "a message") or []
+    return wait_for(lambda: put() or link.wait_for_chunks_or_timeout(0.05), "a message") or []
 
 
 def test_payload_and_attachment(router: Any, endpoint: str) -> None:
@@ -47,7 +47,7 @@ def test_payload_and_attachment(router: Any, endpoint: str) -> None:
     link.open()
     with_attachment = until_it_comes(link, lambda: router.put("imu/a/samples", b"payload", attachment=b"attached"))
     assert (with_attachment[0].data, with_attachment[0].attachment) == (b"payload", b"attached")
-    while link.poll_chunks(0.1):
+    while link.wait_for_chunks_or_timeout(0.1):
         pass
     bare = until_it_comes(link, lambda: router.put("imu/b/samples", b"payload"))
     assert bare[0].attachment == b""
@@ -63,7 +63,7 @@ def test_messages_come_in_order_and_none_is_lost(router: Any, endpoint: str) -> 
     got: list[bytes] = []
 
     def read() -> bool:
-        got.extend(c.data for c in link.poll_chunks(0.1) or () if c.data != b"ready")
+        got.extend(c.data for c in link.wait_for_chunks_or_timeout(0.1) or () if c.data != b"ready")
         return len(got) >= 1000
 
     wait_for(read, lambda: f"1000 messages, {len(got)} came")
@@ -74,7 +74,7 @@ def test_messages_come_in_order_and_none_is_lost(router: Any, endpoint: str) -> 
 def test_a_peer_finds_a_router_that_comes_later(endpoint: str) -> None:
     link = build(key="k", mode="peer", connect=[endpoint])
     link.open()
-    assert link.poll_chunks(0.1) is None
+    assert link.wait_for_chunks_or_timeout(0.1) is None
     with open_router(endpoint) as opened:
         assert until_it_comes(link, lambda: opened.put("k", b"x"))
     link.close()
@@ -110,7 +110,7 @@ def test_long_messages_that_nobody_reads_give_way(router: Any, endpoint: str) ->
     wait_for(lambda: link._waiting[-1].data[:1] == b"\x0b", "the last message")
     held = sum(len(chunk.data) for chunk in link._waiting)
     assert held <= zenoh_link.MAX_QUEUED_BYTES
-    assert link.poll_chunks(0.1)
+    assert link.wait_for_chunks_or_timeout(0.1)
     link.close()
 
 
@@ -162,7 +162,7 @@ def test_a_process_that_forgets_to_close_still_ends(endpoint: str) -> None:
         from drivers.links import zenoh_link
         link = zenoh_link.build(zenoh_link.Settings(key="k", mode="peer", connect=["{endpoint}"]))
         link.open()
-        assert link.poll_chunks(0.1) is None
+        assert link.wait_for_chunks_or_timeout(0.1) is None
         print("done", flush=True)
     """
     ran = subprocess.run(

@@ -5,21 +5,21 @@ import pytest
 
 from drivers.timing.duplicate_rows import MIN_NEW_KEYS, DuplicateDetector
 from drivers.timing.event_rate_limiter import MIN_EVENT_INTERVAL_S, EventRateLimiter
-from drivers.timing.sender_times import find_evenly_spaced_order
+from drivers.timing.sender_time_gaps import find_evenly_spaced_order
 
 MS = 10**6
 
 
 def found(repeats, keys, first=0.0):
     values = np.tile(first + np.arange(len(keys), dtype=float)[:, None], 6)
-    return repeats.find_repeats(np.array(keys, np.int64), values)
+    return repeats.find_repeats_and_count_shared_keys(np.array(keys, np.int64), values)
 
 
 def test_nothing_is_called_a_repeat_before_enough_is_seen():
     repeats = DuplicateDetector(ordered=True)
-    assert repeats.find_repeats(np.zeros(5, np.int64), np.zeros((5, 6))) == (None, 0)
+    assert repeats.find_repeats_and_count_shared_keys(np.zeros(5, np.int64), np.zeros((5, 6))) == (None, 0)
     assert found(repeats, range(1, MIN_NEW_KEYS + 1)) == (None, 0)
-    mask, others = repeats.find_repeats(np.array([99, 99]), np.ones((2, 6)))
+    mask, others = repeats.find_repeats_and_count_shared_keys(np.array([99, 99]), np.ones((2, 6)))
     assert (mask.tolist(), others) == ([False, True], 0)
 
 
@@ -28,14 +28,18 @@ def test_absent_axes_are_equal():
     found(repeats, range(100))
     values = np.full((2, 6), np.nan)
     values[:, 0] = 1.0
-    assert repeats.find_repeats(np.array([100, 100]), values)[0].tolist() == [False, True]
+    assert repeats.find_repeats_and_count_shared_keys(np.array([100, 100]), values)[0].tolist() == [False, True]
 
 
 def test_a_counter_that_wraps_repeats_only_the_row_before():
     repeats = DuplicateDetector(ordered=False)
     for _ in range(3):
-        assert repeats.find_repeats(np.arange(50), np.zeros((50, 6)))[0] is None
-    assert repeats.find_repeats(np.array([50, 50, 7]), np.zeros((3, 6)))[0].tolist() == [False, True, False]
+        assert repeats.find_repeats_and_count_shared_keys(np.arange(50), np.zeros((50, 6)))[0] is None
+    assert repeats.find_repeats_and_count_shared_keys(np.array([50, 50, 7]), np.zeros((3, 6)))[0].tolist() == [
+        False,
+        True,
+        False,
+    ]
 
 
 def test_a_clock_set_back_by_hours_does_not_slow_what_follows():

@@ -94,7 +94,7 @@ class TestCounter:
         clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         out = feed(clock, arrive(T0 + index / rate)[kept], ticks_of(index, kind, rate)[kept])
         assert lost(out) == (~kept).sum()
-        assert clock.rate_hz == pytest.approx(rate, rel=1e-3)
+        assert clock.configured_or_measured_rate_hz == pytest.approx(rate, rel=1e-3)
         assert kinds(clock) == []
 
     def test_duplicates_lose_nothing_and_are_kept_out(self, kind, rate, nominal):
@@ -137,7 +137,7 @@ class TestCounter:
         ticks, arrived = ticks_of(index, kind, rate), jitter(T0 + index / rate)
         clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         out = feed(clock, arrived[:at], ticks[:at])
-        clock.note_link_closed()
+        clock.count_next_gap_by_arrival()
         later = feed(clock, arrived[at + n :], ticks[at + n :])
         assert lost(out + later) == n
         assert times(out)[-1] < times(later)[0]
@@ -150,7 +150,7 @@ class TestCounter:
         fresh = ticks_of(index, kind, rate) if kind[0] == 256 else np.rint(index / rate / kind[1] if kind[1] else index)
         clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         out = feed(clock, arrived[:at], ticks[:at])
-        clock.note_link_closed()
+        clock.count_next_gap_by_arrival()
         out += feed(clock, arrived[at + n :], fresh[: index.size - at - n])
         turn = kind[0] / (rate and 1) * (kind[1] or 1 / rate) * rate  # samples
         if nominal or at_s > 5.0:
@@ -241,7 +241,7 @@ def test_arrival_jitter_does_not_become_jitter_of_the_samples(rate, arrive, nomi
     if arrive is jitter and rate >= 99.0:
         assert np.abs(np.diff(settled) - 1 / rate).max() < 10e-6
     assert np.ptp(settled - taken[int(FORGET_S * rate) :]) < 3e-3
-    assert clock.rate_hz == pytest.approx(rate, rel=2e-5 if rate > 50 else 2e-4)
+    assert clock.configured_or_measured_rate_hz == pytest.approx(rate, rel=2e-5 if rate > 50 else 2e-4)
     assert clock.measured_hz == pytest.approx(rate, rel=2e-4)
 
 
@@ -293,11 +293,11 @@ class TestArrival:
         at, n = int(at_s * rate), int(5 * rate)
         clock = self.clock(rate, nominal)
         out = feed(clock, arrived[:at])
-        clock.note_link_closed()
+        clock.count_next_gap_by_arrival()
         out += feed(clock, arrived[at + n :])
         if nominal or at_s > 5.0:
             assert lost(out) == pytest.approx(n, abs=2)
-        assert clock.rate_hz == pytest.approx(rate, rel=1e-3)
+        assert clock.configured_or_measured_rate_hz == pytest.approx(rate, rel=1e-3)
 
 
 @pytest.mark.parametrize("rate", [20.0, 100.0, 400.0])
@@ -330,7 +330,7 @@ def test_unix_time_keeps_its_nanoseconds():
 def test_the_first_samples_of_an_unknown_rate_are_in_order():
     clock = SampleClock(ArrivalTimedFormat(), None)
     out = clock.assign_times(make_block(np.full(50, 10**9), np.zeros((50, 6))))
-    assert clock.rate_hz is None
+    assert clock.configured_or_measured_rate_hz is None
     assert (np.diff(times(out)) > 0).all()
 
 
@@ -360,7 +360,7 @@ def test_given_times_are_kept_and_holes_told_where_they_can_be(rows, nominal, sc
     assert np.array_equal(times(out), t_ns)
     if scatter in ("exact", "ms", "normal"):
         assert lost(out) in ((51,) if scatter != "normal" else (49, 50, 51, 52))
-        assert clock.rate_hz == pytest.approx(100.0, rel=5e-3)
+        assert clock.configured_or_measured_rate_hz == pytest.approx(100.0, rel=5e-3)
     else:  # late and early by whole periods: nothing is invented
         assert lost(out) <= 1
     shared = len(np.unique(t_ns)) < len(t_ns)  # Unix time as a double
@@ -375,7 +375,7 @@ def test_given_times_that_jump_are_told_and_the_rate_survives():
         out += clock.assign_times(make_block(np.rint(t[at : at + 100] * NS).astype(np.int64), np.zeros((100, 6))))
     texts = [event.text for event in clock.take_events()]
     assert [text.split(" by ")[0] for text in texts] == ["time went back", "time jumped ahead"]
-    assert clock.rate_hz == 100.0
+    assert clock.configured_or_measured_rate_hz == 100.0
     assert lost(out) == round((9000.0 - 14.99) * 100) - 1
 
 
@@ -426,7 +426,7 @@ def test_a_recording_in_which_every_row_stands_twice():
     clock = SampleClock(SenderTimedFormat(), None)
     out = stamp_given(clock, sent / 100, varied(3000)[sent], 1000)
     assert np.array_equal(np.concatenate([one.values for one in out])[:, 0], np.arange(3000))
-    assert clock.rate_hz == 100.0
+    assert clock.configured_or_measured_rate_hz == 100.0
 
 
 @pytest.mark.parametrize("rows", [1, 50, 4096])
@@ -560,7 +560,7 @@ def test_a_device_clock_contradicts_the_rate_however_its_samples_arrive(tick_s):
         # at no sample is the rate believed: not checked yet, then contradicted
         assert all(unchecked != contradicted for unchecked, contradicted in seen)
         assert wrong.contradicting_rate_hz == pytest.approx(100.0, rel=1e-3)
-        assert (wrong.rate_hz, right.rate_hz) == (100.0, 100.0)
+        assert (wrong.configured_or_measured_rate_hz, right.configured_or_measured_rate_hz) == (100.0, 100.0)
         assert not right.rate_check_pending
 
 
@@ -569,7 +569,7 @@ def test_a_tick_too_coarse_for_single_steps_contradicts_nothing():
     clock = SampleClock(CounterTimedFormat(1 << 16, 1e-3), 416.0)
     feed(clock, jitter(T0 + np.arange(4160) / 416.0), ticks)
     assert not clock.rate_check_pending
-    assert (clock.rate_hz, clock.contradicting_rate_hz) == (416.0, None)
+    assert (clock.configured_or_measured_rate_hz, clock.contradicting_rate_hz) == (416.0, None)
 
 
 @pytest.mark.parametrize("arrive", [jitter, burst, stall])
@@ -582,7 +582,7 @@ def test_jitter_of_arrivals_contradicts_no_rate_that_is_nearly_right(arrive, see
         feed(clock, arrived[a : a + 10])
         assert clock.contradicting_rate_hz is None
     assert not clock.rate_check_pending
-    assert clock.rate_hz == 100.2
+    assert clock.configured_or_measured_rate_hz == 100.2
 
 
 @pytest.mark.parametrize("arrive", [jitter, burst, stall])
@@ -596,7 +596,7 @@ def test_how_fast_a_file_is_read_contradicts_nothing():
     clock = SampleClock(ArrivalTimedFormat(), 100.0, arrivals_are_timed=False)
     feed(clock, T0 + np.arange(6000) / 2000.0)
     assert not clock.rate_check_pending
-    assert (clock.rate_hz, clock.contradicting_rate_hz) == (100.0, None)
+    assert (clock.configured_or_measured_rate_hz, clock.contradicting_rate_hz) == (100.0, None)
 
 
 def test_given_times_contradict_a_rate_also_where_there_are_few():
@@ -616,7 +616,7 @@ def test_times_that_never_show_a_rate_leave_the_configured_one():
         assert clock.rate_check_pending == (i > 0)
         clock.assign_times(make_block(np.zeros(4000, np.int64), varied(4000) + i))
     assert not clock.rate_check_pending
-    assert (clock.rate_hz, clock.contradicting_rate_hz) == (100.0, None)
+    assert (clock.configured_or_measured_rate_hz, clock.contradicting_rate_hz) == (100.0, None)
 
 
 def test_a_jump_of_given_times_does_not_begin_the_check_anew():

@@ -81,7 +81,7 @@ def replace_endless_commands() -> None:
         (service_in_terminal, "run_service"),
         (service_in_terminal, "run_fleet_viewer"),
         (watch, "watch"),
-        (reconcile, "run_reconciliation"),
+        (reconcile, "reconcile_and_write_report"),
     ]
     for place, name in places:
         setattr(place, name, _accepted(name))

@@ -14,7 +14,7 @@ def main() -> None:
     try:
         link.open()
         while True:
-            link.poll_chunks(1.0)
+            link.wait_for_chunks_or_timeout(1.0)
     except (ConfigError, LinkUnavailable, LinkEnded) as error:
         print(error, file=sys.stderr)
         sys.exit(0 if str(error).endswith("the end of the file.") else 2)

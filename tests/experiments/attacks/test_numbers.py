@@ -360,7 +360,7 @@ def try_model(text: str) -> None:
     try:
         model = NoiseModel.from_toml(text)
         rate_hz = model.sample_rate_hz or 100.0
-        series = model.start_stream(rate_hz, 1).draw_samples(64)
+        series = model.start_stream(rate_hz, 1).draw_next_samples(64)
     except ConfigError:
         return
     assert series.shape == (64, 6), text

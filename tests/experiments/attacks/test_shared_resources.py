@@ -26,7 +26,7 @@ from drivers.zenoh.session_config import build_session_config
 from monitor.common import topics
 from monitor.daemon.operations.prometheus_metrics import MetricsOutput
 from monitor.publishing.zenoh.publisher import ZenohPublisher
-from monitor.settings.loading import Metrics, ZenohTable
+from monitor.settings.loading import MetricsAddress, ZenohTable
 from tests.experiments.benchmarks import faults
 
 IMU_MONITOR = [sys.executable, "-m", "monitor.cli"]
@@ -244,10 +244,10 @@ def test_two_daemons_with_one_prefix_and_the_same_device_name(tmp_path: Path) ->
 def test_two_daemons_on_one_metrics_port() -> None:
     pytest.importorskip("prometheus_client")
     port = free_port()
-    with contextlib.closing(MetricsOutput(Metrics("127.0.0.1", port))) as first:
+    with contextlib.closing(MetricsOutput(MetricsAddress("127.0.0.1", port))) as first:
         first.start()
         eventually(lambda: first.state == "ok", first.state)
-        with contextlib.closing(MetricsOutput(Metrics("127.0.0.1", port))) as second:
+        with contextlib.closing(MetricsOutput(MetricsAddress("127.0.0.1", port))) as second:
             second.start()
             eventually(lambda: second.state != "starting", second.state)
             assert second.state == f"127.0.0.1:{port}: {os.strerror(98)}; trying again"
@@ -259,13 +259,13 @@ def test_two_daemons_on_one_metrics_port() -> None:
 @pytest.mark.timeout(600)
 def test_two_daemons_on_one_viewer_port() -> None:
     from monitor.publishing.rerun.queued_view import RerunView
-    from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+    from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
 
     settings = ViewerSettings("web", free_port(), free_port())
-    with contextlib.closing(RerunView(settings, [DeviceInfo("a")])) as first:
+    with contextlib.closing(RerunView(settings, [ViewerDeviceDescription("a")])) as first:
         first.start()
         eventually(lambda: first.state == "ok", first.state)
-        with contextlib.closing(RerunView(settings, [DeviceInfo("b")])) as second:
+        with contextlib.closing(RerunView(settings, [ViewerDeviceDescription("b")])) as second:
             second.start()
             eventually(lambda: second.state.startswith("ok"), second.state)
             assert f"ok, but port {settings.port} is busy: " in second.state

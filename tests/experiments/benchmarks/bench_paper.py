@@ -26,7 +26,7 @@ from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
+from monitor.estimation.fit.coefficient_fit import MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
 
 L: Final = 202
@@ -219,7 +219,7 @@ def each_sample(length: int, taus: int, rounds: int) -> tuple[str, ...]:
         fitting.add_samples(samples)
     parts = [make_block(np.arange(100), noise(100)) for _ in range(n // 100)]
     model, table_ = make_design_matrix(sizes, 1.0), covariances(length, sizes)
-    avar, terms, slope = window.avar(), window.term_counts(), window.rate_slopes_per_axis_and_tau()[0]
+    avar, terms, slope = window.avar(), window.term_counts(), window.drift_slopes_by_axis_and_tau()[0]
     took = alternate(
         {
             "kernel": for_each(window.append_samples, [one.values for one in parts]),
@@ -227,7 +227,7 @@ def each_sample(length: int, taus: int, rounds: int) -> tuple[str, ...]:
             "fitting": for_each(fitting.add_samples, parts),
             "solved": for_each(
                 lambda curve: fit_coefficients(model, table_, curve, full_covariance=False),
-                [MeasuredCurve(avar, terms, slope)] * 100,
+                [MeasuredVariancesAndSlopes(avar, terms, slope)] * 100,
             ),
         },
         rounds,

@@ -61,11 +61,11 @@ NORMALS: Final = {"five": 4, "eight": 5}
 def streamed(effects: tuple[Effect, ...], n: int) -> Callable[[], None]:
     """A stream of six axes, in blocks."""
     stream = NoiseModel(dict.fromkeys(AXES, effects)).start_stream(RATE_HZ, 1)
-    stream.draw_samples(BLOCK)  # compiles
+    stream.draw_next_samples(BLOCK)  # compiles
 
     def work() -> None:
         for _ in range(n // BLOCK):
-            stream.draw_samples(BLOCK)
+            stream.draw_next_samples(BLOCK)
 
     return work
 
@@ -162,7 +162,7 @@ def memory(samples: int) -> None:
     drawn = 0
     for mark in np.unique(np.geomspace(BLOCK, samples, 6).astype(np.int64) // BLOCK * BLOCK):
         while drawn < mark:
-            stream.draw_samples(BLOCK)
+            stream.draw_next_samples(BLOCK)
             drawn += BLOCK
         shown.add_row(f"{drawn:,}", f"{process.memory_info().rss / 1e6:.1f}")
     console.print(shown)

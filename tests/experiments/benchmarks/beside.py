@@ -20,7 +20,7 @@ from scipy.signal import welch
 
 from drivers.data_types import AXES, Floats
 from monitor.commands import analyze, simulate
-from monitor.common.units import (
+from monitor.common.unit_formatting import (
     COEFFICIENT_UNITS,
     DEGREE,
     DEVIATION_UNITS,
@@ -31,7 +31,7 @@ from monitor.common.units import (
     sensor_kind,
 )
 from monitor.estimation.analysis import RecordingAnalysis
-from monitor.estimation.detection.line_and_outlier_detection import detect_spectral_lines
+from monitor.estimation.detection.line_and_outlier_detection import detect_spectral_lines_per_axis
 from monitor.noise.model_loading import load_model
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.plots.allan_figure import FIT_DASHES, MARKER_SIZES, MARKERS
@@ -143,7 +143,7 @@ def curve(side: Side, axis: str) -> tuple[Floats, Floats, Floats, Floats]:
 def name_lines(axes: "Axes", side: Side, kind: Kind) -> None:
     """A mark where each line of the recording stands out most, one for those of several axes."""
     result = side.result
-    found = detect_spectral_lines(
+    found = detect_spectral_lines_per_axis(
         result.values, np.zeros(len(result.values), bool), side.rate_hz, result.estimate.curve
     )
     named: list[float] = []

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from drivers.data_types import AXES, Floats
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.window import AllanWindow
-from monitor.estimation.detection.change_detection import NOISE_SHARE, RATE_AT_ZERO, Change, ChangeDetector
+from monitor.estimation.detection.change_detection import NOISE_SHARE, RATE_AT_ZERO, Change, NoiseAndBiasChangeDetector
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
@@ -50,7 +50,7 @@ def white(rate_hz: float, seed: int) -> Callable[[int], Floats]:
 
 def coarse(rate_hz: float, seed: int) -> Callable[[int], Floats]:
     """The mix through an output of 0.05 °/s a bit; at 100 Hz a bit is 0.58 σ, at 10 Hz 1.8 σ."""
-    draw = mix().start_stream(rate_hz, seed).draw_samples
+    draw = mix().start_stream(rate_hz, seed).draw_next_samples
     return lambda n: np.asarray(np.round(draw(n) / STEP_OF_OUTPUT) * STEP_OF_OUTPUT)
 
 
@@ -71,7 +71,7 @@ def constant(seed: int) -> None:
     )
     for h in (8.0, 9.0, 10.0, 11.0, 12.0):
         # a rate of 1 Hz only sets what is learned before an accusation: 64 terms
-        detector = ChangeDetector(1.0, 86_400.0 * 6 * RATE_AT_ZERO / (NOISE_SHARE * np.exp(h)))
+        detector = NoiseAndBiasChangeDetector(1.0, 86_400.0 * 6 * RATE_AT_ZERO / (NOISE_SHARE * np.exp(h)))
         draw, n = white(1.0, seed), 0
         kinds: Counter[str] = Counter()
         while n < 10_000_000:
@@ -94,12 +94,12 @@ def false_alarms(years: float, seed: int) -> None:
     day = 86_400.0
     cases: list[tuple[str, float, float, Callable[[int], Floats]]] = [
         ("white, 10 Hz", 10.0, years * 365.25, white(10.0, seed)),
-        ("MEMS mix, 10 Hz", 10.0, years * 365.25 / 3, mix().start_stream(10.0, seed).draw_samples),
+        ("MEMS mix, 10 Hz", 10.0, years * 365.25 / 3, mix().start_stream(10.0, seed).draw_next_samples),
         ("mix at 0.05 °/s, 10 Hz", 10.0, years * 365.25 / 3, coarse(10.0, seed)),
-        ("MEMS mix, 100 Hz", 100.0, years * 365.25 / 30, mix().start_stream(100.0, seed).draw_samples),
+        ("MEMS mix, 100 Hz", 100.0, years * 365.25 / 30, mix().start_stream(100.0, seed).draw_next_samples),
     ]
     for title, rate_hz, days, draw in cases:
-        detectors = [ChangeDetector(rate_hz, stated) for stated in (1 / 30, 1.0, 10.0)]
+        detectors = [NoiseAndBiasChangeDetector(rate_hz, stated) for stated in (1 / 30, 1.0, 10.0)]
         kinds: list[Counter[str]] = [Counter() for _ in detectors]
         for _ in range(int(days * day * rate_hz / PIECE)):
             values = draw(PIECE)
@@ -146,7 +146,7 @@ def onsets() -> dict[str, tuple[float, float, Callable[[Floats, np.random.Genera
 
 def looked(first: Floats, second: Floats) -> Iterator[list[Change]]:
     """What a detector finds on each axis that changes from one series to the other, first change only."""
-    detector = ChangeDetector(RATE_HZ)
+    detector = NoiseAndBiasChangeDetector(RATE_HZ)
     detector.process_samples(first)
     early = {change.axis for change in detector.take_changes()}
     detector.process_samples(second)
@@ -190,7 +190,7 @@ def delays(repeats: int, seed: int) -> None:
         shown.add_row(*row(title, results, int(before * RATE_HZ)))
     results = []
     for k in range(-(-repeats // 24)):  # K × 3 wants days: the mix at 10 Hz, where K is the same
-        slow = ChangeDetector(10.0)
+        slow = NoiseAndBiasChangeDetector(10.0)
         cut, n = 2 * 864_000, 864_000
         slow.process_samples(mix().simulate(cut, 10.0, seed + k))
         early = {change.axis for change in slow.take_changes()}
@@ -222,7 +222,7 @@ def steps(repeats: int, seed: int) -> None:
 def cost() -> None:
     """Beside AllanWindow in one run, blocks of 100 samples, processor time."""
     values = white(RATE_HZ, 0)(100_000)
-    detector, window = ChangeDetector(RATE_HZ), AllanWindow(100_000, cluster_sizes(100_000, RATE_HZ))
+    detector, window = NoiseAndBiasChangeDetector(RATE_HZ), AllanWindow(100_000, cluster_sizes(100_000, RATE_HZ))
 
     def run(update: Callable[[Floats], None]) -> Callable[[], None]:
         def work() -> None:

@@ -26,7 +26,7 @@ from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import fit_arma, stationary_covariance
 from monitor.drift.compensation.compensation_result import AxisCompensation
 from monitor.drift.compensation.compensator import Compensator
-from monitor.drift.compensation.live_compensation import LiveCompensation
+from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.thermal.interval_means import compute_interval_means
 from monitor.noise.model_loading import load_model
@@ -371,7 +371,7 @@ def alarms(seeds: int) -> None:
     for name, records, rate_hz in sources:
         told: list[str] = []
         for values in records:
-            one, by_hand = LiveCompensation(rate_hz), ArmaWorker("", synchronous=True)
+            one, by_hand = LiveDriftCompensation(rate_hz), ArmaWorker("", synchronous=True)
             t_ns = np.round(np.arange(len(values)) / rate_hz * 1e9).astype(np.int64)
             for start in range(0, len(values), 100):
                 one.compensate_block(make_block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))

@@ -32,7 +32,12 @@ from scipy.optimize import least_squares, nnls
 from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds, rate_slope_per_tau
 from monitor.estimation.allan.uncertainty import CovarianceTable, covariance_table
-from monitor.estimation.fit.coefficient_fit import DesignMatrix, MeasuredCurve, fit_coefficients, make_design_matrix
+from monitor.estimation.fit.coefficient_fit import (
+    DesignMatrix,
+    MeasuredVariancesAndSlopes,
+    fit_coefficients,
+    make_design_matrix,
+)
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from tests.experiments.benchmarks.records import (
     HOURS_3,
@@ -88,7 +93,9 @@ def _fitted(values: Floats, rate_hz: float, full: bool) -> Floats:
     factors, columns, covariances = _octaves(len(values), rate_hz)
     avar, terms = overlapping_avar(values, factors)
     straight, each = rate_slope_from_thirds(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
-    found = fit_coefficients(columns, covariances, MeasuredCurve(avar, terms, straight, each), full_covariance=full)
+    found = fit_coefficients(
+        columns, covariances, MeasuredVariancesAndSlopes(avar, terms, straight, each), full_covariance=full
+    )
     return np.asarray(np.sqrt(np.maximum(found.theta, 0.0)))
 
 

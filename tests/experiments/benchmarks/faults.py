@@ -29,7 +29,7 @@ import numpy as np
 from drivers.recordings import segment_file
 from monitor.common.device_health import Health
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.output_interface import Output
+from monitor.daemon.outputs.output import Output
 from monitor.daemon.service import Service
 from monitor.settings import loading
 from tests.support.ports import free_endpoint, free_port
@@ -424,14 +424,14 @@ def full_disk(folder: Path, times: int) -> Outcome:
 
 def slow_disk(folder: Path, times: int) -> Outcome:
     """Every batch takes two seconds to write."""
-    write = segment_file.SingleSegmentWriter.write_samples
+    write = segment_file.SegmentFileWriter.write_samples
 
-    def slowly(writer: segment_file.SingleSegmentWriter, *arguments: Any) -> None:
+    def slowly(writer: segment_file.SegmentFileWriter, *arguments: Any) -> None:
         time.sleep(2.0)
         write(writer, *arguments)
 
     with (
-        mock.patch("drivers.recordings.segment_file.SingleSegmentWriter.write_samples", slowly),
+        mock.patch("drivers.recordings.segment_file.SegmentFileWriter.write_samples", slowly),
         running(folder, _storage(folder / "store")) as rig,
     ):
         for _ in range(4):

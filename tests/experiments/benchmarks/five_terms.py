@@ -13,11 +13,11 @@ import numpy as np
 from drivers.data_types import AXES, Floats, make_block
 from monitor.estimation.analysis import DETECTOR_CHUNK_ROWS, RecordingAnalysis, analyze
 from monitor.estimation.analysis_notes import LINE_FREQUENCY_TOLERANCE, MIN_OUTLIER_SHARE
-from monitor.estimation.detection.change_detection import Change, ChangeDetector
+from monitor.estimation.detection.change_detection import Change, NoiseAndBiasChangeDetector
 from monitor.estimation.detection.coarse_quantization import find_coarsely_quantized_axes
 from monitor.estimation.detection.line_and_outlier_detection import (
     SpectralLine,
-    detect_spectral_lines,
+    detect_spectral_lines_per_axis,
     outlier_share_of_axes,
 )
 from monitor.estimation.detection.motion_detection import detect_motion
@@ -77,15 +77,15 @@ def _of_fit(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str,
 
 
 def _of_events(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
-    """Of what ``detect_events`` looks for, where it stands as numbers: each thing is sought once, as there."""
+    """Of what ``detect_disturbances`` looks for, where it stands as numbers: each thing is sought once, as there."""
     values, rate_hz = result.values, result.estimate.rate_hz
     moving, _ = detect_motion(values, rate_hz)
-    for line in detect_spectral_lines(values, moving, rate_hz, result.estimate.curve):
+    for line in detect_spectral_lines_per_axis(values, moving, rate_hz, result.estimate.curve):
         if not _expected(line, model):
             yield AXES[line.axis], "narrowband" if line.wide else "sinusoidal"
     for i in np.flatnonzero(outlier_share_of_axes(values, moving) > MIN_OUTLIER_SHARE).tolist():
         yield AXES[i], "outliers"
-    detector = ChangeDetector(rate_hz)
+    detector = NoiseAndBiasChangeDetector(rate_hz)
     for begin in range(0, len(values), DETECTOR_CHUNK_ROWS):
         rows = slice(begin, begin + DETECTOR_CHUNK_ROWS)
         detector.process_samples(np.where(moving[rows, None], np.nan, values[rows]))

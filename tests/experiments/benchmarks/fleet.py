@@ -27,7 +27,7 @@ import psutil
 import zenoh
 
 from drivers.zenoh.session_config import build_session_config
-from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.remote_devices import RemoteDeviceRegistry
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from tests.support.ports import free_port
 
@@ -133,7 +133,7 @@ class Watcher:
 
     def __init__(self, endpoint: str) -> None:
         self.arriving = ZenohSubscriber("imu/**", [endpoint])
-        self.board = DeviceStates()
+        self.board = RemoteDeviceRegistry()
         self.gone_s: dict[str, float] = {}
         self.messages: Counter[str] = Counter()
         self.bytes: Counter[str] = Counter()
@@ -164,7 +164,7 @@ class Watcher:
     def states(self) -> Counter[str]:
         """How many devices are in which state."""
         now_s = time.monotonic()
-        return Counter(one.state(now_s) for one in self.board.sorted_devices(now_s))
+        return Counter(one.state(now_s) for one in self.board.devices_with_problems_first(now_s))
 
 
 def fleet(daemons: int, rate: float, publish: str, seconds: float) -> dict[str, Any]:

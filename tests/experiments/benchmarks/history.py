@@ -19,12 +19,12 @@ import numpy as np
 
 from monitor.estimation.estimate import Estimate
 from monitor.history import history_table as past
-from monitor.history.bucket import HistoryRow, pack_count_min_max_last
-from monitor.history.column_conversion import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
+from monitor.history.estimate_to_columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, EstimateToColumnsConverter
+from monitor.history.history_row import HistoryRow, pack_count_min_max_last
 from monitor.history.history_table import HistoryTable
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.query_parameters import PARTS, HistoryQuery
-from monitor.history.sqlite_store import HistoryStore, open_history
+from monitor.history.sqlite_store import HistoryFileWriter, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.history import HistoryMessage
@@ -83,7 +83,7 @@ def cost() -> None:
 def years(path: Path, count: float) -> None:
     """Write so many years, and say what they take."""
     rng, course = np.random.default_rng(1), _Course(estimate())
-    store, begun, written = HistoryStore(path), time.perf_counter(), 0
+    store, begun, written = HistoryFileWriter(path), time.perf_counter(), 0
     days = round(count * YEAR_D)
     largest = 0
     for day in range(days):
@@ -137,7 +137,7 @@ class _Course:
     """Rows of days: each number wanders around what a sensor has."""
 
     def __init__(self, first: Estimate) -> None:
-        numbers = ColumnConverter(first)
+        numbers = EstimateToColumnsConverter(first)
         self.names = (*numbers.names, *HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
         values = np.concatenate([numbers.convert_estimate(first), [100.0, 0.02, 1.8e8, 25.0]])
         self._centre = values

@@ -8,7 +8,7 @@ import time
 import urllib.request
 
 from monitor.daemon.operations.prometheus_metrics import MetricsOutput
-from monitor.settings.loading import Metrics
+from monitor.settings.loading import MetricsAddress
 from tests.monitor.publishing import made
 
 SCRAPES = 30
@@ -17,7 +17,7 @@ SCRAPES = 30
 def main() -> None:
     """1, 16 and 100 devices."""
     for devices in (1, 16, 100):
-        output = MetricsOutput(Metrics("127.0.0.1", 0))
+        output = MetricsOutput(MetricsAddress("127.0.0.1", 0))
         for i in range(devices):
             output.publish_health(f"device-{i}", 0.0, made.health())
             output.publish_result(f"device-{i}", 0.0, 0, made.estimate())

@@ -89,7 +89,7 @@ class Wire:
     def close(self) -> None:
         self._closed.set()
 
-    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
+    def wait_for_chunks_or_timeout(self, timeout_s: float) -> list[Chunk] | None:
         if self._closed.is_set():
             raise LinkLost("closed")
         truth = self.truth

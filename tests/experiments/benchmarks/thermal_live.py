@@ -13,7 +13,7 @@ from itertools import islice
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.drift.thermal.online_thermal_model import OnlineThermalModel, PredictedAxisInterval
+from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean, OnlineThermalModel
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
 from tests.experiments.benchmarks.machine import console, table
 from tests.monitor.drift.made import COEFFICIENT, late, weather
@@ -55,13 +55,13 @@ def wandering(draws: Floats) -> Floats:
 
 def followed(
     kind: str, seed: int, step: float = 0.0
-) -> tuple[list[PredictedAxisInterval], list[tuple[int, UnexplainedChange]], float]:
+) -> tuple[list[MeasuredAndPredictedMean], list[tuple[int, UnexplainedChange]], float]:
     """The intervals, what was told when, and the deviation of a mean."""
     biases, warmth, size = record(kind, seed, step)
     axis, looks, told = OnlineThermalModel(60.0 * MINUTES), [], []
     for k, (bias, temperature_c) in enumerate(zip(biases.tolist(), warmth.tolist(), strict=True)):
         looks.append(axis.predict_and_add_interval(bias, size, temperature_c))
-        while axis.run_selection_step():
+        while axis.run_selection_step_if_active():
             pass
         told += [(k, found) for found in axis.take_unexplained_changes()]
     return looks, told, size

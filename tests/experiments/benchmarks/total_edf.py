@@ -23,7 +23,7 @@ from monitor.estimation.allan.squared_difference_moments import (
 )
 from monitor.estimation.allan.total import total_estimator_moments, total_variance
 from monitor.estimation.allan.uncertainty import covariance_table
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
+from monitor.estimation.fit.coefficient_fit import MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 from monitor.noise.effect import Source
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
@@ -48,7 +48,7 @@ def records(coefficients: tuple[float, ...], n: int, count: int, rng: np.random.
     values = np.zeros((n, count))
     for kind, letter, size in zip(kinds, "QNBK", coefficients, strict=True):
         for column in range(count if size else 0):
-            values[:, column] += kind(**{letter: size}).start_series(1.0, rng).draw_samples(n)
+            values[:, column] += kind(**{letter: size}).start_series(1.0, rng).draw_next_samples(n)
     return values
 
 
@@ -56,7 +56,7 @@ def fitted(values: Floats) -> Floats:
     """θ [5, k] of the records themselves."""
     factors = cluster_sizes(len(values), 1.0)
     avar, terms = overlapping_avar(values, factors)
-    measured = MeasuredCurve(avar, terms, rate_slope_from_thirds(values))
+    measured = MeasuredVariancesAndSlopes(avar, terms, rate_slope_from_thirds(values))
     return fit_coefficients(make_design_matrix(factors, 1.0), covariance_table(len(values), factors), measured).theta
 
 

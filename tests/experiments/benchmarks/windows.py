@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
-from monitor.estimation.allan.window import AllanWindow, samples_per_displayed_tau
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit_coefficients, make_design_matrix
+from monitor.estimation.allan.window import AllanWindow, newest_samples_per_displayed_tau
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.noise.effect import Source
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
@@ -48,7 +48,7 @@ def windows(factors: Ints, length: int, rate_hz: float) -> dict[str, AllanWindow
     """The recursive ones."""
     return {
         "rectangle": AllanWindow(length, factors),
-        "a window per τ": AllanWindow(length, factors, samples_per_displayed_tau(factors, rate_hz, length)),
+        "a window per τ": AllanWindow(length, factors, newest_samples_per_displayed_tau(factors, rate_hz, length)),
     }
 
 
@@ -235,12 +235,12 @@ def fitted(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
     """The fit as if the curve were a rectangle's, each row of its own number of terms."""
     whole = covariances(length, factors)
     spans = (
-        samples_per_displayed_tau(factors, RATE_HZ, length)
+        newest_samples_per_displayed_tau(factors, RATE_HZ, length)
         if name == "a window per τ"
         else np.full(factors.size, length)
     )
     terms = np.repeat(np.maximum(spans + 1 - 2 * factors, 0)[:, None], 6, axis=1)
-    return fit_coefficients(make_design_matrix(factors, RATE_HZ), whole, MeasuredCurve(avar, terms))
+    return fit_coefficients(make_design_matrix(factors, RATE_HZ), whole, MeasuredVariancesAndSlopes(avar, terms))
 
 
 def restarted(values: Floats, factors: Ints, before: int, ends: Sequence[int]) -> Iterator[Fit]:

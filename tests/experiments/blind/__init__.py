@@ -1,6 +1,7 @@
 """Blind harness of ``reconcile``: effects are hidden in recordings, found as a user would look for them, then scored.
 
     python -m tests.experiments.blind --set singles --level plain --seeds 4 --jobs 2 --out plain.jsonl
+    python -m tests.experiments.blind --set all --sizes 0.25 1.2 --seeds 8 --jobs 2 --out power.jsonl
     python -m tests.experiments.blind --report plain.jsonl
 
 ``processes`` draws every effect by algorithms of its own and ``cases`` makes recordings, baseline models and truths
@@ -9,7 +10,8 @@ compares its ``report.json`` with the truth. Nothing here imports the program un
 
 **Levels** are gains of log-likelihood: plain is at least 50 over the baseline and at least 10 over the best wrong
 name, faint 15 and 5. ``cases`` searches the size at which the oracle's gains lie a little above; both stand in the
-truth.
+truth. ``--sizes`` multiplies the size by a factor drawn from a range, so that half the plain size has a quarter of its
+gain; the report then shows the share of right names against the factor.
 
 **Not identifiable, so not asked for**: a clock error where no axis has a line (the laws of noise have no clock of
 their own: N, B, K and the ratio trade); temperature effects without a recorded temperature; a sinusoid against a

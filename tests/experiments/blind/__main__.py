@@ -1,6 +1,7 @@
 """The blind harness from the command line; what it is: ``tests/experiments/blind/__init__.py``.
 
 python -m tests.experiments.blind --set singles --level plain --seeds 4 --jobs 2 --out plain.jsonl   # run and print
+python -m tests.experiments.blind --set all --sizes 0.25 1 --seeds 8 --out power.jsonl               # power curves
 python -m tests.experiments.blind --report plain.jsonl faint.jsonl                                   # print again
 python -m tests.experiments.blind --set singles --level faint --only outliers --write cases  # only make the files
 """
@@ -24,7 +25,8 @@ def main() -> None:
         print(tables.report([one for file in options.report for one in run.outcomes(file)]))
         return
     seeds = range(options.first_seed, options.first_seed + options.seeds)
-    todo = run.jobs(options.set, options.level, seeds, options.seconds, options.only, options.baseline)
+    sizes = None if options.sizes is None else (options.sizes[0], options.sizes[1])
+    todo = run.jobs(options.set, options.level, seeds, 3600.0 * options.hours, options.only, options.baseline, sizes)
     if options.write:
         _write(todo, options.write)
         return
@@ -38,12 +40,15 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m tests.experiments.blind", description="Hidden effects through reconcile."
     )
-    parser.add_argument("--set", choices=("singles", "pairs", "nulls", "foreign", "off"), default="singles")
+    parser.add_argument("--set", choices=("singles", "pairs", "nulls", "foreign", "off", "all"), default="singles")
     parser.add_argument("--level", choices=("plain", "faint"), default="plain")
     parser.add_argument("--baseline", choices=("exact", "off"), default="exact", help="off: N, B, K 5 %% off")
     parser.add_argument("--seeds", type=int, default=4, help="how many of each case")
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=3600.0, help="length of recordings")
+    parser.add_argument(
+        "--sizes", type=float, nargs=2, metavar=("LO", "HI"), help="draw multiples of the level's size from this range"
+    )
+    parser.add_argument("--hours", type=float, default=1.0, help="length of recordings")
     parser.add_argument("--only", nargs="+", default=(), metavar="CASE", help="these cases of the set")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--in-process", action="store_true", help="call the command without starting a program")

@@ -35,8 +35,8 @@ def as_it_is() -> Iterator[None]:
 def without_null() -> Iterator[None]:
     """Thresholds from a table instead of from simulated recordings."""
     from monitor.reconcile import reconcile
-    from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
     from monitor.reconcile.diagnostics.null_distribution import AxisNull, NullDistribution
+    from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 
     def table(simulated: Mapping[str, Sequence[Any]]) -> dict[str, AxisNull]:
         return {axis: dict.fromkeys(DIAGNOSTICS, NullDistribution(1.92, 3.32)) for axis in simulated}
@@ -73,7 +73,7 @@ def without_withdrawal() -> Iterator[None]:
     """Names stay, whatever is left at their place."""
     from monitor.reconcile.search import search
 
-    with patch.object(search, "keep_supported_effects", lambda found, *_others: found):
+    with patch.object(search, "keep_uncontradicted_effects", lambda found, *_others: found):
         yield
 
 

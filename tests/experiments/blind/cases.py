@@ -14,10 +14,10 @@ from zlib import crc32
 import numpy as np
 
 from tests.experiments.blind import foreign
-from tests.experiments.blind.levels import NotIdentifiable, aim, at_level, size_lines
+from tests.experiments.blind.levels import NotIdentifiable, aim, at_level, at_multiple, size_lines
 from tests.experiments.blind.oracle import Gains
 from tests.experiments.blind.processes import Floats
-from tests.experiments.blind.recipes import RECIPES
+from tests.experiments.blind.recipes import RECIPES, log_uniform
 from tests.experiments.blind.sensors import off, sensor, with_lines, with_shaking, with_temperature, without_term
 from tests.experiments.blind.world import AXES, Effect, Foreign, World, model_text
 
@@ -85,6 +85,8 @@ class _Plan:
     world: World
     rng: np.random.Generator
     level: str
+    sizes: tuple[float, float] | None
+    factor: float = 1.0
     told: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -97,6 +99,7 @@ def case(
     rate: float = 100.0,
     axes: int = 6,
     baseline: str = "exact",
+    sizes: tuple[float, float] | None = None,
 ) -> Case:
     """Make one case.
 
@@ -107,11 +110,12 @@ def case(
         seconds, rate: length and stated sample rate (Hz) of the recording
         axes: 6, or fewer counted from gx
         baseline: exact, or off: N, B and K 5 % too large or too small
+        sizes: range of the multiple of the level's size, drawn evenly on a logarithmic scale; None for the level itself
     """
     entropy = [crc32(name.encode()), crc32(level.encode()), seed]
     rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(entropy)))
     for redrawn in range(REDRAWS):
-        plan = _Plan(sensor(rng, seconds, rate, AXES[:axes]), rng, level)
+        plan = _Plan(sensor(rng, seconds, rate, AXES[:axes]), rng, level, sizes)
         try:
             _fill(plan, name)
             break
@@ -123,6 +127,7 @@ def case(
     truth = {
         "case": name,
         "level": level,
+        "size": plan.factor,
         "seed": seed,
         "seconds": seconds,
         "rate": rate,
@@ -168,6 +173,16 @@ def _hide(plan: _Plan, name: str) -> None:
                 hidden[k] = effect.sized(ratio=aims[k].size), gains
             else:
                 hidden[k] = at_level(known, effect, aims[k])
+    if plan.sizes is not None:
+        plan.factor = log_uniform(plan.rng, *plan.sizes)
+        for k in hidden:
+            others = tuple(other for j, (other, _) in hidden.items() if j != k)
+            known = replace(plan.world, baseline=(*plan.world.baseline, *others))
+            if aims[k].lines:
+                plan.world, gains = size_lines(plan.world, aims[k].target * plan.factor**2)
+                hidden[k] = hidden[k][0], gains
+            else:
+                hidden[k] = at_multiple(known, hidden[k][0], plan.factor)
     plan.told = [_told(*hidden[k]) for k in range(len(drawn))]
     plan.world = plan.world.with_hidden(*(effect for effect, _ in hidden.values()))
 

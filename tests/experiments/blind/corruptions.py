@@ -29,10 +29,10 @@ import numpy as np  # noqa: E402
 from scipy.signal import welch  # noqa: E402
 
 from drivers.data_types import AXES, Floats  # noqa: E402
-from monitor.noise.effects import Bias  # noqa: E402
+from monitor.noise.effects import ConstantBias  # noqa: E402
 from monitor.noise.model import NoiseModel  # noqa: E402
 from monitor.reconcile.likelihood.axis_fit import RegressorCache  # noqa: E402
-from monitor.reconcile.preparation.reconcile_input import Recording, select_usable_axes  # noqa: E402
+from monitor.reconcile.preparation.reconcile_input import Recording, select_axes_and_smooth_temperature  # noqa: E402
 from monitor.reconcile.reconcile import reconcile  # noqa: E402
 from monitor.reconcile.recording_checks.checks import check_recording, sort_findings  # noqa: E402
 from monitor.reconcile.recording_checks.sample_rate_from_features import (  # noqa: E402
@@ -40,7 +40,7 @@ from monitor.reconcile.recording_checks.sample_rate_from_features import (  # no
     estimate_sample_rate_error,
 )
 from monitor.reconcile.result import RecordingFinding  # noqa: E402
-from monitor.reconcile.search.axis_repair import build_repaired_axes  # noqa: E402
+from monitor.reconcile.search.repaired_axes import build_repaired_axes  # noqa: E402
 from monitor.reconcile.search.sample_rate_from_spectrum import detect_sample_rate_error  # noqa: E402
 
 
@@ -315,9 +315,9 @@ def answer(case: Case, model: NoiseModel, whole: bool) -> Answer:
 def checks_before_search(recording: Recording, model: NoiseModel) -> tuple[RecordingFinding, ...]:
     """Return the findings of ``reconcile`` without the search for effects."""
     checked = check_recording(recording, model, 1)
-    usable, _ = select_usable_axes(checked.recording, model)
+    usable, _ = select_axes_and_smooth_temperature(checked.recording, model)
     cache = RegressorCache(usable.sample_count, usable.rate_hz, usable.temperature_c)
-    effects = {axis: tuple(e for e in model.effects[axis] if not isinstance(e, Bias)) for axis in usable.values}
+    effects = {axis: tuple(e for e in model.effects[axis] if not isinstance(e, ConstantBias)) for axis in usable.values}
     axes = build_repaired_axes(usable, effects, cache, np.random.default_rng(1))
     error = estimate_sample_rate_error(
         {axis: one.coefficients for axis, one in axes.items()},

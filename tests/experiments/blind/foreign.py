@@ -21,10 +21,9 @@ def chirp(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
     return 0.25 * size * np.sin(phase + rng.uniform(0.0, 2.0 * np.pi))
 
 
-def power_law(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
-    """S ∝ f^−1.5, as strong as white noise at 3 Hz."""
-    floor = size**2 / clock.rate_hz
-    return shaped(clock, rng, lambda f: floor * (f / 3.0) ** -1.5)
+def plateau(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """As strong as white noise from 5 to 10 Hz, and nothing elsewhere."""
+    return shaped(clock, rng, lambda f: np.where((f > 5.0) & (f < 10.0), size**2 / clock.rate_hz, 0.0))
 
 
 def amplitude_modulated_line(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
@@ -50,15 +49,9 @@ def quadratic_temperature(clock: Clock, rng: np.random.Generator, size: float) -
     return np.asarray(0.4 * size * square / square.std())
 
 
-def quadratic_drift(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
-    """t², about the middle of the recording."""
-    t = 2.0 * clock.t_s * clock.rate_hz / clock.n - 1.0
-    return float(rng.choice((-1.0, 1.0))) * size * np.square(t)
-
-
-def pulse_train(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
-    """20 ms of every second: something else in the box is polled."""
-    return np.where(np.mod(clock.t_s + rng.uniform(0.0, 1.0), 1.0) < 0.02, 0.4 * size, 0.0)
+def sawtooth(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """A slope that falls back every 2.7 s: a counter that leaks."""
+    return 0.4 * size * (np.mod(clock.t_s / 2.7 + rng.uniform(0.0, 1.0), 1.0) - 0.5)
 
 
 def two_correlated(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
@@ -71,29 +64,14 @@ SERIES: Final[dict[str, Callable[[Clock, np.random.Generator, float], Floats]]] 
     function.__name__: function
     for function in (
         chirp,
-        power_law,
+        plateau,
         amplitude_modulated_line,
         wandering_line,
         quadratic_temperature,
-        quadratic_drift,
-        pulse_train,
+        sawtooth,
         two_correlated,
     )
 }
-
-
-def breathing(clock: Clock, rng: np.random.Generator) -> Floats:
-    """The variance of the white noise rises and falls by 40 % in 300 s."""
-    return _breath(clock, rng, 0.4)
-
-
-def shallow_breathing(clock: Clock, rng: np.random.Generator) -> Floats:
-    """By 6 %."""
-    return _breath(clock, rng, 0.06)
-
-
-def _breath(clock: Clock, rng: np.random.Generator, depth: float) -> Floats:
-    return np.sqrt(1.0 + depth * np.sin(2.0 * np.pi * clock.t_s / 300.0 + rng.uniform(0.0, 2.0 * np.pi)))
 
 
 def bursts(clock: Clock, rng: np.random.Generator) -> Floats:
@@ -105,13 +83,13 @@ def bursts(clock: Clock, rng: np.random.Generator) -> Floats:
     return gain
 
 
-def student_t(clock: Clock, rng: np.random.Generator) -> Floats:
-    """Student's t of 5 degrees of freedom with the variance of the Gaussian: √(3/χ²₅) in front of it."""
-    return np.sqrt(3.0 / rng.chisquare(5.0, clock.n))
+def laplace(clock: Clock, rng: np.random.Generator) -> Floats:
+    """Laplace's distribution with the variance of the Gaussian: the root of an exponential in front of it."""
+    return np.sqrt(rng.exponential(1.0, clock.n))
 
 
 LEVELS: Final[dict[str, Callable[[Clock, np.random.Generator], Floats]]] = {
-    function.__name__: function for function in (breathing, shallow_breathing, bursts, student_t)
+    function.__name__: function for function in (bursts, laplace)
 }
 
 NAMES: Final = (*SERIES, *LEVELS)

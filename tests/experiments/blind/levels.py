@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from tests.experiments.blind.oracle import EXACT, Gains, Observer
-from tests.experiments.blind.recipes import RECIPES, log_uniform, sign, sized
+from tests.experiments.blind.recipes import RECIPES, log_uniform, scaled, sign, sized
 from tests.experiments.blind.world import Effect, World
 
 TARGETS: Final[Mapping[str, tuple[float, float, float]]] = {
@@ -53,6 +53,12 @@ def at_level(world: World, effect: Effect, aimed: Aim) -> tuple[Effect, Gains]:
     if aimed.size is None:
         return _search(world, effect, aimed)
     effect = effect.sized(**{RECIPES[effect.name].size: float(aimed.size)})
+    return effect, Gains(np.inf, np.inf) if effect.name in EXACT else Observer(world, effect).gains()
+
+
+def at_multiple(world: World, effect: Effect, factor: float) -> tuple[Effect, Gains]:
+    """The effect, which has a size already, at a multiple of it, and what the oracle gains there."""
+    effect = scaled(effect, world, factor)
     return effect, Gains(np.inf, np.inf) if effect.name in EXACT else Observer(world, effect).gains()
 
 

@@ -8,7 +8,8 @@ What the gain is of,
   times the room that the data leave: a jump of height h in white noise N is timed to ∫exp(−v|t|/2 + √v W)dt, v =
   h²/N², of which the mean logarithm is ln(10/v) (Laplace's method; both-sided Dufresne integral, simulated). A jump
   that is timed no better than jumps are spaced gains nothing and costs nothing;
-- outliers and noise steps: the samples whitened by 1/√S, then a two-Gaussian mixture, or two variances;
+- outliers, noise steps and heavy tails: the samples whitened by 1/√S, then a two-Gaussian mixture, two variances, or
+  Student's t;
 - what is exact (a grid, repeats, clipping) gains without bound: ``inf``;
 - a wrong clock: each line of the model found where it is and missed where it should be.
 
@@ -23,9 +24,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy import stats
 from scipy.fft import dct, rfft
 
-from tests.experiments.blind.processes import Floats
+from tests.experiments.blind.processes import Floats, modulated
 from tests.experiments.blind.rivals import Rivals
 from tests.experiments.blind.spectra import SHAPES, coefficients, density, frequencies, log_likelihood
 from tests.experiments.blind.world import LEAKS, Effect, World
@@ -36,6 +38,9 @@ KNOWN: Final = (
     "sinusoidal",
     "temperature_bias",
     "temperature_lag",
+    "temperature_hysteresis",
+    "pulse_train",
+    "bias_curve",
     "turn_on_transient",
     "bias_step",
     *LEAKS,
@@ -79,7 +84,7 @@ class Observer:
             return self._known(coefficients(self._signal(self.effect)))
         if name in ("random_telegraph", "poisson_steps"):
             return self._path()
-        if name in ("outliers", "noise_step"):
+        if name in ("outliers", "noise_step", "heavy_tails", "variance_modulation"):
             return self._samples()
         return self._gaussian([*self.baseline, self.effect])
 
@@ -155,6 +160,13 @@ class Observer:
             after = np.arange(self.n) >= self.effect.parameters["time"] * self.rate
             ratio = self.effect.parameters["ratio"]
             return float(np.sum(0.5 * w[after] ** 2 * (1.0 - ratio**-2.0)) - after.sum() * np.log(ratio))
+        if self.effect.name == "variance_modulation":
+            power = np.maximum(modulated(self.world.clock(), **self.effect.parameters), 1e-3)
+            return float(np.sum(0.5 * w**2 * (1.0 - 1.0 / power) - 0.5 * np.log(power)))
+        if self.effect.name == "heavy_tails":
+            nu = self.effect.parameters["nu"]
+            student = stats.t(nu, scale=np.sqrt(1.0 - 2.0 / nu))
+            return float(np.sum(student.logpdf(w) - stats.norm.logpdf(w)))
         share = self.effect.parameters["fraction"]
         s2 = 1.0 + (self.effect.parameters["scale"] / self.world.noise(self.effect.axis)) ** 2
         mixed = np.logaddexp(np.log1p(-share) - 0.5 * w**2, np.log(share) - 0.5 * np.log(s2) - 0.5 * w**2 / s2)

@@ -115,6 +115,12 @@ def narrowband(clock: Clock, rng: np.random.Generator, sigma: float, frequency: 
     return cosine * np.cos(angle) + sine * np.sin(angle)
 
 
+def power_law(clock: Clock, rng: np.random.Generator, density: float, exponent: float) -> Floats:
+    """S = D² (sin(πfτ0)/(πτ0))^−α; what wraps at the ends of a steep one is far away."""
+    tau0 = 1.0 / clock.rate_hz
+    return shaped(clock, rng, lambda f: density**2 * (np.sin(np.pi * f * tau0) / (np.pi * tau0)) ** -exponent)
+
+
 def temperature_bias(
     clock: Clock, rng: np.random.Generator, coefficient: float, reference: float, quadratic: float = 0.0
 ) -> Floats:
@@ -137,6 +143,18 @@ def temperature_lag(
     return coefficient * (np.asarray(inside) - reference)
 
 
+def temperature_hysteresis(clock: Clock, rng: np.random.Generator, height: float, reversal: float) -> Floats:
+    """Half the height above or below the middle: where T stands in a window that it drags along."""
+    if clock.temperature_c is None:
+        raise ValueError("temperature_hysteresis needs a temperature")
+    half, middle = 0.5 * reversal, np.empty(clock.n)
+    at = float(clock.temperature_c[0])
+    for k, one in enumerate(clock.temperature_c.tolist()):
+        at = min(max(at, one - half), one + half)
+        middle[k] = at
+    return height * (clock.temperature_c - middle) / reversal
+
+
 def turn_on_transient(clock: Clock, rng: np.random.Generator, amplitude: float, time_constant: float) -> Floats:
     """A exp(−t/τ)."""
     return amplitude * np.exp(-clock.t_s / time_constant)
@@ -145,6 +163,11 @@ def turn_on_transient(clock: Clock, rng: np.random.Generator, amplitude: float, 
 def bias_step(clock: Clock, rng: np.random.Generator, time: float, height: float) -> Floats:
     """One jump."""
     return np.where(clock.t_s >= time, height, 0.0)
+
+
+def bias_curve(clock: Clock, rng: np.random.Generator, slope: float, curvature: float) -> Floats:
+    """A parabola."""
+    return np.asarray(np.polyval([curvature, slope, 0.0], clock.t_s))
 
 
 def random_telegraph(clock: Clock, rng: np.random.Generator, amplitude: float, dwell_time: float) -> Floats:
@@ -164,12 +187,32 @@ def poisson_steps(clock: Clock, rng: np.random.Generator, rate: float, height: f
     return np.asarray(levels[np.searchsorted(times, clock.t_s, side="right")])
 
 
+def heavy_tails(clock: Clock, rng: np.random.Generator, nu: float) -> Floats:
+    """[n] in front of Gaussian samples: √((ν − 2)/χ²) makes them Student's t of the same variance."""
+    return np.sqrt((nu - 2.0) / rng.chisquare(nu, clock.n))
+
+
 def outliers(clock: Clock, rng: np.random.Generator, fraction: float, scale: float) -> Floats:
     """A drawn number of samples, any of them."""
     values = np.zeros(clock.n)
     hit = rng.choice(clock.n, rng.binomial(clock.n, fraction), replace=False)
     values[hit] = scale * rng.standard_normal(hit.size)
     return values
+
+
+def pulse_train(
+    clock: Clock, rng: np.random.Generator, height: float, period: float, width: float, delay: float
+) -> Floats:
+    """By the times of rising and falling edges."""
+    count = int(clock.n / clock.rate_hz / period) + 3
+    rising = delay + period * np.arange(-1, count)
+    edges = np.stack([rising, rising + width], axis=1).ravel() - 1e-9
+    return height * (np.searchsorted(edges, clock.t_s, side="right") % 2)
+
+
+def modulated(clock: Clock, depth: float, period: float, phase: float) -> Floats:
+    """Variance that rises and falls, relative to its mean."""
+    return np.asarray(1.0 + depth * np.imag(np.exp(1j * (2.0 * np.pi * clock.t_s / period + phase))))
 
 
 SOURCES: Final[dict[str, Callable[..., Floats]]] = {
@@ -183,13 +226,17 @@ SOURCES: Final[dict[str, Callable[..., Floats]]] = {
         exponentially_correlated,
         sinusoidal,
         narrowband,
+        power_law,
         temperature_bias,
         temperature_lag,
+        temperature_hysteresis,
         turn_on_transient,
         bias_step,
+        bias_curve,
         random_telegraph,
         poisson_steps,
         outliers,
+        pulse_train,
     )
 }
 
@@ -199,7 +246,9 @@ def scale_factor(values: Floats, rate_hz: float, rng: np.random.Generator, facto
     return factor * values
 
 
-def bandwidth_limit(values: Floats, rate_hz: float, rng: np.random.Generator, cutoff: float, order: int) -> Floats:
+def bandwidth_limit(
+    values: Floats, rate_hz: float, rng: np.random.Generator, cutoff: float, order: int, floor: float = 0.0
+) -> Floats:
     """Butterworth's poles on the unit circle, bilinear: s = i tan(πfτ0)/tan(πf_cτ0); settled at the first sample."""
     padded = np.concatenate([np.full(SETTLING, values[0]), values])
     size = next_fast_len(padded.size, real=True)
@@ -210,7 +259,7 @@ def bandwidth_limit(values: Floats, rate_hz: float, rng: np.random.Generator, cu
     response = 1.0 / np.prod(s[:, None] - poles, axis=1)
     # circular: what the end of the series leaves behind falls into the constant stretch, which is cut off
     filtered = irfft(rfft(padded - values[0], size) * response, size)[SETTLING : padded.size]
-    return np.asarray(filtered + values[0])
+    return np.asarray(filtered + values[0] + floor * np.sqrt(rate_hz) * white(values.size, rng))
 
 
 def saturation(values: Floats, rate_hz: float, rng: np.random.Generator, limit: float) -> Floats:

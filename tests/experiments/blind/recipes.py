@@ -9,6 +9,7 @@ exact (see the package), ``fixed`` gives the size of each level:
 | `resolution` | step of 0.5–2 deviations of the white noise | 0.05–0.2 |
 | `sample_hold` | 0.5–3 % of the samples | 0.02–0.1 % |
 | `saturation` | 0.2–1 % of the samples clipped | 0.01–0.04 % |
+| `heavy_tails` | 4–25 degrees of freedom | 60–90 |
 | `bandwidth_limit` | cutoff of 10–35 % of the sample rate | 42–48 % |
 """
 
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from tests.experiments.blind.world import AXES, Effect, World
 
@@ -85,6 +86,26 @@ def _late(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
     return {"reference": 25.0, "time_constant": log_uniform(rng, world.seconds / 60.0, world.seconds / 8.0)}
 
 
+def _loop(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
+    temperature_c = world.clock().temperature_c
+    assert temperature_c is not None
+    return {"reversal": log_uniform(rng, 0.05, 0.4) * float(np.ptp(temperature_c))}
+
+
+def _pulses(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
+    period = float(rng.choice((1.0, log_uniform(rng, 0.2, 20.0))))
+    width = max(period * log_uniform(rng, 0.01, 0.3), 2.0 / world.rate_hz)
+    return {"period": period, "width": width, "delay": uniform(rng, 0.0, 1.0) * period}
+
+
+def _curve(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
+    return {"slope": sign(rng) * world.noise(axis) / world.seconds}
+
+
+def _breath(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
+    return {"period": log_uniform(rng, 5.0, world.seconds / 6.0), "phase": uniform(rng, 0.0, 2.0 * np.pi)}
+
+
 def _transient(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
     return {"time_constant": log_uniform(rng, world.seconds / 60.0, world.seconds / 6.0)}
 
@@ -115,7 +136,15 @@ def _from_neighbour(rng: np.random.Generator, world: World, axis: str) -> dict[s
 
 
 def _low_pass(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
-    return {"order": int(rng.integers(1, 4))}
+    filtered = {"order": int(rng.integers(1, 4))}
+    if rng.random() < 0.5:
+        return filtered
+    return {**filtered, "floor": log_uniform(rng, 0.05, 0.5) * world.term(axis, "angle_random_walk", "N")}
+
+
+def _between_classics(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
+    lo, hi = ((0.4, 0.7), (1.3, 1.7), (2.3, 2.6))[rng.integers(3)]
+    return {"exponent": uniform(rng, lo, hi)}
 
 
 def _by_level(plain: tuple[float, float], faint: tuple[float, float]) -> Callable[..., float]:
@@ -132,6 +161,10 @@ def _step(rng: np.random.Generator, world: World, axis: str, level: str) -> floa
 def _limit(rng: np.random.Generator, world: World, axis: str, level: str) -> float:
     share = _by_level((2e-3, 1e-2), (1e-4, 4e-4))(rng, world, axis, level)
     return abs(world.bias[axis]) - float(ndtri(share)) * world.noise(axis)
+
+
+def _tails(rng: np.random.Generator, world: World, axis: str, level: str) -> float:
+    return _by_level((4.0, 25.0), (60.0, 90.0))(rng, world, axis, level)
 
 
 def _cutoff(rng: np.random.Generator, world: World, axis: str, level: str) -> float:
@@ -153,16 +186,24 @@ RECIPES: Final[Mapping[str, Recipe]] = {
     "narrowband": Recipe(_resonance, "sigma", _noise(0.05)),
     "temperature_bias": Recipe(_warmth, "coefficient", _noise(0.05), "temperature"),
     "temperature_lag": Recipe(_late, "coefficient", _noise(0.05), "temperature"),
+    "temperature_hysteresis": Recipe(_loop, "height", _noise(0.1), "temperature"),
     "turn_on_transient": Recipe(_transient, "amplitude", _noise(0.3)),
     "bias_step": Recipe(_moment, "height", _noise(0.1)),
+    "bias_curve": Recipe(_curve, "curvature", lambda world, axis: world.noise(axis) / world.seconds**2),
     "random_telegraph": Recipe(_popcorn, "amplitude", _noise(0.1)),
     "poisson_steps": Recipe(_jumps, "height", _noise(0.1)),
     "outliers": Recipe(_wild, "scale", _noise(4.0)),
+    "pulse_train": Recipe(_pulses, "height", _noise(0.1)),
     "noise_step": Recipe(_moment, "ratio", lambda world, axis: 0.02),
+    "variance_modulation": Recipe(_breath, "depth", lambda world, axis: 0.02),
+    "heavy_tails": Recipe(_nothing, "nu", lambda world, axis: 10.0, fixed=_tails),
     "g_sensitivity": Recipe(
         _from_accelerometer, "coefficient", lambda world, axis: 1e-4, "shaking source", gyros_only=True
     ),
     "cross_axis": Recipe(_from_neighbour, "coefficient", lambda world, axis: 5e-3, "shaking source"),
+    "power_law": Recipe(
+        _between_classics, "density", lambda world, axis: 0.01 * world.noise(axis) / world.rate_hz**0.5
+    ),
     "scale_factor": Recipe(_nothing, "factor", lambda world, axis: 0.2, least=0.1),
     "bandwidth_limit": Recipe(_low_pass, "cutoff", _noise(0.0), fixed=_cutoff),
     "sample_rate_error": Recipe(_nothing, "ratio", _noise(0.03), "lines"),
@@ -171,7 +212,7 @@ RECIPES: Final[Mapping[str, Recipe]] = {
     "sample_hold": Recipe(_nothing, "fraction", lambda world, axis: 0.01, fixed=_by_level((5e-3, 3e-2), (2e-4, 1e-3))),
 }
 
-SIGNED: Final = ("coefficient", "amplitude", "height")
+SIGNED: Final = ("coefficient", "amplitude", "height", "curvature")
 UNSIGNED_AMPLITUDES: Final = ("sinusoidal", "random_telegraph", "poisson_steps")
 
 
@@ -185,3 +226,19 @@ def sized(effect: Effect, size: float, sense: float) -> Effect:
     else:
         value = size
     return effect.sized(**{parameter: float(value)})
+
+
+def scaled(effect: Effect, world: World, factor: float) -> Effect:
+    """The effect at a multiple of its size; of a limit the clipped share, of a low-pass the band that is cut off."""
+    parameter = RECIPES[effect.name].size
+    value = float(effect.parameters[parameter])
+    if parameter in ("ratio", "factor"):
+        value = value**factor
+    elif parameter == "cutoff":
+        value = max(0.5 * world.rate_hz - factor * (0.5 * world.rate_hz - value), 0.02 * world.rate_hz)
+    elif parameter == "limit":
+        noise, bias = world.noise(effect.axis), abs(world.bias[effect.axis])
+        value = bias - float(ndtri(factor * ndtr((bias - value) / noise))) * noise
+    else:
+        value = factor * value
+    return effect.sized(**{parameter: value})

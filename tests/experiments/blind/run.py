@@ -37,11 +37,15 @@ class Job:
     rate: float = 100.0
     axes: int = 6
     baseline: str = "exact"
+    sizes: tuple[float, float] | None = None
 
     @property
     def key(self) -> str:
         """What tells it from others in a result file."""
-        return f"{self.name} {self.level} {self.seed} {self.seconds:g}s {self.rate:g}Hz {self.axes} {self.baseline}"
+        sizes = "" if self.sizes is None else f" x{self.sizes[0]:g}-{self.sizes[1]:g}"
+        return (
+            f"{self.name} {self.level} {self.seed} {self.seconds:g}s {self.rate:g}Hz {self.axes} {self.baseline}{sizes}"
+        )
 
     @property
     def folder(self) -> str:
@@ -58,6 +62,7 @@ class Job:
             rate=self.rate,
             axes=self.axes,
             baseline=self.baseline,
+            sizes=self.sizes,
         )
 
 
@@ -68,23 +73,30 @@ def jobs(
     seconds: float,
     only: Sequence[str] = (),
     baseline: str = "exact",
+    sizes: tuple[float, float] | None = None,
 ) -> list[Job]:
-    """The cases of a set; ``off`` is short for singles with a baseline that is off.
+    """The cases of a set; ``off`` is short for singles with a baseline that is off, ``all`` for the other four sets.
 
     ``nulls`` are of two sorts: six axes of a sixth of the length, and one axis of the whole.
 
     Raises:
         ValueError: no such set
     """
+    if which == "all":
+        return [
+            job
+            for each in ("singles", "pairs", "nulls", "foreign")
+            for job in jobs(each, level, seeds, seconds, only, baseline, sizes)
+        ]
     if which == "off":
         which, baseline = "singles", "off"
     names = {"singles": cases.SINGLES, "pairs": cases.PAIRS, "foreign": cases.FOREIGN, "nulls": ("null",)}
     if which not in names:
-        raise ValueError(f"no set {which!r}: {', '.join(names)} or off")
+        raise ValueError(f"no set {which!r}: {', '.join(names)}, off or all")
     if which in ("foreign", "nulls"):
-        level = "plain"  # they have but one
+        level, sizes = "plain", None  # they have but one
     made = [
-        Job(name, level, seed, seconds, baseline=baseline)
+        Job(name, level, seed, seconds, baseline=baseline, sizes=sizes)
         for seed in seeds
         for name in names[which]
         if not only or name in only

@@ -22,6 +22,7 @@ Json = Mapping[str, Any]
 
 NOT_JUDGED: Final = ("reference", "order", "source")  # the mean is free; whole numbers and names have no interval
 ANYWHERE: Final = ("sample_rate_error",)
+FAINT: Final = (15.0, 5.0)  # gains of the oracle: see the package
 OPEN: Final = ("unexplained", "partly_explained")
 
 
@@ -54,6 +55,8 @@ class Outcome:
     seconds: float
     foreign: tuple[str, ...] = field(default=())
     gain: float | None = None  # the smallest of the oracle's
+    size: float = 1.0  # multiple of the level's size
+    margin: float | None = None  # the smallest of the oracle's, over the best wrong name
 
     @property
     def false(self) -> tuple[Name, ...]:
@@ -66,6 +69,11 @@ class Outcome:
         if self.foreign:
             return self.honest
         return bool(self.verdict) and not self.missed and not self.false
+
+    @property
+    def is_identifiable(self) -> bool:
+        """Whether the oracle gains what a faint effect gains, over the baseline and over the best wrong name."""
+        return (self.gain is None or self.gain >= FAINT[0]) and (self.margin is None or self.margin >= FAINT[1])
 
     @property
     def honest(self) -> bool:
@@ -113,6 +121,7 @@ def score(truth: Json, report: Json | None, exit_status: int, seconds: float) ->
             if step["effect"] in ANYWHERE:
                 told_anywhere.add(step["effect"])
     gains = [one["gain"] for one in truth["hidden"] if np.isfinite(one["gain"])]
+    margins = [one["margin"] for one in truth["hidden"] if np.isfinite(one["margin"])]
     return Outcome(
         case=truth["case"],
         level=truth["level"],
@@ -129,6 +138,8 @@ def score(truth: Json, report: Json | None, exit_status: int, seconds: float) ->
         seconds=seconds,
         foreign=tuple(one["name"] for one in truth["foreign"]),
         gain=min(gains, default=None),
+        size=truth.get("size", 1.0),
+        margin=min(margins, default=None),
     )
 
 

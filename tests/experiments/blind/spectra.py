@@ -30,6 +30,7 @@ def density(effects: Iterable[Effect], f_hz: Floats, rate_hz: float) -> Floats:
             corner = np.tan(np.pi * effect.parameters["cutoff"] * tau0)
             with np.errstate(over="ignore"):
                 total /= 1.0 + (np.tan(np.pi * f_hz * tau0) / corner) ** (2 * effect.parameters["order"])
+            total += effect.parameters.get("floor", 0.0) ** 2
         elif effect.name == "resolution":
             total += effect.parameters["step"] ** 2 * tau0 / 12.0
     return total
@@ -52,6 +53,9 @@ SHAPES: Final[dict[str, Callable[..., Any]]] = {
     ),
     "narrowband": lambda f, tau0, sigma, frequency, bandwidth: _decaying(
         f, tau0, sigma**2, np.exp((-bandwidth + 2j * frequency) * np.pi * tau0)
+    ),
+    "power_law": lambda f, tau0, density, exponent: (
+        density**2 * (np.sin(np.pi * f * tau0) / (np.pi * tau0)) ** -exponent
     ),
     "random_telegraph": lambda f, tau0, amplitude, dwell_time: _decaying(
         f, tau0, 0.25 * amplitude**2, np.exp(-2.0 * tau0 / dwell_time)

@@ -2,6 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -10,6 +11,8 @@ from scipy.special import ndtri
 from tests.experiments.blind.score import Outcome
 
 SURE: Final = 0.95
+SIZES: Final = (0.0, 0.21, 0.3, 0.42, 0.6, 0.85, np.inf)  # edges of the columns of a power curve: 0.25, 0.35, 0.5, …
+CONFIDENCES: Final = (0.0, 0.5, 0.8, 0.9, 0.99, np.inf)
 
 
 def wilson(held: int, looks: int) -> tuple[float, float]:
@@ -35,7 +38,8 @@ def share(held: int, looks: int) -> str:
 
 def report(outcomes: Sequence[Outcome]) -> str:
     """Markdown of everything."""
-    parts = [_summary(outcomes), _by_case(outcomes), _matrix(outcomes), _coverage(outcomes), _false_names(outcomes)]
+    tables = (_summary, _power, _reliability, _by_case, _matrix, _coverage, _false_names)
+    parts = [table(outcomes) for table in tables]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -90,6 +94,45 @@ def _summary(outcomes: Sequence[Outcome]) -> str:
         f"Truth within the 95 % interval: {share(*_held([c for one in outcomes for c in one.coverage]))}.",
     ]
     return "\n\n".join(lines)
+
+
+def _power(outcomes: Sequence[Outcome]) -> str:
+    """The share of right answers against the size of what is hidden.
+
+    An effect is identifiable at its size if the oracle gains what a faint effect gains.
+    """
+    drawn = [one for one in outcomes if one.size != 1.0]
+    if not drawn:
+        return ""
+    columns = [(lo, hi) for lo, hi in pairwise(SIZES) if any(lo <= one.size < hi for one in drawn)]
+
+    def row(name: str, group: Sequence[Outcome], said: Callable[[int, int], str]) -> tuple[str, ...]:
+        within = [[one.right for one in group if lo <= one.size < hi] for lo, hi in columns]
+        return (name, *(said(sum(flags), len(flags)) for flags in within))
+
+    kinds = sorted(_groups(drawn, kind).items())
+    rows = [row(f"all {name}s", group, share) for name, group in kinds]
+    rows += [
+        row(f"identifiable {name}s", [one for one in group if one.is_identifiable], share) for name, group in kinds
+    ]
+    rows += [
+        row(name, group, lambda held, looks: f"{held} of {looks}")
+        for name, group in sorted(_groups(drawn, lambda one: one.case).items())
+    ]
+    head = ("hidden", *(f"{lo:g}–{hi:g}" for lo, hi in columns))
+    return "Right answers against the multiple of the level's size:\n\n" + markdown(head, rows)
+
+
+def _reliability(outcomes: Sequence[Outcome]) -> str:
+    """Whether names are right as often as their confidence says."""
+    given = [name for one in outcomes for name in one.names]
+    rows = []
+    for lo, hi in pairwise(CONFIDENCES):
+        group = [name for name in given if lo <= (name.confidence or 0.0) < hi]
+        mean = f"{np.mean([name.confidence for name in group]):.3f}" if group else "—"
+        held = share(sum(name.right for name in group), len(group))
+        rows.append((f"{lo:g}–{min(hi, 1.0):g}", mean, held))
+    return "Names against their confidence:\n\n" + markdown(("confidence", "mean", "right"), rows) if given else ""
 
 
 def _by_case(outcomes: Sequence[Outcome]) -> str:

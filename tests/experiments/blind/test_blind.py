@@ -34,7 +34,7 @@ def test_true_model_is_not_accused(seed: int) -> None:
     assert (found.exit_status, found.verdict, found.names) == (0, "agrees", ())
 
 
-@pytest.mark.parametrize("name", ["chirp", "breathing"])
+@pytest.mark.parametrize("name", ["chirp", "sawtooth"])
 def test_foreign_effect_gets_no_name(name: str) -> None:
     found = run(job(f"foreign:{name}", axes=1), in_process=True)
     assert found.exit_status == 0

@@ -231,6 +231,8 @@ def test_vocabulary_is_complete() -> None:
         *processes.SOURCES,
         *processes.TRANSFORMS,
         "noise_step",
+        "variance_modulation",
+        "heavy_tails",
         "g_sensitivity",
         "cross_axis",
         "sample_rate_error",

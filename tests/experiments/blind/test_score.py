@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.experiments.blind import run, tables
+from tests.experiments.blind import cases, recipes, run, tables
 from tests.experiments.blind.score import Outcome, score
 
 
@@ -181,7 +181,7 @@ def test_only_what_is_missing_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_sets_and_their_cases() -> None:
-    assert len(run.jobs("singles", "faint", range(3), 3600.0)) == 3 * 24
+    assert len(run.jobs("singles", "faint", range(3), 3600.0)) == 3 * len(cases.SINGLES)
     assert {job.baseline for job in run.jobs("off", "plain", range(1), 3600.0)} == {"off"}
     assert {(job.axes, job.seconds) for job in run.jobs("nulls", "plain", range(1), 3600.0)} == {
         (6, 600.0),
@@ -256,3 +256,36 @@ def test_run_tells_what_the_program_said_when_it_failed(
     found = run.run(run.Job("null", "plain", 3, 10.0), in_process=True)
     assert (found.exit_status, found.verdict, found.right) == (2, "", False)
     assert "exit status 2: imu-monitor: no" in capsys.readouterr().err
+
+
+def test_power_curve_and_reliability_count_by_size_and_confidence() -> None:
+    told = {**truth(LINE), "size": 0.5}
+    found = judged(told, report(gz=[step("sinusoidal", confidence=0.95)]))
+    wrong = judged(told, report(gz=[step("narrowband", confidence=0.6)]))
+    plain = judged(truth(LINE), report(gz=[step("sinusoidal", confidence=0.97)]))
+    text = tables.report([found, wrong, plain])
+    assert "| identifiable singles | 50.0 % (9.5–90.5) 1 of 2 |" in text
+    assert "| sinusoidal | 1 of 2 |" in text  # the recording of the level's own size is no point of the curve
+    rows = {line.split(" | ")[0]: line.split(" | ")[1:] for line in text.splitlines()}
+    assert rows["| 0.9–0.99"] == ["0.960", "100.0 % (34.2–100.0) 2 of 2 |"]
+    assert rows["| 0.5–0.8"] == ["0.600", "0.0 % (0.0–79.3) 0 of 1 |"]
+
+
+def test_all_sets_in_one_run_have_sizes_where_a_size_is_hidden() -> None:
+    todo = run.jobs("all", "plain", range(1), 600.0, sizes=(0.25, 1.0))
+    assert {job.name for job in todo} == {*cases.SINGLES, *cases.PAIRS, *cases.FOREIGN, "null"}
+    assert {job.name for job in todo if job.sizes is None} == {*cases.FOREIGN, "null"}
+    assert len({job.key for job in todo}) == len(todo)
+
+
+@pytest.mark.parametrize("name", ["bias_step", "noise_step", "saturation", "resolution"])
+def test_multiple_of_a_size_changes_nothing_else(name: str) -> None:
+    plain = cases.case(name, seed=1, seconds=600.0, axes=1)
+    half = cases.case(name, seed=1, seconds=600.0, axes=1, sizes=(0.5, 0.5))
+    whole, part = plain.truth["hidden"][0], half.truth["hidden"][0]
+    size = recipes.RECIPES[name].size
+    assert half.truth["size"] == pytest.approx(0.5)
+    assert {k for k, v in whole["parameters"].items() if part["parameters"][k] != v} == {size}
+    if name == "bias_step":
+        assert part["parameters"][size] == pytest.approx(0.5 * whole["parameters"][size])
+        assert part["gain"] < 0.5 * whole["gain"]

@@ -13,7 +13,16 @@ from typing import Any, Final
 import numpy as np
 
 from tests.experiments.blind import foreign
-from tests.experiments.blind.processes import SOURCES, TRANSFORMS, Clock, Floats, generator, white
+from tests.experiments.blind.processes import (
+    SOURCES,
+    TRANSFORMS,
+    Clock,
+    Floats,
+    generator,
+    heavy_tails,
+    modulated,
+    white,
+)
 
 AXES: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 LEAKS: Final = ("g_sensitivity", "cross_axis")
@@ -149,6 +158,10 @@ class World:
         for effect in self.on(axis):
             if effect.name == "noise_step":
                 level = level * np.where(clock.t_s >= effect.parameters["time"], effect.parameters["ratio"], 1.0)
+            elif effect.name == "variance_modulation":
+                level = level * np.sqrt(modulated(clock, **effect.parameters))
+            elif effect.name == "heavy_tails":
+                level = level * heavy_tails(clock, generator(self.seed, axis, effect.name), **effect.parameters)
         for one in self.strangers:
             if one.axis == axis and one.name in foreign.LEVELS:
                 level = level * foreign.LEVELS[one.name](clock, generator(self.seed, axis, one.name))
@@ -194,7 +207,7 @@ def model_text(effects: tuple[Effect, ...], rate_hz: float) -> str:
         head = f"{effect.axis}.{effect.name}"
         lines = [f"[[{head}]]" if times[effect.axis, effect.name] > 1 else f"[{head}]"]
         for name, value in effect.parameters.items():
-            if name != "phase":
+            if name not in ("phase", "delay"):
                 lines.append(f'{name} = "{value}"' if isinstance(value, str) else f"{name} = {value!r}")
         tables.append("\n".join(lines) + "\n")
     return "\n".join(tables)

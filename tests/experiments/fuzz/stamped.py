@@ -37,7 +37,7 @@ class Stamped:
         kept_out = self.clock.dropped_repeated_rows + self.clock.dropped_late_rows
         assert self._passed + kept_out == self._rows, "a row is gone, or came twice"
         self._missing_is_possible()
-        rate = self.clock.rate_hz
+        rate = self.clock.configured_or_measured_rate_hz
         assert rate is None or 0.0 < rate < float("inf"), rate
         for event in self.clock.take_events():
             assert event.text

@@ -80,7 +80,9 @@ def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three minutes of the shipped model."""
     path = tmp_path_factory.mktemp("recording") / "static.csv"
-    values = read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(RATE_HZ, 7).draw_samples(18_000)
+    values = (
+        read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(RATE_HZ, 7).draw_next_samples(18_000)
+    )
     save_samples(path, np.arange(len(values)) / RATE_HZ, values)
     return path
 
@@ -1123,7 +1125,7 @@ def counted(self, *arguments):
     truth = self.workers[0].simulated.fault_counts
     if "demo" in caught.blocks:
         numbers = (concatenate_blocks(caught.blocks["demo"]).ticks // 10_000_000).tolist()
-        print(json.dumps([numbers, truth.sample_count, truth.dropped]), file=sys.stderr)
+        print(json.dumps([numbers, truth.total_simulated_samples, truth.dropped]), file=sys.stderr)
 monitor.daemon.service.Service.run = counted
 sys.argv[0] = "imu-monitor"
 sys.exit(main())
@@ -1241,12 +1243,12 @@ def test_watching_listens_nowhere() -> None:
 @pytest.fixture(scope="session")
 def histories(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what was kept of two devices for two hours."""
-    from monitor.history.bucket import HistoryRow
-    from monitor.history.sqlite_store import FILE_NAME, HistoryStore
+    from monitor.history.history_row import HistoryRow
+    from monitor.history.sqlite_store import FILE_NAME, HistoryFileWriter
     from monitor.history.stored_events import StoredEvent
 
     folder = tmp_path_factory.mktemp("kept")
-    store = HistoryStore(folder / FILE_NAME)
+    store = HistoryFileWriter(folder / FILE_NAME)
     names, rng = ("gz.N", "gz.N.lo", "gz.N.hi", "gz.B", "temperature"), np.random.default_rng(1)
     for device in ("bench-1", "bench-2"):
         for i in range(120):

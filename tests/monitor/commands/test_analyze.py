@@ -10,7 +10,7 @@ from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import save_samples
 from monitor.commands import analyze, thermal
 from monitor.commands.analyze import AnalysisRequest, TooFewSamples, run_analysis
-from monitor.common.units import MILLI_G
+from monitor.common.unit_formatting import MILLI_G
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing import exporters
 from monitor.publishing.messages.analysis_json import AnalysisMessage

@@ -17,7 +17,7 @@ import pytest
 from drivers.data_types import make_block
 from drivers.driver import AxisMap
 from drivers.recordings import segment_file
-from drivers.recordings.segment_file import DaemonState, SingleSegmentWriter
+from drivers.recordings.segment_file import DaemonState, SegmentFileWriter
 from monitor.commands import doctor
 from monitor.commands.doctor import (
     SAMPLE_BYTES,
@@ -262,14 +262,14 @@ def test_room_is_judged_by_days(tmp_path: Path) -> None:
 def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
     """Ten minutes of noise that fills a 32-bit float, packed as the daemon does it."""
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
-    values = read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(100.0, 1).draw_samples(60_000)
+    values = (
+        read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(100.0, 1).draw_next_samples(60_000)
+    )
     values = values.astype(np.float32).astype(np.float64)
     rng = np.random.default_rng(1)
     t_ns = 1_760_000_000_000_000_000 + np.arange(60_000) * 10_000_000 + rng.integers(-1000, 1000, 60_000)
     temperature = np.round(25.0 + 0.01 * rng.standard_normal(60_000), 2)
-    writer = SingleSegmentWriter(
-        tmp_path / segment_file.format_segment_name(1, 1.76e9), segment_metadata("a", AxisMap())
-    )
+    writer = SegmentFileWriter(tmp_path / segment_file.format_segment_name(1, 1.76e9), segment_metadata("a", AxisMap()))
     for at in range(0, 60_000, 50):
         rows = slice(at, at + 50)
         ticks = np.arange(at, at + 50) * 10
@@ -277,7 +277,7 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
             [make_block(t_ns[rows].copy(), values[rows].copy(), temperature[rows].copy(), ticks)], DaemonState()
         )
     writer.close()
-    list(segment_file.compress_segment(writer.path))
+    list(segment_file.compress_segment_stepwise(writer.path))
     (packed,) = tmp_path.iterdir()
     assert 0.8 * SAMPLE_BYTES < packed.stat().st_size / 60_000 < SAMPLE_BYTES
 
@@ -288,7 +288,7 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
 def test_the_libraries_here_are_those_that_are_required() -> None:
     found = doctor.check_library_versions()
     assert [one.mark for one in found] == ["well"], found
-    required = {name: optional for name, _, optional in doctor.required_libraries()}
+    required = {name: optional for name, _, optional in doctor.library_requirements()}
     assert required["numpy"] is False
     assert required["rerun-sdk"] is True
     assert "pytest" not in required

@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import ConfigError, NotReady, RecordingError
 from monitor.cli import main
 from monitor.commands import reconcile, simulate
-from monitor.commands.reconcile import ComparisonRequest, compare_recordings, unique_recording_names
+from monitor.commands.reconcile import RecordingsComparisonRequest, compare_recordings, unique_recording_names
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, BiasStep, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import Reconciliation
@@ -110,7 +110,9 @@ def test_the_terminal_tells_the_same(compared: tuple[Path, str]) -> None:
 def test_without_a_model_that_of_the_first_is_for_all(tmp_path: Path) -> None:
     paths = tuple(recorded(tmp_path / f"{name}.csv", KNOWN + LINE, seed, 200.0) for name, seed in (("a", 1), ("b", 2)))
     told = []
-    found = compare_recordings(ComparisonRequest(paths, None, tmp_path / "out"), lambda what, _share: told.append(what))
+    found = compare_recordings(
+        RecordingsComparisonRequest(paths, None, tmp_path / "out"), lambda what, _share: told.append(what)
+    )
     assert found.fitted_to == "a"
     first, second = (run.result for run in found.runs)
     assert first.fitted_first
@@ -128,7 +130,7 @@ def test_a_recording_without_an_answer_is_left_out_and_named(tmp_path: Path, mon
         recorded(tmp_path / f"{name}.csv", KNOWN, k, s)
         for k, (name, s) in enumerate((("a", 60), ("b", 60), ("short", 2)))
     ]
-    found = compare_recordings(ComparisonRequest(tuple(paths), KNOWN, tmp_path / "out"))
+    found = compare_recordings(RecordingsComparisonRequest(tuple(paths), KNOWN, tmp_path / "out"))
     assert [run.name for run in found.runs] == ["a", "b"]
     assert "200 samples" in found.without_result["short"]
     last = report(tmp_path / "out")["recordings"][-1]
@@ -162,16 +164,16 @@ def test_what_cannot_be_compared_is_refused_before_the_work(tmp_path: Path, monk
     def worked(*_: object) -> Reconciliation:
         raise AssertionError("worked")
 
-    monkeypatch.setattr(reconcile, "run_reconciliation", worked)
+    monkeypatch.setattr(reconcile, "reconcile_and_write_report", worked)
     (tmp_path / "a.csv").touch()
     (tmp_path / "b").mkdir()
     a, b = tmp_path / "a.csv", tmp_path / "b"
     with pytest.raises(ConfigError, match=r"a\.csv: is given twice"):
-        compare_recordings(ComparisonRequest((a, tmp_path / "b" / ".." / "a.csv"), KNOWN, tmp_path / "out"))
+        compare_recordings(RecordingsComparisonRequest((a, tmp_path / "b" / ".." / "a.csv"), KNOWN, tmp_path / "out"))
     with pytest.raises(RecordingError, match=r"c\.csv: cannot be read"):
-        compare_recordings(ComparisonRequest((a, tmp_path / "c.csv"), KNOWN, tmp_path / "out"))
+        compare_recordings(RecordingsComparisonRequest((a, tmp_path / "c.csv"), KNOWN, tmp_path / "out"))
     with pytest.raises(ConfigError, match=r"--out: .*b is a recording"):
-        compare_recordings(ComparisonRequest((a, b), KNOWN, tmp_path))
+        compare_recordings(RecordingsComparisonRequest((a, b), KNOWN, tmp_path))
     assert not (tmp_path / "out").exists()
 
 
@@ -180,7 +182,7 @@ def test_one_recording_is_reported_as_before(tmp_path: Path) -> None:
     (tmp_path / "known.toml").write_text(KNOWN.to_toml())
     status, said, _ = command("reconcile", path, "--model", tmp_path / "known.toml", "--out", tmp_path / "out")
     assert status == 0
-    assert said.startswith("6000 samples at 100 Hz, ")
+    assert said.startswith("● agrees The model agrees with the recording on one axis.\n6000 samples at 100 Hz, ")
     assert report(tmp_path / "out")["schema"] == "imu-monitor/reconcile/1"
     assert not [found for found in (tmp_path / "out").iterdir() if found.is_dir()]
 
@@ -188,8 +190,8 @@ def test_one_recording_is_reported_as_before(tmp_path: Path) -> None:
 def test_the_first_without_an_answer_ends_it_where_the_model_was_to_be_its(tmp_path: Path) -> None:
     paths = (recorded(tmp_path / "s.csv", KNOWN, 1, 2.0), recorded(tmp_path / "t.csv", KNOWN, 1, 2.0))
     with pytest.raises(NotReady, match=r"0 can be evaluated: s: the recording has 200 samples"):
-        compare_recordings(ComparisonRequest(paths, None, tmp_path / "out"))
+        compare_recordings(RecordingsComparisonRequest(paths, None, tmp_path / "out"))
     with pytest.raises(
         NotReady, match=r"0 can be evaluated: s: the recording has 200 samples.*; t: the recording has 200 samples"
     ):
-        compare_recordings(ComparisonRequest(paths, KNOWN, tmp_path / "out"))
+        compare_recordings(RecordingsComparisonRequest(paths, KNOWN, tmp_path / "out"))

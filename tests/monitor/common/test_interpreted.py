@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.data_types import Floats, make_block
 from monitor.common.compiled import Kernel
-from monitor.drift.compensation.live_compensation import LiveCompensation
+from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.drift.thermal.thermal_response import apply_first_order_lag
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import MIN_SAMPLES, Estimator
@@ -73,7 +73,7 @@ def results(seed: int) -> list[Any]:
     estimator = Estimator(RATE_HZ, float(rng.choice([2.0, 10.0, 60.0])), every_sample=seed % 4 == 0)
     watch, compensation = (
         SignalMonitor(RATE_HZ, bool(seed % 2), 10.0, keep_samples_at_rest=True),
-        LiveCompensation(RATE_HZ),
+        LiveDriftCompensation(RATE_HZ),
     )
     found: list[Any] = []
     at = 0
@@ -93,7 +93,7 @@ def results(seed: int) -> list[Any]:
     found += [estimator.step_slow_statistics() for _ in range(3)]
     found += [
         watch.take_events(),
-        watch.take_samples_at_rest(),
+        watch.take_samples_with_motion_masked(),
         compensation.take_events(),
         apply_first_order_lag(values[:, 0], 0.5),
     ]

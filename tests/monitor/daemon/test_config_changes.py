@@ -18,11 +18,11 @@ from structlog.testing import capture_logs
 from drivers.data_types import Event
 from drivers.errors import ConfigError
 from monitor.daemon import config_changes
-from monitor.daemon.output_interface import Output
-from monitor.daemon.result_outputs import TableOutput
+from monitor.daemon.outputs.output import Output
+from monitor.daemon.outputs.table_output import TableOutput
 from monitor.daemon.service import Service
 from monitor.noise.model_loading import read_model
-from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.remote_devices import RemoteDeviceRegistry
 from monitor.publishing.terminal import live_table
 from monitor.settings import loading
 from tests.monitor.daemon.operations.test_systemd import Listening
@@ -263,14 +263,14 @@ def in_use() -> tuple[int, int]:
 
 
 def test_a_device_that_is_gone_has_no_row() -> None:
-    board = DeviceStates()
+    board = RemoteDeviceRegistry()
     table = TableOutput(board)
     for name in ("first", "second"):
         table.publish_health(name, 0.0, made.health())
         table.publish_event(name, 0.0, 1, Event("moved", 0, f"{name} was moved"))
     table.remove_device("first")
     with (console := Console(width=200)).capture() as captured:
-        console.print(live_table.device_table(board, 0.0))
+        console.print(live_table.device_overview(board, 0.0))
     assert "second was moved" in captured.get()
     assert "first" not in captured.get()
 

@@ -14,14 +14,14 @@ from drivers.links import replay_link
 from monitor.daemon.device import device_worker
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
-from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.compensation.live_compensation import MeasuredAndSubtractedDrift
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.estimation.detection.model_comparison import ModelComparison
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings import loading as settings
-from monitor.settings.loading import Device, Driver
+from monitor.settings.loading import BuiltLinkAndDecoder, Device
 from tests.support.loopback_link import LoopbackLink
 from tests.support.settings import read_settings
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -47,7 +47,7 @@ class Caught:
             Estimate: self.estimates,
             ModelComparison: self.gaps,
             ThermalIntervalResult: self.thermals,
-            DriftUpdate: self.drifts,
+            MeasuredAndSubtractedDrift: self.drifts,
         }
         if isinstance(result, TotalAndHadamardCurves):
             self.totals.append((received, *result))
@@ -55,7 +55,7 @@ class Caught:
         else:
             kept[type(result)].append((unix_s, result))
 
-    def publish_compensated_samples(self, device, received, samples, offset_ns):
+    def publish_drift_compensated_samples(self, device, received, samples, offset_ns):
         self.rates.append(samples)
 
     def publish_event(self, device, unix_s, received, event):
@@ -90,7 +90,7 @@ class Rig:
             tau=tau,
             refit_s=refit_s,
             publish_s=publish_s,
-            driver=Driver(self.link, decoder, silence_s=0.0),
+            driver=BuiltLinkAndDecoder(self.link, decoder, silence_s=0.0),
             model=model,
             thermal_s=thermal_s,
             compensate=compensate,
@@ -149,7 +149,7 @@ def test_a_running_device_whose_can_frames_are_late_says_so():
     for i, chunk in enumerate(sent):
         delay_ns = i % 2 * (8_000_000 if i // 2 == 30 else 1_000_000)
         rig.link.write(replace(chunk, t_ns=chunk.t_ns + delay_ns))
-    rig.station.driver.run_once()
+    rig.station.driver.read_and_push_once()
     health = rig.station.status.build_health({}, 0)
     assert health.state == "running"
     assert (health.received, health.bad, health.lost, health.late) == (49, 0, 1, 1)
@@ -333,7 +333,7 @@ def test_through_the_reader_s_thread_to_the_end_of_a_replay():
     for chunk in encoder.encode(made):
         rig.link.write(chunk.data)
     rig.link.end()
-    rig.station.start()
+    rig.station.start_reader_and_resume_recording()
     wait_for(lambda: rig.work(time.monotonic()) or rig.station.replay_finished, "the end of the replay")
     rig.station.stop()
     assert rig.station.join_reader_thread(PATIENCE_S)
@@ -589,7 +589,7 @@ def follow_temperature(rig, seconds, begin_s=0.0):
 def test_bias_is_held_against_temperature():
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 30.0)
-    while rig.station.pipeline.thermal.run_selection_step():  # until the models are chosen
+    while rig.station.pipeline.thermal.run_selection_step_if_active():  # until the models are chosen
         pass
     follow_temperature(rig, 3.0, 100.0)
     assert len(rig.caught.thermals) >= 31
@@ -644,7 +644,7 @@ def test_where_it_is_off_nothing_is_held_against_temperature():
     rig = Rig(thermal_s=None)
     follow_temperature(rig, 5.0)
     assert (rig.station.pipeline.thermal, rig.caught.thermals) == (None, [])
-    assert rig.station.pipeline.signal_monitor.take_samples_at_rest() == []
+    assert rig.station.pipeline.signal_monitor.take_samples_with_motion_masked() == []
 
 
 def test_without_a_model_there_is_no_gap():

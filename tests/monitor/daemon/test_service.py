@@ -16,16 +16,16 @@ from drivers.data_types import Event
 from drivers.recordings import save_samples
 from monitor.common.device_health import Health
 from monitor.daemon.kernels import kernel_compilation, kernel_parts
-from monitor.daemon.output_interface import Output
-from monitor.daemon.result_outputs import TableOutput
+from monitor.daemon.outputs.output import Output
+from monitor.daemon.outputs.table_output import TableOutput
 from monitor.daemon.service import Service
-from monitor.estimation.detection.model_comparison import ModelComparison
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.history import history_table as past
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.remote_devices import RemoteDeviceRegistry
 from monitor.publishing.terminal import live_table
 from monitor.settings import loading
 
@@ -61,7 +61,7 @@ def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     viewer = f'mode = "auto"\nport = {free_port()}\nweb_port = {free_port()}\n'
-    board = DeviceStates()
+    board = RemoteDeviceRegistry()
     rounds = Rounds()
     service = Service(config(tmp_path, 'link = "virtual"', viewer), [TableOutput(board), rounds])
     assert service.viewer is not None
@@ -74,7 +74,7 @@ def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
             before = rounds.healths
             wait_for(lambda: rounds.healths >= before + 2, "two more rounds of the status")
             with (console := Console(width=200)).capture() as captured:
-                console.print(live_table.device_table(board, time.monotonic()))
+                console.print(live_table.device_overview(board, time.monotonic()))
         finally:
             service.request_stop()
             thread.join(PATIENCE_S)
@@ -236,11 +236,11 @@ folder = "kept"
 record = false
 """
     )
-    told, board = Estimates(), DeviceStates()
+    told, board = Estimates(), RemoteDeviceRegistry()
     Service(loading.load_config(path), [told, TableOutput(board)]).run(60.0)
     with open_history(tmp_path / "kept" / FILE_NAME) as reader:
         kept = past.read_history(reader, "d", TimeRange(-math.inf, math.inf), step_s=60)
-    (known,) = board.sorted_devices(time.monotonic())
+    (known,) = board.devices_with_problems_first(time.monotonic())
     assert known.coefficients is not None
     published = {Status(one) for estimate in told.all for one in estimate.coefficients.status.ravel().tolist()}
     assert told.all[-1].rate_hz == 100.0

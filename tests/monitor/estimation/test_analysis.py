@@ -8,9 +8,9 @@ import pytest
 
 from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan.batch import overlapping_avar
-from monitor.estimation.analysis import MIN_SAMPLES, analyze, detect_events
+from monitor.estimation.analysis import MIN_SAMPLES, analyze, detect_disturbances
 from monitor.estimation.fit.coefficient_values import Status
-from monitor.estimation.regular_grid import MAX_GAP_SAMPLES, resample_to_grid
+from monitor.estimation.regular_grid import MAX_GAP_SAMPLES, place_samples_on_grid
 from tests.support.recordings import recorded_blocks, recordings, white
 
 
@@ -34,7 +34,7 @@ def test_holes_stay_in_their_places(rate, rows):
     index = np.arange(8000)
     kept = ~((index >= 3000) & (index < 3123) | (index == 5000))
     values = white(8000)
-    grid, found, notes = resample_to_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
+    grid, found, notes = place_samples_on_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
     assert found == 100.0
     assert notes == ["124 samples are missing in 2 places; differences that contain them are left out"]
     expected = np.where(kept[:, None], values, np.nan)
@@ -44,7 +44,7 @@ def test_holes_stay_in_their_places(rate, rows):
 def test_a_very_long_pause_is_not_counted_among_the_short_holes():
     index = np.concatenate([np.arange(3000), 3000 + 2 * MAX_GAP_SAMPLES + np.arange(3000)])
     index = np.delete(index, [1000, 1001, 1002])
-    _, _, notes = resample_to_grid(recorded_blocks(index / 100, white(5997)), 100.0)
+    _, _, notes = place_samples_on_grid(recorded_blocks(index / 100, white(5997)), 100.0)
     assert "3 samples are missing in 1 place; differences that contain them are left out" in notes
 
 
@@ -152,12 +152,12 @@ def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
     left = analyze(blocks, 100.0)
     assert left.motions == ()
     assert not any("moved" in note for note in left.notes)  # asked only by events_of
-    told = detect_events(left)
+    told = detect_disturbances(left)
     [motion] = told.motions
     assert 5900 <= motion.since < 6000
     assert "the sensor moved once, 3 s in all: not removed; --rest removes the samples in motion" in told.notes
     assert any(note.startswith(f"at {motion.since / 100:.1f} s: moved for 3.0 s: gx") for note in told.notes)
-    struck = detect_events(analyze(blocks, 100.0, remove_motion=True))
+    struck = detect_disturbances(analyze(blocks, 100.0, remove_motion=True))
     assert struck.motions == told.motions
     assert sum("s in all: removed" in note for note in struck.notes) == 1
     assert np.isnan(struck.values[motion.since : motion.until]).all()
@@ -170,13 +170,13 @@ def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
 @pytest.mark.long
 def test_motion_is_no_change_of_noise():
     values = moved(30_000)
-    assert detect_events(analyze(recorded_blocks(np.arange(30_000) / 100, values), 100.0)).changes == ()
+    assert detect_disturbances(analyze(recorded_blocks(np.arange(30_000) / 100, values), 100.0)).changes == ()
 
 
 def test_changes_are_told_with_time_and_size():
     values = white(60_000)
     values[40_000:, 2] += 1.5e-3 * np.random.default_rng(9).standard_normal(20_000)
-    found = detect_events(
+    found = detect_disturbances(
         analyze(recorded_blocks(np.arange(60_000) / 100, values), 100.0, reading_notes=["of the file"])
     )
     [change] = found.changes

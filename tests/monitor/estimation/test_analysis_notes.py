@@ -10,8 +10,8 @@ from drivers.data_types import AXES, make_block
 from monitor.estimation import analysis_notes
 from monitor.estimation.analysis import analyze
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_and_outlier_detection import SpectralLine, detect_spectral_lines
-from monitor.estimation.detection.motion_detection import Motion
+from monitor.estimation.detection.line_and_outlier_detection import SpectralLine, detect_spectral_lines_per_axis
+from monitor.estimation.detection.motion_detection import MotionEpisode
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.estimation.fit.low_pass_search import LowPass
 
@@ -49,7 +49,7 @@ def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
     assert where == "0.64"  # a line's deviation peaks at 0.37 of its period, 2 s: sin⁴(πfτ)/(πfτ)²
     assert found.fit.misfit[0] == 1.0
     curve = found.estimate.curve
-    told = detect_spectral_lines(values, np.zeros(len(values), bool), RATE_HZ, curve)
+    told = detect_spectral_lines_per_axis(values, np.zeros(len(values), bool), RATE_HZ, curve)
     known = analysis_notes.replace_guessed_causes(["first", *found.notes], curve, found.fit, told)
     assert known[0] == "first"
     [known] = [one for one in known if "do not explain the curve" in one]
@@ -152,7 +152,7 @@ def test_with_samples_missing_no_slope_tells_them_apart():
 
 
 def motion(since):
-    return Motion("motion", since, since + 100, 0.5, "gx", 0.1, "moved for 0.5 s: gx up to 5.7 °/s")
+    return MotionEpisode("motion", since, since + 100, 0.5, "gx", 0.1, "moved for 0.5 s: gx up to 5.7 °/s")
 
 
 def change(kind="noise_changed"):

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from monitor.history import sqlite_store as stores
-from monitor.history.bucket import HistoryRow
-from monitor.history.sqlite_store import HistoryStore
+from monitor.history.history_row import HistoryRow
+from monitor.history.sqlite_store import HistoryFileWriter
 from monitor.history.stored_events import StoredEvent
 
 T0 = 1_760_400_000  # a multiple of all widths
@@ -33,7 +33,7 @@ def row_of(i: int) -> HistoryRow:
 def main() -> None:
     path, first = Path(sys.argv[1]), int(sys.argv[2])
     stores.LEVELS = LEVELS  # type: ignore[misc, assignment]
-    store = HistoryStore(path)
+    store = HistoryFileWriter(path)
     i = first
     while True:
         store.write_rows_and_events(

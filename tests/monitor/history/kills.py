@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from monitor.history.bucket import HistoryRow
+from monitor.history.history_row import HistoryRow
 from monitor.history.sqlite_store import open_history
 from monitor.history.time_ranges import TimeRange
 from tests.monitor.history.killed import T0, row_of

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from monitor.history.bucket import HistoryRow
+from monitor.history.history_row import HistoryRow
 
 NAMES = ("gz.N", "gz.sigma.1", "rate")
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from drivers.errors import NotReady
 from monitor.history import history_table as past
-from monitor.history.bucket import HistoryRow
+from monitor.history.history_row import HistoryRow
 from monitor.history.history_table import HistoryTable
-from monitor.history.sqlite_store import HistoryStore, open_history
+from monitor.history.sqlite_store import HistoryFileWriter, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from tests.monitor.history.made import NAMES, row, same, together
@@ -23,7 +23,7 @@ DAY_S = 86_400
 
 
 def kept(path: Path, rows: list[HistoryRow], events: tuple[StoredEvent, ...] = ()) -> None:
-    store = HistoryStore(path)
+    store = HistoryFileWriter(path)
     store.write_rows_and_events([("a", one) for one in rows], [("a", one) for one in events])
     while store.merge_old_rows(math.inf):
         pass
@@ -121,7 +121,7 @@ def test_a_table_is_read_while_rows_are_written(tmp_path: Path) -> None:
     done = threading.Event()
 
     def write() -> None:
-        store = HistoryStore(path)
+        store = HistoryFileWriter(path)
         for i in range(1, 200):
             store.write_rows_and_events([("a", row(T0 + 60 * i, rng))])
             store.merge_old_rows(math.inf)

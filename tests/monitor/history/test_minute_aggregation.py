@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monitor.history.bucket import STATES, HistoryRow
+from monitor.history.history_row import STATES, HistoryRow
 from monitor.history.minute_aggregation import MinuteAggregator
 from tests.monitor.history.made import numbers_of
 from tests.monitor.publishing.made import estimate, health
@@ -46,9 +46,9 @@ def test_counts_are_what_came_in_the_minute_and_a_restart_begins_at_nothing() ->
 
 def test_a_row_has_the_worst_state_and_the_temperature() -> None:
     minutes = MinuteAggregator()
-    minutes.generate_temperature(T0, np.array([20.0, np.nan, 22.0]))
-    minutes.generate_temperature(T0 + 1.0, np.array([np.nan]))
-    minutes.generate_temperature(T0 + 2.0, np.array([30.0]))
+    minutes.add_temperature(T0, np.array([20.0, np.nan, 22.0]))
+    minutes.add_temperature(T0 + 1.0, np.array([np.nan]))
+    minutes.add_temperature(T0 + 2.0, np.array([30.0]))
     minutes.add_health(T0 + 3.0, health(state="lost", rate_hz=None, latency_p99_s=None))
     minutes.add_health(T0 + 4.0, health(state="running"))
     (row,) = gathered(minutes)
@@ -82,5 +82,5 @@ def test_an_axis_that_comes_within_a_minute_makes_two_rows_of_it() -> None:
 def test_where_nothing_came_there_is_no_row() -> None:
     minutes = MinuteAggregator()
     assert minutes.flush() is None
-    assert minutes.generate_temperature(T0, np.array([np.nan])) is None
+    assert minutes.add_temperature(T0, np.array([np.nan])) is None
     assert minutes.flush() is None

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from drivers.errors import RecordingError
 from monitor.history import sqlite_store as stores
-from monitor.history.bucket import HistoryRow
-from monitor.history.sqlite_store import LEVELS, HistoryStore, open_history
+from monitor.history.history_row import HistoryRow
+from monitor.history.sqlite_store import LEVELS, HistoryFileWriter, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from tests.monitor.history.kills import ALL, kill
@@ -27,8 +27,8 @@ T0 = 1_760_400_000  # a multiple of all widths
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[HistoryStore]:
-    store = HistoryStore(path)
+def writing(path: Path) -> Iterator[HistoryFileWriter]:
+    store = HistoryFileWriter(path)
     try:
         yield store
     finally:
@@ -40,7 +40,7 @@ def rows_in(path: Path, device: str = "a", span: TimeRange = ALL) -> list[Histor
         return sorted(reader.read_rows(device, span), key=lambda one: one.start_s)
 
 
-def thinned(store: HistoryStore, now_s: float) -> int:
+def thinned(store: HistoryFileWriter, now_s: float) -> int:
     done = 0
     while some := store.merge_old_rows(now_s, 7):
         done += some
@@ -255,7 +255,7 @@ def test_what_is_not_a_history_is_said_and_left_alone(tmp_path: Path) -> None:
     empty.touch()
     for path, says in ((text, "damaged"), (other, "not a history"), (newer, "newer imu-monitor")):
         before = path.read_bytes()
-        for attempt in (lambda path=path: HistoryStore(path), lambda path=path: rows_in(path)):
+        for attempt in (lambda path=path: HistoryFileWriter(path), lambda path=path: rows_in(path)):
             with pytest.raises(RecordingError, match=says) as error:
                 attempt()
             assert str(path) in str(error.value)

@@ -5,7 +5,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError
-from monitor.common.units import format_utc
+from monitor.common.unit_formatting import format_utc
 from monitor.history.time_ranges import UNITS_S, TimeRange, parse_duration_s, parse_time, parse_zenoh_range
 
 NOW = 1_763_700_000.0

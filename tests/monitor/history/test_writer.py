@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from monitor.history import writer as writers
-from monitor.history.sqlite_store import APPLICATION, SQLITE_SUFFIXES, VERSION, HistoryStore, open_history
+from monitor.history.sqlite_store import APPLICATION, SQLITE_SUFFIXES, VERSION, HistoryFileWriter, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.writer import HistoryWriter
 from tests.monitor.history.kills import ALL
@@ -109,7 +109,7 @@ def test_no_more_than_some_files_are_moved_aside(tmp_path: Path, monkeypatch: py
 def test_a_history_of_a_newer_version_is_left_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _checked_briskly(monkeypatch)
     path = tmp_path / "h.sqlite"
-    HistoryStore(path).close()
+    HistoryFileWriter(path).close()
     with contextlib.closing(sqlite3.connect(path)) as db:
         db.execute("PRAGMA user_version = 99")
     data = path.read_bytes()
@@ -276,7 +276,7 @@ def test_a_file_that_is_held_by_another_is_waited_for(tmp_path: Path, monkeypatc
     monkeypatch.setattr(writers, "RETRY_S", 0.05)
     monkeypatch.setattr("monitor.history.sqlite_store.BUSY_TIMEOUT_S", 0.05)
     path = tmp_path / "h.sqlite"
-    HistoryStore(path).close()
+    HistoryFileWriter(path).close()
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as other, started(path) as writer:
         other.execute("BEGIN IMMEDIATE")
         fill(writer, 5)

@@ -26,7 +26,7 @@ def test_first_sample_is_as_noisy_as_later_ones():
     def deviation_after(skip: int) -> float:
         rng = np.random.default_rng(2)
         series = [bias_instability._Flicker(1.0, rng) for _ in range(3000)]
-        return float(np.std([one.draw_samples(skip + 1)[-1] for one in series]))
+        return float(np.std([one.draw_next_samples(skip + 1)[-1] for one in series]))
 
     # two standard deviations of 3000 values each: 1.8 % of their ratio
     assert deviation_after(0) == pytest.approx(deviation_after(2000), rel=0.08)

@@ -8,7 +8,7 @@ import pytest
 import config
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from monitor.noise.effects import EFFECTS, AngleRandomWalk, Bias, GSensitivity, RateRandomWalk
+from monitor.noise.effects import EFFECTS, AngleRandomWalk, ConstantBias, GSensitivity, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
 
@@ -32,14 +32,14 @@ def test_wildcards_stand_for_a_kind_of_axes_and_add_to_named_ones():
     assert model.effects == {
         "gx": (AngleRandomWalk(N=2e-4),),
         "gy": (AngleRandomWalk(N=2e-4),),
-        "gz": (Bias(value=1.0), AngleRandomWalk(N=2e-4)),
+        "gz": (ConstantBias(value=1.0), AngleRandomWalk(N=2e-4)),
     }
 
 
 def test_an_effect_that_occurs_twice_is_an_array_of_tables():
     text = "[[gx.bias]]\nvalue = 1.0\n[[gx.bias]]\nvalue = 2.0\n"
     model = NoiseModel.from_toml(text)
-    assert model.effects["gx"] == (Bias(value=1.0), Bias(value=2.0))
+    assert model.effects["gx"] == (ConstantBias(value=1.0), ConstantBias(value=2.0))
     assert NoiseModel.from_toml(model.to_toml()) == model
 
 
@@ -131,7 +131,10 @@ def test_sum_keeps_the_first_rate_and_temperature():
 
 def test_print_is_a_table_with_units():
     model = NoiseModel(
-        {"gz": (AngleRandomWalk(N=1.5e-4), GSensitivity(source="az", coefficient=2e-5)), "az": (Bias(value=9.8),)},
+        {
+            "gz": (AngleRandomWalk(N=1.5e-4), GSensitivity(source="az", coefficient=2e-5)),
+            "az": (ConstantBias(value=9.8),),
+        },
         100.0,
         Temperature(mean=25.0, swing=3.0, period=86400.0),
     )
@@ -166,7 +169,7 @@ def test_axes_and_equal_effects_are_independent():
 def test_series_depends_on_seed_not_on_blocks():
     model = NoiseModel.from_toml(MODELS[0].read_text(encoding="utf-8"))
     stream = model.start_stream(100.0, 7)
-    pieces = np.concatenate([stream.draw_samples(n) for n in (1, 0, 9, 490)])
+    pieces = np.concatenate([stream.draw_next_samples(n) for n in (1, 0, 9, 490)])
     np.testing.assert_array_equal(pieces, model.simulate(500, 100.0, 7))
     assert not np.array_equal(pieces, model.simulate(500, 100.0, 8))
 
@@ -207,6 +210,6 @@ sigma = 1e-3
         "gz.narrowband: frequency is missing",
         "gz.narrowband: bandwidth is missing",
     ]
-    assert len(caught.value.lines) == len(begins), caught.value.lines
-    for line, begin in zip(caught.value.lines, begins, strict=True):
+    assert len(caught.value.mistake_lines) == len(begins), caught.value.mistake_lines
+    for line, begin in zip(caught.value.mistake_lines, begins, strict=True):
         assert line.startswith(begin), line

@@ -12,10 +12,11 @@ from drivers.errors import ConfigError
 from monitor.noise.effects import (
     TRANSFORM_ORDER,
     AngleRandomWalk,
+    AxisPermutation,
     BandwidthLimit,
-    Bias,
     BiasInstability,
     BiasStep,
+    ConstantBias,
     CrossAxis,
     ExponentiallyCorrelated,
     GSensitivity,
@@ -46,8 +47,9 @@ RATE_HZ = 100.0
 def test_transforms_act_in_their_order_wherever_they_stand():
     assert [kind.name for kind in TRANSFORM_ORDER] == [
         "scale_factor", "bandwidth_limit", "sample_rate_error", "saturation", "resolution", "sample_hold",
+        "unit_error",
     ]  # fmt: skip
-    axis = (Resolution(step=0.4), Saturation(limit=1.0), Bias(value=0.7), ScaleFactor(factor=2.0))
+    axis = (Resolution(step=0.4), Saturation(limit=1.0), ConstantBias(value=0.7), ScaleFactor(factor=2.0))
     # 0.7 · 2 = 1.4, clipped to 1.0, rounded to 0.8; any other order gives another number
     assert NoiseModel({"gx": axis}).simulate(3, RATE_HZ, 0)[:, 0].tolist() == [0.8, 0.8, 0.8]
 
@@ -73,7 +75,7 @@ def test_axes_leak_what_they_read_by_themselves():
 
 def test_held_samples_are_the_same_ones_with_and_without_a_leak():
     axis = (AngleRandomWalk(N=1.0), RandomSampleHold(fraction=0.5))
-    model = NoiseModel({"gx": axis, "gy": (Bias(value=0.0),)})
+    model = NoiseModel({"gx": axis, "gy": (ConstantBias(value=0.0),)})
     leaking = model + NoiseModel({"gx": (CrossAxis(source="gy", coefficient=1.0),)})
     np.testing.assert_array_equal(model.simulate(5000, RATE_HZ, 2), leaking.simulate(5000, RATE_HZ, 2))
 
@@ -97,29 +99,31 @@ def test_an_effect_added_before_the_first_sample_is_as_one_of_the_model(effect):
     running = model.start_stream(RATE_HZ, 1)
     running.add_effect("gz", effect)
     whole = (model + NoiseModel({"gz": (effect,)})).simulate(5000, RATE_HZ, 1)
-    np.testing.assert_array_equal(running.draw_samples(5000), whole)
+    np.testing.assert_array_equal(running.draw_next_samples(5000), whole)
 
 
 def test_what_is_added_acts_from_the_next_sample_on():
-    model = NoiseModel({"gz": (AngleRandomWalk(N=0.5), BandwidthLimit(cutoff=20.0, order=2)), "gx": (Bias(value=1.0),)})
+    model = NoiseModel(
+        {"gz": (AngleRandomWalk(N=0.5), BandwidthLimit(cutoff=20.0, order=2)), "gx": (ConstantBias(value=1.0),)}
+    )
     plain = model.simulate(6000, RATE_HZ, 1)
     running = model.start_stream(RATE_HZ, 1)
-    np.testing.assert_array_equal(running.draw_samples(3000), plain[:3000])
-    running.add_effect("gx", Bias(value=2.0))
+    np.testing.assert_array_equal(running.draw_next_samples(3000), plain[:3000])
+    running.add_effect("gx", ConstantBias(value=2.0))
     running.add_effect("gx", BiasStep(time=40.0, height=8.0))
     running.add_effect("gx", RateRamp(R=1.0))
     running.add_effect("gz", CrossAxis(source="gx", coefficient=1e-12))
-    later = running.draw_samples(3000)
+    later = running.draw_next_samples(3000)
     np.testing.assert_allclose(later[:, 2], plain[3000:, 2], atol=1e-9)  # the filter was not begun anew
     k = np.arange(3000)
     np.testing.assert_allclose(later[:, 0], 3.0 + 8.0 * (k >= 1000) + k / RATE_HZ)
 
 
 def test_what_cannot_be_added_is_said_and_changes_nothing():
-    model = NoiseModel({"gz": (Bias(value=1.0),)})
+    model = NoiseModel({"gz": (ConstantBias(value=1.0),)})
     running = model.start_stream(RATE_HZ, 1)
     for axis, effect, says in (
-        ("gq", Bias(value=1.0), 'unknown axis "gq"'),
+        ("gq", ConstantBias(value=1.0), 'unknown axis "gq"'),
         ("gz", Sinusoidal(amplitude=1.0, frequency=60.0), "gz.sinusoidal: frequency must be below 50 Hz"),
         (
             "gz",
@@ -132,7 +136,7 @@ def test_what_cannot_be_added_is_said_and_changes_nothing():
     ):
         with pytest.raises(ConfigError, match=f"^{says}"):
             running.add_effect(axis, effect)
-    np.testing.assert_array_equal(running.draw_samples(10), model.simulate(10, RATE_HZ, 1))
+    np.testing.assert_array_equal(running.draw_next_samples(10), model.simulate(10, RATE_HZ, 1))
 
 
 def test_truth_tells_what_the_seed_decided():
@@ -152,7 +156,7 @@ def test_truth_tells_what_the_seed_decided():
     )
     stream = model.start_stream(RATE_HZ, 8)
     assert stream.drawn_random_values()["gx"]["poisson_steps"][0]["count"] == 0
-    values = stream.draw_samples(10_000)
+    values = stream.draw_next_samples(10_000)
     truth = json.loads(json.dumps(stream.drawn_random_values()))
     assert set(truth) == {"gx", "gy", "gz", "ax", "ay"}
 
@@ -179,7 +183,7 @@ def test_truth_tells_what_the_seed_decided():
 
 def test_truth_lists_no_more_than_a_stated_number():
     stream = NoiseModel({"gx": (Outliers(fraction=0.5, scale=1.0),)}).start_stream(RATE_HZ, 0)
-    stream.draw_samples(5000)
+    stream.draw_next_samples(5000)
     told = stream.drawn_random_values()["gx"]["outliers"][0]
     assert told["count"] > 2000
     assert len(told["times"]) == len(told["errors"]) == 1000
@@ -188,7 +192,7 @@ def test_truth_lists_no_more_than_a_stated_number():
 def test_dwells_are_exponential_and_either_level_comes_first():
     model = NoiseModel({"gx": (RandomTelegraph(amplitude=2.0, dwell_time=0.5),)})
     stream = model.start_stream(1000.0, 3)
-    stream.draw_samples(400_000)
+    stream.draw_next_samples(400_000)
     dwells = np.diff(stream.drawn_random_values()["gx"]["random_telegraph"][0]["times"])
     assert kstest(dwells, "expon", args=(0.0, 0.5)).pvalue > 0.001
     firsts = [model.simulate(1, 1000.0, seed)[0, 0] for seed in range(200)]
@@ -262,11 +266,20 @@ def test_memory_does_not_grow_with_the_length():
     )
     model = NoiseModel(dict.fromkeys(AXES, axis), None, Temperature(mean=20.0, wander=1.0, wander_time=9.0))
     stream = model.start_stream(RATE_HZ, 1)
-    stream.draw_samples(300_000)  # the lists of events are full
+    stream.draw_next_samples(300_000)  # the lists of events are full
     tracemalloc.start()
     for _ in range(30):
-        stream.draw_samples(10_000)
+        stream.draw_next_samples(10_000)
     held, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert held < 100_000
     assert peak < 2_000_000  # one block of 10 000 samples is 560 kB
+
+
+def test_exchanged_axes_show_each_other():
+    plain = NoiseModel({"gx": (AngleRandomWalk(N=1.0), ConstantBias(value=9.0)), "gy": (AngleRandomWalk(N=2.0),)})
+    swap = NoiseModel({"gx": (AxisPermutation(source="gy"),), "gy": (AxisPermutation(source="gx"),)})
+    drawn, swapped = (one.simulate(5000, 100.0, 1) for one in (plain, plain + swap))
+    np.testing.assert_array_equal(swapped, drawn[:, [1, 0, 2, 3, 4, 5]])
+    tau_s = np.array([1.0])
+    assert (plain + swap).avar("gx", tau_s, 0.01) == plain.avar("gy", tau_s, 0.01)

@@ -8,9 +8,9 @@ from monitor.noise.effect import Source
 from monitor.noise.effects import (
     AngleRandomWalk,
     BandwidthLimit,
-    Bias,
     BiasInstability,
     BiasStep,
+    ConstantBias,
     CrossAxis,
     ExponentiallyCorrelated,
     GSensitivity,
@@ -82,7 +82,7 @@ def test_line_and_slope_through_the_low_pass():
     line, slope = Sinusoidal(amplitude=2.0, frequency=17.3), RateRamp(R=1e-3)
     tau = np.array([0.01, 0.02, 3.0, 200.0])
     bare = NoiseModel({"gx": (line,)}).avar("gx", tau, TAU0_S)
-    limited = NoiseModel({"gx": (line, slope, Bias(value=3.0), BandwidthLimit(cutoff=17.3, order=3))})
+    limited = NoiseModel({"gx": (line, slope, ConstantBias(value=3.0), BandwidthLimit(cutoff=17.3, order=3))})
     np.testing.assert_allclose(limited.avar("gx", tau, TAU0_S), 0.5 * bare + 0.5e-6 * tau**2)
 
 
@@ -138,7 +138,7 @@ def test_leaks_bring_what_the_source_measures_by_itself():
         (AngleRandomWalk(N=1.0), NoiseStep(time=1.0, ratio=2.0)),
         (AngleRandomWalk(N=1.0), BiasStep(time=1.0, height=2.0)),
         (AngleRandomWalk(N=1.0), Saturation(limit=30.0)),
-        (AngleRandomWalk(N=1.0), Bias(value=95.0), Saturation(limit=100.0)),
+        (AngleRandomWalk(N=1.0), ConstantBias(value=95.0), Saturation(limit=100.0)),
         (AngleRandomWalk(N=1.0), Resolution(step=20.0)),
     ],
 )

@@ -7,13 +7,13 @@ import numpy as np
 from drivers.data_types import AXES
 from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
+from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve, compute_hadamard_curve
-from monitor.estimation.allan.total import TotalCurve, compute_total_curve
+from monitor.estimation.allan.total import TotalVarianceCurve, compute_total_curve
 from monitor.estimation.analysis import RecordingAnalysis
-from monitor.estimation.detection.model_comparison import ModelComparison, PreparedModel
+from monitor.estimation.detection.comparison_with_noise_model import ModelAllanVariances, ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
 from monitor.estimation.fit.coefficient_values import Coefficients, Status
@@ -96,13 +96,13 @@ def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> M
         f"[{axis}]\n" + "\n".join(f"{name} = {float(letters[row, i])}" for row, name in enumerate(names))
         for i, axis in enumerate(AXES)
     )
-    in_force = PreparedModel(NoiseModel.from_toml(text), 360_000)
+    in_force = ModelAllanVariances(NoiseModel.from_toml(text), 360_000)
     return replace(in_force.compare_with_estimate(found), agrees=agrees)
 
 
 def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalIntervalResult:
     """Ten minutes of a device that measures gz and az; az has no model yet."""
-    gz = PredictedAxisInterval(
+    gz = MeasuredAndPredictedMean(
         bias,
         1e-6,
         PredictionInterval(2e-4, 1e-4, 3e-4),
@@ -111,11 +111,11 @@ def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalIntervalResult:
         2e-5,
         "",
     )
-    az = PredictedAxisInterval(9.81, np.nan, None, None, "", np.nan, "temperature hardly changed")
+    az = MeasuredAndPredictedMean(9.81, np.nan, None, None, "", np.nan, "temperature hardly changed")
     return ThermalIntervalResult(t_ns, 600.0, 25.5, {"gz": gz, "az": az})
 
 
-def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
+def slow_curves() -> tuple[TotalVarianceCurve, HadamardCurve]:
     """Total and Hadamard deviations of ten seconds of white noise."""
     values = 1e-3 * np.random.default_rng(3).standard_normal((1000, 6))
     theta = np.zeros((5, 6))

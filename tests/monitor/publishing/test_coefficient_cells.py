@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES
-from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, axes_of, coefficient_unit, format_number
+from monitor.common.unit_formatting import COEFFICIENT_UNITS, DEVIATION_UNITS, axes_of, coefficient_unit, format_number
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.publishing.coefficient_cells import format_coefficient
 

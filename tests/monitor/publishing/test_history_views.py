@@ -11,9 +11,9 @@ from rich.console import Console
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings.formats import FORMATS
-from monitor.common.units import coefficient_unit
+from monitor.common.unit_formatting import coefficient_unit
 from monitor.estimation.fit.coefficient_values import SYMBOLS
-from monitor.history.bucket import STATES, HistoryRow
+from monitor.history.history_row import STATES, HistoryRow
 from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
@@ -57,7 +57,7 @@ def printed(tell, *arguments: object, width: int = 110) -> str:
 
 def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
     past = made()
-    text = printed(history_text.print_history, past, AXES, ("N", "R"))
+    text = printed(history_text.print_history_summary, past, AXES, ("N", "R"))
     assert "bench-1: 2025-11-21 00:00 to 2025-11-22 00:00 UTC, 44 rows of 30 min, 7,920,000 samples" in text
     n = past.select_column("gz.N")
     unit = coefficient_unit("N", "gz")
@@ -85,7 +85,7 @@ def test_one_axis_over_time_has_a_line_a_bucket() -> None:
 
 def test_a_span_of_events_alone_is_printed() -> None:
     past = build_table("bench-1", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2)
-    text = printed(history_text.print_history, past, AXES, SYMBOLS)
+    text = printed(history_text.print_history_summary, past, AXES, SYMBOLS)
     assert "no rows between 2025-11-21 00:00:00" in text
     assert "gz noisier" in text
 

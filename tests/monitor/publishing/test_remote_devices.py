@@ -104,17 +104,20 @@ def test_nothing_known_but_its_presence() -> None:
 
 
 def test_ranks_and_words_of_trouble() -> None:
-    assert device(state="lost", text="no such port").display_rank(100.0) == 0
-    assert device(state="waiting").display_rank(100.0) == 1
-    assert device().display_rank(100.0) == 2
-    assert device(state="ended").display_rank(100.0) == 3
+    assert device(state="lost", text="no such port").problems_first_rank(100.0) == 0
+    assert device(state="waiting").problems_first_rank(100.0) == 1
+    assert device().problems_first_rank(100.0) == 2
+    assert device(state="ended").problems_first_rank(100.0) == 3
     assert device().describe_problems() == ""
     assert device(outputs={"zenoh": "off", "viewer": "ok"}).describe_problems() == ""
     stalled = device(outputs={"zenoh": "ok", "viewer": "stalled"}, text="odd", overflowed=1200)
-    assert stalled.display_rank(100.0) == 1
+    assert stalled.problems_first_rank(100.0) == 1
     assert stalled.describe_problems().startswith("odd; viewer: stalled; 1,200 samples overwritten")
     elsewhere = device(outputs={"zenoh": "ok, but the port is busy"})
-    assert (elsewhere.display_rank(100.0), elsewhere.describe_problems()) == (2, "zenoh: ok, but the port is busy")
+    assert (elsewhere.problems_first_rank(100.0), elsewhere.describe_problems()) == (
+        2,
+        "zenoh: ok, but the port is busy",
+    )
 
 
 def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
@@ -128,22 +131,22 @@ def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() 
     status = decode_message(StatusMessage, StatusMessage.from_result("a", 1.0, 0, made.health()).encode())
     payload = ModelGapMessage.from_result("a", 1.0, 0, made.look(scale=1.2, gz=False, gx=True)).encode()
     one = RemoteDevice("imu/a", 0.0, status)
-    assert one.display_rank(0.0) == 2
+    assert one.problems_first_rank(0.0) == 2
     gap = decode_message(ModelGapMessage, payload)
     one.update_from_message(gap)
-    assert one.display_rank(0.0) == 1
+    assert one.problems_first_rank(0.0) == 1
     found = gap.axes["gz"]
     lo, hi = found.where.tau
     assert one.describe_problems() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
     one.update_from_message(
         decode_message(ModelGapMessage, ModelGapMessage.from_result("a", 1.0, 0, made.look(gz=True)).encode())
     )
-    assert (one.display_rank(0.0), one.describe_problems()) == (2, "")
+    assert (one.problems_first_rank(0.0), one.describe_problems()) == (2, "")
 
 
 def test_a_limit_that_is_passed_is_trouble() -> None:
     one = device(crossed=("gz N",))
-    assert one.display_rank(100.0) == 1
+    assert one.problems_first_rank(100.0) == 1
     assert one.describe_problems() == "limits exceeded: gz N"
     many = device(crossed=tuple(f"gz {i}" for i in range(100)))
     assert many.describe_problems() == "limits exceeded: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"

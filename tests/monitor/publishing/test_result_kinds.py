@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monitor.common import topics
-from monitor.estimation.estimate import PerSampleCoefficients
+from monitor.estimation.estimate import CoefficientsAfterEachSample
 from monitor.publishing.messages import results
 from monitor.publishing.messages.message import Message
 from monitor.publishing.result_kinds import (
@@ -25,7 +25,7 @@ def test_each_kind_and_each_message_stands_in_one_row() -> None:
     published = [message for kind in RESULT_KINDS for message in kind.messages]
     assert len(set(published)) == len(published)
     known = {one for one in vars(results).values() if isinstance(one, type) and issubclass(one, Message)}
-    answers = {Message, results.WindowResultMessage, results.ResetReply, results.ReconcileReply}
+    answers = {Message, results.SlidingWindowMessage, results.ResetReply, results.ReconcileReply}
     assert set(published) == known - answers
 
 
@@ -38,13 +38,13 @@ def test_the_schema_of_a_message_is_that_of_its_topic() -> None:
 
 def test_each_drawing_has_a_panel() -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    from monitor.publishing.rerun import result_panels
+    from monitor.publishing.rerun import panels
 
     for kind in RESULT_KINDS:
         for drawing in kind.drawings:
-            panel = getattr(result_panels, drawing.panel)
-            assert issubclass(panel, result_panels.Panel)
-            assert panel.draw is not result_panels.Panel.draw
+            panel = getattr(panels, drawing.panel)
+            assert issubclass(panel, panels.Panel)
+            assert panel.draw is not panels.Panel.draw
 
 
 def test_the_size_of_a_result_is_that_of_its_arrays() -> None:
@@ -70,7 +70,7 @@ def test_results_that_wait_are_merged() -> None:
 def test_no_value_of_a_single_sample_is_lost_when_estimates_are_merged() -> None:
     waiting: list[TimedResult] = []
     for i in range(3):
-        history = PerSampleCoefficients(np.array([i]), np.full((1, 5, 6), float(i)))
+        history = CoefficientsAfterEachSample(np.array([i]), np.full((1, 5, 6), float(i)))
         keep_newest_and_spaced(waiting, (0.1 * i, replace(made.estimate(), history=history)))
     assert [t_s for t_s, _ in waiting] == [0.0, pytest.approx(0.2)]
     assert waiting[-1][1].history.t_ns.tolist() == [1, 2]

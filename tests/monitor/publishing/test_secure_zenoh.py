@@ -254,7 +254,7 @@ def test_samples_of_another_daemon_come_through_the_link_with_a_certificate(by_c
 
             def come() -> Any:
                 nose.put("imu/nose/samples", b"batch")
-                return link.poll_chunks(0.1)
+                return link.wait_for_chunks_or_timeout(0.1)
 
             assert wait_for(come)[0].data == b"batch"
     finally:

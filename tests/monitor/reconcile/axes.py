@@ -4,19 +4,20 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 
 from drivers.data_types import AXES, Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, BiasInstability, RateRandomWalk
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 from monitor.reconcile.likelihood.axis_fit import Axis, RegressorCache
-from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.reconcile_input import Recording
-from monitor.reconcile.search.axis_repair import build_repaired_axes
+from monitor.reconcile.search.repaired_axes import build_repaired_axes
 
 RATE_HZ = 100.0
 N, B, K = 1e-4, 2e-5, 2e-6  # rad/√s, rad/s, rad/s/√s
@@ -104,6 +105,10 @@ def check_report(report: dict[str, Any]) -> None:
     assert report["schema"] == "imu-monitor/reconcile/1"
     assert report["verdict"] in VERDICTS
     assert report["axes"]
+    assert 1 <= len(report["summary"]) <= 5
+    shares = [one["share"] for one in (*report["findings"], *report["remaining"])]
+    assert all(0.0 <= share <= 1.0 for share in shares)
+    assert not shares or sum(shares) == pytest.approx(1.0 if report["gap_nats"] else 0.0)
     for name, one in report["axes"].items():
         assert name in AXES
         expected = {
@@ -123,7 +128,7 @@ def check_report(report: dict[str, Any]) -> None:
 
 def _check_step(step: dict[str, Any]) -> None:
     assert set(step["found"]) == SCORE
-    assert step["kind"] in ("added", "retuned")
+    assert step["kind"] in ("added", "retuned", "absent")
     assert step["effect"] in EFFECTS
     assert 0.0 <= step["confidence"] <= 1.0
     allowed = set(EFFECTS[step["effect"]].__dataclass_fields__)

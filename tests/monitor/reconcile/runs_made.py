@@ -8,13 +8,13 @@ from monitor.noise.effects import EFFECTS, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
+    AlternativeEffect,
+    AxisModelDiagnostics,
     AxisResult,
     Decision,
     DiagnosticGap,
-    DiagnosticSnapshot,
     Location,
     ParameterInterval,
-    RunnerUp,
 )
 from monitor.reconcile.several_recordings.comparison import NamedResult
 from tests.monitor.reconcile import samples
@@ -32,8 +32,8 @@ def step(
         name: one if isinstance(one, ParameterInterval) else around(one, 0.01 * abs(one)) for name, one in given.items()
     }
     return AddedOrResizedEffect(
-        kind, effect, parameters, 0.99, tuple(RunnerUp(one, 0.01) for one in rivals),  # type: ignore[arg-type]
-        before, LENS, None, None, "made by hand", "it was made by hand", DiagnosticSnapshot((LENS,), ()),
+        kind, effect, parameters, 0.99, tuple(AlternativeEffect(one, 0.01) for one in rivals),  # type: ignore[arg-type]
+        before, LENS, None, None, "made by hand", "it was made by hand", AxisModelDiagnostics((LENS,), ()),
     )  # fmt: skip
 
 
@@ -60,7 +60,7 @@ def run(
     """A recording of one axis with these steps; its model has their effects."""
     verdict: Decision = ("partly_explained" if steps else "unexplained") if left else "explained" if steps else "agrees"
     result = AxisResult(
-        axis, verdict, DiagnosticSnapshot((LENS,), ()), steps, tuple(left), DiagnosticSnapshot((LENS,), ())
+        axis, verdict, AxisModelDiagnostics((LENS,), ()), steps, tuple(left), AxisModelDiagnostics((LENS,), ())
     )
     whole = samples.agrees()
     given = whole.baseline.effects[axis]

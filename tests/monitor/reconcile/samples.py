@@ -13,14 +13,16 @@ from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWa
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
+    AllanInfluence,
+    AlternativeEffect,
+    AxisModelDiagnostics,
     AxisResult,
     DiagnosticGap,
-    DiagnosticSnapshot,
+    DiagnosticPlotData,
     Location,
     ParameterInterval,
-    PlotData,
     Reconciliation,
-    RunnerUp,
+    RemainingGap,
 )
 
 RATE_HZ, SECONDS = 100.0, 3600.0
@@ -53,7 +55,7 @@ def look(
     line: bool = False,
     known_line: bool = False,
     hump: bool = False,
-) -> DiagnosticSnapshot:
+) -> AxisModelDiagnostics:
     """One axis beside a model through four lenses; ``line`` is measured, ``known_line`` is in the model too."""
     rng = np.random.default_rng(AXES.index(axis))  # the same measurement beside every model
     size = 1.0 if axis.startswith("g") else ACCELEROMETER
@@ -73,7 +75,7 @@ def look(
         DiagnosticGap("distribution", Location(), 0.4 + off / 9, 1.8, 2.7),
         DiagnosticGap("other_axes", Location(source="ax" if axis != "ax" else "gx"), 0.2, 1.5, 2.5),
     )
-    return DiagnosticSnapshot(scores, views)
+    return AxisModelDiagnostics(scores, views)
 
 
 def agrees(fitted_first: bool = False) -> Reconciliation:
@@ -96,7 +98,7 @@ def explained() -> Reconciliation:
             "frequency": ParameterInterval(17.300012, 17.299912, 17.300112),
         },
         confidence=0.9983,
-        runners_up=(RunnerUp("narrowband", 0.0016), RunnerUp("sample_rate_error", 0.0001)),
+        runners_up=(AlternativeEffect("narrowband", 0.0016), AlternativeEffect("sample_rate_error", 0.0001)),
         before=start.gaps[0],
         after=with_line.gaps[0],
         held_out_before=DiagnosticGap("psd", Location(frequency=(17.1, 17.5)), 39.7, 1.9, 2.6),
@@ -105,6 +107,8 @@ def explained() -> Reconciliation:
         because="One bin of 0.28 mHz at 17.3 Hz holds 41 times what the model expects there, and its phase holds "
         "from the first minute to the last; a resonance would be at least 1 mHz wide.",
         snapshot_after=with_line,
+        gain_nats=848.0,
+        allan=AllanInfluence(1.05, 0.02),
     )
     white = AddedOrResizedEffect(
         kind="retuned",
@@ -119,6 +123,8 @@ def explained() -> Reconciliation:
         held_out_reason="a known term of another size is not held out",
         because="From 0.01 s to 0.6 s the Allan deviation is higher by one factor, 1.20, with white noise's slope.",
         snapshot_after=with_all,
+        gain_nats=38.0,
+        allan=AllanInfluence(1.2, 0.01),
     )
     whole = agrees()
     axes = {**whole.axes, "gz": AxisResult("gz", "explained", start, (line, white), (), white.snapshot_after)}
@@ -137,14 +143,16 @@ def partly_explained() -> Reconciliation:
     whole = explained()
     gz = whole.axes["gz"]
     left = tuple(score for score in gz.steps[0].snapshot_after.gaps if score.is_significant)
-    result = replace(gz, verdict="partly_explained", steps=gz.steps[:1], left_over=left)
+    remaining = (RemainingGap("spectrum", left[0], 38.0),)
+    result = replace(gz, verdict="partly_explained", steps=gz.steps[:1], left_over=left, remaining=remaining)
     return replace(whole, verdict="partly_explained", axes={**whole.axes, "gz": result})
 
 
 def unexplained() -> Reconciliation:
     """One accelerometer with a hump in its spectrum."""
     start = look("ax", hump=True)
-    result = AxisResult("ax", "unexplained", start, (), (start.gaps[0],), start)
+    remaining = (RemainingGap("spectrum", start.gaps[0], 31.2),)
+    result = AxisResult("ax", "unexplained", start, (), (start.gaps[0],), start, remaining)
     model = NoiseModel({"ax": _terms()}, sample_rate_hz=RATE_HZ)
     return Reconciliation("unexplained", {"ax": result}, model, model, True, RATE_HZ, 360_000, SECONDS, 7)
 
@@ -162,7 +170,7 @@ def _psd(
     line: bool,
     known_line: bool,
     hump: bool,
-) -> PlotData:
+) -> DiagnosticPlotData:
     """Bins of a log-binned DCT: the first 48 single, then 16 an octave, at most 0.1 Hz wide."""
     single = np.arange(1, 49) / (2 * SECONDS)
     edges = [float(single[-1])]
@@ -175,7 +183,7 @@ def _psd(
     truth = truth * (1 + 0.5 * hump * np.exp(-0.5 * (np.log(f / 8.0) / 0.15) ** 2))
     expected = spectrum(f, n_model) + known_line * density
     spread = 1.96 * np.sqrt(2 / count)
-    return PlotData(
+    return DiagnosticPlotData(
         "psd", "frequency", "Hz", "spectral density", "(rad/s)²/Hz" if axis.startswith("g") else "(m/s²)²/Hz", True, f,
         size**2 * truth * rng.chisquare(count) / count,
         size**2 * expected, size**2 * expected * np.exp(-spread), size**2 * expected * np.exp(0.7 * spread),
@@ -184,37 +192,37 @@ def _psd(
 
 def _allan(
     axis: str, rng: np.random.Generator, size: float, n_model: float, n_true: float, line: bool, known_line: bool
-) -> PlotData:
+) -> DiagnosticPlotData:
     tau = 2.0 ** np.arange(17) / RATE_HZ
     edf = 1.5 * SECONDS / tau
     expected = size * np.sqrt(avar(tau, n_model) + known_line * line_avar(tau))
     measured = size * np.sqrt((avar(tau, n_true) + line * line_avar(tau)) * rng.chisquare(edf) / edf)
     spread = np.exp(0.98 * np.sqrt(2 / edf))
     unit = "rad/s" if axis.startswith("g") else "m/s²"
-    return PlotData(
+    return DiagnosticPlotData(
         "allan", "averaging time", "s", "Allan deviation", unit, True, tau, measured,
         expected, expected / spread, expected * spread,
     )  # fmt: skip
 
 
-def _level(axis: str, rng: np.random.Generator, size: float) -> PlotData:
+def _level(axis: str, rng: np.random.Generator, size: float) -> DiagnosticPlotData:
     """Means of 10 s."""
     t = np.arange(5.0, SECONDS, 10.0)
     sigma = size * np.sqrt(avar(np.array([10.0]), N)[0] + K**2 * 300)
     measured = sigma * rng.standard_normal(t.size)
     unit = "rad/s" if axis.startswith("g") else "m/s²"
     half = 1.96 * sigma * np.ones_like(t)
-    return PlotData("level", "time", "s", "mean of 10 s", unit, False, t, measured, 0 * t, -half, half)
+    return DiagnosticPlotData("level", "time", "s", "mean of 10 s", unit, False, t, measured, 0 * t, -half, half)
 
 
-def _distribution(rng: np.random.Generator, ratio: float) -> PlotData:
+def _distribution(rng: np.random.Generator, ratio: float) -> DiagnosticPlotData:
     """Density of the whitened samples."""
     x = np.linspace(-4.5, 4.5, 73)
     expected = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
     truth = np.exp(-0.5 * (x / ratio) ** 2) / np.sqrt(2 * np.pi) / ratio
     sigma = np.sqrt(expected / 360_000 / (x[1] - x[0]))
     measured = np.maximum(truth + sigma * rng.standard_normal(x.size), 0.0)
-    return PlotData(
+    return DiagnosticPlotData(
         "distribution", "value over its deviation", "1", "density", "1", False, x, measured,
         expected, np.maximum(expected - 1.96 * sigma, 0.0), expected + 1.96 * sigma,
     )  # fmt: skip

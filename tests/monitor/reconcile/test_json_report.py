@@ -9,9 +9,9 @@ import numpy as np
 from monitor.reconcile.json_report import encode_report
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
+    AxisModelDiagnostics,
     AxisResult,
     DiagnosticGap,
-    DiagnosticSnapshot,
     Location,
     ParameterInterval,
     Reconciliation,
@@ -48,6 +48,7 @@ def test_a_step_is_written_as_its_schema_says() -> None:
             "frequency": {"value": 17.300012, "lo": 17.299912, "hi": 17.300112},
         },
         "confidence": 0.9983,
+        "gain_nats": 848.0,
         "runners_up": [
             {"effect": "narrowband", "confidence": 0.0016},
             {"effect": "sample_rate_error", "confidence": 0.0001},
@@ -56,6 +57,19 @@ def test_a_step_is_written_as_its_schema_says() -> None:
                 "null95": 1.9, "threshold": 2.6},
         "held_out_gap": {"before": 39.7, "after": 1.0, "null95": 1.9, "threshold": 2.6},
     }  # fmt: skip
+
+
+def test_the_summary_and_the_ranked_findings_come_first() -> None:
+    report = written(samples.partly_explained())
+    assert list(report)[:3] == ["schema", "verdict", "summary"]
+    assert report["summary"][0].startswith("The model differs from the recording on gz")
+    assert report["gap_nats"] == 886.0
+    (line,), (left,) = report["findings"], report["remaining"]
+    assert (line["kind"], line["effect"], line["axes"]) == ("added", "sinusoidal", ["gz"])
+    assert line["parameters"]["frequency"]["value"] == 17.300012
+    assert line["allan"] == {"gz": {"ratio": 1.05, "tau": 0.02}}
+    assert (left["axis"], left["group"], left["strongest"]["lens"]) == ("gz", "spectrum", "psd")
+    assert line["share"] == report["explained_share"] == 1.0 - left["share"] == 848.0 / 886.0
 
 
 def test_what_was_compared_stands_beside_it() -> None:
@@ -123,9 +137,20 @@ def test_numbers_of_numpy_are_numbers() -> None:
     score = DiagnosticGap(
         "psd", Location(frequency=(np.float64(1), np.float64(2))), np.float64(3), np.float64(1), np.float64(2)
     )
-    look = DiagnosticSnapshot((score,), ())
+    look = AxisModelDiagnostics((score,), ())
     step = AddedOrResizedEffect(
-        "added", "bias_step", {}, np.float64(0.5), (), score, score, None, None, "once", "it jumps", look
+        "added",
+        "bias_step",
+        {"time": ParameterInterval(np.float64(3))},
+        np.float64(0.5),
+        (),
+        score,
+        score,
+        None,
+        None,
+        "once",
+        "it jumps",
+        look,
     )
     axes = {"gx": AxisResult("gx", "explained", look, (step,), (), look)}
     model = samples.explained().model

@@ -11,7 +11,7 @@ from drivers.data_types import AXES
 from drivers.errors import NotReady
 from monitor.noise.effects import (
     AngleRandomWalk,
-    Bias,
+    ConstantBias,
     CrossAxis,
     Outliers,
     QuantizationNoise,
@@ -28,7 +28,7 @@ from monitor.reconcile.preparation.reconcile_input import (
     MIN_SAMPLES,
     Recording,
     _smooth_temperature,
-    select_usable_axes,
+    select_axes_and_smooth_temperature,
 )
 from monitor.reconcile.reconcile import RecordingContext, _effects_by_axis, fit_five_terms, reconcile
 from monitor.reconcile.result import combine_decisions
@@ -117,10 +117,27 @@ def test_same_seed_same_bytes_also_in_threads():
         assert encode_report(reconcile(small, MODEL, 4, pool.map)) == one
     other = reconcile(small, MODEL, 5)
     assert other.seed == 5
-    # other simulated recordings stand behind its thresholds
-    for axis in GYRO_AXES:
-        limits = [[score.threshold for score in found.axes[axis].start.gaps] for found in (first, other)]
-        assert limits[0] != limits[1]
+    # the outliers are replaced by other draws
+    ends = [[score.gap for score in found.axes["gy"].end.gaps] for found in (first, other)]
+    assert ends[0] != ends[1]
+
+
+def test_a_line_at_another_frequency_is_one_retuned_step():
+    known, other = Sinusoidal(amplitude=3e-4, frequency=17.3), Sinusoidal(amplitude=3e-4, frequency=5.0)
+    plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK))) + NoiseModel({"gy": (known, other)})
+    true = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK))) + NoiseModel(
+        {"gy": (Sinusoidal(amplitude=3e-4, frequency=16.1), other)}
+    )
+    found = reconcile(recording(true, 24_000, 6), plain, 1)
+    check_report(json.loads(encode_report(found)))
+    assert found.verdict == "explained"
+    (step,) = (step for one in found.axes.values() for step in one.steps)
+    assert (step.kind, step.effect) == ("retuned", "sinusoidal")
+    assert step.parameters["frequency"].lo < 16.1 < step.parameters["frequency"].hi
+    assert step.confidence > 0.9
+    assert "another frequency of sinusoidal" in step.because
+    lines = [effect.frequency for effect in found.model.effects["gy"] if isinstance(effect, Sinusoidal)]
+    assert lines == [pytest.approx(16.1, abs=1e-3), 5.0]
 
 
 def test_a_wrong_clock_is_one_step_for_all_axes():
@@ -157,10 +174,12 @@ def test_of_two_axes_that_correlate_one_leaks():
 def test_without_a_model_the_five_terms_come_first():
     drawn = recording(MODEL, 24_000, 8)
     told = []
-    found = reconcile(drawn, None, 1, report_stage=told.append)
+    found = reconcile(drawn, None, 1, report_stage=lambda what, share: told.append((what, share)))
     assert found.fitted_first
     assert found.verdict == "agrees"
-    assert told[:2] == ["checking the recording", "fitting the five terms"]
+    assert told[:2] == [("checking the recording", None), ("fitting the five terms", None)]
+    shares = [share for what, share in told if what == "searching for missing effects"]
+    assert shares == pytest.approx([0.0, 1 / 3, 2 / 3, 1.0])
     for axis in GYRO_AXES:
         sizes = {effect.name: effect for effect in found.baseline.effects[axis]}
         assert pytest.approx(N, rel=0.03) == sizes["angle_random_walk"].N
@@ -195,24 +214,26 @@ def drawn(**changed):
 
 def test_too_few_samples_say_how_many_are_needed():
     with pytest.raises(NotReady, match=rf"{MIN_SAMPLES - 1} samples; at least {MIN_SAMPLES} .*100 Hz"):
-        select_usable_axes(recording(MODEL, MIN_SAMPLES - 1, 1), MODEL)
-    assert select_usable_axes(drawn(), MODEL)[1] == ()
+        select_axes_and_smooth_temperature(recording(MODEL, MIN_SAMPLES - 1, 1), MODEL)
+    assert select_axes_and_smooth_temperature(drawn(), MODEL)[1] == ()
 
 
 def test_axes_that_cannot_be_compared_are_left_out_and_told():
     values = drawn().values
     holed = values["gx"].copy()
     holed[10:] = np.nan
-    kept, notes = select_usable_axes(drawn(gx=holed, gy=np.full(MIN_SAMPLES, 0.3), ax=values["gz"]), MODEL)
+    kept, notes = select_axes_and_smooth_temperature(
+        drawn(gx=holed, gy=np.full(MIN_SAMPLES, 0.3), ax=values["gz"]), MODEL
+    )
     assert list(kept.values) == ["gz"]
     assert [note.split(":")[0] for note in notes] == ["gx", "gy", "ax"]
     assert all(note.endswith("left out") for note in notes)
     with pytest.raises(NotReady, match=r"no axis to compare: gx: .*; gy: "):
-        select_usable_axes(Recording({"gx": holed, "gy": holed}, RATE_HZ), MODEL)
+        select_axes_and_smooth_temperature(Recording({"gx": holed, "gy": holed}, RATE_HZ), MODEL)
 
 
 def test_a_constant_bias_is_no_part_of_the_comparison():
-    model = MODEL + NoiseModel({"gz": (Bias(value=0.3),)})
+    model = MODEL + NoiseModel({"gz": (ConstantBias(value=0.3),)})
     assert _effects_by_axis(model, drawn())["gz"] == TERMS
     assert _effects_by_axis(NoiseModel({}), drawn()) == dict.fromkeys(GYRO_AXES, ())
 

@@ -80,4 +80,4 @@ def test_the_truth_adds_up() -> None:
         truth.count_sample(kind, all_sent=False)
     assert (truth.sent, truth.repeated, truth.lost, truth.flipped, truth.cut) == (2, 1, 1, 1, 1)
     assert truth.dropped == len(FaultKind)
-    assert truth.sample_count == 2 * len(FaultKind)
+    assert truth.total_simulated_samples == 2 * len(FaultKind)

@@ -100,7 +100,7 @@ class Rig:
         truth, counts = self.truth, self.counts
         self.wait(
             lambda: (
-                truth.sample_count == self.samples
+                truth.total_simulated_samples == self.samples
                 and self.received == truth.sent + truth.repeated
                 and counts.lost + counts.bad == truth.lost + truth.flipped + truth.cut
             )
@@ -188,7 +188,7 @@ def test_bursts_held_back_lose_nothing(tmp_path: Path) -> None:
 def test_a_clock_that_is_off_shows_in_the_rate(tmp_path: Path) -> None:
     example = next(example for example in EXAMPLES if example.name == "dbc")  # without a counter of its own
     with Rig(example, tmp_path, speed=1.0, samples=None, clock=1.25) as rig:
-        rig.wait(lambda: rig.truth.sample_count >= 350)
+        rig.wait(lambda: rig.truth.total_simulated_samples >= 350)
         # the measured rate converges; late arrivals on a loaded machine only delay it
         rig.wait(lambda: rig.driver.clock.measured_hz == pytest.approx(125.0, rel=0.03))
 

@@ -62,7 +62,7 @@ class Rig:
 @pytest.mark.parametrize("module", [vectornav_binary, stim300, xsens_mtdata2], ids=lambda m: m.__name__)
 def test_what_it_sends_is_received(module):
     with Rig(module, allowed=100) as rig:
-        rig.wait(lambda: rig.imu.fault_counts.sample_count == rig.driver.counts.received == 100)
+        rig.wait(lambda: rig.imu.fault_counts.total_simulated_samples == rig.driver.counts.received == 100)
     counts, truth = rig.driver.counts, rig.imu.fault_counts
     assert (truth.sent, truth.dropped) == (100, 0)
     assert (counts.lost, counts.bad) == (0, 0)
@@ -75,7 +75,9 @@ def test_what_it_sends_is_received(module):
 def test_a_pulled_cable_and_back():
     with Rig(allowed=50) as rig:
         counts, truth = rig.driver.counts, rig.imu.fault_counts
-        rig.wait(lambda: truth.sample_count == counts.received == 50)  # nothing is on the way when the cable is pulled
+        rig.wait(
+            lambda: truth.total_simulated_samples == counts.received == 50
+        )  # nothing is on the way when the cable is pulled
         rig.imu.port.unplug()
         rig.wait(lambda: rig.driver.state == "lost")
         assert not rig.imu.port.path.exists()
@@ -85,7 +87,7 @@ def test_a_pulled_cable_and_back():
         rig.imu.port.plug()
         rig.allowed = 150
         rig.wait(lambda: rig.driver.state == "running")
-        rig.wait(lambda: truth.sample_count == 150 and counts.received == 100)
+        rig.wait(lambda: truth.total_simulated_samples == 150 and counts.received == 100)
         kinds = rig.kinds()
     assert kinds.count("link_lost") == kinds.count("link_back") == 1
     assert "samples_lost" in kinds
@@ -119,7 +121,7 @@ def test_plugging_twice_and_pulling_twice_is_harmless_and_leaves_nothing_open():
 def test_same_seed_same_noise():
     a, b = Rig().imu, Rig().imu
     try:
-        assert np.array_equal(a._sensor._stream.draw_samples(50), b._sensor._stream.draw_samples(50))
+        assert np.array_equal(a._sensor._stream.draw_next_samples(50), b._sensor._stream.draw_next_samples(50))
     finally:
         a.stop()
         b.stop()

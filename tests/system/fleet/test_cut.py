@@ -20,10 +20,10 @@ mode = "none"
 """
 WATCH = """
 import contextlib, sys, time
-from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.remote_devices import RemoteDeviceRegistry
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 
-board = DeviceStates()
+board = RemoteDeviceRegistry()
 with contextlib.closing(ZenohSubscriber("imu/**", [sys.argv[1]])) as arriving:
     arriving.start()
     while True:
@@ -33,8 +33,8 @@ with contextlib.closing(ZenohSubscriber("imu/**", [sys.argv[1]])) as arriving:
             else:
                 board.process_message(message.key, message.payload)
         now_s = time.monotonic()
-        states = [one.state(now_s) for one in board.sorted_devices(now_s)] or ["nobody"]
-        received = [one.status.received for one in board.sorted_devices(now_s) if one.status] or [0]
+        states = [one.state(now_s) for one in board.devices_with_problems_first(now_s)] or ["nobody"]
+        received = [one.status.received for one in board.devices_with_problems_first(now_s) if one.status] or [0]
         print(states[0], received[0], arriving.state, flush=True)
 """
 

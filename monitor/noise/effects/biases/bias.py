@@ -10,10 +10,10 @@ from monitor.noise.spectrum import Spectrum, zero_spectrum
 
 
 @dataclass(frozen=True, slots=True)
-class Bias(Source):
+class ConstantBias(Source):
     """Constant bias, which also represents gravity on an accelerometer axis. Allan variance and spectrum are zero.
 
-    >>> Bias(value=9.8).spectrum(0.01).level
+    >>> ConstantBias(value=9.8).spectrum(0.01).level
     9.8
     """
 

@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 @dataclass(frozen=True, slots=True)
 class TemperatureBias(Source):
-    """Bias that is a second-order polynomial of the temperature: b = c (T − T_r) + q (T − T_r)² (IEEE Std 952).
+    """Bias that is a polynomial of the temperature: b = c (T − T_r) + q (T − T_r)² + k (T − T_r)³ (IEEE Std 952).
 
     >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).two_sided_psd(np.array([1.0]), 0.01)[0]))
     True
@@ -21,6 +21,7 @@ class TemperatureBias(Source):
     coefficient: float = parameter_field("rad/s/°C", "m/s²/°C", signed=True)
     reference: float = parameter_field("°C", signed=True)
     quadratic: float | None = parameter_field("rad/s/°C²", "m/s²/°C²", signed=True, optional=True)
+    cubic: float | None = parameter_field("rad/s/°C³", "m/s²/°C³", signed=True, optional=True)
 
     description: ClassVar[str] = "The bias depends on the temperature of the sensor, without delay."
     uses_temperature: ClassVar[bool] = True
@@ -34,6 +35,6 @@ class TemperatureBias(Source):
 
         def add_temperature_bias(values: Floats, block: SampleBlockContext) -> None:
             warmer = block.temperature_c - self.reference
-            values += (self.coefficient + (self.quadratic or 0.0) * warmer) * warmer
+            values += (self.coefficient + ((self.quadratic or 0.0) + (self.cubic or 0.0) * warmer) * warmer) * warmer
 
         return StatelessSeries(add_temperature_bias)

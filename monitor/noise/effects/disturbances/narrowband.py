@@ -9,7 +9,7 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
-from monitor.noise.gauss_markov import gauss_markov_spectrum
+from monitor.noise.gauss_markov_avar_and_spectrum import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
 
@@ -43,12 +43,14 @@ class Narrowband(Source):
         peaks = ((self.frequency, self.bandwidth),)
         return replace(gauss_markov_spectrum(self.sigma, self._decay, tau0_s), peaks=peaks)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Resonance":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "ResonanceSeries":
         """Start a stationary series."""
-        return _Resonance(self.sigma, self._decay / rate_hz, rng)
+        return ResonanceSeries(self.sigma, self._decay / rate_hz, rng)
 
 
-class _Resonance(NoiseSeries):
+class ResonanceSeries(NoiseSeries):
+    """Series of the real part of the process z ← φz + w."""
+
     def __init__(self, sigma: float, step: complex, rng: np.random.Generator) -> None:
         self._rng = rng
         phi = np.exp(-step)
@@ -57,6 +59,7 @@ class _Resonance(NoiseSeries):
         self._x, self._y = sigma * rng.standard_normal(2)
 
     def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        """Add the next samples of the process."""
         white = self._rng.standard_normal((values.size, 2))
         self._x, self._y = _add_resonance(values, white, self._cos, self._sin, self._drive, self._x, self._y)
 

@@ -3,11 +3,14 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from monitor.noise.effect import Effect, parameter_field
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.noise.effect import RunningGain, WhiteNoiseGain, first_sample_at_or_after, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class NoiseStep(Effect):
+class NoiseStep(WhiteNoiseGain):
     """Multiplication of the angle random walk by ``ratio`` from the first sample at or after ``time``.
 
     The ratios of several noise steps are multiplied. Allan variance and spectrum are NaN, because they depend on the
@@ -20,4 +23,18 @@ class NoiseStep(Effect):
     time: float = parameter_field("s")
     ratio: float = parameter_field("1")
 
-    description: ClassVar[str] = "The size of the white noise changes once by a factor."
+    description: ClassVar[str] = "At one moment, the standard deviation of the white noise changes by a factor."
+
+    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> "_Step":
+        """Start a gain with a step. ``time`` is relative to the first sample of the stream."""
+        return _Step(first_sample_at_or_after(self.time, rate_hz), self.ratio)
+
+
+class _Step(RunningGain):
+    def __init__(self, at: int, ratio: float) -> None:
+        self._at, self._ratio = at, ratio
+
+    def compute_gain(self, first: int, n: int) -> Floats:
+        gain = np.ones(n)
+        gain[max(0, self._at - first) :] = self._ratio
+        return gain

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
-from monitor.noise.gauss_markov import gauss_markov_spectrum
+from monitor.noise.gauss_markov_avar_and_spectrum import gauss_markov_spectrum
 from monitor.noise.random_events import RandomEvents
 from monitor.noise.spectrum import Spectrum
 
@@ -42,7 +42,7 @@ class RandomTelegraph(Source):
         return gauss_markov_spectrum(0.5 * self.amplitude, 2.0 / self.dwell_time, tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_TwoLevels":
-        """Start a stationary series at a random level."""
+        """Start a series that begins at one of the two levels, chosen at random."""
         return _TwoLevels(0.5 * self.amplitude, self.dwell_time * rate_hz, rate_hz, rng)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
-from monitor.noise.gauss_markov import gauss_markov_spectrum
+from monitor.noise.gauss_markov_avar_and_spectrum import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
 

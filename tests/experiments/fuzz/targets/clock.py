@@ -61,7 +61,7 @@ def clock(data: bytes) -> None:
         i += 1
         kind = tape.byte()
         if kind % 16 == 15:
-            stamped.clock.note_link_closed()
+            stamped.clock.count_next_gap_by_arrival()
             continue
         n = 1 + kind % 8
         given = isinstance(timing, SenderTimedFormat)

@@ -22,7 +22,7 @@ from drivers.data_types import AXES, EXTENDED_ID, NO_TICK, Chunk, CounterTimedFo
 from drivers.decoders.base import Decoder
 from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
-from drivers.decoders.dbc.database import Database
+from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, EXAMPLES, NAMES, Example
 from tests.experiments.fuzz.checks import fed, seen
@@ -223,7 +223,7 @@ def _can(i: int) -> tuple[Any, DbcSettings, Any]:
         path = Path(folder) / "a.dbc"
         path.write_text(text or "")
         settings = read_settings(DbcSettings, {"file": str(path) if text else file, **keys})
-        database = Database(settings)
+        database = ConfiguredDbcMessages(settings)
         return database.messages, settings, database.timing
 
 

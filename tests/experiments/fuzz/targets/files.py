@@ -190,7 +190,7 @@ def replayed(path: Path, channel: str | None = None) -> None:
         with mock.patch.object(memory_check, "available_bytes", return_value=FREE_BYTES):
             link.open()
         for _ in range(1000):
-            for chunk in link.poll_chunks(0.0) or []:
+            for chunk in link.wait_for_chunks_or_timeout(0.0) or []:
                 assert abs(chunk.t_ns) < LARGEST_NS, "a time beyond int64"
                 assert 0 <= chunk.address < 1 << 32, "no CAN identifier"
                 if link.carrier == "frames":

@@ -3,7 +3,7 @@
 import math
 
 from drivers.errors import ConfigError
-from monitor.common.units import format_utc
+from monitor.common.unit_formatting import format_utc
 from monitor.history.query_parameters import parse_query
 from monitor.history.time_ranges import parse_duration_s, parse_time, parse_zenoh_range
 from tests.experiments.fuzz.checks import one_line

@@ -16,8 +16,8 @@ from monitor.cli.shared import options
 from monitor.commands import thermal
 from monitor.common import topics
 from monitor.publishing.exporters import FORMATS, export, from_analysis_json
-from monitor.publishing.remote_devices import DeviceStates
-from monitor.publishing.terminal.live_table import device_table
+from monitor.publishing.remote_devices import RemoteDeviceRegistry
+from monitor.publishing.terminal.live_table import device_overview
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
 from monitor.simulator.effect_option_parser import parse_effects
@@ -62,8 +62,8 @@ def _messages() -> Iterator[bytes]:
         yield bytes([i]) + payload[:-1] + b',"x":' + b"[" * 1200
 
 
-def _taken(data: bytes) -> DeviceStates:
-    board = DeviceStates(lambda: 1.0)
+def _taken(data: bytes) -> RemoteDeviceRegistry:
+    board = RemoteDeviceRegistry(lambda: 1.0)
     name = NAMES[data[0] % len(NAMES)] if data else "status"
     board.process_message(f"imu/a/{name}", data[1:])
     return board
@@ -80,7 +80,7 @@ def heard(data: bytes) -> None:
 def board(data: bytes) -> None:
     """The same, and then shown."""
     console = Console(width=100, height=30, file=_Nowhere(), force_terminal=True)
-    console.print(device_table(_taken(data), 2.0))
+    console.print(device_overview(_taken(data), 2.0))
 
 
 class _Nowhere:

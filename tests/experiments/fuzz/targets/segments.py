@@ -9,9 +9,9 @@ from drivers.data_types import AXES, Chunk, make_block
 from drivers.errors import RecordingError
 from drivers.recordings.segment_file import (
     DaemonState,
+    SegmentFileWriter,
     SegmentMetadata,
-    SingleSegmentWriter,
-    compress_segment,
+    compress_segment_stepwise,
     read_chunks,
     read_last_piece,
     read_metadata,
@@ -26,7 +26,7 @@ NAME: Final = "00000001_2026-11-22T03-00-00Z.arrows"
 
 def _written(of: SegmentMetadata, packed: bool) -> bytes:
     path = folder() / f"seed-{NAME}"
-    writer = SingleSegmentWriter(path, of)
+    writer = SegmentFileWriter(path, of)
     for i in range(3):
         rng = np.random.default_rng(i)
         rows = make_block(10**18 + np.arange(4) * 10**7, rng.normal(size=(4, 6)), np.full(4, 20.0), np.arange(4), i)
@@ -36,7 +36,7 @@ def _written(of: SegmentMetadata, packed: bool) -> bytes:
             writer.write_chunks([Chunk(rng.bytes(9), 10**18 + i, i, b"beside"[:i])])
     writer.close()
     if packed:
-        list(compress_segment(path))
+        list(compress_segment_stepwise(path))
     data = path.read_bytes()
     path.unlink()
     return data
@@ -78,7 +78,7 @@ def segment(data: bytes) -> None:
         pieces = [*read_samples(path)]
         last = read_last_piece(path)
         assert last is None or pieces
-        for _ in compress_segment(path):
+        for _ in compress_segment_stepwise(path):
             pass
     except RecordingError as error:
         one_line(error)

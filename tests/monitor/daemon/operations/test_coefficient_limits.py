@@ -59,7 +59,7 @@ def test_a_limit_is_crossed_once_and_back_once() -> None:
 def test_a_value_whose_interval_reaches_under_the_limit_has_not_crossed_it() -> None:
     limits = LimitMonitor([N_ABOVE], None)
     assert told(limits, [(float(t), 2.5e-4) for t in range(600)], error=0.6e-4) == []
-    assert limits.limits_crossed_now == ()
+    assert limits.coefficients_beyond_limits == ()
 
 
 def test_one_look_under_the_limit_begins_the_time_anew() -> None:
@@ -77,7 +77,7 @@ def test_a_look_without_an_answer_shows_nothing_either_way() -> None:
         e for t in range(200, 400) for e in limits.check_estimate(look(float(t), 0.0, status=Status.UNESTIMATED))
     ]
     assert unknown == []
-    assert limits.limits_crossed_now == ("gz N",)
+    assert limits.coefficients_beyond_limits == ("gz N",)
 
 
 def test_what_is_missing_proves_nothing() -> None:
@@ -86,7 +86,7 @@ def test_what_is_missing_proves_nothing() -> None:
     assert limits.check_estimate(look(0.0, 2.5e-4)) == []
     later = replace(look(0.5, 2.5e-4), t_ns=3_600_000_000_000)
     assert limits.check_estimate(later) == []
-    assert limits.limits_crossed_now == ()
+    assert limits.coefficients_beyond_limits == ()
 
 
 def test_an_upper_bound_counts_under_a_lower_limit_and_never_above_an_upper_one() -> None:
@@ -107,7 +107,7 @@ def test_an_upper_bound_counts_under_a_lower_limit_and_never_above_an_upper_one(
 def test_an_upper_bound_is_back_only_when_it_is_under_the_limit_itself() -> None:
     limits = LimitMonitor([N_ABOVE], None)
     told(limits, [(float(t), 2.5e-4) for t in range(61)])
-    assert limits.limits_crossed_now == ("gz N",)
+    assert limits.coefficients_beyond_limits == ("gz N",)
     loose = [e for t in range(61, 200) for e in limits.check_estimate(look(float(t), 2.5e-4, 1e-5, Status.UPPER_BOUND))]
     assert loose == []
     tight = [e for t in range(200, 300) for e in limits.check_estimate(look(float(t), 1e-4, 1e-5, Status.UPPER_BOUND))]
@@ -135,4 +135,4 @@ def test_new_limits_go_on_where_the_old_ones_were() -> None:
     same, other = LimitMonitor([N_ABOVE, N_BELOW], None), LimitMonitor([N_BELOW], None)
     same.copy_states_from(old)
     other.copy_states_from(old)
-    assert (same.limits_crossed_now, other.limits_crossed_now) == (("gz N",), ())
+    assert (same.coefficients_beyond_limits, other.coefficients_beyond_limits) == (("gz N",), ())

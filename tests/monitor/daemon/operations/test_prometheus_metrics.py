@@ -13,7 +13,7 @@ import pytest
 from drivers.data_types import AXES, Event
 from monitor.daemon.operations.prometheus_metrics import MAX_SCRAPES, MISSING_LIBRARY_TEXT, MetricsOutput
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
-from monitor.settings.loading import Metrics
+from monitor.settings.loading import MetricsAddress
 from tests.monitor.publishing import made
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -26,7 +26,7 @@ Numbers = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
 @contextmanager
 def serving(port: int = 0, host: str = "127.0.0.1") -> Iterator[MetricsOutput]:
-    output = MetricsOutput(Metrics(host, port))
+    output = MetricsOutput(MetricsAddress(host, port))
     output.start()
     try:
         yield output
@@ -113,7 +113,7 @@ def test_a_port_that_is_taken_is_said_and_tried_again(monkeypatch: pytest.Monkey
     monkeypatch.setattr("monitor.daemon.operations.prometheus_metrics.RETRY_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        output = MetricsOutput(Metrics("127.0.0.1", port))
+        output = MetricsOutput(MetricsAddress("127.0.0.1", port))
         output.start()
         said = f"127.0.0.1:{port}: Address already in use; trying again"
         wait_for(lambda: output.state == said)

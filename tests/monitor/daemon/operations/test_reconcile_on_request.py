@@ -17,9 +17,9 @@ from drivers.recordings import load_samples
 from monitor.daemon.operations.reconcile_on_request import (
     COMMAND,
     NICENESS_INCREASE,
-    ReconcileJob,
     Reconciler,
-    format_reconcile_result,
+    WindowCopyForReconcile,
+    describe_reconcile_result,
 )
 from monitor.estimation.estimator import Estimator
 from monitor.publishing.zenoh.publisher import Command
@@ -63,18 +63,20 @@ class Asked:
 
 def job(
     device: str = "bench-1", model: Path | None = None, folder: Path | None = None, warm: bool = True
-) -> ReconcileJob:
+) -> WindowCopyForReconcile:
     estimator = Estimator(100.0, N / 100.0)
     estimator.add_samples(make_block(np.arange(N) * 10_000_000, VALUES.copy()))
     temperature_c = WARM if warm else np.full(N, np.nan)
-    return ReconcileJob(device, 1_763_700_000.0, 360_000, estimator.copy_window(), temperature_c, model, folder)
+    return WindowCopyForReconcile(
+        device, 1_763_700_000.0, 360_000, estimator.copy_window(), temperature_c, model, folder
+    )
 
 
 def program(text: str) -> tuple[str, ...]:
     return (sys.executable, "-c", GIVEN + textwrap.dedent(text))
 
 
-def run(text: str, one: ReconcileJob | None = None, limit_s: float = PATIENCE_S) -> tuple[Asked, list[str]]:
+def run(text: str, one: WindowCopyForReconcile | None = None, limit_s: float = PATIENCE_S) -> tuple[Asked, list[str]]:
     """The answer of one query, and what is said of it."""
     reconciler, asked = Reconciler(program(text), limit_s), Asked()
     reconciler.start_reconciliation(one or job(), asked.command)
@@ -241,9 +243,9 @@ def test_the_program_is_this_one() -> None:
 
 def test_a_verdict_without_steps_and_a_step_without_confidence() -> None:
     step = {"kind": "retuned", "effect": "angle_random_walk", "confidence": None}
-    assert format_reconcile_result({"verdict": "explained", "axes": {"gz": {"steps": [step]}}}) == (
+    assert describe_reconcile_result({"verdict": "explained", "axes": {"gz": {"steps": [step]}}}) == (
         "reconcile: explained: gz angle_random_walk retuned"
     )
     assert (
-        format_reconcile_result({"verdict": "unexplained", "axes": {"gz": {"steps": []}}}) == "reconcile: unexplained"
+        describe_reconcile_result({"verdict": "unexplained", "axes": {"gz": {"steps": []}}}) == "reconcile: unexplained"
     )

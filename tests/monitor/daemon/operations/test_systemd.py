@@ -121,7 +121,7 @@ class Freezing:
     def open(self) -> None:
         self._closed.clear()
 
-    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
+    def wait_for_chunks_or_timeout(self, timeout_s: float) -> list[Chunk] | None:
         if self.frozen.is_set():
             self._closed.wait()
             raise LinkLost("closed")

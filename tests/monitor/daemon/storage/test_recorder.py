@@ -17,12 +17,12 @@ from drivers.data_types import Chunk, SampleBlock, concatenate_blocks, make_bloc
 from drivers.decoders import text
 from drivers.driver import AxisMap
 from drivers.recordings import load_samples, segment_file
-from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
+from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.storage import device_recording, recorder, retention
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
-from monitor.settings.loading import Device, Driver, Storage
+from monitor.settings.loading import BuiltLinkAndDecoder, Device, Storage
 from tests.support.loopback_link import LoopbackLink
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -39,7 +39,7 @@ def rows(first: int, n: int, lost: int = 0, start_ns: int = START_NS) -> SampleB
     return make_block(start_ns + index * 10_000_000, values, 20.0 + index * 1e-4, index.astype(np.int64), lost)
 
 
-def written(folder: Path) -> list[segment_file.SegmentPiece]:
+def written(folder: Path) -> list[segment_file.GapFreeSegmentPart]:
     return [piece for path in segment_file.list_segments(folder) for piece in segment_file.read_samples(path)]
 
 
@@ -118,7 +118,7 @@ def test_raw_bytes_come_back_as_chunks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("cut", [1, 7, 200, 1999, 2600])
 def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) -> None:
     path = tmp_path / segment_file.format_segment_name(1, 1.7e9)
-    writer = SingleSegmentWriter(path, SAMPLES)
+    writer = SegmentFileWriter(path, SAMPLES)
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
@@ -131,7 +131,7 @@ def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) 
     newest = segment_file.read_last_piece(path)
     assert newest is not None
     assert newest.samples.ticks[-1] == len(back) - 1
-    list(segment_file.compress_segment(path))
+    list(segment_file.compress_segment_stepwise(path))
     np.testing.assert_array_equal(
         concatenate_blocks([piece.samples for piece in segment_file.read_samples(path)]).values, back.values
     )
@@ -142,7 +142,7 @@ def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
 ) -> None:
     path = tmp_path / segment_file.format_segment_name(1, 1.7e9)
-    writer = SingleSegmentWriter(path, SAMPLES)
+    writer = SegmentFileWriter(path, SAMPLES)
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
@@ -151,12 +151,12 @@ def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
     def open_then_pack(name: Path) -> IO[bytes]:
         file = opened(name)
         monkeypatch.setattr(segment_file, "open_regular_file", opened)
-        list(segment_file.compress_segment(path))
+        list(segment_file.compress_segment_stepwise(path))
         return file
 
     monkeypatch.setattr(segment_file, "open_regular_file", open_then_pack)
     found = read(path)
-    pieces = [found] if isinstance(found, segment_file.SegmentPiece) else list(found)  # type: ignore[call-overload]
+    pieces = [found] if isinstance(found, segment_file.GapFreeSegmentPart) else list(found)  # type: ignore[call-overload]
     assert segment_file.read_metadata(path).packed
     assert pieces[-1].samples.ticks[-1] == 99
 
@@ -165,7 +165,7 @@ def rows_of(n: int) -> np.ndarray:
     return np.concatenate([rows(first, 10).values for first in range(0, n, 10)])
 
 
-class Broken(SingleSegmentWriter):
+class Broken(SegmentFileWriter):
     """A disk that fails in the middle of a batch while ``why`` is set; it writes nothing until it is ``released``."""
 
     why: int | None = None
@@ -299,7 +299,7 @@ def station(folder: Path, keeper: Recorder, window_s: float = 30.0, axes: AxisMa
     for kernels in (ready.window, ready.fit, ready.all):
         kernels.set()
     link = LoopbackLink()
-    driver = Driver(link, decoder, silence_s=0.0)
+    driver = BuiltLinkAndDecoder(link, decoder, silence_s=0.0)
     device = Device.model_construct(
         name="bench", rate_hz=RATE, window_s=window_s, axes=axes or AxisMap(), driver=driver
     )
@@ -335,7 +335,7 @@ def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
     after = station(tmp_path, keeper)
     after.restore.resume_from(keeper.find_recording_tail("bench"))
     assert not after._can_take()  # new samples wait
-    after.rebuild_window()
+    after.refill_window_from_recording()
     assert after._can_take()
     old, new = before.pipeline.estimator.get_estimate(), after.pipeline.estimator.get_estimate()
     assert new.curve.n == old.curve.n == 3000
@@ -370,7 +370,7 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
     keeper.close(PATIENCE_S)
     after = station(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())]))
     after.restore.resume_from(after._recorder.find_recording_tail("bench"))
-    after.rebuild_window()
+    after.refill_window_from_recording()
     old, new = before.pipeline.estimator.get_estimate(), after.pipeline.estimator.get_estimate()
     assert old.curve.terms[0, 2] < old.curve.terms[0, 0]
     np.testing.assert_array_equal(new.curve.terms, old.curve.terms)
@@ -383,9 +383,9 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
     lived(tmp_path, tick_step)
     keeper = Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())])
     after = station(tmp_path, keeper)
-    after.start()
+    after.start_reader_and_resume_recording()
     try:
-        after.rebuild_window()
+        after.refill_window_from_recording()
         if tick_step is None:
             rebuilt_s = time.monotonic()
             wait_for(lambda: time.monotonic() > rebuilt_s + 1.0)  # longer than the lines that come at once would take
@@ -422,7 +422,7 @@ def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s:
     keeper.close(PATIENCE_S)
     after = station(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", axes)]), axes=axes)
     after.restore.resume_from(after._recorder.find_recording_tail("bench"))
-    after.rebuild_window()
+    after.refill_window_from_recording()
     assert after.pipeline.estimator is None
     assert after._can_take() is False or after.ring.free_capacity == after.ring.capacity
     texts = [event.text for event in after.timeline._events]
@@ -435,7 +435,7 @@ def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     (tmp_path / "bench" / segment_file.format_segment_name(901, 1.8e9)).write_bytes(b"")
     after = station(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())]))
     after.restore.resume_from(after._recorder.find_recording_tail("bench"))
-    after.rebuild_window()
+    after.refill_window_from_recording()
     assert after.pipeline.estimator.samples_in_window == 3000
 
 

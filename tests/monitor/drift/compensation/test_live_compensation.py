@@ -5,13 +5,15 @@ import pytest
 
 from drivers.data_types import make_block
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.live_compensation import EVENT_KIND, LiveCompensation
+from monitor.drift.compensation.live_compensation import EVENT_KIND, LiveDriftCompensation
 
 RATE_HZ = 100.0
 SIGMA = 1e-3
 
 
-def fed(live: LiveCompensation, seconds: float, start_s: float = 0.0, scale: float = 1.0, lost: int = 0, seed: int = 0):
+def fed(
+    live: LiveDriftCompensation, seconds: float, start_s: float = 0.0, scale: float = 1.0, lost: int = 0, seed: int = 0
+):
     n = round(seconds * RATE_HZ)
     t_ns = np.round((start_s + np.arange(n) / RATE_HZ) * 1e9).astype(np.int64)
     values = 0.01 + scale * SIGMA * np.random.default_rng(seed).standard_normal((n, 6))
@@ -19,7 +21,7 @@ def fed(live: LiveCompensation, seconds: float, start_s: float = 0.0, scale: flo
 
 
 def test_blocks_keep_what_is_not_a_rate():
-    live = LiveCompensation(RATE_HZ)
+    live = LiveDriftCompensation(RATE_HZ)
     first, second = fed(live, 30.0), fed(live, 10.0, 31.0, lost=100)
     assert (second.lost, len(second)) == (100, 1000)
     assert (first.temperature_c == 21.0).all()
@@ -32,7 +34,7 @@ def test_blocks_keep_what_is_not_a_rate():
 
 
 def test_noise_that_grows_is_an_event_with_its_times():
-    live = LiveCompensation(RATE_HZ)
+    live = LiveDriftCompensation(RATE_HZ)
     fed(live, 100.0)
     for axis in range(3):
         live.apply_identification_result(
@@ -52,7 +54,7 @@ def test_noise_that_grows_is_an_event_with_its_times():
 
 
 def test_another_rate_begins_anew_and_nearly_the_same_does_not():
-    live = LiveCompensation(RATE_HZ)
+    live = LiveDriftCompensation(RATE_HZ)
     fed(live, 20.0)
     kept = live.compensator
     live.set_rate(101.0)

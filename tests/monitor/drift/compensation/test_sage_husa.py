@@ -83,7 +83,7 @@ def test_a_first_level_has_to_be_confirmed():
     for k in range(sage_husa.MIN_CONFIRMED_INTERVALS - 1):
         sage_husa.update_with_interval(row, 50.0, 1.0, 1e-12)
         assert row["rest_count"] == k + 1
-    sage_husa.process_interval_in_motion(row)
+    sage_husa.discard_unconfirmed_level_in_motion(row)
     assert row["rest_count"] == 0.0
     for _ in range(sage_husa.MIN_CONFIRMED_INTERVALS):
         sage_husa.update_with_interval(row, 2.0, 1.0, 1e-12)

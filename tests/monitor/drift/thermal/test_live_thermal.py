@@ -38,7 +38,7 @@ def fed(live, values, warmth, edges=None, lost=0, choose=True):
         missing = lost if hi == edges[-1] else 0
         t_ns = PERIOD_NS * (np.arange(lo, hi) + missing)
         looks += live.process_block(make_block(t_ns, values[lo:hi], warmth[lo:hi], None, missing))
-        while choose and live.run_selection_step():
+        while choose and live.run_selection_step_if_active():
             pass
     return looks
 

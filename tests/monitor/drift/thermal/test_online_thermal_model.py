@@ -27,7 +27,7 @@ class Run:
     def give(self, biases, temperatures):
         for bias, temperature_c in zip(biases, temperatures, strict=True):
             self.looks.append(self.following.predict_and_add_interval(float(bias), 1e-7, float(temperature_c)))
-            while not self.slow and self.following.run_selection_step():
+            while not self.slow and self.following.run_selection_step_if_active():
                 pass
             self.found += [*self.following.take_unexplained_changes(), None][:1]
         return self
@@ -115,7 +115,7 @@ def test_a_choice_is_made_in_pieces_and_holds_nothing_up():
     assert run.following.is_selecting_model
     assert run.looks[-1].text == "the model is being selected"
     pieces = 0
-    while run.following.run_selection_step():
+    while run.following.run_selection_step_if_active():
         pieces += 1
     assert pieces > 10
     run.give(means.bias[40:41], means.temperature_c[40:41])
@@ -130,7 +130,7 @@ def test_choices_follow_at_growing_spacings():
         run.give(means.bias[k : k + 1], means.temperature_c[k : k + 1])
         if run.following.is_selecting_model:
             at.append(k + 1)
-        while run.following.run_selection_step():
+        while run.following.run_selection_step_if_active():
             pass
     assert at[0] == 12
     assert all(later >= REFIT_GROWTH * one for one, later in pairwise(at))

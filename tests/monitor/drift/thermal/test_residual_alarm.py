@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
-from monitor.drift.thermal.residual_alarm import MIN_OUTSIDE, WINDOW_INTERVALS, ResidualAlarm
+from monitor.drift.thermal.residual_alarm import MIN_OUTSIDE, WINDOW_INTERVALS, UnexplainedBiasChangeDetector
 
 MULTI, ONE = PredictionInterval(0.0, -3.0, 3.0), PredictionInterval(1.0, -1.0, 3.0)
 
 
 def told(biases):
-    suspicion = ResidualAlarm()
+    suspicion = UnexplainedBiasChangeDetector()
     return [suspicion.check_interval(bias, MULTI, ONE) for bias in biases]
 
 
@@ -37,7 +37,7 @@ def test_what_was_not_measured_is_no_witness_and_keeps_its_place():
 
 
 def test_outside_now_or_twice_before_is_not_clear():
-    suspicion = ResidualAlarm()
+    suspicion = UnexplainedBiasChangeDetector()
     for bias, clear in [(5.0, False), (0.0, True), (-5.0, False), (0.0, True), (5.0, False), (0.0, False)]:
         suspicion.check_interval(bias, MULTI, ONE)
         assert suspicion.recent_intervals_fit_prediction is clear
@@ -46,7 +46,7 @@ def test_outside_now_or_twice_before_is_not_clear():
 
 
 def test_far_outside_is_no_chance():
-    suspicion = ResidualAlarm()
+    suspicion = UnexplainedBiasChangeDetector()
     assert not suspicion.last_interval_is_far_outside
     for bias, far in [(4.9, False), (5.1, True), (-3.1, True), (1.0, False)]:
         suspicion.check_interval(bias, MULTI, ONE)  # half a width of 2 about 1

@@ -14,7 +14,7 @@ from monitor.drift.thermal.temperature_removal import (
 )
 from monitor.estimation.analysis import analyze
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
-from monitor.publishing.terminal.thermal_output import temperature_notes
+from monitor.publishing.terminal.thermal_output import notes_on_temperature_dependence
 
 RATE_HZ = 2.0
 N = 1e-4
@@ -50,7 +50,7 @@ def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     assert found.coefficients.value[1, 0] == pytest.approx(N, rel=0.03)  # N is as it was
     assert "gy" not in found.dependences
     assert found.axes_explained_by_temperature == ("gx",)
-    (note,) = temperature_notes(found)
+    (note,) = notes_on_temperature_dependence(found)
     assert note.startswith("gx follows its temperature: a cubic explains ")
     assert "without temperature (polynomial 1), K falls from " in note
 

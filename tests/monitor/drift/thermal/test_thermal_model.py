@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from monitor.drift.thermal.thermal_model import ThermalModel, bias_derivatives_by_time_constant, coefficient_covariance
+from monitor.drift.thermal.thermal_model import (
+    ThermalModel,
+    bias_derivatives_by_log_time_constant,
+    coefficient_covariance,
+)
 from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors
 
 X = np.random.default_rng(5).standard_normal(40).cumsum()
@@ -29,7 +33,7 @@ def test_the_bias_bends_with_its_time_constants_as_differences_say():
         moved = tuple(one * np.exp(by if i == at else 0.0) for i, one in enumerate(constants))
         return build_regressors(ThermalModelForm(1, moved), X, 60.0, with_initial_state=True) @ np.array(sizes + start)
 
-    found = bias_derivatives_by_time_constant(
+    found = bias_derivatives_by_log_time_constant(
         model(ThermalModelForm(1, constants), sizes, start), X, np.array(sizes + start)
     )
     want = np.stack([(bias(at, 1e-5) - bias(at, -1e-5)) / 2e-5 for at in (0, 1)], axis=1)

@@ -7,7 +7,7 @@ from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan import batch
 from monitor.estimation.allan.dynamic_allan import MAX_STEPS, compute_dynamic_allan
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
-from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit_coefficients, make_design_matrix
+from monitor.estimation.fit.coefficient_fit import MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.effects import (
     AngleRandomWalk,
@@ -64,7 +64,9 @@ def test_every_step_is_a_batch_over_its_window() -> None:
             batch.rate_slope_from_thirds(window) * RATE_HZ,
             batch.rate_slope_per_tau(window, factors) * RATE_HZ,
         )
-        expected = fit_coefficients(columns, covariances, MeasuredCurve(avar, terms, slope, slopes, entered))
+        expected = fit_coefficients(
+            columns, covariances, MeasuredVariancesAndSlopes(avar, terms, slope, slopes, entered)
+        )
         entered = expected.entered
         lo, hi = deviation_intervals(avar, expected.edf)
         assert found.deviation[row] == pytest.approx(np.sqrt(avar), rel=1e-9)

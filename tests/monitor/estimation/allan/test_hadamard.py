@@ -102,7 +102,9 @@ def test_intervals_hold_what_they_promise():
     rng = np.random.default_rng(22)
     theta = np.array([0.0, 1.0, 0.02, 1e-3, 0.0])
     sources = AngleRandomWalk(N=1.0), BiasInstability(B=0.02**0.5), RateRandomWalk(K=1e-3**0.5)
-    values = sum(np.stack([s.start_series(rate_hz, rng).draw_samples(n) for _ in range(runs)], axis=1) for s in sources)
+    values = sum(
+        np.stack([s.start_series(rate_hz, rng).draw_next_samples(n) for _ in range(runs)], axis=1) for s in sources
+    )
     factors = np.array([4, 16, 64, 128, 170])
     curve = compute_hadamard_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
     white = 1.0 / curve.tau_s  # of these, white noise is all but a ten-thousandth

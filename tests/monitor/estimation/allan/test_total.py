@@ -153,7 +153,9 @@ def test_intervals_hold_what_they_promise_up_to_half_the_record(rate_hz):
         BiasInstability(B=0.02**0.5),
         RateRandomWalk(K=1e-3**0.5),
     )
-    values = sum(np.stack([s.start_series(rate_hz, rng).draw_samples(n) for _ in range(runs)], axis=1) for s in sources)
+    values = sum(
+        np.stack([s.start_series(rate_hz, rng).draw_next_samples(n) for _ in range(runs)], axis=1) for s in sources
+    )
     factors = np.array([64, 128, 256, 384])
     curve = compute_total_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
     truth = sum(s.avar(factors / rate_hz, 1.0 / rate_hz) for s in sources)

@@ -78,7 +78,7 @@ def test_covariance_is_that_of_simulated_curves(source, pair):
     n, factors, runs = 512, np.array([1, 4, 16, 64, 128]), 3000
     t = covariance_table(n, factors)
     rng = np.random.default_rng(11)
-    records = np.stack([source.start_series(1.0, rng).draw_samples(n) for _ in range(runs)], axis=1)
+    records = np.stack([source.start_series(1.0, rng).draw_next_samples(n) for _ in range(runs)], axis=1)
     measured = np.cov(overlapping_avar(records, factors)[0])
     stated = t.covariance[:, :, PAIRS.index(pair)]
     # a sample covariance of 3000 curves scatters by 3–5 % of the two deviations

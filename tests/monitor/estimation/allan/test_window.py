@@ -11,7 +11,13 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_stat
 
 from drivers.errors import ConfigError
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds, rate_slope_per_tau
-from monitor.estimation.allan.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, samples_per_displayed_tau
+from monitor.estimation.allan.window import (
+    FULL_SCALE,
+    MAX_LENGTH,
+    MIN_LENGTH,
+    AllanWindow,
+    newest_samples_per_displayed_tau,
+)
 from monitor.estimation.allan.window_kernel import STAGE_SAMPLES, append_staged_samples
 from tests.experiments.benchmarks import long_run
 
@@ -265,7 +271,7 @@ def test_slope_and_length_are_those_of_the_whole_window():
     for window in (plain, spanned):
         window.append_samples(values)
     assert spanned.samples_in_window == 300
-    assert np.array_equal(plain.rate_slopes_per_axis_and_tau()[0], spanned.rate_slopes_per_axis_and_tau()[0])
+    assert np.array_equal(plain.drift_slopes_by_axis_and_tau()[0], spanned.drift_slopes_by_axis_and_tau()[0])
 
 
 def test_a_transient_leaves_each_row_after_its_own_span():
@@ -290,7 +296,7 @@ def test_impossible_spans_are_refused(factors, spans):
 @pytest.mark.parametrize(("length", "rate_hz"), [(100, 1.0), (100, 100.0), (360_000, 100.0), (3_600_000, 1000.0)])
 def test_quick_spans_fit_any_window(length, rate_hz):
     factors = np.unique([*cluster_sizes(length, rate_hz), length // 2])
-    window = AllanWindow(length, factors, samples_per_displayed_tau(factors, rate_hz, length))
+    window = AllanWindow(length, factors, newest_samples_per_displayed_tau(factors, rate_hz, length))
     assert ((window.spans >= 16 * factors) | (window.spans == length)).all()
     assert (window.spans >= min(10 * rate_hz, length)).all()
 
@@ -507,10 +513,10 @@ class Calls(RuleBasedStateMachine):
         check(self.window, self.held)
         if len(self.held) >= 3:
             np.testing.assert_allclose(
-                self.window.rate_slopes_per_axis_and_tau()[0], rate_slope_from_thirds(self.held), rtol=1e-6, atol=1e-12
+                self.window.drift_slopes_by_axis_and_tau()[0], rate_slope_from_thirds(self.held), rtol=1e-6, atol=1e-12
             )
             seen, true = (
-                self.window.rate_slopes_per_axis_and_tau()[1],
+                self.window.drift_slopes_by_axis_and_tau()[1],
                 rate_slope_per_tau(self.held, self.window.factors),
             )
             assert np.array_equal(np.isnan(seen), np.isnan(true))
@@ -549,16 +555,16 @@ def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
     window.keep_newest(4, 60)
     lengths = np.full(6, LENGTH)
     lengths[4] = 60
-    assert np.isnan(window.rate_slopes_per_axis_and_tau()[0][4])
-    assert window.rate_slopes_per_axis_and_tau(lengths)[0][4] == pytest.approx(
+    assert np.isnan(window.drift_slopes_by_axis_and_tau()[0][4])
+    assert window.drift_slopes_by_axis_and_tau(lengths)[0][4] == pytest.approx(
         rate_slope_from_thirds(values[-60:])[4], rel=1e-6
     )
-    assert window.rate_slopes_per_axis_and_tau(lengths)[0][[0, 5]] == pytest.approx(
+    assert window.drift_slopes_by_axis_and_tau(lengths)[0][[0, 5]] == pytest.approx(
         rate_slope_from_thirds(values)[[0, 5]], rel=1e-6
     )
     expected = rate_slope_per_tau(values[-60:], FACTORS)[:, 4]
     there = np.isfinite(expected)
-    assert window.rate_slopes_per_axis_and_tau(lengths)[1][there, 4] == pytest.approx(expected[there], rel=1e-6)
+    assert window.drift_slopes_by_axis_and_tau(lengths)[1][there, 4] == pytest.approx(expected[there], rel=1e-6)
 
 
 # --- for ever
@@ -579,20 +585,20 @@ def test_a_small_gap_leaves_the_slope(gap):
     whole.append_samples(values)
     values[at : at + missing] = np.nan
     window.append_samples(values)
-    np.testing.assert_allclose(window.rate_slopes_per_axis_and_tau()[0], rate_slope_from_thirds(values), rtol=1e-9)
+    np.testing.assert_allclose(window.drift_slopes_by_axis_and_tau()[0], rate_slope_from_thirds(values), rtol=1e-9)
     np.testing.assert_allclose(
-        window.rate_slopes_per_axis_and_tau()[0], whole.rate_slopes_per_axis_and_tau()[0], rtol=0.01
+        window.drift_slopes_by_axis_and_tau()[0], whole.drift_slopes_by_axis_and_tau()[0], rtol=0.01
     )
     # a missing sample stands for the level, here up to the whole ramp away
     np.testing.assert_allclose(
-        window.rate_slopes_per_axis_and_tau()[1][3:], whole.rate_slopes_per_axis_and_tau()[1][3:], rtol=0.05
+        window.drift_slopes_by_axis_and_tau()[1][3:], whole.drift_slopes_by_axis_and_tau()[1][3:], rtol=0.05
     )
     np.testing.assert_allclose(
-        rate_slope_per_tau(values, factors)[3:], whole.rate_slopes_per_axis_and_tau()[1][3:], rtol=0.05
+        rate_slope_per_tau(values, factors)[3:], whole.drift_slopes_by_axis_and_tau()[1][3:], rtol=0.05
     )
     values[:100] = np.nan
     window.append_samples(values)
-    assert np.isnan(window.rate_slopes_per_axis_and_tau()[0]).all()
+    assert np.isnan(window.drift_slopes_by_axis_and_tau()[0]).all()
     assert np.isnan(rate_slope_from_thirds(values)).all()
-    assert np.isnan(window.rate_slopes_per_axis_and_tau()[1]).all()
+    assert np.isnan(window.drift_slopes_by_axis_and_tau()[1]).all()
     assert np.isnan(rate_slope_per_tau(values, factors)).all()

@@ -6,9 +6,12 @@ from scipy.signal import lfilter
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from monitor.estimation.detection.change_detection import LEARN_S, ChangeDetector
+from monitor.estimation.detection.change_detection import LEARN_S, NoiseAndBiasChangeDetector
 from monitor.estimation.detection.change_kernel import TICK_SAMPLES, F, N, S
-from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_changed_coefficients
+from monitor.estimation.detection.changed_coefficient_identification import (
+    HaarVariancesBeforeAfter,
+    identify_changed_coefficients,
+)
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
@@ -25,7 +28,7 @@ def white(n, seed=0):
 
 
 def found(values, rate_hz=100.0, **options):
-    detector = ChangeDetector(rate_hz, **options)
+    detector = NoiseAndBiasChangeDetector(rate_hz, **options)
     detector.process_samples(values)
     return detector.take_changes()
 
@@ -52,7 +55,7 @@ def eventful():
 @pytest.mark.parametrize("seed", range(3))
 def test_blocks_of_any_cut_equal_one_by_one(seed):
     values = eventful()
-    whole, cut = ChangeDetector(100.0), ChangeDetector(100.0)
+    whole, cut = NoiseAndBiasChangeDetector(100.0), NoiseAndBiasChangeDetector(100.0)
     whole.process_samples(values)
     edges = np.unique(np.random.default_rng(seed).integers(0, len(values), 200))
     for part in np.split(values, edges):
@@ -66,7 +69,7 @@ def test_blocks_of_any_cut_equal_one_by_one(seed):
 
 def test_one_by_one_equals_the_block():
     values = eventful()[:13_000]
-    whole, single = ChangeDetector(100.0), ChangeDetector(100.0)
+    whole, single = NoiseAndBiasChangeDetector(100.0), NoiseAndBiasChangeDetector(100.0)
     whole.process_samples(values)
     for row in values:
         single.process_samples(row[None])
@@ -76,7 +79,7 @@ def test_one_by_one_equals_the_block():
 
 def test_the_reference_is_the_allan_variance_of_disjoint_pairs():
     values = white(1 << 16)
-    detector = ChangeDetector(100.0)
+    detector = NoiseAndBiasChangeDetector(100.0)
     detector.process_samples(values)
     band = detector._state.band
     for j in (0, 3, 4, 5, 8):
@@ -90,7 +93,7 @@ def test_the_reference_is_the_allan_variance_of_disjoint_pairs():
 def test_a_missing_sample_costs_its_own_differences_only():
     values = white(4096)
     values[1000, GZ] = np.nan
-    detector = ChangeDetector(100.0)
+    detector = NoiseAndBiasChangeDetector(100.0)
     detector.process_samples(values)
     terms = detector._state.band[GZ, :9, N]
     pairs = 4096 // (2 << np.arange(9))
@@ -103,7 +106,7 @@ def test_a_missing_sample_costs_its_own_differences_only():
 
 def test_skipped_samples_are_missing_samples():
     values = white(12_000)
-    one, other = ChangeDetector(100.0), ChangeDetector(100.0)
+    one, other = NoiseAndBiasChangeDetector(100.0), NoiseAndBiasChangeDetector(100.0)
     one.process_samples(values[:5000])
     one.skip_missing_samples(700)
     one.process_samples(values[5000:])
@@ -145,7 +148,7 @@ def test_a_steady_resonance_has_fewer_degrees_of_freedom():
     rng = np.random.default_rng(2)
     values = white(200_000)
     values[:, GZ] += 3.0 * SIGMA * lfilter([0.2], [1.0, -1.2, 0.98], rng.standard_normal(200_000))
-    detector = ChangeDetector(100.0)
+    detector = NoiseAndBiasChangeDetector(100.0)
     detector.process_samples(values)
     assert detector.take_changes() == []
     assert detector._state.band[GZ, 1, F] > 3.0
@@ -221,7 +224,7 @@ def test_a_burst_is_told_once_and_forgotten():
     values = white(80_000)
     at = 20_000 + np.random.default_rng(1).choice(300, 20, replace=False)
     values[at, GZ] += 0.05 * np.random.default_rng(3).standard_normal(20)
-    detector = ChangeDetector(100.0)
+    detector = NoiseAndBiasChangeDetector(100.0)
     detector.process_samples(values)
     (change,) = detector.take_changes()
     assert (change.kind, AXES[change.axis]) == ("outlier_burst", "gz")
@@ -309,7 +312,7 @@ def test_nothing_known_names_nothing():
 
 
 def test_learned_after_its_time():
-    detector = ChangeDetector(100.0)
+    detector = NoiseAndBiasChangeDetector(100.0)
     detector.process_samples(white(int(LEARN_S * 100) - TICK_SAMPLES))
     assert not detector.octaves_ready_for_alarm[0].any()
     detector.process_samples(white(4 * TICK_SAMPLES))
@@ -324,17 +327,17 @@ def test_learned_after_its_time():
 @pytest.mark.parametrize(("rate", "alarms"), [(0.0, 1.0), (float("nan"), 1.0), (100.0, 0.0), (100.0, -1.0)])
 def test_impossible_arguments(rate, alarms):
     with pytest.raises(ConfigError):
-        ChangeDetector(rate, alarms)
+        NoiseAndBiasChangeDetector(rate, alarms)
 
 
 def test_samples_of_another_shape():
     with pytest.raises(ValueError, match="expected is"):
-        ChangeDetector(100.0).process_samples(np.zeros((3, 5)))
+        NoiseAndBiasChangeDetector(100.0).process_samples(np.zeros((3, 5)))
 
 
 @pytest.mark.parametrize(("rate_hz", "alarms_per_day"), [(1e6, 1e-6), (1e-3, 1e4), (1e9, 1e-6)])
 def test_thresholds_are_finite_at_the_ends_of_what_is_supported(rate_hz: float, alarms_per_day: float) -> None:
     """The share of false alarms for one look is far below the distance of 1 from the next smaller double."""
-    levels = ChangeDetector(rate_hz, alarms_per_day)._state.levels
+    levels = NoiseAndBiasChangeDetector(rate_hz, alarms_per_day)._state.levels
     assert np.isfinite(levels).all()
     assert levels[2] > 2.0  # standard deviations

@@ -14,7 +14,7 @@ from monitor.estimation.detection.line_and_outlier_detection import (
     MIN_STRETCHES,
     ROWS,
     allan_variance_share_of_line,
-    detect_spectral_lines,
+    detect_spectral_lines_per_axis,
     outlier_share_of_axes,
 )
 
@@ -35,7 +35,7 @@ def curve_of(values):
 
 
 def found(values, moving=None):
-    return detect_spectral_lines(
+    return detect_spectral_lines_per_axis(
         values, np.zeros(len(values), bool) if moving is None else moving, RATE_HZ, curve_of(values)
     )
 
@@ -103,7 +103,7 @@ def test_what_adds_less_than_matters_is_not_told():
     )
     quiet = curve_of(strong)
     quiet.avar[:] *= 2.0 * line.share / MIN_LINE_SHARE
-    assert detect_spectral_lines(strong, np.zeros(600_000, bool), RATE_HZ, quiet) == []
+    assert detect_spectral_lines_per_axis(strong, np.zeros(600_000, bool), RATE_HZ, quiet) == []
 
 
 def test_the_strongest_of_an_axis_come_first_and_no_more_than_three():
@@ -260,7 +260,7 @@ def test_next_to_no_samples_are_no_error(n):
     values = np.ones((n, 6))
     nothing = np.full((1, 6), np.nan)
     curve = AllanCurve(np.ones(1), np.ones(1, np.int64), nothing, nothing, nothing, nothing, nothing, n)
-    assert detect_spectral_lines(values, np.zeros(n, bool), RATE_HZ, curve) == []
+    assert detect_spectral_lines_per_axis(values, np.zeros(n, bool), RATE_HZ, curve) == []
     assert shares(values).shape == (6,)
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from drivers.data_types import Event
+from monitor.estimation.detection.comparison_with_noise_model import MIN_SAMPLES, AxisModelComparison, ModelComparison
 from monitor.estimation.detection.model_agreement_monitor import KIND, RENEWED_SHARE, ModelAgreementMonitor
-from monitor.estimation.detection.model_comparison import MIN_SAMPLES, AxisModelComparison, ModelComparison
 
 STEP = 100  # samples from look to look
 WINDOW = 40_000

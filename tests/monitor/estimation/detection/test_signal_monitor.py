@@ -74,21 +74,21 @@ def test_what_is_at_rest_can_be_had_whatever_is_handed_on(remove_motion):
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
     watch = SignalMonitor(RATE_HZ, remove_motion, keep_samples_at_rest=True)
     feed(watch, values)
-    still = np.concatenate([one.values for one in watch.take_samples_at_rest()])
+    still = np.concatenate([one.values for one in watch.take_samples_with_motion_masked()])
     assert len(still) < len(values)  # the last are not judged yet
     watch.flush_delayed_samples()
-    still = np.concatenate([still, *(one.values for one in watch.take_samples_at_rest())])
+    still = np.concatenate([still, *(one.values for one in watch.take_samples_with_motion_masked())])
     struck = np.isnan(still[:, 0])
     assert struck.sum() == watch.samples_in_motion > 300
     assert np.array_equal(still[~struck], values[~struck])
-    assert watch.take_samples_at_rest() == []
+    assert watch.take_samples_with_motion_masked() == []
     assert watch.orientation_changes == 0
 
 
 def test_still_samples_are_kept_only_for_who_wants_them():
     watch = SignalMonitor(RATE_HZ)
     feed(watch, noise(1000))
-    assert watch.take_samples_at_rest() == []
+    assert watch.take_samples_with_motion_masked() == []
 
 
 def test_being_left_in_another_orientation_is_counted():

@@ -11,7 +11,7 @@ from scipy.stats import binom
 from drivers.data_types import AXES
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit_coefficients, make_design_matrix
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
@@ -35,7 +35,7 @@ def fit_values(values: np.ndarray, with_slope: bool = True, **more) -> Fit:
     factors = cluster_sizes(len(values), RATE_HZ)
     avar, terms = overlapping_avar(values, factors)
     slope = rate_slope_from_thirds(values) * RATE_HZ if with_slope else None
-    measured = MeasuredCurve(avar, terms, slope)
+    measured = MeasuredVariancesAndSlopes(avar, terms, slope)
     return fit_coefficients(
         make_design_matrix(factors, RATE_HZ), covariance_table(len(values), factors), measured, **more
     )
@@ -64,7 +64,9 @@ def exact_curve(theta: np.ndarray, n: int = N) -> Fit:
     t = covariance_table(n, factors)
     columns = np.repeat(avar[:, None], 6, axis=1)
     return fit_coefficients(
-        make_design_matrix(factors, RATE_HZ), t, MeasuredCurve(columns, np.repeat(t.terms[:, None], 6, axis=1))
+        make_design_matrix(factors, RATE_HZ),
+        t,
+        MeasuredVariancesAndSlopes(columns, np.repeat(t.terms[:, None], 6, axis=1)),
     )
 
 
@@ -181,7 +183,7 @@ def test_hysteresis_enters_late_and_leaves_late():
     for b in np.linspace(1e-5, 1e-4, 60):
         theta[2] = b**2
         avar = sum(x * s.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for x, s in zip(theta, UNIT_SOURCES, strict=True))
-        measured = MeasuredCurve(np.repeat(avar[:, None], 6, 1), np.repeat(t.terms[:, None], 6, 1))
+        measured = MeasuredVariancesAndSlopes(np.repeat(avar[:, None], 6, 1), np.repeat(t.terms[:, None], 6, 1))
         both = [replace(measured, entered_before=before) for before in (never, always)]
         entered.append([fit_coefficients(make_design_matrix(factors, RATE_HZ), t, one).entered[2, 0] for one in both])
     entered = np.array(entered)
@@ -198,7 +200,7 @@ def test_too_few_tau_is_unestimated_but_has_degrees_of_freedom():
     values = np.random.default_rng(0).standard_normal((64, 6))
     avar, terms = overlapping_avar(values, factors)
     result = fit_coefficients(
-        make_design_matrix(factors, RATE_HZ), covariance_table(64, factors), MeasuredCurve(avar, terms)
+        make_design_matrix(factors, RATE_HZ), covariance_table(64, factors), MeasuredVariancesAndSlopes(avar, terms)
     )
     assert (result.coefficients.status == Status.UNESTIMATED).all()
     assert np.isnan(result.coefficients.hi).all()
@@ -253,7 +255,7 @@ def test_where_the_terms_are_no_description_none_is_more_than_the_curve():
     factors = cluster_sizes(t.size, 100.0)
     avar, terms = overlapping_avar(values, factors)
     columns = make_design_matrix(factors, 100.0)
-    found = fit_coefficients(columns, covariance_table(t.size, factors), MeasuredCurve(avar, terms))
+    found = fit_coefficients(columns, covariance_table(t.size, factors), MeasuredVariancesAndSlopes(avar, terms))
     assert (found.misfit > 1.0).all()
     c = found.coefficients
     for axis in range(6):

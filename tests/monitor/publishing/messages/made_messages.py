@@ -8,17 +8,17 @@ from drivers.data_types import Event
 from monitor.common.device_health import Health
 from monitor.drift.thermal.bias_temperature_tests import TemperatureDependence
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
+from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
-from monitor.drift.thermal.temperature_removal import TemperatureRemoval
+from monitor.drift.thermal.temperature_removal import TemperatureRemovalComparison
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.model_comparison import AxisModelComparison, ModelComparison
-from monitor.estimation.detection.motion_detection import Motion
+from monitor.estimation.detection.comparison_with_noise_model import AxisModelComparison, ModelComparison
+from monitor.estimation.detection.motion_detection import MotionEpisode
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
 from monitor.estimation.fit.coefficient_values import Coefficients, Status
@@ -36,7 +36,7 @@ from monitor.publishing.messages.results import (
     ModelGapMessage,
     ResetReply,
     StatusMessage,
-    ThermalMessage,
+    ThermalPredictionMessage,
     TotalAndHadamardCurves,
     TotalAndHadamardMessage,
 )
@@ -83,18 +83,18 @@ def gap() -> ModelComparison:
 
 
 def thermal() -> ThermalIntervalResult:
-    gz = PredictedAxisInterval(
+    gz = MeasuredAndPredictedMean(
         3e-4, 1e-6, PredictionInterval(2e-4, 1e-4, 3e-4), PredictionInterval(2.2e-4, 1.8e-4, 2.6e-4), "linear", 2e-5, ""
     )
-    az = PredictedAxisInterval(9.81, np.nan, None, None, "", np.nan, "the temperature hardly moved")
+    az = MeasuredAndPredictedMean(9.81, np.nan, None, None, "", np.nan, "the temperature hardly moved")
     return ThermalIntervalResult(0, 600.0, 25.5, {"gz": gz, "az": az})
 
 
-def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
+def slow_curves() -> tuple[TotalVarianceCurve, HadamardCurve]:
     found = estimate().curve
     lo = found.lo.copy()
     lo[1:] = np.nan
-    total = TotalCurve(TAU_S, found.factors, found.avar, found.terms, found.edf, lo, found.hi)
+    total = TotalVarianceCurve(TAU_S, found.factors, found.avar, found.terms, found.edf, lo, found.hi)
     two = slice(0, 2)
     hadamard = HadamardCurve(
         TAU_S[two], found.factors[two], 0.25 * found.avar[two], found.terms[two], found.edf[two], lo[two], found.hi[two]
@@ -117,7 +117,7 @@ def health() -> Health:
 
 
 def analysis() -> RecordingAnalysis:
-    motion = Motion("knock", 250, 400, 0.5, "gx", 0.25, "knocked")
+    motion = MotionEpisode("knock", 250, 400, 0.5, "gx", 0.25, "knocked")
     noise = Change("noise_changed", 2, 25_000, 25_100, 9.5, {"N": (1.5e-4, 2.5e-4)}, "gz rose")
     line = Change("noise_changed", 0, 30_000, 30_100, 12.0, {"band": (10.0, 20.0), "rms": (1e-3, 2e-3)}, "gx line")
     found = estimate()
@@ -138,8 +138,8 @@ def dynamic() -> DynamicAllan:
     )  # fmt: skip
 
 
-def without_temperature() -> TemperatureRemoval:
-    return TemperatureRemoval(
+def without_temperature() -> TemperatureRemovalComparison:
+    return TemperatureRemovalComparison(
         {"gz": "cubic"}, coefficients(), coefficients(0.5), (False,) * 6,
         {"gz": TemperatureDependence(0.75, 1e-6, "cubic", True, 60.0)},
     )  # fmt: skip
@@ -179,7 +179,7 @@ def messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
         "coefficients": CoefficientsMessage.from_result(device, UNIX_S, 0, estimate()),
         "total": TotalAndHadamardMessage.from_result(device, UNIX_S, 360_000, TotalAndHadamardCurves(*slow_curves())),
         "gap": ModelGapMessage.from_result(device, UNIX_S, 0, gap()),
-        "thermal": ThermalMessage.from_result(device, UNIX_S, 360_000, thermal()),
+        "thermal": ThermalPredictionMessage.from_result(device, UNIX_S, 360_000, thermal()),
         "event": EventMessage.from_result(device, UNIX_S, 7, event()),
         "event_plain": EventMessage.from_result(device, UNIX_S, 7, Event("link_back", 0, "back")),
         "status": StatusMessage.from_result(device, UNIX_S, 0, health()),

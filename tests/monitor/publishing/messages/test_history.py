@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from drivers.data_types import AXES
 from monitor.estimation.fit.coefficient_values import SYMBOLS
-from monitor.history.bucket import STATES, HistoryRow, merge_rows
+from monitor.history.history_row import STATES, HistoryRow, merge_rows
 from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.query_parameters import PARTS, HistoryQuery
@@ -32,7 +32,7 @@ def made() -> HistoryTable:
     looks = [(0.0, 1000.0), (20.0, 1200.0), (60.0, 3600.0), (70.0, 3500.0)]
     rows = [minutes.add_estimate(T0 + at, estimate(seconds=seconds, seed=i)) for i, (at, seconds) in enumerate(looks)]
     rows.append(minutes.add_health(T0 + 75.0, health(received=7000)))
-    rows.append(minutes.generate_temperature(T0 + 76.0, np.array([21.5])))
+    rows.append(minutes.add_temperature(T0 + 76.0, np.array([21.5])))
     rows.append(minutes.add_health(T0 + 130.0, health(state="lost", received=7000, rate_hz=None, latency_p99_s=None)))
     rows.append(minutes.flush())
     full: list[HistoryRow] = [row for row in rows if row is not None]

@@ -13,7 +13,7 @@ from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan
 from monitor.estimation.allan.hadamard import compute_hadamard_curve
 from monitor.estimation.allan.total import compute_total_curve
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.motion_detection import Motion
+from monitor.estimation.detection.motion_detection import MotionEpisode
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.publishing.messages.analysis_json import AnalysisMessage
 from monitor.publishing.messages.results import (
@@ -24,7 +24,7 @@ from monitor.publishing.messages.results import (
     ReconcileReply,
     ResetReply,
     StatusMessage,
-    ThermalMessage,
+    ThermalPredictionMessage,
     TotalAndHadamardCurves,
     TotalAndHadamardMessage,
 )
@@ -56,7 +56,7 @@ ALL = {
         "bench-1", UNIX_S, 360_000, TotalAndHadamardCurves(*made.slow_curves())
     ).encode(),
     topics.GAP: ModelGapMessage.from_result("bench-1", UNIX_S, 0, made.look(gz=False, gx=True)).encode(),
-    topics.THERMAL: ThermalMessage.from_result("bench-1", UNIX_S, 360_000, made.thermal_look()).encode(),
+    topics.THERMAL: ThermalPredictionMessage.from_result("bench-1", UNIX_S, 360_000, made.thermal_look()).encode(),
     topics.EVENT: EventMessage.from_result("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back")).encode(),
     topics.STATUS: StatusMessage.from_result("bench-1", UNIX_S, 0, made.health()).encode(),
     topics.RESET: ResetReply.from_result("bench-1", UNIX_S, 360_000, "the window is empty").encode(),
@@ -286,7 +286,7 @@ def test_a_bandwidth_is_a_number_or_null() -> None:
 
 
 def test_motions_and_changes_are_told_with_their_times() -> None:
-    motion = Motion("knock", 250, 400, 0.5, "gx", 0.3, "knocked: gx up to 17 °/s")
+    motion = MotionEpisode("knock", 250, 400, 0.5, "gx", 0.3, "knocked: gx up to 17 °/s")
     noise = Change(
         "noise_changed", 2, 25_000, 25_100, 9.1, {"N": (1.5e-4, 2.2e-4)}, "gz angle random walk rose by 47 %"
     )

@@ -18,7 +18,7 @@ from monitor.publishing.plots.reconcile_figures import (
     zoomed_view,
 )
 from monitor.publishing.plots.style import COLOURS, ORANGE
-from monitor.reconcile.result import Location, ParameterInterval, PlotData
+from monitor.reconcile.result import DiagnosticPlotData, Location, ParameterInterval
 from tests.monitor.reconcile import samples
 
 pytest.importorskip("matplotlib")
@@ -30,7 +30,7 @@ PEAK = Location(frequency=(17.1, 17.5))
 
 
 def drawing(
-    *views: PlotData, where: Location | None = None, width: float = 4.0, height: float = 2.5
+    *views: DiagnosticPlotData, where: Location | None = None, width: float = 4.0, height: float = 2.5
 ) -> ElementTree.Element:
     return ElementTree.fromstring(
         diagnostic_comparison_svg([(f"panel {i}", view) for i, view in enumerate(views)], "gz", width, height, where)

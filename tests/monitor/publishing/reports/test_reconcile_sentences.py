@@ -9,7 +9,8 @@ from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, AngleRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.reconcile.result import AddedOrResizedEffect, Location, ParameterInterval, Reconciliation, RunnerUp
+from monitor.reconcile.result import AddedOrResizedEffect, AlternativeEffect, Location, ParameterInterval
+from monitor.reconcile.summary.ranked_findings import rank_findings
 from tests.monitor.reconcile import samples
 
 NO_MODEL = NoiseModel({})
@@ -91,23 +92,10 @@ def test_a_place_is_said_with_its_unit(where: Location, said: str) -> None:
     assert words.format_range(where, "gz") == said
 
 
-@pytest.mark.parametrize(
-    ("made", "said"),
-    [
-        (samples.agrees(), "The model and the recording agree: on all 6 axes, no diagnostic shows a difference "
-                           "larger than chance."),
-        (samples.explained(), "The model and the recording differ by more than chance on gz. With 1 added effect "
-                              "(sinusoidal) and 1 retuned term (angle random walk), no difference larger than chance "
-                              "remains."),
-        (samples.partly_explained(), "The model and the recording differ by more than chance on gz. The "
-                                     "difference is partly explained with 1 added effect (sinusoidal). On gz, a "
-                                     "difference remains that no known effect explains."),
-        (samples.unexplained(), "The model of five classic terms, fitted first, and the recording differ by more than "
-                                "chance on ax. No known effect explains the difference, so no effect is named."),
-    ],
-)  # fmt: skip
-def test_the_verdict_is_a_plain_sentence(made: Reconciliation, said: str) -> None:
-    assert words.summarize(made) == said
+def test_the_influence_on_the_allan_deviation_has_its_averaging_time() -> None:
+    line, white = rank_findings(samples.explained()).findings
+    assert words.describe_allan_influence(line) == "× 1.05 at τ = 0.02 s (gz)"
+    assert words.describe_allan_influence(replace(white, influences={})) == "—"
 
 
 def test_runners_up_are_named_with_their_share() -> None:
@@ -118,5 +106,5 @@ def test_runners_up_are_named_with_their_share() -> None:
     assert (
         words.describe_alternatives(replace(step, runners_up=())) == "No other effect explains the gap nearly as well."
     )
-    alone = words.describe_alternatives(replace(step, runners_up=(RunnerUp("bias_step", 0.31),)))
+    alone = words.describe_alternatives(replace(step, runners_up=(AlternativeEffect("bias_step", 0.31),)))
     assert alone == "Less likely explanations of the same gap: bias step (31.0 %)."

@@ -7,18 +7,18 @@ from monitor.publishing.rerun.allan_chart import (
     FILL_STEPS,
     HEIGHT,
     WIDTH,
-    ChartScale,
+    ChartDecadeRange,
     band_strokes,
     chart_grid,
     decade_range,
     finite_sections,
     interval_strokes,
 )
-from monitor.publishing.rerun.decimation import ROWS_PER_FLUSH, ROWS_PER_S, average_buckets, decimate_extremes
+from monitor.publishing.rerun.panels.decimation import ROWS_PER_FLUSH, ROWS_PER_S, average_buckets, decimate_extremes
 
 
 def test_decades_become_the_corners_of_the_box():
-    scale = ChartScale((-2, 3), (0, 3))
+    scale = ChartDecadeRange((-2, 3), (0, 3))
     at = scale.to_chart_positions(np.array([0.01, 1000.0, 1.0]), np.array([1000.0, 1.0, 0.0]))
     assert at[0] == pytest.approx([0.0, 0.0])
     assert at[1] == pytest.approx([WIDTH, HEIGHT])
@@ -26,7 +26,7 @@ def test_decades_become_the_corners_of_the_box():
 
 
 def test_white_noise_falls_by_half_a_decade_a_decade():
-    scale = ChartScale((0, 4), (0, 4))
+    scale = ChartDecadeRange((0, 4), (0, 4))
     tau = np.array([1.0, 10.0, 100.0])
     at = scale.to_chart_positions(tau, 1000.0 / np.sqrt(tau))
     assert np.diff(at[:, 1]) / HEIGHT * 4 == pytest.approx(0.5)
@@ -40,7 +40,7 @@ def test_the_scale_holds_its_data_and_no_decade_more():
 
 
 def test_every_decade_has_a_labelled_tick():
-    drawn = chart_grid(ChartScale((-2, 3), (-1, 2)))
+    drawn = chart_grid(ChartDecadeRange((-2, 3), (-1, 2)))
     labels = [label for _, _, label in drawn.ticks]
     assert labels == ["0.01", "0.1", "1", "10", "100", "1000", "0.1", "1", "10", "100"]
     assert len(drawn.minor) == 8 * (5 + 3)

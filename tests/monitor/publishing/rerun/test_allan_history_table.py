@@ -18,7 +18,10 @@ def scaled(factor: float) -> Estimate:
 
 def test_a_column_is_the_geometric_mean_of_its_estimates() -> None:
     surface = AllanHistory(column_s=2.0)
-    done = [surface.add_estimate(float(t), scaled(factor)) for t, factor in enumerate((1.0, 4.0, 2.0, 8.0, 8.0))]
+    done = [
+        surface.add_estimate_and_check_column_complete(float(t), scaled(factor))
+        for t, factor in enumerate((1.0, 4.0, 2.0, 8.0, 8.0))
+    ]
     assert done == [False, False, True, False, True]
     assert surface.ends_s == [2.0, 4.0]
     first, second = surface.log_ratio_to_median()[:, 3, 2]
@@ -30,7 +33,7 @@ def test_the_history_stays_bounded_and_keeps_its_whole_span() -> None:
     surface = AllanHistory(column_s=1.0)
     most = 0
     for t in range(5000):
-        surface.add_estimate(float(t), scaled(2.0 if t < 2500 else 6.0))
+        surface.add_estimate_and_check_column_complete(float(t), scaled(2.0 if t < 2500 else 6.0))
         most = max(most, len(surface.ends_s))
     assert COLUMNS / 2 <= len(surface.ends_s) < COLUMNS
     assert most < COLUMNS
@@ -47,13 +50,13 @@ def test_the_history_stays_bounded_and_keeps_its_whole_span() -> None:
 def test_other_averaging_times_or_an_earlier_time_begin_anew() -> None:
     surface = AllanHistory(column_s=1.0)
     for t in range(10):
-        surface.add_estimate(float(t), ESTIMATE)
+        surface.add_estimate_and_check_column_complete(float(t), ESTIMATE)
     assert len(surface.ends_s) == 9
-    surface.add_estimate(4.0, ESTIMATE)
+    surface.add_estimate_and_check_column_complete(4.0, ESTIMATE)
     assert surface.ends_s == []
-    surface.add_estimate(5.0, ESTIMATE)
+    surface.add_estimate_and_check_column_complete(5.0, ESTIMATE)
     assert surface.ends_s == [5.0]
-    surface.add_estimate(6.0, made.estimate(seconds=60.0))
+    surface.add_estimate_and_check_column_complete(6.0, made.estimate(seconds=60.0))
     assert surface.ends_s == []
     assert surface.tau_s.size < ESTIMATE.curve.tau_s.size
 
@@ -66,7 +69,7 @@ def test_what_is_not_measured_has_no_colour() -> None:
     surface = AllanHistory(column_s=1.0)
     assert surface.log_ratio_to_median().shape == (0, 0, 6)
     for t in range(3):
-        surface.add_estimate(float(t), some)
+        surface.add_estimate_and_check_column_complete(float(t), some)
     relative = surface.log_ratio_to_median()
     assert np.isnan(relative[:, :, 4]).all()
     assert np.isnan(relative[:, -1, 0]).all()

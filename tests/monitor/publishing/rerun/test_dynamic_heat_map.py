@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES, Event
-from monitor.publishing.rerun.viewer_settings import DeviceInfo
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 from tests.monitor.publishing import made
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -18,7 +18,7 @@ from PIL import Image
 
 from monitor.publishing.rerun import blueprint, dynamic_heat_map
 from monitor.publishing.rerun.allan_history_table import COLUMNS
-from monitor.publishing.rerun.viewer_content import Scene
+from monitor.publishing.rerun.panel_scene import Scene
 
 T0 = 1.76e9
 
@@ -59,9 +59,9 @@ def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
     stream = rr.RecordingStream("imu-monitor")
     stream.save(path)
     scene = Scene(stream)
-    scene.set_devices([DeviceInfo("bench-1")])
+    scene.set_detailed_devices([ViewerDeviceDescription("bench-1")])
     for i in range(12):
-        scene.draw("bench-1", "AllanPanel", [(T0 + i, made.estimate(T0 + i, seed=i))])
+        scene.draw("bench-1", "AllanAndCoefficientPanel", [(T0 + i, made.estimate(T0 + i, seed=i))])
     what = {"N": {"before": 1.5e-4, "after": 3.0e-4}, "floor": {"after": 1.0}}
     event = Event("noise_changed", 0, "gz is louder", axis="gz", values=what)
     scene.draw("bench-1", "EventsPanel", [(T0 + 9, event)])
@@ -89,15 +89,17 @@ def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
 
 
 def test_a_device_has_a_tab_for_now_and_one_for_the_time() -> None:
-    tabs = blueprint.blueprint([DeviceInfo("bench-1")]).root_container
+    tabs = blueprint.blueprint([ViewerDeviceDescription("bench-1")]).root_container
     assert [page.name for page in tabs.contents] == ["Now", "Dynamic"]
     assert tabs.active_tab == 0
-    fleet = blueprint.blueprint([DeviceInfo("nose"), DeviceInfo("tail")]).root_container
+    fleet = blueprint.blueprint([ViewerDeviceDescription("nose"), ViewerDeviceDescription("tail")]).root_container
     assert [page.name for page in fleet.contents] == ["Overview", "nose", "tail"]
 
 
 def test_the_tab_of_temperature_is_there_only_where_bias_is_held_against_it() -> None:
-    fleet = blueprint.blueprint([DeviceInfo("a"), DeviceInfo("b", has_thermal=True)]).root_container
+    fleet = blueprint.blueprint(
+        [ViewerDeviceDescription("a"), ViewerDeviceDescription("b", has_thermal=True)]
+    ).root_container
     (_, first, second) = fleet.contents
     assert [page.name for page in first.contents] == ["Now", "Dynamic"]
     assert [page.name for page in second.contents] == ["Now", "Dynamic", "Temperature"]
@@ -110,8 +112,12 @@ def test_gaps_have_their_row_only_where_there_is_a_model() -> None:
             name for one in getattr(page, "contents", []) for name in views(one)
         ]
 
-    assert not [name for name in views(blueprint.blueprint([DeviceInfo("a")]).root_container) if "gap" in str(name)]
-    fleet = blueprint.blueprint([DeviceInfo("a"), DeviceInfo("b", has_model=True)]).root_container
+    assert not [
+        name for name in views(blueprint.blueprint([ViewerDeviceDescription("a")]).root_container) if "gap" in str(name)
+    ]
+    fleet = blueprint.blueprint(
+        [ViewerDeviceDescription("a"), ViewerDeviceDescription("b", has_model=True)]
+    ).root_container
     (_, first, second) = fleet.contents
     assert not [name for name in views(first) if "gap" in str(name)]
     assert [name for name in views(second) if "gap" in str(name)] == [

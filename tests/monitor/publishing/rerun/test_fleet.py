@@ -11,12 +11,12 @@ from drivers.data_types import Event, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.publishing.messages.results import AllanMessage, CoefficientsMessage, EventMessage, StatusMessage
-from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.remote_devices import RemoteDeviceRegistry
 from monitor.publishing.rerun.fleet import FleetView, full_device_key
-from monitor.publishing.rerun.panel_text import fleet_text
-from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+from monitor.publishing.rerun.panels.panel_text import fleet_text
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
 from monitor.publishing.zenoh.publisher import ZenohPublisher
-from monitor.publishing.zenoh.subscriber import ReceivedMessage, ZenohSubscriber
+from monitor.publishing.zenoh.subscriber import ReceivedMessageOrLiveliness, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
@@ -39,7 +39,7 @@ def test_the_keys_of_devices_in_detail() -> None:
 def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     endpoint, path = free_endpoint(), tmp_path / "fleet.rrd"
     stop, told = threading.Event(), []
-    viewer = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("imu/nose", "over zenoh")], fleet=True)
+    viewer = RerunView(ViewerSettings(mode=str(path)), [ViewerDeviceDescription("imu/nose", "over zenoh")], fleet=True)
     out = ZenohPublisher(ZenohTable(listen=(), connect=(endpoint,)), ["nose", "tail"])
     with (
         router(endpoint),
@@ -87,7 +87,9 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
             "tail",
             EventMessage.from_result("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz")).encode(),
         )
-        wait_for(lambda: "imu/tail/event" in taken and len(fleet.board.sorted_devices(time.monotonic())) == 2)
+        wait_for(
+            lambda: "imu/tail/event" in taken and len(fleet.board.devices_with_problems_first(time.monotonic())) == 2
+        )
         tables = len(drawn)
         wait_for(lambda: len(drawn) >= tables + 2, "two more tables")
         stop.set()
@@ -103,29 +105,33 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
 
 
 def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
+    viewer = RerunView(ViewerSettings(mode="none"), [ViewerDeviceDescription("imu/a")], fleet=True)
     drawn: list[float] = []
     monkeypatch.setattr(viewer, "put", lambda _device, unix_s, _health: drawn.append(unix_s))
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
     fleet.process_message(
-        ReceivedMessage("imu/a/status", StatusMessage.from_result("a", None, 0, made.health(state="waiting")).encode())
+        ReceivedMessageOrLiveliness(
+            "imu/a/status", StatusMessage.from_result("a", None, 0, made.health(state="waiting")).encode()
+        )
     )
-    (known,) = fleet.board.sorted_devices(time.monotonic())
+    (known,) = fleet.board.devices_with_problems_first(time.monotonic())
     assert known.status is not None
     assert known.status.state == "waiting"
     assert drawn == []
     fleet.process_message(
-        ReceivedMessage("imu/a/status", StatusMessage.from_result("a", 5.0, 0, made.health()).encode())
+        ReceivedMessageOrLiveliness("imu/a/status", StatusMessage.from_result("a", 5.0, 0, made.health()).encode())
     )
     assert drawn == [5.0]
     assert fleet.malformed == fleet.board.malformed == 0
 
 
 def test_hostile_messages_change_nothing_and_are_counted() -> None:
-    viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
+    viewer = RerunView(ViewerSettings(mode="none"), [ViewerDeviceDescription("imu/a")], fleet=True)
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
     fleet.process_message(
-        ReceivedMessage("imu/a/coefficients", CoefficientsMessage.from_result("a", 1.0, 0, made.estimate()).encode())
+        ReceivedMessageOrLiveliness(
+            "imu/a/coefficients", CoefficientsMessage.from_result("a", 1.0, 0, made.estimate()).encode()
+        )
     )
     for key, payload in {
         "imu/a/samples": b"\x81" * 10_000,
@@ -133,13 +139,13 @@ def test_hostile_messages_change_nothing_and_are_counted() -> None:
         "imu/a/event": b"[" * 60_000,
         "other": b"",
     }.items():
-        fleet.process_message(ReceivedMessage(key, payload))
+        fleet.process_message(ReceivedMessageOrLiveliness(key, payload))
     assert (fleet.malformed, fleet.board.malformed) == (2, 1)
-    assert [one.key for one in fleet.board.sorted_devices(time.monotonic())] == ["imu/a"]
+    assert [one.key for one in fleet.board.devices_with_problems_first(time.monotonic())] == ["imu/a"]
 
 
 def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell() -> None:
-    board = DeviceStates(lambda: 10.0)
+    board = RemoteDeviceRegistry(lambda: 10.0)
     for device, changed in {
         "well": {},
         "bad": {"state": "lost", "text": "gone | <img src=x> [a](http://b)\n\n# head"},
@@ -150,7 +156,7 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
         board.process_message(
             f"imu/{device}/coefficients", CoefficientsMessage.from_result(device, 1.0, 0, made.estimate()).encode()
         )
-    text = fleet_text(board.sorted_devices(10.0), 10.0, 40, "1 of 2 there")
+    text = fleet_text(board.devices_with_problems_first(10.0), 10.0, 40, "1 of 2 there")
     lines = text.splitlines()
     assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"
     assert "**1 of 2 there**" in lines
@@ -158,4 +164,4 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
     assert table[2].startswith("| **imu/bad** | **LOST** |")
     assert table[3].startswith("| **imu/well** | running | 99.98 Hz | 360,000 | 3 | 1 | 0.515 |")
     assert r"gone \| \<img src=x\> \[a\](http://b)  \# head" in table[2]
-    assert "… and 1 more with fewer problems" in fleet_text(board.sorted_devices(10.0), 10.0, 1)
+    assert "… and 1 more with fewer problems" in fleet_text(board.devices_with_problems_first(10.0), 10.0, 1)

@@ -19,8 +19,8 @@ import pytest
 from drivers.data_types import AXES, Event
 from monitor.publishing.rerun import queued_view as rerun_view
 from monitor.publishing.rerun.queued_view import MISSING, RerunView
-from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
-from monitor.publishing.result_kinds import SampleRows
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
+from monitor.publishing.result_kinds import SampleBatch
 from tests.monitor.publishing import made
 from tests.support.ports import free_port
 from tests.support.waiting import FOREVER_S, PATIENCE_S, stays_true, wait_for
@@ -29,7 +29,7 @@ pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
 from monitor.publishing.rerun import sinks
 
-DEVICE = [DeviceInfo("bench-1", "stim300 on a test")]
+DEVICE = [ViewerDeviceDescription("bench-1", "stim300 on a test")]
 T0 = 1.76e9
 
 
@@ -51,7 +51,7 @@ def feed(view: RerunView, i: int) -> None:
     """Pass a tenth of a second of everything to the view. The calls never wait for a viewer."""
     t = T0 + 0.1 * i
     samples, estimate, health = made.samples(t, 0.1), made.estimate(t, seconds=60 + i, seed=i), made.health()
-    view.put("bench-1", t, SampleRows(*samples))
+    view.put("bench-1", t, SampleBatch(*samples))
     view.put("bench-1", t, estimate)
     view.put("bench-1", t, health)
 
@@ -63,7 +63,7 @@ def test_a_recording_holds_what_was_shown(tmp_path: Path) -> None:
     wait_for(lambda: view.state == "ok")
     t, values, temperature_c = made.samples(T0, 1.0)
     estimate = made.estimate(T0 + 1)
-    view.put("bench-1", T0, SampleRows(t, values, temperature_c))
+    view.put("bench-1", T0, SampleBatch(t, values, temperature_c))
     view.put("bench-1", T0 + 1, estimate)
     view.put("bench-1", T0 + 1, Event("noise_changed", 0, "gz angle random walk rose by 47 %", axis="gz"))
     view.put("bench-1", T0 + 1, made.health())
@@ -89,7 +89,10 @@ def test_a_recording_holds_what_was_shown(tmp_path: Path) -> None:
 
 def test_the_gap_has_a_course_and_the_model_a_line(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    view = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("bench-1", has_model=True), DeviceInfo("plain")])
+    view = RerunView(
+        ViewerSettings(mode=str(path)),
+        [ViewerDeviceDescription("bench-1", has_model=True), ViewerDeviceDescription("plain")],
+    )
     view.start()
     wait_for(lambda: view.state == "ok")
     looks = [made.look(made.estimate(T0 + i, seed=i), scale=1.1) for i in range(3)]
@@ -113,7 +116,7 @@ def test_the_gap_has_a_course_and_the_model_a_line(tmp_path: Path) -> None:
 
 def test_means_have_a_course_beside_what_was_expected(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    view = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("bench-1", has_thermal=True)])
+    view = RerunView(ViewerSettings(mode=str(path)), [ViewerDeviceDescription("bench-1", has_thermal=True)])
     view.start()
     wait_for(lambda: view.state == "ok")
     for i in range(3):
@@ -192,16 +195,16 @@ def test_a_process_with_a_frozen_viewer_exits(server: sinks.ViewerProcess) -> No
         import os, signal, time
         import numpy as np
         from monitor.publishing.rerun.queued_view import RerunView
-        from monitor.publishing.result_kinds import SampleRows
-        from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
-        view = RerunView(ViewerSettings("native", port={server.port}), [DeviceInfo("d")])
+        from monitor.publishing.result_kinds import SampleBatch
+        from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
+        view = RerunView(ViewerSettings("native", port={server.port}), [ViewerDeviceDescription("d")])
         view.start()
         while view.state != "ok":
             time.sleep(0.02)
         os.kill({server.pid}, signal.SIGSTOP)
         t = np.arange(2000) / 100
         for i in range(400):
-            view.put("d", 20.0 * i, SampleRows(t + 20.0 * i, np.random.default_rng(i).standard_normal((2000, 6)), t))
+            view.put("d", 20.0 * i, SampleBatch(t + 20.0 * i, np.random.default_rng(i).standard_normal((2000, 6)), t))
             time.sleep(0.005)
         while not view.state.startswith("stalled"):
             time.sleep(0.05)
@@ -283,9 +286,9 @@ def test_a_killed_daemon_takes_its_viewer_along() -> None:
     program = f"""
         import time
         from monitor.publishing.rerun.queued_view import RerunView
-        from monitor.publishing.result_kinds import SampleRows
-        from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
-        RerunView(ViewerSettings("web", {port}, {web_port}), [DeviceInfo("d")]).start()
+        from monitor.publishing.result_kinds import SampleBatch
+        from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
+        RerunView(ViewerSettings("web", {port}, {web_port}), [ViewerDeviceDescription("d")]).start()
         time.sleep({FOREVER_S})
     """
     with subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)]) as daemon:
@@ -343,9 +346,9 @@ def test_mode_none_imports_and_starts_nothing() -> None:
     program = """
         import sys, threading
         from monitor.publishing.rerun.queued_view import RerunView
-        from monitor.publishing.result_kinds import SampleRows
-        from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
-        view = RerunView(ViewerSettings("none"), [DeviceInfo("d")])
+        from monitor.publishing.result_kinds import SampleBatch
+        from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
+        view = RerunView(ViewerSettings("none"), [ViewerDeviceDescription("d")])
         view.start()
         view.close()
         assert "rerun" not in sys.modules and threading.active_count() == 1, sys.modules.keys()

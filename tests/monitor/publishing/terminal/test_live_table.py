@@ -15,7 +15,7 @@ from drivers.errors import ConfigError
 from monitor.common import topics
 from monitor.publishing import remote_devices
 from monitor.publishing.messages.results import CoefficientsMessage, EventMessage, ModelGapMessage, StatusMessage
-from monitor.publishing.remote_devices import MAX_EVENTS, DeviceStates
+from monitor.publishing.remote_devices import MAX_EVENTS, RemoteDeviceRegistry
 from monitor.publishing.terminal import live_table
 from monitor.publishing.terminal.coefficient_tables import analysis_table
 from monitor.publishing.terminal.watch import watch
@@ -38,33 +38,33 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def board(clock: Clock) -> DeviceStates:
-    return DeviceStates(clock)
+def board(clock: Clock) -> RemoteDeviceRegistry:
+    return RemoteDeviceRegistry(clock)
 
 
-def status(board: DeviceStates, device: str, prefix: str = "imu", **changed: object) -> None:
+def status(board: RemoteDeviceRegistry, device: str, prefix: str = "imu", **changed: object) -> None:
     board.process_message(
         topics.STATUS.key(prefix, device), StatusMessage.from_result(device, 1.76e9, 0, made.health(**changed)).encode()
     )
 
 
-def noise(board: DeviceStates, device: str, seconds: float = 3600.0, scale: float = 1.0) -> None:
+def noise(board: RemoteDeviceRegistry, device: str, seconds: float = 3600.0, scale: float = 1.0) -> None:
     estimate = made.estimate(seconds=seconds, scale=scale)
     board.process_message(
         topics.COEFFICIENTS.key("imu", device), CoefficientsMessage.from_result(device, 1.76e9, 0, estimate).encode()
     )
 
 
-def event(board: DeviceStates, device: str, text: str) -> None:
+def event(board: RemoteDeviceRegistry, device: str, text: str) -> None:
     payload = EventMessage.from_result(device, 1.76e9, 1, Event("noise_changed", 0, text)).encode()
     board.process_message(topics.EVENT.key("imu", device), payload)
 
 
 def shown(
-    board: DeviceStates, width: int = 120, now_s: float = NOW_S, height: int = 50, is_terminal: bool = False
+    board: RemoteDeviceRegistry, width: int = 120, now_s: float = NOW_S, height: int = 50, is_terminal: bool = False
 ) -> str:
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=is_terminal, record=True)
-    console.print(live_table.device_table(board, now_s))
+    console.print(live_table.device_overview(board, now_s))
     return console.export_text()
 
 
@@ -72,12 +72,12 @@ def row(text: str, device: str) -> str:
     return next(line for line in text.splitlines() if line.startswith(f"{device} "))
 
 
-def test_nothing_heard_yet(board: DeviceStates) -> None:
+def test_nothing_heard_yet(board: RemoteDeviceRegistry) -> None:
     board.note = "nobody at tcp/127.0.0.1:7450; trying again"
     assert " ".join(shown(board).split()) == "imu-monitor 0 devices nobody at tcp/127.0.0.1:7450; trying again"
 
 
-def test_one_row_a_device_with_all_its_numbers(board: DeviceStates) -> None:
+def test_one_row_a_device_with_all_its_numbers(board: RemoteDeviceRegistry) -> None:
     for device, scale in (("bench-1", 1.0), ("bench-2", 2.0)):
         status(board, device)
         noise(board, device, scale=scale)
@@ -92,7 +92,7 @@ def test_one_row_a_device_with_all_its_numbers(board: DeviceStates) -> None:
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 160, 200])
-def test_nothing_is_cut_off_at_any_usual_width(board: DeviceStates, width: int) -> None:
+def test_nothing_is_cut_off_at_any_usual_width(board: RemoteDeviceRegistry, width: int) -> None:
     for device in ("bench-1", "bench-2"):
         status(board, device, received=28_812_345, lost=48_123)
         noise(board, device)
@@ -104,14 +104,14 @@ def test_nothing_is_cut_off_at_any_usual_width(board: DeviceStates, width: int) 
     assert ("0.515" in text) == (width != 100)  # two digits where three do not fit in a line
 
 
-def test_a_line_a_device_from_100_columns_on(board: DeviceStates) -> None:
+def test_a_line_a_device_from_100_columns_on(board: RemoteDeviceRegistry) -> None:
     for device in ("a", "b", "c"):
         status(board, device)
         noise(board, device)
     assert [len(shown(board, width).splitlines()) for width in (79, 100, 160)] == [1 + 1 + 9, 1 + 2 + 3, 1 + 2 + 3]
 
 
-def test_bounds_and_too_few_data_are_marked(board: DeviceStates) -> None:
+def test_bounds_and_too_few_data_are_marked(board: RemoteDeviceRegistry) -> None:
     for device in ("early", "other"):
         status(board, device)
     noise(board, "early", seconds=100.0)
@@ -122,7 +122,7 @@ def test_bounds_and_too_few_data_are_marked(board: DeviceStates) -> None:
     assert row(shown(board, 160), "early").count("—") == 9
 
 
-def test_trouble_comes_first_and_has_a_sign_and_a_word(board: DeviceStates) -> None:
+def test_trouble_comes_first_and_has_a_sign_and_a_word(board: RemoteDeviceRegistry) -> None:
     status(board, "a-good")
     status(board, "b-ended", state="ended")
     status(board, "c-waiting", state="waiting", text="waiting for serial /dev/ttyUSB3", rate_hz=None)
@@ -145,7 +145,7 @@ def test_trouble_comes_first_and_has_a_sign_and_a_word(board: DeviceStates) -> N
     ]  # fmt: skip
 
 
-def test_hostile_messages_leave_a_bounded_board(board: DeviceStates) -> None:
+def test_hostile_messages_leave_a_bounded_board(board: RemoteDeviceRegistry) -> None:
     status(board, "good")
     known = StatusMessage.from_result("good", 1.0, 0, made.health()).encode()
     deep = known[:-1] + b',"more":' + b"[" * 20_000 + b"]" * 20_000 + b"}"
@@ -171,7 +171,7 @@ def test_devices_beyond_the_bound_are_passed_over_until_others_have_been_silent_
 ) -> None:
     monkeypatch.setattr(remote_devices, "MAX_DEVICES", 3)
     clock = [0.0]
-    board = DeviceStates(lambda: clock[0])
+    board = RemoteDeviceRegistry(lambda: clock[0])
     payload = StatusMessage.from_result("a", 1.0, 0, made.health()).encode()
     for device in ("a", "b", "c", "d", "x" * 300):
         board.process_message(f"imu/{device}/status", payload)
@@ -189,7 +189,7 @@ def test_states_have_different_signs_for_different_ranks() -> None:
     assert len({signs[state] for state in ("running", "waiting", "lost", "silent", "ended", "present")}) == 6
 
 
-def test_a_device_that_goes_is_marked(board: DeviceStates, clock: Clock) -> None:
+def test_a_device_that_goes_is_marked(board: RemoteDeviceRegistry, clock: Clock) -> None:
     status(board, "a")
     board.set_liveliness_token("imu/a/alive", True)
     board.set_liveliness_token("imu/a/alive", False)
@@ -200,14 +200,14 @@ def test_a_device_that_goes_is_marked(board: DeviceStates, clock: Clock) -> None
     assert row(shown(board, now_s=NOW_S + 10.5), "a").split()[1:3] == ["●", "running"]
 
 
-def test_a_device_of_which_only_the_presence_is_known(board: DeviceStates) -> None:
+def test_a_device_of_which_only_the_presence_is_known(board: RemoteDeviceRegistry) -> None:
     board.set_liveliness_token("imu/new/alive", True)
     assert row(shown(board), "new").split()[:3] == ["new", "○", "present"]
     board.set_liveliness_token("imu/other/status", True)
     assert "other" not in shown(board)
 
 
-def test_devices_of_several_prefixes_show_their_whole_key(board: DeviceStates) -> None:
+def test_devices_of_several_prefixes_show_their_whole_key(board: RemoteDeviceRegistry) -> None:
     status(board, "a", prefix="lab")
     status(board, "a", prefix="roof/north")
     text = shown(board)
@@ -215,7 +215,7 @@ def test_devices_of_several_prefixes_show_their_whole_key(board: DeviceStates) -
     assert row(text, "roof/north/a")
 
 
-def test_one_device_alone_shows_every_coefficient_with_its_interval(board: DeviceStates) -> None:
+def test_one_device_alone_shows_every_coefficient_with_its_interval(board: RemoteDeviceRegistry) -> None:
     status(board, "a")
     noise(board, "a", seconds=1000.0)
     text = shown(board, 140)
@@ -258,7 +258,7 @@ def test_axes_whose_slow_part_is_temperature_are_marked() -> None:
     assert "†" not in console.export_text()
 
 
-def test_a_gyroscope_alone_has_no_accelerometer_columns(board: DeviceStates) -> None:
+def test_a_gyroscope_alone_has_no_accelerometer_columns(board: RemoteDeviceRegistry) -> None:
     whole = made.estimate()
     whole.curve.avar[:, 3:] = float("nan")
     status(board, "a")
@@ -269,7 +269,7 @@ def test_a_gyroscope_alone_has_no_accelerometer_columns(board: DeviceStates) -> 
     assert "Accelerometers" not in text
 
 
-def test_the_last_events(board: DeviceStates) -> None:
+def test_the_last_events(board: RemoteDeviceRegistry) -> None:
     for i in range(9):
         event(board, "a", f"event {i}")
     lines = shown(board).splitlines()[-MAX_EVENTS:]
@@ -277,13 +277,13 @@ def test_the_last_events(board: DeviceStates) -> None:
     assert all(len(line.split("  ")[0]) == 8 for line in lines)
 
 
-def test_a_time_that_is_no_date(board: DeviceStates) -> None:
+def test_a_time_that_is_no_date(board: RemoteDeviceRegistry) -> None:
     payload = EventMessage.from_result("a", 1e300, 1, Event("moved", 0, "moved")).encode()
     board.process_message("imu/a/event", payload)
     assert "1e+300 s  a  moved" in shown(board)
 
 
-def test_malformed_messages_are_counted_and_change_nothing(board: DeviceStates) -> None:
+def test_malformed_messages_are_counted_and_change_nothing(board: RemoteDeviceRegistry) -> None:
     status(board, "a")
     before = shown(board)
     for topic in (topics.STATUS, topics.COEFFICIENTS, topics.GAP, topics.EVENT):
@@ -297,18 +297,18 @@ def test_malformed_messages_are_counted_and_change_nothing(board: DeviceStates) 
     assert after.replace("  40 malformed messages", "") == before
 
 
-def test_a_sender_cannot_steer_the_terminal(board: DeviceStates) -> None:
+def test_a_sender_cannot_steer_the_terminal(board: RemoteDeviceRegistry) -> None:
     evil = "\x1b[2J\x1b]0;owned\x07[red]x[/red]\r\n\x9b31m"
     status(board, "a" + evil.replace("\n", ""), state=evil, text=evil, outputs={evil: evil})
     event(board, "a", evil)
     console = Console(width=200, file=io.StringIO(), force_terminal=False)
-    console.print(live_table.device_table(board, NOW_S))
+    console.print(live_table.device_overview(board, NOW_S))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "[red]x[/red]" in text
     assert all(character.isprintable() or character == "\n" for character in text)
 
 
-def test_more_devices_than_lines(board: DeviceStates) -> None:
+def test_more_devices_than_lines(board: RemoteDeviceRegistry) -> None:
     for i in range(100):
         status(board, f"device-{i:03}")
     status(board, "zz", state="lost")
@@ -321,7 +321,7 @@ def test_more_devices_than_lines(board: DeviceStates) -> None:
     assert shown(board, 120).count("device-") == 100  # a file takes them all
 
 
-def test_two_threads_at_once(board: DeviceStates) -> None:
+def test_two_threads_at_once(board: RemoteDeviceRegistry) -> None:
     def feed() -> None:
         for i in range(300):
             status(board, f"d{i}")
@@ -343,7 +343,7 @@ def test_watch_refuses_what_zenoh_refuses() -> None:
         watch(connect=["nowhere"], console=console, once_s=0.0)
 
 
-def test_a_device_that_disagrees_with_its_model_says_so(board: DeviceStates) -> None:
+def test_a_device_that_disagrees_with_its_model_says_so(board: RemoteDeviceRegistry) -> None:
     status(board, "a")
     board.process_message(
         "imu/a/gap", ModelGapMessage.from_result("a", 1.0, 0, made.look(scale=1.2, gz=False)).encode()

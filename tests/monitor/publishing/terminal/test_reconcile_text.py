@@ -13,9 +13,9 @@ from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import line, run, step, with_axes
 
 
-def told(r: Reconciliation, width: int = 140) -> list[str]:
+def told(r: Reconciliation, width: int = 140, details: bool = True) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
-    print_reconciliation(r, console)
+    print_reconciliation(r, console, details=details)
     return console.export_text().splitlines()
 
 
@@ -25,14 +25,32 @@ def joined(line: str) -> str:
 
 def test_every_step_is_a_line_with_gap_and_confidence() -> None:
     lines = told(samples.explained())
-    assert lines[0] == "360000 samples at 100 Hz, 1 h 00 min"
-    assert lines[1].startswith("● explained The model and the recording differ by more than chance on gz.")
+    assert lines[0].startswith("● explained The model differs from the recording on gz, and 2 findings explain all")
     (first,) = [line for line in lines if line.startswith("gz")]
     said = "added sinusoidal: amplitude 30.94 ± 0.54 °/h, frequency 17.300012 ± 0.000100 Hz"
     assert joined(first) == f"gz ● explained 41.2 → 4.60 99.8 % {said}"
     second = lines[lines.index(first) + 1]
     assert joined(second) == "8.70 → 0.70 > 99.9 % retuned angle random walk: N 0.6188 ± 0.0014 °/√h"
     assert lines[-1] == "note: 12 missing samples <in 1 gap> & filled"
+
+
+def test_without_details_only_the_summary_is_told() -> None:
+    text = joined(" ".join(told(samples.explained(), details=False)))
+    assert text == (
+        "● explained The model differs from the recording on gz, and 2 findings explain all of the difference. "
+        "Line at 17.3 Hz on gz (96 %) and 1 smaller finding (4.3 %). "
+        "Continue with model.toml, which contains the findings, if the findings belong to the sensor. "
+        "360000 samples at 100 Hz, 1 h 00 min note: 12 missing samples <in 1 gap> & filled"
+    )
+
+
+def test_the_findings_stand_in_the_order_of_their_share() -> None:
+    lines = [joined(line) for line in told(samples.explained())]
+    at = lines.index("share finding conf. Allan deviation")
+    assert lines[at + 1] == "96 % added line at 17.3 Hz on gz 99.8 % × 1.05 at τ = 0.02 s (gz)"
+    assert lines[at + 2] == "4.3 % retuned white noise N times 1.2 on gz > 99.9 % × 1.2 at τ = 0.01 s (gz)"
+    left = [joined(line) for line in told(samples.partly_explained())]
+    assert "4.3 % left over: a difference in the spectrum from 6 to 11 Hz on gz" in left
 
 
 def test_an_axis_that_agrees_tells_its_largest_gap() -> None:

@@ -23,7 +23,7 @@ from monitor.common import topics
 from monitor.publishing.messages.results import CoefficientsMessage, StatusMessage
 from monitor.publishing.terminal import watch
 from monitor.publishing.zenoh.publisher import ZenohPublisher
-from monitor.publishing.zenoh.subscriber import ReceivedMessage, ZenohSubscriber
+from monitor.publishing.zenoh.subscriber import ReceivedMessageOrLiveliness, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
@@ -67,13 +67,13 @@ def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohPubl
 
 
 @contextlib.contextmanager
-def listening(keyexpr: str, *connect: str) -> Iterator[tuple[ZenohSubscriber, list[ReceivedMessage]]]:
+def listening(keyexpr: str, *connect: str) -> Iterator[tuple[ZenohSubscriber, list[ReceivedMessageOrLiveliness]]]:
     with contextlib.closing(ZenohSubscriber(keyexpr, connect)) as arriving:
         arriving.start()
         yield arriving, []
 
 
-def keys(arriving: ZenohSubscriber, so_far: list[ReceivedMessage]) -> set[str]:
+def keys(arriving: ZenohSubscriber, so_far: list[ReceivedMessageOrLiveliness]) -> set[str]:
     so_far += arriving.take(0.1)
     return {one.key for one in so_far}
 
@@ -89,7 +89,7 @@ def test_results_and_presence_arrive_but_not_the_bulk(endpoint: str) -> None:
         assert arriving.state == "ok"
         status = next(one for one in got if one.key == "imu/a/status")
         assert json.loads(status.payload or b"")["device"] == "a"
-        assert [one for one in got if one.payload is None] == [ReceivedMessage("imu/a/alive", None, True)]
+        assert [one for one in got if one.payload is None] == [ReceivedMessageOrLiveliness("imu/a/alive", None, True)]
 
 
 @pytest.mark.parametrize(
@@ -128,11 +128,11 @@ def test_daemons_that_come_late_go_and_come_back() -> None:
             with daemon(first, "a"):
                 wait_for(lambda: keys(arriving, got) >= {"imu/a/status", "imu/a/alive"})
                 assert arriving.state == "ok"
-            wait_for(lambda: keys(arriving, got) and ReceivedMessage("imu/a/alive", None, False) in got)
-            assert ReceivedMessage("imu/b/alive", None, False) not in got
+            wait_for(lambda: keys(arriving, got) and ReceivedMessageOrLiveliness("imu/a/alive", None, False) in got)
+            assert ReceivedMessageOrLiveliness("imu/b/alive", None, False) not in got
             got.clear()
             with daemon(first, "a"):
-                wait_for(lambda: keys(arriving, got) and ReceivedMessage("imu/a/alive", None, True) in got)
+                wait_for(lambda: keys(arriving, got) and ReceivedMessageOrLiveliness("imu/a/alive", None, True) in got)
 
 
 def test_through_a_router(endpoint: str) -> None:

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm, t
 
-from monitor.reconcile.likelihood.outlier_fit import fit_outliers
+from monitor.reconcile.likelihood.outlier_fit import convert_student_to_gaussian, fit_outliers, student_misfit_z
 
 N = 60_000
 
@@ -55,8 +56,29 @@ def test_noise_of_students_t_is_not_a_mixture(freedom):
     assert found.gain_over_student < -5.0
 
 
-def test_laplacian_noise_fits_no_mixture():
-    assert fit_outliers(np.random.default_rng(0).laplace(size=N)).misfit_z > 5.0
+@pytest.mark.parametrize("freedom", [3.0, 6.0, 12.0])
+@pytest.mark.parametrize("unit", [1e-4, 1.0])
+def test_student_fits_his_own_noise(freedom, unit):
+    w = unit * np.random.default_rng(1).standard_t(freedom, 4 * N)
+    found = fit_outliers(w).student
+    assert found.nu.value == pytest.approx(freedom, rel=0.1)
+    assert found.nu.lo < freedom < found.nu.hi
+    assert found.scale == pytest.approx(unit, rel=0.02)
+    assert student_misfit_z(w, found) < 3.5
+
+
+def test_laplacian_noise_fits_neither_a_mixture_nor_student():
+    w = np.random.default_rng(0).laplace(size=N)
+    found = fit_outliers(w)
+    assert found.misfit_z > 5.0
+    assert student_misfit_z(w, found.student) > 4.0
+
+
+def test_values_of_student_become_gaussian_ones_of_the_same_probability():
+    probability = np.array([1e-9, 0.02, 0.5, 0.7, 1.0 - 1e-9])
+    made = convert_student_to_gaussian(t(5.0, scale=0.6**0.5).ppf(probability), 5.0)
+    assert made == pytest.approx(norm.ppf(probability), abs=1e-6)
+    assert np.isfinite(convert_student_to_gaussian(np.array([1e200, -1e200]), 1000.0)).all()
 
 
 def bursts():

@@ -14,7 +14,7 @@ from monitor.reconcile.likelihood.state_space_comparison import (
     correlated_noise_of_block_means,
     fit_event_process,
     kalman_log_likelihood,
-    maximise_log_likelihood,
+    maximise_over_log_parameters,
     prior_level_variance,
 )
 from tests.monitor.reconcile.event_noise import BLOCK_S, dense
@@ -65,7 +65,7 @@ def test_maximum_and_its_width():
         x = np.log([a, b]) - target
         return 7.0 - 0.5 * x @ inverse @ x
 
-    height, at = maximise_log_likelihood(likelihood, (5e-4, 9.0))
+    height, at = maximise_over_log_parameters(likelihood, (5e-4, 9.0))
     assert height == pytest.approx(7.0, abs=0.02)
     assert at == pytest.approx(target, abs=0.05)
     found = fit_event_process(lambda a, b, odds: likelihood(a, b) + 12.0 * np.log(odds), {"a": 5e-4, "b": 9.0})
@@ -85,7 +85,7 @@ def test_no_interval_without_a_peak():
 
 
 def test_search_does_not_leave_the_neighbourhood_of_its_start():
-    _, (at,) = maximise_log_likelihood(np.log, (2.0,))
+    _, (at,) = maximise_over_log_parameters(np.log, (2.0,))
     assert 2.0 < np.exp(at) <= 60.0 * (1.0 + 1e-9)
 
 

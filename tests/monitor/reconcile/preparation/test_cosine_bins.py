@@ -92,3 +92,11 @@ def test_sums_are_those_of_each_bin_and_spread_is_their_way_back():
     each = found.expand_to_coefficients(np.arange(found.count.size, dtype=float))
     assert each.size == 4999
     assert found.sum_over_bins(each) == pytest.approx(np.arange(found.count.size) * found.count)
+
+
+def test_sums_of_a_short_array_are_those_with_zeros():
+    bins = build_frequency_bins(10_000, 100.0)
+    products = np.random.default_rng(0).standard_normal(9999)
+    for size in (1, 48, 5000, 9999):
+        padded = np.where(np.arange(9999) < size, products, 0.0)
+        np.testing.assert_allclose(bins.sum_over_bins(products[:size]), bins.sum_over_bins(padded), atol=1e-9)

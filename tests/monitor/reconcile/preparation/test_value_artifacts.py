@@ -43,6 +43,18 @@ def test_a_grid_with_an_offset_is_detected():
     assert detect_quantization(0.25 * np.rint(noise() / 0.25) + 9.81).step.value == pytest.approx(0.25)
 
 
+@pytest.mark.parametrize("decimals", [6, 8])
+def test_a_coarse_grid_rounded_in_text_is_neither_the_grid_of_the_text_nor_clipping(decimals):
+    step = np.radians(1.0 / 131.0)
+    counts = np.rint(0.5 * np.random.default_rng(0).standard_normal(60_000))  # five levels
+    written = np.radians(np.round(np.degrees(counts * step), decimals))
+    found = detect_quantization(written)
+    assert found.step.value == pytest.approx(step, rel=1e-3)
+    assert found.levels == 5
+    clipped = detect_clipping(written, found.step.value)
+    assert clipped is None or clipped.gain < 3.0
+
+
 @pytest.mark.parametrize(
     "written",
     [

@@ -3,7 +3,7 @@
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from monitor.noise.effects import AngleRandomWalk, Bias, BiasInstability, Narrowband, Resolution
+from monitor.noise.effects import AngleRandomWalk, BiasInstability, ConstantBias, Narrowband, Resolution
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.preparation.reconcile_input import Recording
 
@@ -24,7 +24,7 @@ def make_model(gravity: bool = False, step: float = 0.0) -> NoiseModel:
             Narrowband(sigma=5.0 * scale, frequency=(11.3, 17.9, 23.1)[k % 3], bandwidth=0.3),
         ]
         if gravity and k >= 3:
-            of.append(Bias(value=GRAVITY[k - 3]))
+            of.append(ConstantBias(value=GRAVITY[k - 3]))
         if step:
             of.append(Resolution(step=step * scale))
         effects[axis] = tuple(of)

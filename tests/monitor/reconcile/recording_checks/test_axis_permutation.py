@@ -6,7 +6,7 @@ import pytest
 from drivers.data_types import AXES
 from monitor.noise.effects import AngleRandomWalk, Narrowband
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.recording_checks.axis_permutation import compute_resonance_variances, reorder_axes
+from monitor.reconcile.recording_checks.axis_permutation import compute_resonance_log_power_variances, reorder_axes
 from monitor.reconcile.recording_checks.checks import check_recording
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, changed, draw, make_model
 
@@ -47,7 +47,7 @@ def test_reordering_is_the_inverse_of_the_permutation():
 
 
 def test_the_power_of_a_narrow_resonance_is_uncertain():
-    ((f_hz, variance),) = compute_resonance_variances(
+    ((f_hz, variance),) = compute_resonance_log_power_variances(
         [Narrowband(sigma=1.0, frequency=9.0, bandwidth=1e-3), AngleRandomWalk(N=1.0)], 10.0
     )
     assert f_hz == 9.0

@@ -6,7 +6,7 @@ from monitor.noise.effects import AngleRandomWalk, ExponentiallyCorrelated, Rand
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.recording_checks.missing_rows import check_missing_rows
 from monitor.reconcile.recording_checks.repeated_rows import check_repeated_rows
-from monitor.reconcile.recording_checks.slow_terms import check_slow_terms
+from monitor.reconcile.recording_checks.untestable_slow_terms import check_slow_terms
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 
 MODEL = make_model(step=8.0)

@@ -11,7 +11,7 @@ from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.recording_checks.sample_rate_from_features import (
     correct_impossible_sample_rate,
     estimate_sample_rate_error,
-    group_features,
+    group_features_with_gains,
 )
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 
@@ -69,7 +69,7 @@ def test_features_that_move_differently_are_no_wrong_rate():
 def test_harmonics_are_one_group():
     effects = {"gx": tuple(Narrowband(sigma=1e-3, frequency=f, bandwidth=0.1) for f in (7.0, 14.0, 21.0, 17.0))}
     y = np.random.default_rng(0).standard_normal(20_000)
-    groups = group_features({"gx": cosine_transform(y)}, RATE_HZ, effects)
+    groups = group_features_with_gains({"gx": cosine_transform(y)}, RATE_HZ, effects)
     assert len(groups) == 2
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.recording_checks.stuck_values import check_stuck_values, find_longest_run
+from monitor.reconcile.recording_checks.stuck_values import check_stuck_values, find_longest_run_bounds
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 
 
@@ -55,4 +55,4 @@ def test_coarse_values_repeat_by_chance(noise):
 
 
 def test_the_longest_run_ignores_missing_samples():
-    assert find_longest_run(np.array([1.0, np.nan, np.nan, np.nan, 2.0, 2.0])) == (4, 6)
+    assert find_longest_run_bounds(np.array([1.0, np.nan, np.nan, np.nan, 2.0, 2.0])) == (4, 6)

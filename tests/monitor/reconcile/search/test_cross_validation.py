@@ -16,11 +16,11 @@ from monitor.noise.effects import (
     Sinusoidal,
     TemperatureBias,
 )
-from monitor.reconcile.diagnostics.diagnostics import find_periodogram_peaks
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
-from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_fixed_noise
-from monitor.reconcile.search.axis_repair import repair_axis_again
+from monitor.reconcile.diagnostics.whiteness_tests import find_peak_gains_and_frequencies
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_fixed_noise
 from monitor.reconcile.search.cross_validation import cross_validate
+from monitor.reconcile.search.repaired_axes import repair_axis_again
 from tests.monitor.reconcile.axes import (
     WALK,
     WHITE,
@@ -105,7 +105,7 @@ def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
     """The strongest line of pure noise gains its dozen nats; halves of that decide nothing, and the reason says so."""
     one = axis(noise(4))
     view = seen(one, MODEL)
-    gain, f_hz = find_periodogram_peaks(view.series, one.rate_hz, 1)[0]
+    gain, f_hz = find_peak_gains_and_frequencies(view.periodogram, one.rate_hz, 1)[0]
     assert gain > 7.0
     found = proven(one, Sinusoidal(amplitude=1.0, frequency=f_hz, phase=0.0), "lines")
     assert found.reason or not found.kept
@@ -116,7 +116,7 @@ def test_another_size_of_a_known_noise():
     one = axis(1.2 * noise(5))
     before = fit_with_fixed_noise(one, MODEL)
     after = fit_with_fewest_changes(one, (), MODEL)
-    assert after.refitted_size_count >= 1
+    assert after.resized_model_effect_count >= 1
     found = cross_validate(before, after, None, "psd", NULL, np.random.default_rng(0))
     assert found.kept
     assert found.after < 0.2 * found.before

@@ -11,9 +11,10 @@ from monitor.noise.effects import (
     RandomTelegraph,
     RateRandomWalk,
 )
-from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes
 from monitor.reconcile.search.non_gaussian_alternatives import (
     build_background_noise,
+    compare_poisson_with_added_noise,
     fit_poisson_alternative,
     fit_telegraph_alternative,
 )
@@ -138,3 +139,14 @@ def test_a_model_that_is_right_is_not_asked():
     stepped = axis(step)
     state = fit_with_fewest_changes(stepped, (BiasStep(time=200.0, height=1.0),), MODEL)
     assert fit_poisson_alternative(state).gain < 0.0  # one step is a step
+
+
+def test_jumps_are_told_from_correlated_noise_that_absorbed_them():
+    rng = np.random.default_rng(3)
+    stepped = compare_poisson_with_added_noise(found_as_noise(noise(rng) + jumps(rng, 0.05, 6e-4)))
+    assert stepped.gain > 5.0
+    assert isinstance(stepped.added[-1], PoissonSteps)
+    assert not any(isinstance(one, ExponentiallyCorrelated) for one in stepped.added)
+    smooth = compare_poisson_with_added_noise(found_as_noise(noise(rng) + correlated(n, rng, 3e-4, 5.0)))
+    assert smooth is None or smooth.gain < 0.0
+    assert compare_poisson_with_added_noise(fit_with_fewest_changes(axis(noise(rng)), (), MODEL)) is None

@@ -1,17 +1,27 @@
 """The search on one axis: what was hidden is named, what is right is left alone, what nobody knows gets no name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from monitor.noise.effects import (
     AngleRandomWalk,
+    BandwidthLimit,
+    BiasInstability,
     ExponentiallyCorrelated,
+    Narrowband,
     NoiseStep,
     Outliers,
+    PowerLaw,
     RateRandomWalk,
     Sinusoidal,
+    TemperatureBias,
+    TemperatureHysteresis,
 )
-from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_fixed_noise
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.likelihood.effect_roles import build_unit_regressors
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_fixed_noise
 from monitor.reconcile.search.search import AxisSearchResult, drop_unneeded_effects, search_missing_effects
 from monitor.reconcile.search.trials import generate_trial_groups
 from tests.monitor.reconcile.axes import (
@@ -67,8 +77,11 @@ HIDDEN = {
     "rate_ramp": 4e-6 * T,
     "bias_step": 6e-4 * (T > 130.0),
     "turn_on_transient": 1e-3 * np.exp(-T / 12.0),
+    "bias_curve": 1.2e-3 * (2.0 * T / T[-1] - 1.0) ** 2,
     "temperature_bias": 2e-4 * (warmth(n) - 25.0),
+    "power_law": NoiseModel({"gz": (PowerLaw(density=0.5 * N, exponent=1.5),)}).simulate(n, RATE_HZ, 3)[:, 2],
     "outliers": (RNG.random(n) < 1e-3) * 1.5e-2 * RNG.standard_normal(n),
+    "pulse_train": 3e-4 * (np.mod(T + 1e-9, 1.0) < 0.03),
 }
 
 
@@ -93,6 +106,28 @@ def test_a_slow_telegraph_is_no_random_walk_and_no_poisson_steps(seed):
     assert names(looked(noise(seed) + 1e-3 * levels)) == ["random_telegraph"]
 
 
+@pytest.mark.parametrize(("quadratic", "cubic"), [(2e-7, None), (2e-7, 4e-9)], ids=["quadratic", "quadratic and cubic"])
+@pytest.mark.parametrize("given", [(), (TemperatureBias(coefficient=1e-5, reference=25.0),)], ids=["new", "beside c"])
+def test_a_temperature_curve_has_its_order(quadratic, cubic, given):
+    """−18 … 74 °C; the model may have the linear coefficient already."""
+    warm = 28.0 - 46.0 * np.cos(2.0 * np.pi * T / T[-1])
+    away = warm - 25.0
+    y = noise(4) + (1e-5 + (quadratic + (cubic or 0.0) * away) * away) * away
+    found = looked(y, (*MODEL, *given), warm)
+    assert names(found) == ["temperature_bias"]
+    curve = found.hypothesis.effects[-1]
+    assert (curve.quadratic is None, curve.cubic is None) == (quadratic is None, cubic is None)
+    if cubic is not None:
+        assert curve.cubic == pytest.approx(cubic, rel=0.1)
+
+
+def test_a_loop_over_temperature_is_found_beside_a_slope():
+    warm = warmth(n)
+    (loop,) = build_unit_regressors(TemperatureHysteresis(height=1.0, reversal=0.8), n, RATE_HZ, warm)
+    found = looked(noise(5) + 8e-4 * loop + 2e-4 * (warm - 25.0), temperature_c=warm)
+    assert sorted(names(found)) == ["temperature_bias", "temperature_hysteresis"]
+
+
 def test_noise_that_becomes_another_is_a_step_of_it():
     found = looked(white(n, np.random.default_rng(3)) * np.where(T < 150.0, 1.0, 1.5), (WHITE,))
     assert names(found) == ["noise_step"]
@@ -100,6 +135,16 @@ def test_noise_that_becomes_another_is_a_step_of_it():
     assert isinstance(step, NoiseStep)
     assert step.time == pytest.approx(150.0, abs=2.0)
     assert step.ratio == pytest.approx(1.5, rel=0.05)
+
+
+def test_noise_that_rises_and_falls_is_modulated():
+    gain = np.sqrt(1.0 + 0.3 * np.sin(2.0 * np.pi * T / 37.0 + 1.0))
+    found = looked(white(n, np.random.default_rng(3)) * gain, (WHITE,))
+    assert names(found) == ["variance_modulation"]
+    effect = found.hypothesis.effects[-1]
+    assert effect.depth == pytest.approx(0.3, abs=0.05)
+    assert effect.period == pytest.approx(37.0, rel=0.02)
+    assert effect.phase == pytest.approx(1.0, abs=0.3)
 
 
 def test_values_that_are_not_as_the_model_says():
@@ -136,14 +181,63 @@ def test_another_size_is_no_name():
     assert size == pytest.approx(5e-5, rel=0.5)
 
 
+def test_a_band_of_noise_with_sharp_edges_stays_to_be_seen():
+    drawn = np.fft.rfft(np.random.default_rng(13).standard_normal(n))
+    f_hz = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
+    found = looked(noise(14) + SIGMA * np.fft.irfft(drawn * ((f_hz > 5.0) & (f_hz < 10.0)), n))
+    assert found.final.findings["psd"].gain > STRICT["psd"].threshold
+    assert not {"power_law", "bandwidth_limit", "exponentially_correlated"} & set(names(found))
+
+
 def test_what_nobody_knows_has_no_name():
-    """A chirp through the whole band, and Student's t of six degrees of freedom: both stay to be seen."""
+    """A chirp through the whole band, and Laplace's distribution: both stay to be seen."""
     chirp = 1.5 * SIGMA * np.sin(2 * np.pi * (2.0 * T + 0.5 * (40.0 / T[-1]) * T**2))
     found = looked(noise(9) + chirp)
     assert any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
-    student = looked(SIGMA * np.random.default_rng(10).standard_t(6, n) / np.sqrt(1.5), (WHITE,))
-    assert "outliers" not in names(student)
-    assert student.final.findings["tails"].gain > STRICT["tails"].threshold
+    laplace = looked(SIGMA * np.random.default_rng(10).laplace(size=n) / np.sqrt(2.0), (WHITE,))
+    assert names(laplace) == []
+    assert laplace.final.findings["tails"].gain > STRICT["tails"].threshold
+
+
+@pytest.mark.parametrize(("nu", "seed"), [(3.0, 1), (6.0, 2), (20.0, 3)])
+def test_noise_of_student_has_heavy_tails(nu, seed):
+    rng = np.random.default_rng(seed)
+    found = looked(SIGMA * rng.standard_t(nu, n) * np.sqrt(1.0 - 2.0 / nu) + walk(n, rng))
+    assert names(found) == ["heavy_tails"]
+    assert found.hypothesis.effects[-1].nu == pytest.approx(nu, rel=0.25)
+    assert max(one.gain for one in found.final.findings.values()) < 20.0  # of 60 to 8000 before
+
+
+@pytest.mark.parametrize("period_s", [5.0, 100.0])
+def test_a_periodic_variance_is_no_heavy_tail(period_s):
+    rng = np.random.default_rng(15)
+    found = looked(white(n, rng) * np.sqrt(1.0 + 0.5 * np.sin(2 * np.pi * T / period_s)) + walk(n, rng))
+    assert names(found) == ["variance_modulation"]
+    assert found.hypothesis.effects[-1].period == pytest.approx(period_s, rel=0.02)
+    assert found.final.findings["variance"].gain < STRICT["variance"].threshold
+
+
+def test_a_weak_ramp_is_named_although_every_diagnostic_is_below_its_threshold():
+    y, ramp = white(n, np.random.default_rng(13)), T - T.mean()
+    y -= ramp * (ramp @ y) / (ramp @ ramp)
+    found = looked(y + ramp * SIGMA * np.sqrt(2.0 * 12.5 / (ramp @ ramp)), (WHITE,))  # a gain of 12.5 nats
+    assert names(found) == ["rate_ramp"]
+    level = found.rounds[0].before.findings["level"].gain
+    assert STRICT["level"].search_threshold < level < STRICT["level"].threshold
+
+
+def test_poisson_steps_are_neither_correlated_noise_nor_another_bias_instability():
+    rng = np.random.default_rng(14)
+    model = (WHITE, BiasInstability(B=0.5 * N), WALK)
+    jumps = 6e-4 * np.cumsum((rng.random(n) < 0.05 / RATE_HZ) * rng.standard_normal(n))
+    found = looked(noise(14) + jumps, model)
+    assert names(found) == ["poisson_steps"]
+    assert found.hypothesis.effects[: len(model)] == model
+
+
+def test_a_transient_beside_correlated_noise_is_named_with_it():
+    y = noise(15) + correlated(n, np.random.default_rng(16), 3e-4, 1.0) + 2e-3 * np.exp(-T / 20.0)
+    assert sorted(names(looked(y))) == ["exponentially_correlated", "turn_on_transient"]
 
 
 def test_the_same_generator_gives_the_same_search():
@@ -175,3 +269,49 @@ def test_candidates_on_a_true_model_are_not_worth_their_price():
         assert trials
         wrong += max(each.score for each in trials) > 0.0
     assert wrong <= 1
+
+
+@pytest.mark.parametrize(
+    ("known", "new_hz"),
+    [
+        (Sinusoidal(amplitude=2e-4, frequency=17.3), 16.1),
+        (Sinusoidal(amplitude=2e-4, frequency=17.3), 23.7),
+        (Narrowband(sigma=4e-4, frequency=17.3, bandwidth=1.5), 20.3),
+    ],
+)
+def test_a_line_of_the_model_that_has_moved_is_no_new_line(known, new_hz):
+    other = Sinusoidal(amplitude=3e-4, frequency=5.0)
+    true = NoiseModel({"gz": (*MODEL, replace(known, frequency=new_hz), other)}).simulate(n, RATE_HZ, 32)
+    found = looked(true[:, 2].copy(), (*MODEL, known, other))
+    assert names(found) == []
+    assert [trial.moved for trial in (one.trials[0] for one in found.rounds)] == [2]
+    assert found.hypothesis.effects[2].frequency == pytest.approx(new_hz, abs=0.1)
+    assert found.hypothesis.effects[3].frequency == 5.0
+    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
+
+
+def test_a_new_line_beside_a_line_of_the_model_is_added():
+    known = Sinusoidal(amplitude=2e-4, frequency=17.3)
+    true = NoiseModel({"gz": (*MODEL, known, replace(known, frequency=16.1))}).simulate(n, RATE_HZ, 33)
+    found = looked(true[:, 2].copy(), (*MODEL, known))
+    assert names(found) == ["sinusoidal"]
+    assert found.hypothesis.effects[2].frequency == 17.3
+
+
+@pytest.mark.parametrize("kind", ["butterworth", "iir", "fir"])
+def test_a_filter_with_noise_behind_is_one_effect(kind):
+    hidden = BandwidthLimit(cutoff=12.0, order=2, floor=0.15 * N, kind=kind)
+    y = NoiseModel({"gz": (WHITE, hidden)}).simulate(n, RATE_HZ, 30)[:, 2].copy()
+    found = looked(y, (WHITE,))
+    assert names(found) == ["bandwidth_limit"]
+    limit = found.hypothesis.effects[-1]
+    assert limit.cutoff == pytest.approx(12.0, rel=0.05)
+    assert limit.floor == pytest.approx(0.15 * N, rel=0.2)  # the kinds differ most above the cutoff
+    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
+
+
+def test_noise_behind_a_known_filter_is_its_floor():
+    y = NoiseModel({"gz": (WHITE, BandwidthLimit(cutoff=12.0, order=2, floor=0.15 * N))}).simulate(n, RATE_HZ, 31)
+    found = looked(y[:, 2].copy(), (WHITE, BandwidthLimit(cutoff=12.0, order=2, floor=0.0)))
+    assert names(found) == []
+    assert found.hypothesis.effects[1].floor == pytest.approx(0.15 * N, rel=0.05)

@@ -54,6 +54,7 @@ def test_what_happens_once_may_differ(effect: str) -> None:
     given: dict[str, dict[str, Any]] = {
         "bias_step": {"time": 9.0, "height": 1.0},
         "noise_step": {"time": 9.0, "ratio": 2.0},
+        "bias_curve": {"slope": 1.0, "curvature": 2.0},
     }
     one = step(effect, **given.get(effect, {"amplitude": 1.0, "time_constant": 9.0}))
     assert said(shown(one), run("two")).meaning == "may_differ"

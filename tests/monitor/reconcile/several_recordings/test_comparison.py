@@ -6,7 +6,12 @@ import pytest
 
 from monitor.noise.effects import AngleRandomWalk, BandwidthLimit, BiasStep, Sinusoidal, TemperatureBias
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.several_recordings.comparison import AxisComparison, MatchedEffect, NamedResult, compare_results
+from monitor.reconcile.several_recordings.comparison import (
+    AxisComparison,
+    EffectInRecordings,
+    NamedResult,
+    compare_results,
+)
 from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import LENS, around, known_lines, line, run, step, with_axes
 
@@ -15,7 +20,7 @@ def gz(*runs: NamedResult) -> AxisComparison:
     return compare_results(runs).axes["gz"]
 
 
-def only(found: tuple[MatchedEffect, ...]) -> MatchedEffect:
+def only(found: tuple[EffectInRecordings, ...]) -> EffectInRecordings:
     (one,) = found
     return one
 

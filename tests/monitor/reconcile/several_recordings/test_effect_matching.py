@@ -9,9 +9,9 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.several_recordings.effect_matching import (
     IDENTIFYING_PARAMETERS,
+    distance_if_parameters_match,
     find_effect_of_step,
     find_identifying_parameter,
-    identifying_parameter_distance,
     identifying_parameter_name,
 )
 from tests.monitor.reconcile.runs_made import around, line, step
@@ -49,13 +49,13 @@ def test_a_place_is_a_parameter_of_its_effect(effect: str) -> None:
 def test_places_drift_with_their_sensors(
     effect: str, a: ParameterInterval | None, b: ParameterInterval | None, same: bool
 ) -> None:
-    assert (identifying_parameter_distance(effect, a, b) is not None) is same
-    assert (identifying_parameter_distance(effect, b, a) is not None) is same
+    assert (distance_if_parameters_match(effect, a, b) is not None) is same
+    assert (distance_if_parameters_match(effect, b, a) is not None) is same
 
 
 def test_nearer_places_are_nearer() -> None:
     near, far = (
-        identifying_parameter_distance("sinusoidal", around(17.3, 1e-3), around(f, 1e-3)) for f in (17.31, 17.35)
+        distance_if_parameters_match("sinusoidal", around(17.3, 1e-3), around(f, 1e-3)) for f in (17.31, 17.35)
     )
     assert near is not None
     assert far is not None

@@ -1,0 +1,47 @@
+"""Base class of the receivers of the results: zenoh, viewer, history, log, table, metrics and hooks."""
+
+from typing import Any
+
+from drivers.data_types import Event, Ints, SampleBlock
+from monitor.common.device_health import Health
+
+
+class Output:
+    """Receiver of the results of all devices. Subclasses override methods, which must not block.
+
+    All times are on the timeline of the samples. For a recording, the timeline may differ from the host clock by years,
+    and the present time is unknown before the first sample.
+
+    Parameters
+    ----------
+    device : str
+        Name of the device.
+    unix_s : float
+        Unix time of the result in seconds.
+    received : int
+        Number of samples that the device has received since the start.
+    samples : SampleBlock
+        Samples in SI units.
+    offset_ns : array of int64, shape (n,), or int
+        Offset that converts the times of the samples to Unix time, in nanoseconds.
+    """
+
+    def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
+        """Publish a block of samples."""
+
+    def publish_drift_compensated_samples(
+        self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int
+    ) -> None:
+        """Publish a block of samples after compensation of the gyroscope drift."""
+
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Publish a result of one of the kinds in ``monitor.publishing.result_kinds``."""
+
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """Publish an event of the device."""
+
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
+        """Publish the status of the device once a second; ``unix_s`` is None if the present time is unknown."""
+
+    def remove_device(self, device: str) -> None:
+        """Remove the data of a device that was removed from the configuration."""

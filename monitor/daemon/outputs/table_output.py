@@ -1,0 +1,76 @@
+"""Output of the daemon for the table in the terminal."""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import structlog
+
+from drivers.data_types import Event
+from monitor.common import topics
+from monitor.common.device_health import Health
+from monitor.daemon.outputs.output import Output
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
+from monitor.estimation.estimate import Estimate
+from monitor.publishing.messages.message import Message
+from monitor.publishing.messages.results import (
+    CoefficientsMessage,
+    EventMessage,
+    ModelGapMessage,
+    StatusMessage,
+)
+from monitor.publishing.remote_devices import RemoteDeviceRegistry
+
+PREFIX: Final = "imu"
+"""First part of the keys of the messages for the table in the terminal."""
+_log = structlog.get_logger("imu-monitor")
+
+
+class ZenohOutput(Output):
+    """Output that publishes the results as zenoh messages."""
+
+
+class TableOutput(Output):
+    """Output for the table in the terminal.
+
+    Parameters
+    ----------
+    states : RemoteDeviceRegistry
+        Content of the table.
+    request_redraw : callable, optional
+        Function that requests another thread to draw the table.
+    """
+
+    def __init__(self, states: RemoteDeviceRegistry, request_redraw: Callable[[], None] | None = None) -> None:
+        self.states = states
+        self._redraw = request_redraw
+        self._newest: dict[str, dict[type[Message], tuple[float, int, Any]]] = {}  # results since the last status
+
+    def set_viewer_url(self, url: str) -> None:
+        """Show the URL of the viewer above the table, or remove the line if the URL is ""."""
+        self.states.note = f"viewer: {url}" if url else ""
+
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Store the newest estimate and the newest comparison with the noise model until the next status."""
+        if isinstance(result, Estimate | ModelComparison):
+            message: type[Message] = CoefficientsMessage if isinstance(result, Estimate) else ModelGapMessage
+            self._newest.setdefault(device, {})[message] = (unix_s, received, result)
+
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """Add an event to the lines below the table."""
+        self._process(EventMessage.from_result(device, unix_s, received, event))
+
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
+        """Update the row of a device in the table."""
+        self._process(StatusMessage.from_result(device, unix_s, health.received, health))
+        for message, newest in self._newest.pop(device, {}).items():
+            self._process(message.from_result(device, *newest))
+        if self._redraw is not None:
+            self._redraw()
+
+    def remove_device(self, device: str) -> None:
+        """Remove the row of a device from the table."""
+        self._newest.pop(device, None)
+        self.states.remove_device(topics.STATUS.key(PREFIX, device))
+
+    def _process(self, message: Message) -> None:
+        self.states.process_message(message.topic.key(PREFIX, message.device), message.encode())

@@ -1,0 +1,55 @@
+"""Curved drift of the bias, for example by ageing."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.data_types import Floats
+from drivers.errors import ConfigError
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
+
+
+@dataclass(frozen=True, slots=True)
+class BiasCurve(Source):
+    """Curved drift b = s t + c t² + a ln(1 + t/τ), which starts at zero.
+
+    The logarithm describes the ageing of quartz resonators (MIL-PRF-55310).
+
+    >>> bool(np.isnan(BiasCurve(slope=1e-6, curvature=1e-9).avar(np.array([1.0]), 0.01)[0]))
+    True
+    """
+
+    slope: float = parameter_field("rad/s²", "m/s³", signed=True)
+    curvature: float | None = parameter_field("rad/s³", "m/s⁴", signed=True, optional=True)
+    logarithmic: float | None = parameter_field("rad/s", "m/s²", signed=True, optional=True)
+    time_constant: float | None = parameter_field("s", positive=True, optional=True)
+
+    description: ClassVar[str] = "The bias drifts along a curve, for example while a sensor ages."
+
+    def __post_init__(self) -> None:
+        Source.__post_init__(self)
+        if (self.logarithmic is None) != (self.time_constant is None):
+            raise ConfigError(f"{self.name}: logarithmic and time_constant need each other")
+
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return NaN, because the effect of a curve depends on the length of the recording."""
+        return nan_spectrum(tau0_s)
+
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Curve":
+        """Start a drift at the next sample."""
+        return _Curve(self, 1.0 / rate_hz)
+
+
+class _Curve(NoiseSeries):
+    def __init__(self, curve: BiasCurve, tau0_s: float) -> None:
+        self._curve, self._tau0_s = curve, tau0_s
+        self._count = 0
+
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        t_s = self._tau0_s * np.arange(self._count, self._count + values.size)
+        values += (self._curve.slope + (self._curve.curvature or 0.0) * t_s) * t_s
+        if self._curve.logarithmic and self._curve.time_constant is not None:
+            values += self._curve.logarithmic * np.log1p(t_s / self._curve.time_constant)
+        self._count += values.size

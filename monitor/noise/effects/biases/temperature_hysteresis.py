@@ -1,0 +1,66 @@
+"""Bias with different values while the temperature rises and while it falls."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.common.compiled import compiled
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureHysteresis(Source):
+    """Hysteresis between the heating branch and the cooling branch (stop operator of Prandtl).
+
+    The bias is b = h x. The state x follows dx = dT/r, limited to −½ … ½. It is ½ on the heating branch and −½ on the
+    cooling branch. After a reversal, the temperature must change by r before the bias reaches the other branch. The
+    state starts at 0.
+
+    Source: Brokate & Sprekels, Hysteresis and Phase Transitions (1996), section 2.1.
+
+    >>> hysteresis = TemperatureHysteresis(height=1e-3, reversal=2.0)
+    >>> bool(np.isnan(hysteresis.avar(np.array([1.0]), 0.01)[0]))
+    True
+    """
+
+    height: float = parameter_field("rad/s", "m/s²", signed=True)
+    reversal: float = parameter_field("°C", positive=True)
+
+    description: ClassVar[str] = "The bias differs between rising and falling temperature."
+    uses_temperature: ClassVar[bool] = True
+
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return NaN, because the spectrum depends on the temperature."""
+        return nan_spectrum(tau0_s)
+
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Hysteresis":
+        """Start a series in the middle between both branches."""
+        return _Hysteresis(self.height, self.reversal)
+
+
+class _Hysteresis(NoiseSeries):
+    def __init__(self, height: float, reversal_c: float) -> None:
+        self._height, self._reversal_c = height, reversal_c
+        self._state = 0.0
+        self._last_c: float | None = None
+
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        last_c = float(block.temperature_c[0]) if self._last_c is None else self._last_c
+        self._state = _add_hysteresis(
+            values, block.temperature_c, last_c, self._state, self._height, 1.0 / self._reversal_c
+        )
+        self._last_c = float(block.temperature_c[-1])
+
+
+@compiled
+def _add_hysteresis(
+    values: Floats, temperature_c: Floats, last_c: float, state: float, height: float, slope: float
+) -> float:
+    for k in range(values.size):
+        state = min(max(state + slope * (temperature_c[k] - last_c), -0.5), 0.5)
+        last_c = temperature_c[k]
+        values[k] += height * state
+    return state

@@ -1,0 +1,111 @@
+"""Power-law noise with any exponent.
+
+The simulated series is white noise w after the fractional integration (1 − B)^(−d) with d = α/2, where B is the delay
+of one sample (Hosking, "Fractional differencing", 1981). Whole integrations are cumulative sums. For 0 < d < 1, the
+impulse response is a mixture of exponentials by the beta function,
+
+    ψ_k = sin(πd)/π ∫ x^(k+d−1) (1 − x)^(−d) dx   from 0 to 1.
+
+With x = 1/(1 + eˢ), the trapezoidal rule in s approximates ψ_k as Σ w_j x_jᵏ within 0.5 %, up to k = 10⁷.
+"""
+
+from dataclasses import dataclass
+from math import floor, pi, sin
+from typing import ClassVar, Final
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.common.compiled import compiled
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.spectrum import Spectrum, allan_variance_of_density
+
+MAX_EXPONENT: Final = 2.9
+"""Largest exponent. The Allan variance is infinite for an exponent of 3."""
+LOG_ODDS: Final = np.arange(-23.0, 11.0)
+"""Nodes s of the trapezoidal rule, with a spacing of 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class PowerLaw(Source):
+    """Noise with the spectrum S(f) = D² (sin(πfτ0)/(πτ0))^(−α), which is D² f^(−α) far below half the sample rate.
+
+    The exponent α is 0 for angle random walk, 1 for bias instability and 2 for rate random walk. The Allan variance is
+    an integral over the spectrum.
+
+    >>> flicker = PowerLaw(density=1.0, exponent=1.0)
+    >>> print(f"{flicker.avar(np.array([100.0]), 0.01)[0] / (4.0 * np.log(2.0)):.3f}")
+    1.000
+    """
+
+    density: float = parameter_field("rad/s/√Hz", "m/s²/√Hz")
+    exponent: float = parameter_field("1", maximum=MAX_EXPONENT)
+
+    description: ClassVar[str] = "The bias fluctuates with noise between white noise, 1/f noise and a random walk."
+
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return the spectrum, and the Allan variance by numerical integration."""
+
+        def density(f_hz: Floats) -> Floats:
+            return self.density**2 * (np.sin(np.pi * f_hz * tau0_s) / (np.pi * tau0_s)) ** -self.exponent
+
+        return Spectrum(density, lambda tau_s: allan_variance_of_density(density, tau_s, tau0_s, ()), tau0_s)
+
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_FractionalNoise":
+        """Start a stationary series, or a series with stationary increments at zero for exponents of at least 1."""
+        gain = self.density * (2.0 * np.pi / rate_hz) ** (0.5 * self.exponent) * rate_hz**0.5
+        return _FractionalNoise(gain, 0.5 * self.exponent, rng)
+
+
+class _FractionalNoise(NoiseSeries):
+    """Series y = direct·w + Σ weight·s, with white noise w and s ← pole·s + w, summed up for d ≥ 1."""
+
+    def __init__(self, gain: float, d: float, rng: np.random.Generator) -> None:
+        self._rng, self._starts_at_zero, self._is_summed = rng, d >= 0.5, d >= 1.0
+        fraction = d - floor(d)
+        scale = sin(pi * fraction) / pi
+        decay = 1.0 / (1.0 + np.exp(-LOG_ODDS))  # 1 − x
+        weights = scale * (1.0 - decay) ** fraction * decay ** (1.0 - fraction)
+        self._poles, self._weights = 1.0 - decay, gain * weights
+        overlap = decay[:, None] + decay - decay[:, None] * decay  # 1 − x_i x_j
+        variances, vectors = np.linalg.eigh(1.0 / overlap)
+        self._states = vectors @ (np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(decay.size))
+        # poles below the smallest node act as one integrator
+        walk = scale * (decay[0] * np.exp(-0.5)) ** (1.0 - fraction) / (1.0 - fraction) if fraction >= 0.5 else 0.0
+        self._walk = gain * float(walk)
+        self._direct = gain * (1.0 - float(weights.sum()) - float(walk))  # ψ_0 = 1
+        self._totals = np.zeros(2)  # of the integrator and of the output
+        self._start: float | None = None
+
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        series = self._rng.standard_normal(out=block.scratch)
+        _integrate(series, self._states, self._poles, self._weights, self._direct, self._walk, self._totals)
+        if self._is_summed:
+            _sum_up(series, self._totals)
+        if self._start is None:
+            self._start = float(series[0]) if self._starts_at_zero else 0.0
+        values += series
+        values -= self._start
+
+
+@compiled
+def _integrate(
+    series: Floats, states: Floats, poles: Floats, weights: Floats, direct: float, walk: float, totals: Floats
+) -> None:
+    """Replace white noise [n] by fractional noise."""
+    for k in range(series.size):
+        white = series[k]
+        totals[0] += white
+        value = direct * white + walk * totals[0]
+        for i in range(states.size):
+            states[i] = poles[i] * states[i] + white
+            value += weights[i] * states[i]
+        series[k] = value
+
+
+@compiled
+def _sum_up(series: Floats, totals: Floats) -> None:
+    """Replace a series [n] by the cumulative sum."""
+    for k in range(series.size):
+        totals[1] += series[k]
+        series[k] = totals[1]

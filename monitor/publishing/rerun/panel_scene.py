@@ -1,0 +1,136 @@
+"""Content of the Rerun viewer, which consists of panels that log results to one Rerun stream.
+
+Only the thread of the viewer may use this module, because a call blocks while the viewer does not read. Importing this
+module imports Rerun.
+"""
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import rerun as rr
+
+from drivers.data_types import Floats
+from monitor.common.device_health import Health
+from monitor.history.history_table import HistoryTable
+from monitor.publishing.rerun import panels
+from monitor.publishing.rerun.panels import Panel
+from monitor.publishing.rerun.shared_views import TIMELINE
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
+from monitor.publishing.result_kinds import RESULT_KINDS, TimedResult
+
+P = TypeVar("P", bound=Panel)
+PANELS: tuple[type[Panel], ...] = tuple(
+    getattr(panels, drawing.panel) for kind in RESULT_KINDS for drawing in kind.drawings
+)
+"""Classes of all panels."""
+
+
+class Scene:
+    """Panels of all devices in one Rerun stream. The class is not thread-safe, and its methods may block.
+
+    Parameters
+    ----------
+    stream
+        Rerun stream to which the panels log.
+    fleet
+        True if the device table also contains devices that are not shown in detail.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, fleet: bool = False) -> None:
+        self.fleet = fleet
+        self.devices: dict[str, ViewerDeviceDescription] = {}  # devices that are shown
+        self.healths: dict[str, Health] = {}  # newest health of each shown device
+        self._stream = stream
+        self._panels: dict[tuple[str, type[Panel]], Panel] = {}
+
+    def set_detailed_devices(self, devices: Sequence[ViewerDeviceDescription]) -> None:
+        """Set the devices that have panels."""
+        self.devices = {one.name: one for one in devices}
+        self.healths = {name: health for name, health in self.healths.items() if name in self.devices}
+        for name in self.devices:
+            for kind in PANELS:
+                self.get_or_create_panel(name, kind).log_styles()
+
+    def get_or_create_panel(self, device: str, kind: type[P]) -> P:
+        """Return the panel of a device with the given class. The panel is created if it does not exist.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        kind
+            Class of the panel.
+        """
+        found = self._panels.get((device, kind))
+        if not isinstance(found, kind):
+            found = self._panels[device, kind] = kind(self, device)
+        return found
+
+    def draw(self, device: str, panel: str, results: Sequence[TimedResult]) -> None:
+        """Draw results of a device in a panel.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        panel
+                        Name of the panel class.
+        results
+            One or more results with their Unix times [s], in order of time.
+        """
+        kind: type[Panel] = getattr(panels, panel)
+        self.get_or_create_panel(device, kind).draw(
+            np.array([unix_s for unix_s, _ in results]), [one for _, one in results]
+        )
+
+    def draw_history(self, device: str, history: HistoryTable) -> None:
+        """Draw the stored history of a device, with a gap before the live results.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        history
+            Stored history of the device.
+        """
+        for kind in PANELS:
+            self.get_or_create_panel(device, kind).draw_history(history)
+
+    def set_log_time(self, unix_s: float) -> None:
+        """Set the Unix time [s] under which the following calls log their data."""
+        self._stream.set_time(TIMELINE, timestamp=_timestamps(np.array([unix_s]))[0])
+
+    def log(self, path: str, *entities: Any, static: bool = False) -> None:
+        """Log components of a Rerun entity.
+
+        Parameters
+        ----------
+        path
+            Path of the entity in the Rerun recording.
+        *entities
+            Components to log.
+        static
+            True if the components do not change with time.
+        """
+        self._stream.log(path, *entities, static=static)
+
+    def log_scalars(self, path: str, unix_s: Floats, values: Floats) -> None:
+        """Log one or several time series under one path.
+
+        Parameters
+        ----------
+        path
+            Path of the entity in the Rerun recording.
+        unix_s
+            Unix times [s], shape [n].
+        values
+            Values, shape [n] or [n, series].
+        """
+        if unix_s.size:
+            time = rr.TimeColumn(TIMELINE, timestamp=_timestamps(unix_s))
+            self._stream.send_columns(path, [time], rr.Scalars.columns(scalars=values))
+
+
+def _timestamps(unix_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
+    return np.round(unix_s * 1e9).astype("datetime64[ns]")

@@ -1,0 +1,96 @@
+"""Base class of the panels of the Rerun viewer.
+
+Importing this module imports Rerun.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from drivers.data_types import Floats
+from monitor.common.unit_formatting import (
+    SAMPLE_UNITS,
+    sensor_kind,
+)
+from monitor.history.history_table import HistoryTable
+from monitor.publishing.plots import axis_colours
+from monitor.publishing.plots.axis_colours import Colour
+from monitor.publishing.rerun.panels.decimation import decimate_extremes
+from monitor.publishing.rerun.shared_views import markdown_document
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
+
+if TYPE_CHECKING:
+    from monitor.publishing.rerun.panel_scene import Scene
+    from monitor.publishing.result_kinds import CompensatedRateBatch, SampleBatch
+
+
+class Panel:
+    """Base class of the panels that draw one kind of result of one device.
+
+    Parameters
+    ----------
+    scene
+                Scene that contains the panel.
+    device
+        Name of the device.
+    """
+
+    def __init__(self, scene: "Scene", device: str) -> None:
+        self.scene = scene
+        self.device = device
+
+    def log_styles(self) -> None:
+        """Log the names, colours and widths of the lines, which do not change."""
+
+    def draw(self, unix_s: Floats, results: Sequence[Any]) -> None:
+        """Draw results of the device.
+
+        Parameters
+        ----------
+        unix_s
+            Unix times of the results [s].
+        results
+            One or more results, in order of time.
+        """
+        raise NotImplementedError
+
+    def draw_history(self, history: HistoryTable) -> None:
+        """Draw the stored history of the device."""
+
+    @classmethod
+    def tab_layout(cls, device: ViewerDeviceDescription) -> rrb.Container | None:
+        """Return the layout of a separate tab for the panel, or None if the panel has no tab."""
+        return None
+
+    def entity_path(self, name: str) -> str:
+        """Return the path of an entity that belongs to the device."""
+        return f"{self.device}/{name}"
+
+    def _style_lines(self, name: str, lines: Sequence[tuple[str, Colour, float]]) -> None:
+        names, line_colours, widths = zip(*lines, strict=True)
+        self.scene.log(
+            self.entity_path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True
+        )
+
+    def _style_samples(self, name: str, axes: Sequence[str]) -> None:
+        for axis in axes:
+            line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", axis_colours.AXIS_COLOURS[axis], 1.0)
+            self._style_lines(f"{name}/{axis}", [line])
+
+    def _log_samples(
+        self, name: str, axes: Sequence[str], results: "Sequence[SampleBatch | CompensatedRateBatch]"
+    ) -> Floats:
+        """Log decimated samples, and return the times of all samples."""
+        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
+        for i, axis in enumerate(axes):
+            t, y = decimate_extremes(times, values[:, i])
+            factor = SAMPLE_UNITS[sensor_kind(axis)].factor
+            self.scene.log_scalars(self.entity_path(f"{name}/{axis}"), t, y * factor)
+        return times
+
+    def _log_text(self, name: str, unix_s: float, text: str) -> None:
+        self.scene.set_log_time(unix_s)
+        self.scene.log(self.entity_path(name), markdown_document(text))

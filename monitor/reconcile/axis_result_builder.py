@@ -1,0 +1,326 @@
+"""Conversion of the search on one axis into an ``AxisResult`` with parameters, confidence and justification."""
+
+from dataclasses import replace
+from math import erf, exp, inf, log
+from typing import Final
+
+from monitor.common.distributions import Z95
+from monitor.noise.effect import AxisLeak, Effect
+from monitor.noise.effects import (
+    EFFECTS,
+    BandwidthLimit,
+    BiasCurve,
+    BiasStep,
+    ExponentiallyCorrelated,
+    Narrowband,
+    PowerLaw,
+    PulseTrain,
+    ScaleFactor,
+    Sinusoidal,
+    TemperatureBias,
+    TemperatureHysteresis,
+    TemperatureLag,
+    TurnOnTransient,
+)
+from monitor.noise.effects.signal_chain.bandwidth_limit import FILTER_KINDS
+from monitor.reconcile.diagnostics.null_distribution import AxisNull, compute_diagnostic_gaps
+from monitor.reconcile.likelihood.effect_roles import (
+    COEFFICIENTS,
+    MOST_DIRECT_DIAGNOSTIC,
+    SIZE_PARAMETERS,
+    effect_size,
+    linear_coefficient_names,
+)
+from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, compute_shape_interval, compute_size_interval
+from monitor.reconcile.result import (
+    AddedOrResizedEffect,
+    AlternativeEffect,
+    AxisModelDiagnostics,
+    AxisResult,
+    Decision,
+    DiagnosticGap,
+    ParameterInterval,
+    StepKind,
+)
+from monitor.reconcile.search.backward_elimination import changed_sizes
+from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
+from monitor.reconcile.search.trials import RETUNE, Trial
+from monitor.reconcile.summary.allan_influence import compute_allan_influences_of_changes
+from monitor.reconcile.summary.gap_decomposition import decompose_explained_gain, measure_remaining_gaps
+
+SHAPE_PARAMETERS: Final[dict[type[Effect], tuple[str, ...]]] = {
+    ExponentiallyCorrelated: ("correlation_time",),
+    Narrowband: ("frequency", "bandwidth"),
+    Sinusoidal: ("frequency",),
+    TemperatureLag: ("time_constant",),
+    TemperatureHysteresis: ("reversal",),
+    BiasCurve: ("time_constant",),
+    TurnOnTransient: ("time_constant",),
+    BiasStep: ("time",),
+    BandwidthLimit: ("cutoff",),
+    PowerLaw: ("exponent",),
+    ScaleFactor: ("factor",),
+}
+"""For each effect, the shape parameters that are reported with an interval."""
+MAX_RUNNERS_UP: Final = 3
+MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
+"""Smallest confidence with which an alternative effect is reported."""
+
+
+def build_axis_result(
+    search: AxisSearchResult, null: AxisNull, final_null: AxisNull, fitted_first: bool = False
+) -> AxisResult:
+    """Build the result of one axis from the search for missing effects.
+
+    Parameters
+    ----------
+    search : AxisSearchResult
+        Result of the search on the axis.
+    null : AxisNull
+        Null distributions of the diagnostics under the original model.
+    final_null : AxisNull
+        Null distributions of the diagnostics under the extended model.
+    fitted_first : bool, optional
+        True if the original model was fitted to the same recording.
+    """
+    snapshots = [_snapshot(one.before, null) for one in search.rounds]
+    end = _snapshot(search.final, final_null)
+    snapshots.append(end if search.before_withdrawal is None else _snapshot(search.before_withdrawal, null))
+    changes = _remaining_changes(search)
+    gains = decompose_explained_gain(search, fitted_first)
+    influences = (
+        compute_allan_influences_of_changes(search.hypothesis, {index for _, index, _ in changes}) if changes else {}
+    )
+    steps = []
+    for at, index, kind in changes:
+        before = snapshots[0 if search.rounds[at].replaces_effects else at]
+        step = _describe_step(search, search.rounds[at], index, kind, before, snapshots[at + 1])
+        steps.append(replace(step, gain_nats=gains.get(index, 0.0), allan=influences[index]))
+    left_over = tuple(gap for gap in end.gaps if gap.is_significant)
+    decision = _axis_decision(bool(steps), bool(left_over))
+    remaining = measure_remaining_gaps(search, left_over)
+    return AxisResult(search.hypothesis.axis.name, decision, snapshots[0], tuple(steps), left_over, end, remaining)
+
+
+def _snapshot(diagnostics: HypothesisDiagnostics, null: AxisNull) -> AxisModelDiagnostics:
+    return AxisModelDiagnostics(compute_diagnostic_gaps(diagnostics.findings, null), diagnostics.plots)
+
+
+def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKind]]:
+    """Return the changes that the search kept: index of the search round, index of the effect, and kind of change."""
+    hypothesis = search.hypothesis
+    found: list[tuple[int, int, StepKind]] = []
+    left = list(range(hypothesis.given_count, len(hypothesis.effects)))
+    resized = set(changed_sizes(hypothesis))
+    for at, one in enumerate(search.rounds):
+        last = one.hypothesis.effects[-1]
+        index = next((i for i in left if type(hypothesis.effects[i]) is type(last)), None)
+        moved = one.trials[0].moved
+        if moved is not None:
+            found.append((at, moved, "retuned"))
+        elif index is not None and one.hypothesis.added and one.trials[0].effect is not None:
+            left.remove(index)
+            found.append((at, index, "added"))
+        resized.discard(moved if moved is not None else -1)
+        last_round = at == len(search.rounds) - 1
+        for noise in sorted(resized):
+            if noise in one.hypothesis.fit.fitted_noise or last_round:
+                found.append((at, noise, "retuned" if effect_size(hypothesis.effects[noise]) > 0.0 else "absent"))
+                resized.discard(noise)
+    return found
+
+
+def _gap_of(lens: str, snapshot: AxisModelDiagnostics) -> DiagnosticGap:
+    return next(gap for gap in snapshot.gaps if gap.lens == lens)
+
+
+def _axis_decision(changed: bool, left_over: bool) -> Decision:
+    if left_over:
+        return "partly_explained" if changed else "unexplained"
+    return "explained" if changed else "agrees"
+
+
+def _describe_step(
+    search: AxisSearchResult,
+    done: SearchRound,
+    index: int,
+    kind: StepKind,
+    before: AxisModelDiagnostics,
+    after: AxisModelDiagnostics,
+) -> AddedOrResizedEffect:
+    effect, trial = search.hypothesis.effects[index], done.trials[0]
+    moved = trial.moved == index
+    gap = _triggering_gap(effect, "added" if moved else kind, before)
+    later = _gap_of(gap.lens, after)
+    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" or moved else RETUNE, done.trials)
+    if kind != "added" and trial.name != RETUNE and not moved:  # an effect was added in the same round
+        confidence, others = _resize_confidence(search.hypothesis, index), ()
+    held_out_before, held_out_after = _held_out_gaps(done, gap, later)
+    return AddedOrResizedEffect(
+        kind=kind,
+        effect=effect.name,
+        parameters=_parameters_with_bounds(search.hypothesis, index, trial, "added" if moved else kind),
+        confidence=confidence,
+        runners_up=others,
+        before=gap,
+        after=later,
+        held_out_before=held_out_before,
+        held_out_after=held_out_after,
+        held_out_reason=done.validation.reason,
+        because=_justification(effect, kind, gap, later, others, trial),
+        snapshot_after=after,
+    )
+
+
+def _held_out_gaps(
+    done: SearchRound, gap: DiagnosticGap, later: DiagnosticGap
+) -> tuple[DiagnosticGap | None, DiagnosticGap | None]:
+    validation = done.validation
+    if validation.reason:
+        return None, None
+    return (
+        DiagnosticGap(gap.lens, gap.where, validation.before, gap.null95, gap.threshold),
+        DiagnosticGap(gap.lens, gap.where, validation.after, later.null95, later.threshold),
+    )
+
+
+def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics) -> DiagnosticGap:
+    """Return the difference between recording and model that led to an effect.
+
+    A significant difference in the most sensitive diagnostic of the effect is preferred. Otherwise, the difference with
+    the largest ratio to the threshold is returned.
+    """
+    significant = [gap for gap in before.gaps if gap.is_significant] or list(before.gaps)
+    most_direct = MOST_DIRECT_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
+    for gap in significant:
+        if gap.lens == most_direct:
+            return gap
+    return max(significant, key=lambda gap: gap.gap / max(gap.threshold, 1e-9))
+
+
+def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[AlternativeEffect, ...]]:
+    """Return the probability of the selected effect, and the most probable alternative effects.
+
+    Each probability is proportional to exp(score), and all trials of the search round count. The hypothesis without
+    any effect has the score 0.
+    """
+    best: dict[str, float] = {"": 0.0}
+    for trial in trials:
+        best[trial.name] = max(best.get(trial.name, -inf), trial.total_score)
+    top = max(best.values())
+    whole = sum(exp(value - top) for value in best.values())
+    chances = {other: exp(value - top) / whole for other, value in best.items()}
+    others = sorted(
+        (chance, other)
+        for other, chance in chances.items()
+        if other in EFFECTS and other != name and chance >= MIN_RUNNER_UP_CONFIDENCE
+    )
+    runners_up = tuple(AlternativeEffect(other, chance) for chance, other in reversed(others[-MAX_RUNNERS_UP:]))
+    return chances.get(name, chances[max(best, key=lambda one: best[one])]), runners_up
+
+
+def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
+    """Return the probability that the true size of an effect differs from the size in the model."""
+    now, before = effect_size(hypothesis.effects[index]), effect_size(hypothesis.model[index])
+    error = hypothesis.fit.size_standard_error(index)
+    if not (now > 0.0 and before > 0.0 and error > 0.0):
+        return 1.0  # one of the sizes is zero
+    return erf(abs(log(now / before)) * now / error / 2.0**0.5)
+
+
+def _parameters_with_bounds(
+    hypothesis: Hypothesis, index: int, trial: Trial, kind: StepKind
+) -> dict[str, ParameterInterval]:
+    effect = hypothesis.effects[index]
+    if kind == "added" and trial.intervals and trial.name == effect.name:
+        return dict(trial.intervals)
+    found: dict[str, ParameterInterval] = {}
+    if isinstance(effect, AxisLeak):
+        found["source"] = ParameterInterval(effect.source)
+    size_name = SIZE_PARAMETERS.get(type(effect))
+    if size_name is not None and getattr(effect, size_name) is not None:
+        found[size_name] = compute_size_interval(hypothesis.fit, index)
+    for name in linear_coefficient_names(effect)[1:] if type(effect) in COEFFICIENTS else ():
+        found[name] = _coefficient_bounds(hypothesis, index, name)
+    if isinstance(effect, TemperatureBias):
+        found["reference"] = ParameterInterval(effect.reference)
+    for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
+        if getattr(effect, shape) is not None:
+            found[shape] = compute_shape_interval(hypothesis.fit, index, shape)
+    if isinstance(effect, PulseTrain):
+        found |= {name: ParameterInterval(getattr(effect, name)) for name in ("period", "width", "delay")}
+    if isinstance(effect, BandwidthLimit) and kind == "added":
+        found["order"] = ParameterInterval(float(effect.stages))
+        found["kind"] = ParameterInterval(effect.kind or FILTER_KINDS[0])
+    if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
+        # the frequency is fitted too, which doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
+        error = 2.0 * Z95 * hypothesis.fit.size_standard_error(index) / effect.amplitude
+        found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
+    return found
+
+
+def _coefficient_bounds(hypothesis: Hypothesis, index: int, name: str) -> ParameterInterval:
+    fitted = hypothesis.fit.whittle
+    column = next(place for at, place in hypothesis.fit.regressor_slices if at == index).start
+    column += linear_coefficient_names(hypothesis.effects[index]).index(name)
+    value = float(fitted.beta[column])
+    error = Z95 * float(fitted.beta_covariance[column, column]) ** 0.5
+    return ParameterInterval(value, value - error, value + error)
+
+
+EVIDENCE_TEXT: Final = {
+    "values": "The measured values are quantized, clipped or repeated",
+    "psd": "The power differs from the spectrum of the model",
+    "lines": "The spectrum contains a steady oscillation or the harmonics of pulses",
+    "autocorrelation": "Successive samples are correlated more than the model allows",
+    "level": "The level changes more than the model allows",
+    "temperature": "The level depends on the temperature",
+    "other_axes": "The axis contains a share of another axis",
+    "tails": "The samples have heavier tails than Gaussian noise",
+    "variance": "The variance of the noise changes in time",
+    "spectrogram": "The power in a frequency band changes in time",
+}
+"""For each diagnostic, the text that describes its evidence."""
+
+
+def _justification(
+    effect: Effect,
+    kind: StepKind,
+    gap: DiagnosticGap,
+    after: DiagnosticGap,
+    others: tuple[AlternativeEffect, ...],
+    trial: Trial,
+) -> str:
+    gaps = f"the gap is {gap.gap:.1f}, and a true model stays below {gap.threshold:.1f}"
+    sentences = [f"{EVIDENCE_TEXT[gap.lens]}{_location_text(gap)}: {gaps}."]
+    if not gap.is_significant:
+        sentences = [f"{effect.name} explains a difference that no diagnostic alone detects: {gaps}."]
+    if kind != "added":
+        parameter = "frequency" if trial.moved is not None and trial.name == effect.name else "size"
+        change = f"another {parameter} of" if kind == "retuned" else "no"
+        sentences.append(f"With {change} {effect.name}, which the model has, the gap is {after.gap:.1f}.")
+        return " ".join(sentences)
+    sentences.append(f"With {effect.name}, the gap is {after.gap:.1f}.")
+    if trial.event_count and trial.name == effect.name:
+        sentences.append(f"The number of detected events is {trial.event_count}.")
+    if others:
+        phrase = _comparison_phrase(others[0].confidence)
+        sentences.append(f"The effect {others[0].effect} explains the difference {phrase}.")
+    return " ".join(sentences)
+
+
+def _comparison_phrase(confidence: float) -> str:
+    return "nearly as well" if confidence > 0.2 else "less well" if confidence > 0.01 else "clearly less well"
+
+
+def _location_text(gap: DiagnosticGap) -> str:
+    place = gap.where
+    if place.frequency is not None:
+        lo, hi = place.frequency
+        middle, wide = 0.5 * (lo + hi), hi - lo
+        return f" at {middle:.5g} Hz" if wide < 0.05 * middle else f" from {lo:.3g} to {hi:.3g} Hz"
+    if place.source is not None:
+        return f" ({place.source})"
+    if place.time is not None and gap.lens in ("level", "variance") and place.time[1] - place.time[0] < 1e3:
+        return f" near {0.5 * (place.time[0] + place.time[1]):.5g} s"
+    return ""

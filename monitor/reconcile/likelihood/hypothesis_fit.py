@@ -1,0 +1,316 @@
+"""Hypotheses about one axis: effects of a noise model, some with a new size, and added effects.
+
+A noise effect of the model is resized only if the log-likelihood gain exceeds ``RESIZE_PENALTY_NATS``. The sizes of
+added effects and of deterministic effects are always fitted.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from math import exp, log
+from typing import Final
+
+import numpy as np
+
+from monitor.common.distributions import HALF_CHI2_95, Z95
+from monitor.noise.effect import Effect
+from monitor.noise.effects import CommonVibration, ExponentiallyCorrelated, PulseTrain, VarianceModulation
+from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
+from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, effect_size, is_noise_effect
+from monitor.reconcile.likelihood.periodic_pulse_search import find_pulse_delay
+from monitor.reconcile.likelihood.whitening import whiten_axis
+from monitor.reconcile.result import ParameterInterval
+
+RESIZE_PENALTY_NATS: Final = 7.0
+"""Smallest log-likelihood gain, in nats, for a new size of a noise effect of the model.
+
+By chance, the size of a true noise effect gains more than 7 nats with the probability P(χ²₁ > 14) = 0.02 %. A recording
+with six axes has about 24 sizes, so one of 200 recordings contains such a size.
+"""
+GOLDEN: Final = 0.6180339887498949
+SHAPE_ITERATIONS: Final = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """Effects of a noise model and added effects, fitted to one axis."""
+
+    model: Effects  # effects of the model under test with the original sizes; the first entries of ``effects``
+    fit: AxisFit
+
+    @property
+    def axis(self) -> Axis:
+        """Axis to which the effects are fitted."""
+        return self.fit.axis
+
+    @property
+    def given_count(self) -> int:
+        """Number of effects in the original noise model."""
+        return len(self.model)
+
+    @property
+    def added(self) -> Effects:
+        """Effects that were added to the noise model."""
+        return self.fit.effects[self.given_count :]
+
+    @property
+    def effects(self) -> Effects:
+        """All fitted effects: the effects of the noise model, then the added effects."""
+        return self.fit.effects
+
+    @property
+    def resized_model_effect_count(self) -> int:
+        """Number of noise effects of the model with a fitted size."""
+        return sum(at < self.given_count for at in self.fit.fitted_noise)
+
+    @property
+    def resize_penalty(self) -> float:
+        """Penalty in nats for the fitted sizes of the noise model."""
+        return RESIZE_PENALTY_NATS * self.resized_model_effect_count
+
+    @property
+    def penalised_log_likelihood(self) -> float:
+        """Log-likelihood less the penalty for fitted sizes of the noise model, in nats."""
+        return self.fit.log_likelihood - self.resize_penalty
+
+    def refit_with_other_added_effects(self, added: Sequence[Effect]) -> "Hypothesis":
+        """Fit the same noise model with another set of added effects."""
+        return fit_with_fewest_changes(self.axis, added, self.model)
+
+
+def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
+    """Fit the deterministic effects of a noise model and keep the sizes of the noise effects.
+
+    The sizes of deterministic effects, the delays of pulses and the phases of modulations differ between recordings.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    model : tuple of Effect
+        Effects of the axis in the model under test.
+    """
+    model = _with_fitted_timing(axis, model)
+    return Hypothesis(model, axis.fit(model, noise_effect_indices(model)))
+
+
+def _lacks_timing(effect: Effect) -> bool:
+    """Return True for pulses without a delay, and for a modulation without a phase."""
+    pulses = isinstance(effect, PulseTrain) and effect.delay is None
+    return pulses or (isinstance(effect, VarianceModulation) and effect.phase is None)
+
+
+def _with_fitted_timing(axis: Axis, model: Effects) -> Effects:
+    """Return the effects with fitted delays of pulses and fitted phases of modulations."""
+    known = [effect for effect in model if not _lacks_timing(effect)]
+    if len(known) == len(model):
+        return model
+    whitened = whiten_axis(axis.fit(known, noise_effect_indices(known)))
+
+    def fit_timing(effect: Effect) -> Effect:
+        if not _lacks_timing(effect):
+            return effect
+        if isinstance(effect, PulseTrain):
+            return replace(effect, delay=find_pulse_delay(whitened.series, axis.rate_hz, effect.period, effect.width))
+        assert isinstance(effect, VarianceModulation)
+        turns = np.arange(axis.n) / (axis.rate_hz * effect.period)
+        product = np.exp(-2j * np.pi * turns) @ (whitened.flat_series**2 - 1.0)
+        return replace(effect, phase=float(np.angle(1j * product) % (2.0 * np.pi)))
+
+    return tuple(fit_timing(effect) for effect in model)
+
+
+def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects) -> Hypothesis:
+    """Fit added effects together with a noise model, and change as few sizes of the model as possible.
+
+    The gain of a common vibration is not fitted, because the spectrum of one axis does not determine the gain.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    added : sequence of Effect
+        Effects that are added to the model.
+    model : tuple of Effect
+        Effects of the axis in the model under test.
+    """
+    effects = (*model, *added)
+    common = frozenset(len(model) + at for at, effect in enumerate(added) if isinstance(effect, CommonVibration))
+    fixed_noise = noise_effect_indices(model) | common
+    best = Hypothesis(model, axis.fit(effects, fixed_noise))
+    if fixed_noise == common:
+        return best
+    free = Hypothesis(model, axis.fit(effects, common))
+    if free.fit.log_likelihood - best.fit.log_likelihood < RESIZE_PENALTY_NATS:
+        return best
+    while fixed_noise > common:
+        trials = [Hypothesis(model, axis.fit(effects, fixed_noise - {at})) for at in sorted(fixed_noise - common)]
+        better = max(trials, key=lambda one: one.penalised_log_likelihood)
+        if better.penalised_log_likelihood <= best.penalised_log_likelihood:
+            break
+        best, fixed_noise = better, better.fit.fixed_noise
+    # the loop fits one more size at a time and cannot find two sizes that improve the fit only together
+    return free if free.penalised_log_likelihood > best.penalised_log_likelihood else best
+
+
+def noise_effect_indices(effects: Sequence[Effect]) -> frozenset[int]:
+    """Return the indices of the noise effects."""
+    return frozenset(at for at, effect in enumerate(effects) if is_noise_effect(effect))
+
+
+def fit_shape_parameter(
+    axis: Axis, other_effects: Effects, effect: Effect, parameter_name: str, search_factor: float = 1.5
+) -> Effect:
+    """Fit one shape parameter of an effect by maximum likelihood, together with all sizes.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    other_effects : tuple of Effect
+        Other effects of the axis.
+    effect : Effect
+        Effect whose shape parameter is varied.
+    parameter_name : str
+        Name of the shape parameter.
+    search_factor : float, optional
+        Largest factor between the result and the present value, in either direction.
+
+    Returns
+    -------
+    Effect
+        Effect with the fitted shape parameter and the original size.
+    """
+
+    def with_shape_parameter(log_value: float) -> Effect:
+        return with_shape(effect, parameter_name, exp(log_value))
+
+    middle, width = log(getattr(effect, parameter_name)), log(search_factor)
+    best = find_maximum_by_golden_section(
+        lambda x: axis.fit((*other_effects, with_shape_parameter(x))).log_likelihood,
+        middle - width,
+        middle + width,
+        SHAPE_ITERATIONS,
+    )
+    return with_shape_parameter(best)
+
+
+def refit_correlation_times(axis: Axis, added: Sequence[Effect], model: Effects) -> Effects:
+    """Fit the correlation times of added correlated noise again, except for the last added effect.
+
+    A slow effect that is not yet in the hypothesis increases the fitted correlation time.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    added : sequence of Effect
+        Effects that are added to the model. The last effect is new.
+    model : tuple of Effect
+        Effects of the axis in the model under test.
+    """
+    found = tuple(added)
+    for at, effect in enumerate(found[:-1]):
+        if isinstance(effect, ExponentiallyCorrelated):
+            others = (*model, *found[:at], *found[at + 1 :])
+            found = (*found[:at], fit_shape_parameter(axis, others, effect, "correlation_time"), *found[at + 1 :])
+    return found
+
+
+def find_maximum_by_golden_section(function: Callable[[float], float], lo: float, hi: float, iterations: int) -> float:
+    """Find the maximum of a function with a single maximum in an interval, by golden-section search.
+
+    Parameters
+    ----------
+    function : callable
+        Function to maximise.
+    lo, hi : float
+        Ends of the interval.
+    iterations : int
+        Number of iterations. Each iteration evaluates the function once.
+    """
+    a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
+    at_a, at_b = function(a), function(b)
+    for _ in range(iterations):
+        if at_a > at_b:
+            hi, b, at_b = b, a, at_a
+            a = hi - GOLDEN * (hi - lo)
+            at_a = function(a)
+        else:
+            lo, a, at_a = a, b, at_b
+            b = lo + GOLDEN * (hi - lo)
+            at_b = function(b)
+    return 0.5 * (lo + hi)
+
+
+def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
+    """Compute the 95 % interval of the size of an effect.
+
+    The interval is symmetric for a deterministic effect, and symmetric on a logarithmic scale for a noise effect.
+
+    Parameters
+    ----------
+    fit : AxisFit
+        Fit that contains the effect.
+    effect_index : int
+        Index of the effect.
+    """
+    value, error = effect_size(fit.effects[effect_index]), fit.size_standard_error(effect_index)
+    if type(fit.effects[effect_index]) in DETERMINISTIC_SIZE_PARAMETERS:
+        return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
+    if not value > 0.0 or not np.isfinite(error):
+        return ParameterInterval(value)
+    ends = value * exp(-Z95 * error / value), value * exp(Z95 * error / value)
+    effect = fit.effects[effect_index]
+    if isinstance(effect, CommonVibration) and effect.gain < 0.0:
+        return ParameterInterval(-value, -ends[1], -ends[0])
+    return ParameterInterval(value, *ends)
+
+
+def with_shape(effect: Effect, name: str, value: float) -> Effect:
+    """Return a copy of an effect with a new shape parameter, limited to the largest allowed value.
+
+    Parameters
+    ----------
+    effect : Effect
+        Effect to copy.
+    name : str
+        Name of the shape parameter.
+    value : float
+        New value, in the unit of the parameter.
+    """
+    largest = next(f.metadata["most"] for f in fields(effect) if f.name == name)  # type: ignore[arg-type]
+    changed: Effect = replace(effect, **{name: min(value, largest)})  # type: ignore[type-var]
+    return changed
+
+
+def compute_shape_interval(fit: AxisFit, effect_index: int, parameter_name: str) -> ParameterInterval:
+    """Compute the 95 % interval of a shape parameter from the profile likelihood.
+
+    Parameters
+    ----------
+    fit : AxisFit
+        Fit that contains the effect.
+    effect_index : int
+        Index of the effect.
+    parameter_name : str
+        Name of the shape parameter.
+    """
+    effects, effect = fit.effects, fit.effects[effect_index]
+    value = float(getattr(effect, parameter_name))
+
+    def log_likelihood_loss(factor: float) -> float:
+        shaped = with_shape(effect, parameter_name, value * factor)
+        changed = (*effects[:effect_index], shaped, *effects[effect_index + 1 :])
+        return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_noise).log_likelihood
+
+    ends = []
+    for sign in (-1.0, 1.0):
+        step = 1e-6
+        while step < 2.0 and log_likelihood_loss(exp(sign * step)) < HALF_CHI2_95:
+            step *= 2.0
+        lo, hi = 0.5 * step, step
+        for _ in range(8):
+            middle = 0.5 * (lo + hi)
+            lo, hi = (middle, hi) if log_likelihood_loss(exp(sign * middle)) < HALF_CHI2_95 else (lo, middle)
+        ends.append(float(getattr(with_shape(effect, parameter_name, value * exp(sign * hi)), parameter_name)))
+    return ParameterInterval(value, ends[0], ends[1])

@@ -1,0 +1,171 @@
+"""Withdrawal of added effects that the final diagnostics contradict.
+
+Lines and resonances can fit an oscillation with a varying frequency, although the fitted model is wrong. Lines,
+resonances, low-pass filters and power laws are withdrawn in these cases:
+
+- Several lines or resonances overlap.
+- ``MIN_COMB_LINES`` or more lines are harmonics of one frequency.
+- A significant difference remains at the frequency of the effect.
+
+A leak is withdrawn if more than half of the dependence on other axes remains. Pulses are withdrawn if more than a tenth
+of the harmonics remains, or if several lines are harmonics of the pulses. A step or a curve is withdrawn if the mean
+level still changes. A smooth spectrum is withdrawn if the noise is mainly non-Gaussian, non-stationary or common to
+several axes.
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from monitor.noise.effect import AxisLeak, Effect
+from monitor.noise.effects import (
+    BandwidthLimit,
+    BiasCurve,
+    BiasStep,
+    ExponentiallyCorrelated,
+    Narrowband,
+    PowerLaw,
+    PulseTrain,
+    Sinusoidal,
+)
+from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
+from monitor.reconcile.likelihood.axis_fit import Effects
+
+MIN_COMB_LINES: Final = 4
+MAX_HARMONIC: Final = 60
+MIN_PULSE_LINES: Final = 2
+"""Smallest number of lines beside pulses that show another shape."""
+MAX_PULSE_DIVISOR: Final = 4
+"""Largest divisor of the pulse frequency of which lines are harmonics."""
+PULSE_ORDER_TOLERANCE: Final = 0.005
+"""Largest distance of a line from a multiple of the divided pulse frequency, in units of this frequency."""
+DIFFERENCE_DIVISORS: Final = (1, 2, 3)
+"""Divisors that convert the distance of two lines to a possible fundamental frequency."""
+HARMONIC_TOLERANCE: Final = 2e-4
+"""Largest distance of a line from a harmonic, relative to the highest line frequency."""
+RESONANCE_REACH_HALF_WIDTHS: Final = 2.0
+"""Distance from a resonance, in half widths, within which other lines and resonances overlap."""
+LINE_REACH_HZ: Final = 0.1
+MAX_REMAINING_SHARE: Final = 0.1
+"""Largest remaining gain, relative to the gain that an effect should explain."""
+MAX_REMAINING_LEAK_SHARE: Final = 0.5
+"""Largest remaining gain, relative to the gain that a leak should explain."""
+MAX_FOREIGN_RATIO: Final = 100.0
+"""Largest gain of the non-spectral diagnostics, relative to the gain that a smooth spectrum should explain."""
+SMOOTH_SPECTRA: Final = (BandwidthLimit, ExponentiallyCorrelated, PowerLaw)
+NON_SPECTRAL_DIAGNOSTICS: Final = ("tails", "variance", "other_axes")
+"""Diagnostics of non-Gaussian, non-stationary or common noise."""
+FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")
+"""Diagnostics that resolve the frequency."""
+
+
+def keep_uncontradicted_effects(
+    added: Effects, explained_gains: Mapping[type[Effect], float], findings: Findings, null: AxisNull
+) -> Effects:
+    """Return the added effects that the final diagnostics do not contradict.
+
+    Parameters
+    ----------
+    added : tuple of Effect
+        Effects that the search added.
+    explained_gains : mapping of type to float
+        For each type of effect, the gain in nats that the effect should explain.
+    findings : Findings
+        Findings on the axis at the end of the search.
+    null : AxisNull
+        Null distribution of each diagnostic.
+    """
+
+    def significant_gain(lens: str) -> float:
+        gain = findings[lens].gain
+        return gain if gain > null[lens].threshold else 0.0
+
+    def contradicted_effects(kinds: type[Effect] | tuple[type[Effect], ...], gain: float, share: float) -> set[int]:
+        return {
+            at
+            for at, e in enumerate(added)
+            if isinstance(e, kinds) and gain > share * explained_gains.get(type(e), 0.0)
+        }
+
+    withdrawn = _overlapping_features(added) | _harmonic_comb(added) | _pulses_with_lines(added)
+    for lens in FREQUENCY_DIAGNOSTICS:
+        place = findings[lens].where.frequency
+        if place is not None:
+            candidates = contradicted_effects(Effect, significant_gain(lens), MAX_REMAINING_SHARE)
+            withdrawn |= {at for at in candidates if _overlaps(added[at], place)}
+    withdrawn |= contradicted_effects(AxisLeak, significant_gain("other_axes"), MAX_REMAINING_LEAK_SHARE)
+    withdrawn |= contradicted_effects(PulseTrain, significant_gain("lines"), MAX_REMAINING_SHARE)
+    withdrawn |= contradicted_effects((BiasStep, BiasCurve), significant_gain("level"), MAX_REMAINING_SHARE)
+    withdrawn |= contradicted_effects(
+        SMOOTH_SPECTRA, max(map(significant_gain, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO
+    )
+    return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)
+
+
+def _frequency_range(effect: Effect) -> tuple[float, float]:
+    if isinstance(effect, Narrowband):
+        half = max(RESONANCE_REACH_HALF_WIDTHS * 0.5 * effect.bandwidth, LINE_REACH_HZ)
+        return effect.frequency - half, effect.frequency + half
+    assert isinstance(effect, Sinusoidal)
+    return effect.frequency - LINE_REACH_HZ, effect.frequency + LINE_REACH_HZ
+
+
+def _overlaps(effect: Effect, place: tuple[float, float]) -> bool:
+    """Return True if an effect acts in a frequency range."""
+    if isinstance(effect, PowerLaw):
+        return True
+    if isinstance(effect, BandwidthLimit):
+        return place[1] > 0.5 * effect.cutoff
+    if not isinstance(effect, (Narrowband, Sinusoidal)):
+        return False
+    lo, hi = _frequency_range(effect)
+    return lo < place[1] and place[0] < hi
+
+
+def _overlapping_features(added: Effects) -> set[int]:
+    features = {at: effect for at, effect in enumerate(added) if isinstance(effect, (Sinusoidal, Narrowband))}
+    overlapping: set[int] = set()
+    for at, one in features.items():
+        lo, hi = _frequency_range(one)
+        near = {other for other, two in features.items() if other != at and lo < two.frequency < hi}
+        overlapping |= near | {at} if near else set()
+    return overlapping
+
+
+def _pulses_with_lines(added: Effects) -> set[int]:
+    """Return the indices of pulses, and of lines at harmonics of a part of the pulse frequency, if there are several.
+
+    Pulses with additional lines are a periodic signal of another shape.
+    """
+    found: set[int] = set()
+    for at, pulses in enumerate(added):
+        if not isinstance(pulses, PulseTrain):
+            continue
+        for part in range(1, MAX_PULSE_DIVISOR + 1):
+            lines = {
+                other: line.frequency * pulses.period * part
+                for other, line in enumerate(added)
+                if isinstance(line, Sinusoidal)
+            }
+            near = {other for other, order in lines.items() if abs(order - round(order)) < PULSE_ORDER_TOLERANCE}
+            found |= near | {at} if len(near) >= MIN_PULSE_LINES else set()
+    return found
+
+
+def _harmonic_comb(added: Effects) -> set[int]:
+    """Return the indices of lines that are harmonics of one fundamental frequency."""
+    lines = {at: effect.frequency for at, effect in enumerate(added) if isinstance(effect, Sinusoidal)}
+    f = np.array(list(lines.values()))
+    if f.size < MIN_COMB_LINES:
+        return set()
+    apart = np.abs(f[:, None] - f[None, :])[np.triu_indices(f.size, 1)]
+    best: set[int] = set()
+    for fundamental in np.concatenate([f, *(apart / part for part in DIFFERENCE_DIVISORS)]):
+        if fundamental < f.max() / MAX_HARMONIC:
+            continue
+        order = np.rint(f / fundamental)
+        near = (np.abs(f - order * fundamental) < HARMONIC_TOLERANCE * f.max()) & (order > 0)
+        if near.sum() > len(best):
+            best = {at for at, harmonic in zip(lines, near.tolist(), strict=True) if harmonic}
+    return best if len(best) >= MIN_COMB_LINES else set()

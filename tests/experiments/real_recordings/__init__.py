@@ -1,0 +1,1 @@
+"""`reconcile` on real recordings, with an independent check of each finding."""

@@ -1,0 +1,69 @@
+"""Power laws beside the classic terms, beside fractional integration written down a second time, and in time."""
+
+import numpy as np
+import pytest
+from scipy.special import gamma, gammaln
+
+from monitor.noise.effects import AngleRandomWalk, BandwidthLimit, BiasInstability, PowerLaw, RateRandomWalk
+from monitor.noise.effects.disturbances import power_law
+
+RATE_HZ = 100.0
+
+
+@pytest.mark.parametrize("d", [0.02, 0.25, 0.5, 0.75, 0.97])
+def test_the_impulse_response_is_that_of_fractional_integration(d: float) -> None:
+    running = power_law._FractionalNoise(1.0, d, np.random.default_rng(0))
+    k = np.concatenate([np.arange(20.0), np.geomspace(20.0, 1e7, 60).round()])
+    powers = np.exp(k[:, None] * np.log(running._poles))
+    found = powers @ running._weights + running._direct * (k == 0) + running._walk
+    expected = np.exp(gammaln(k + d) - gammaln(k + 1.0)) / gamma(d)
+    np.testing.assert_allclose(found, expected, rtol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("exponent", "classic"),
+    [
+        (0.0, AngleRandomWalk(N=1.0)),
+        (1.0, BiasInstability(B=(2.0 * np.pi) ** 0.5)),
+        (2.0, RateRandomWalk(K=2.0 * np.pi)),
+    ],
+)
+def test_classic_exponents_are_the_classic_terms(exponent: float, classic) -> None:
+    f_hz, tau_s = np.geomspace(1e-3, 1.0, 20), np.array([2.56, 30.0, 1000.0])
+    one = PowerLaw(density=1.0, exponent=exponent)
+    np.testing.assert_allclose(one.two_sided_psd(f_hz, 0.01), classic.two_sided_psd(f_hz, 0.01), rtol=3e-4)
+    np.testing.assert_allclose(one.avar(tau_s, 0.01), classic.avar(tau_s, 0.01), rtol=1e-3)
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.5, 2.5, 2.9])
+def test_allan_variance_grows_with_its_power(exponent: float) -> None:
+    """σ²(τ) ∝ τ^(α−1), also where most of it comes from below the grid of the integral."""
+    tau_s = np.array([10.0, 100.0, 1000.0])
+    avar = PowerLaw(density=1.0, exponent=exponent).avar(tau_s, 0.01)
+    np.testing.assert_allclose(avar[1:] / avar[:-1], 10.0 ** (exponent - 1.0), rtol=5e-3)
+
+
+@pytest.mark.parametrize("exponent", [0.4, 1.0, 1.5, 1.9, 2.4])
+def test_steps_over_any_time_are_as_large_at_the_start_as_later(exponent: float) -> None:
+    """The stated Allan variance, over two samples and over two seconds, from the first sample on."""
+    rng = np.random.default_rng(3)
+    runs = np.stack(
+        [
+            PowerLaw(density=1.0, exponent=exponent).start_series(RATE_HZ, rng).draw_next_samples(2050)
+            for _ in range(1500)
+        ]
+    )
+    stated = PowerLaw(density=1.0, exponent=exponent).avar(np.array([0.01, 1.0]), 0.01)
+    for begin in (0, 1800):
+        part = runs[:, begin : begin + 200]
+        second = np.diff(part[:, :2], axis=1)[:, 0] / 2.0**0.5
+        assert np.mean(second**2) == pytest.approx(stated[0], rel=0.15)
+        halves = (part[:, 100:].mean(axis=1) - part[:, :100].mean(axis=1)) / 2.0**0.5
+        assert np.mean(halves**2) == pytest.approx(stated[1], rel=0.15)
+
+
+def test_behind_a_filter() -> None:
+    """The integral of the filtered spectrum is that without a filter where the filter does nothing."""
+    one = PowerLaw(density=1.0, exponent=2.6).spectrum(0.01)
+    filtered = BandwidthLimit(cutoff=20.0, order=2).transform_spectrum(one)
+    assert filtered.avar(np.array([100.0]))[0] == pytest.approx(one.avar(np.array([100.0]))[0], rel=1e-3)

@@ -1,0 +1,144 @@
+"""A model is believed until the data object; shapes and intervals beside SciPy's."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
+
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    BiasStep,
+    ExponentiallyCorrelated,
+    RateRamp,
+    RateRandomWalk,
+    Sinusoidal,
+)
+from monitor.reconcile.likelihood.hypothesis_fit import (
+    compute_shape_interval,
+    compute_size_interval,
+    fit_shape_parameter,
+    fit_with_fewest_changes,
+    fit_with_fixed_noise,
+    with_shape,
+)
+from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, K, N, axis, correlated, time_s, walk, white
+
+n = 20_000
+MODEL = (WHITE, RateRandomWalk(K=3e-5))
+
+
+def drawn(seed, more=0.0):
+    rng = np.random.default_rng(seed)
+    return white(n, rng) + walk(n, rng, 3e-5) + more
+
+
+def test_a_true_model_is_believed():
+    resized_model_effect_count = 0
+    for seed in range(20):
+        one = axis(drawn(seed))
+        state = fit_with_fewest_changes(one, (), MODEL)
+        resized_model_effect_count += state.resized_model_effect_count
+        assert fit_with_fixed_noise(one, MODEL).fit.log_likelihood <= state.fit.log_likelihood + 1e-6
+    assert resized_model_effect_count <= 1  # another size that gains this much: once in some hundred
+
+
+@pytest.mark.parametrize(("wrong", "at"), [((1.1, 1.0), 0), ((0.93, 1.0), 0), ((1.0, 4.0), 1), ((1.0, 0.2), 1)])
+def test_a_wrong_size_is_another_size_and_the_right_one_stays(wrong, at):
+    one = axis(drawn(1))
+    given = (AngleRandomWalk(N=wrong[0] * N), RateRandomWalk(K=wrong[1] * 3e-5))
+    state = fit_with_fewest_changes(one, (), given)
+    assert state.fit.fitted_noise == (at,)
+    assert state.resized_model_effect_count == 1
+    assert state.effects[1 - at] == given[1 - at]
+    found = (state.effects[0].N / N, state.effects[1].K / 3e-5)[at]
+    assert found == pytest.approx(1.0, abs=0.4 if at else 0.02)
+    assert state.penalised_log_likelihood > fit_with_fixed_noise(one, given).penalised_log_likelihood
+
+
+def test_both_wrong_sizes_are_found():
+    state = fit_with_fewest_changes(axis(drawn(2)), (), (AngleRandomWalk(N=1.3 * N), RateRandomWalk(K=2e-4)))
+    assert state.resized_model_effect_count == 2
+    assert pytest.approx(N, rel=0.03) == state.effects[0].N
+    assert pytest.approx(3e-5, rel=0.5) == state.effects[1].K
+
+
+def test_what_was_found_is_always_fitted():
+    y = drawn(3) + 5e-5 * time_s(n)
+    state = fit_with_fewest_changes(axis(y), (RateRamp(R=1.0),), MODEL)
+    assert state.resized_model_effect_count == 0
+    assert pytest.approx(5e-5, abs=5 * state.fit.size_standard_error(2)) == state.effects[2].R
+    alone = fit_with_fewest_changes(axis(drawn(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
+    assert pytest.approx(N, rel=0.03) == alone.effects[0].N
+    assert alone.resized_model_effect_count == 0  # nothing was given
+
+
+def test_a_shape_is_at_the_top_of_its_profile():
+    rng = np.random.default_rng(4)
+    one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
+    effects = (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.8))
+    found = fit_shape_parameter(one, effects[:1], effects[1], "correlation_time", 3.0)
+
+    def loss(x):
+        return -one.fit((effects[0], with_shape(effects[1], "correlation_time", float(np.exp(x))))).log_likelihood
+
+    best = minimize_scalar(loss, bounds=(np.log(0.2), np.log(2.0)), method="bounded", options={"xatol": 1e-4})
+    assert found.correlation_time == pytest.approx(np.exp(best.x), rel=0.05)
+    assert loss(np.log(found.correlation_time)) == pytest.approx(best.fun, abs=0.05)
+    assert effects[1].correlation_time == 0.8
+
+
+def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
+    rng = np.random.default_rng(5)
+    one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
+    start = ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5)
+    effects = (WHITE, fit_shape_parameter(one, (WHITE,), start, "correlation_time"))
+    state = fit_with_fewest_changes(one, effects, ())
+    found = compute_shape_interval(state.fit, 1, "correlation_time")
+    assert found.lo < found.value < found.hi
+    assert found.lo < 0.5 < found.hi
+    for end in (found.lo, found.hi):
+        at_end = one.fit((effects[0], with_shape(effects[1], "correlation_time", end)))
+        fallen = state.fit.log_likelihood - at_end.log_likelihood
+        assert fallen == pytest.approx(0.5 * chi2.ppf(0.95, 1), abs=0.2)
+
+
+@pytest.mark.long
+def test_intervals_of_a_line_hold_its_frequency():
+    """The error of a frequency is √(6/n)/(π T) × σ/A (Rife and Boorstyn 1974)."""
+    inside = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        y = white(n, rng) + 3e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n) + 1.0)
+        one = axis(y)
+        start = Sinusoidal(amplitude=1e-4, frequency=17.3, phase=0.0)
+        effects = (WHITE, fit_shape_parameter(one, (WHITE,), start, "frequency", 1.0001))
+        state = fit_with_fewest_changes(one, effects, ())
+        found = compute_shape_interval(state.fit, 1, "frequency")
+        inside.append(found.lo < 17.3 < found.hi)
+        error = np.sqrt(6.0 / n) / (np.pi * n / RATE_HZ) * N * RATE_HZ**0.5 / 3e-4
+        assert found.hi - found.lo == pytest.approx(2 * 1.96 * error, rel=0.15)
+    assert np.mean(inside) >= 0.75
+
+
+def test_intervals_of_sizes():
+    inside = []
+    for seed in range(40):
+        y = drawn(seed, np.where(time_s(n) < 80.0, 0.0, -3e-4))
+        state = fit_with_fewest_changes(axis(y), (*MODEL, BiasStep(time=80.0, height=1.0)), ())
+        white_noise, _, step = (compute_size_interval(state.fit, at) for at in range(3))
+        inside += [white_noise.lo < N < white_noise.hi, step.lo < -3e-4 < step.hi]
+        assert white_noise.lo * white_noise.hi == pytest.approx(white_noise.value**2)
+    assert np.mean(inside) > 0.87  # of 80, less than 0.88 once in 150
+
+
+def test_a_size_that_is_held_or_zero_has_no_interval():
+    one = axis(white(n, np.random.default_rng(0)))
+    held = compute_size_interval(fit_with_fixed_noise(one, (WHITE, WALK)).fit, 0)
+    assert (held.value, held.lo, held.hi) == (N, None, None)
+    for seed in range(8):  # K is at its bound in about half of the cases
+        state = fit_with_fewest_changes(axis(white(n, np.random.default_rng(seed))), (WHITE, RateRandomWalk(K=K)), ())
+        if state.effects[1].K == 0.0:
+            assert compute_size_interval(state.fit, 1).lo is None
+            break
+    else:
+        pytest.fail("no fit was at the bound")

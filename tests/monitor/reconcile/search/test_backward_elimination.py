@@ -1,0 +1,168 @@
+"""Backward elimination: fewer names where fewer explain the same, and no loss of a name that is needed."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    ExponentiallyCorrelated,
+    Narrowband,
+    QuantizationNoise,
+    RateRamp,
+    ScaleFactor,
+    Sinusoidal,
+)
+from monitor.reconcile.diagnostics.null_distribution import run_diagnostics
+from monitor.reconcile.likelihood.effect_roles import effect_size
+from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fewest_changes, fit_with_fixed_noise
+from monitor.reconcile.likelihood.whitening import whiten_axis
+from monitor.reconcile.search.backward_elimination import (
+    changed_sizes,
+    eliminate_unneeded_effects,
+    share_frequency_or_time,
+    with_significant_sizes,
+)
+from monitor.reconcile.search.cross_validation import accept_without_validation
+from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
+from monitor.reconcile.search.trials import RETUNE, Trial
+from tests.monitor.reconcile.axes import STRICT, WALK, WHITE, N, axes, axis, ringing, seen, time_s, walk, white
+
+n = 30_000
+MODEL = (WHITE, WALK)
+T = time_s(n)
+
+
+@cache
+def noise(seed=0):
+    rng = np.random.default_rng(seed)
+    return white(n, rng) + walk(n, rng)
+
+
+def searched(hypothesis: Hypothesis) -> AxisSearchResult:
+    """A search that ended with this hypothesis after one round."""
+    reason = accept_without_validation("made by hand")
+    done = SearchRound(HypothesisDiagnostics({}, ()), (Trial(RETUNE, None, 10.0),), hypothesis, reason)
+    final = HypothesisDiagnostics(run_diagnostics(whiten_axis(hypothesis.fit)), ())
+    return AxisSearchResult((done,), hypothesis, final, None)
+
+
+def simplified(y, added, model=MODEL) -> Hypothesis:
+    one = axis(y, model)
+    found = searched(Hypothesis(model, one.fit((*model, *added), frozenset(range(len(model))))))
+    return eliminate_unneeded_effects({"gz": found}, {"gz": STRICT}, fitted_first=False)["gz"].hypothesis
+
+
+def names(hypothesis):
+    return [effect.name for effect in hypothesis.added]
+
+
+def test_an_effect_that_explains_nothing_leaves():
+    line = Sinusoidal(amplitude=1e-4, frequency=17.3)
+    y = noise() + 2e-4 * np.sin(2 * np.pi * 17.3 * T)
+    assert names(simplified(y, (line, RateRamp(R=1e-9), Narrowband(1e-6, 8.0, 0.5)))) == ["sinusoidal"]
+
+
+def test_an_effect_that_is_needed_stays():
+    y = noise() + ringing(n, np.random.default_rng(3), 3e-4, 8.0, 0.5)
+    assert names(simplified(y, (Narrowband(1e-4, 8.0, 0.5),))) == ["narrowband"]
+
+
+def test_two_peaks_under_one_hump_become_one_hump():
+    y = noise() + ringing(n, np.random.default_rng(3), 3e-4, 8.0, 1.5)
+    found = simplified(y, (Narrowband(2e-4, 7.7, 0.6), Narrowband(2e-4, 8.3, 0.6)))
+    (hump,) = found.added
+    assert isinstance(hump, Narrowband)
+    assert hump.frequency == pytest.approx(8.0, abs=0.2)
+    assert hump.bandwidth == pytest.approx(1.5, rel=0.4)
+
+
+def test_two_resonances_apart_stay_two():
+    rng = np.random.default_rng(3)
+    y = noise() + ringing(n, rng, 3e-4, 8.0, 0.2) + ringing(n, rng, 3e-4, 10.0, 0.2)
+    assert names(simplified(y, (Narrowband(2e-4, 8.0, 0.2), Narrowband(2e-4, 10.0, 0.2)))) == ["narrowband"] * 2
+
+
+def test_a_size_that_did_not_change_keeps_its_old_value():
+    one = axis(noise(), MODEL)
+    free = Hypothesis(MODEL, one.fit(MODEL))
+    assert changed_sizes(free) == [0, 1]
+    assert with_significant_sizes(free).effects == MODEL
+
+
+def test_of_two_sizes_the_one_that_changed_is_retuned():
+    rng = np.random.default_rng(5)
+    one = axis(1.1 * white(n, rng) + walk(n, rng), MODEL)
+    found = with_significant_sizes(Hypothesis(MODEL, one.fit(MODEL)))
+    assert changed_sizes(found) == [0]
+    assert effect_size(found.effects[0]) == pytest.approx(1.1 * N, rel=0.02)
+
+
+def test_a_term_that_is_compatible_with_zero_is_absent():
+    model = (*MODEL, QuantizationNoise(Q=3e-6))
+    rng = np.random.default_rng(6)
+    one = axis(white(n, rng) + walk(n, rng), model)
+    almost = (*MODEL, QuantizationNoise(Q=1e-8))
+    found = with_significant_sizes(Hypothesis(model, one.fit(almost, frozenset({0, 1, 2}))))
+    assert changed_sizes(found) == [2]
+    assert effect_size(found.effects[2]) == 0.0
+
+
+def test_sizes_that_change_by_one_factor_are_one_scale_factor_of_a_triad():
+    model = (WHITE, WALK)
+    values = {name: 1.3 * noise(seed) for seed, name in enumerate(("gx", "gy", "gz"))}
+    found = {
+        name: searched(Hypothesis(model, one.fit(model, frozenset({1})))) for name, one in axes(values, model).items()
+    }
+    simple = eliminate_unneeded_effects(found, dict.fromkeys(found, STRICT), fitted_first=False)
+    factors = {one.hypothesis.added for one in simple.values()}
+    ((factor,),) = factors
+    assert isinstance(factor, ScaleFactor)
+    assert factor.factor == pytest.approx(1.3, rel=0.01)
+    assert not any(changed_sizes(one.hypothesis) for one in simple.values())
+    unchanged = eliminate_unneeded_effects(found, dict.fromkeys(found, STRICT), fitted_first=True)
+    assert [one.hypothesis.added for one in unchanged.values()] == [()] * 3
+
+
+def test_sizes_that_change_differently_stay_apart():
+    values = {name: factor * noise(2) for name, factor in (("gx", 1.2), ("gy", 1.3), ("gz", 1.4))}
+    found = {
+        name: searched(Hypothesis(MODEL, one.fit(MODEL, frozenset({1})))) for name, one in axes(values, MODEL).items()
+    }
+    simple = eliminate_unneeded_effects(found, dict.fromkeys(found, STRICT), fitted_first=False)
+    assert [one.hypothesis.added for one in simple.values()] == [()] * 3
+
+
+def test_a_weak_line_stays_if_another_axis_has_it():
+    y = noise() + 4.4e-5 * np.sin(2 * np.pi * 17.3 * T)
+    loud = noise(1) + 1e-3 * np.sin(2 * np.pi * 17.3 * T)
+    line = Sinusoidal(amplitude=1e-5, frequency=17.3)
+    both = axes({"gx": loud, "gz": y}, MODEL)
+    found = {name: searched(fit_with_fewest_changes(one, (line,), MODEL)) for name, one in both.items()}
+    null = dict.fromkeys(found, STRICT)
+    gain = found["gz"].hypothesis.fit.log_likelihood - fit_with_fixed_noise(both["gz"], MODEL).fit.log_likelihood
+    assert 5.0 < gain < 23.0
+    together = eliminate_unneeded_effects(found, null, fitted_first=False)
+    alone = eliminate_unneeded_effects({"gz": found["gz"]}, null, fitted_first=False)
+    assert (names(together["gz"].hypothesis), names(alone["gz"].hypothesis)) == (["sinusoidal"], [])
+
+
+def test_a_simplification_that_a_diagnostic_contradicts_is_undone():
+    y = noise() + 5.2e-5 * np.sin(2 * np.pi * 17.3 * T)
+    one = axis(y, MODEL)
+    found = searched(fit_with_fewest_changes(one, (Sinusoidal(amplitude=1e-5, frequency=17.3),), MODEL))
+    with_line, without = found.final.findings["lines"].gain, run_diagnostics(seen(one, MODEL))["lines"].gain
+    assert without > with_line
+    strict = {**STRICT, "lines": replace(STRICT["lines"], threshold=0.5 * (with_line + without))}
+    (kept,) = eliminate_unneeded_effects({"gz": found}, {"gz": strict}, fitted_first=False).values()
+    assert kept is found
+
+
+def test_a_line_and_a_resonance_at_one_frequency_have_one_cause():
+    line = Sinusoidal(amplitude=1.0, frequency=17.3)
+    assert share_frequency_or_time(line, Narrowband(1.0, 17.31, 0.1))
+    assert not share_frequency_or_time(line, Sinusoidal(amplitude=1.0, frequency=18.3))
+    assert not share_frequency_or_time(AngleRandomWalk(N=1.0), AngleRandomWalk(N=1.0))
+    assert not share_frequency_or_time(line, ExponentiallyCorrelated(sigma=1.0, correlation_time=17.3))

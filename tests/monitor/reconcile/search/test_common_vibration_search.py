@@ -1,0 +1,120 @@
+"""Vibration that several axes share: one name for all axes, and no name for leaks, knocks and independent noise."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from monitor.noise.effects import CommonVibration, CrossAxis
+from monitor.reconcile.diagnostics.whiteness_tests import diagnose_leaks_from_other_axes
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
+from monitor.reconcile.likelihood.whitening import whiten_axis
+from monitor.reconcile.search.common_vibration_search import name_common_vibrations
+from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
+from tests.monitor.reconcile.axes import (
+    GYRO_AXES,
+    STRICT,
+    WALK,
+    WHITE,
+    N,
+    axes,
+    correlated,
+    ringing,
+    walk,
+    white,
+)
+
+n = 30_000
+MODEL = (WHITE, WALK)
+GAINS = {"gx": 2e-4, "gy": -4e-4, "gz": 3e-4}
+
+
+@cache
+def quiet(seed: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {name: white(n, rng) + walk(n, rng) for name in GYRO_AXES}
+
+
+def vibrating(unit: np.ndarray, seed: int = 0, names: tuple[str, ...] = GYRO_AXES) -> dict[str, np.ndarray]:
+    return {name: y + (GAINS[name] * unit if name in names else 0.0) for name, y in quiet(seed).items()}
+
+
+def searched(values: dict[str, np.ndarray]) -> dict[str, AxisSearchResult]:
+    """The result of the search on each axis and of the search for common vibration."""
+    null = dict.fromkeys(values, STRICT)
+    each = {
+        name: search_missing_effects(one, MODEL, STRICT, np.random.default_rng(1))
+        for name, one in axes(values, MODEL).items()
+    }
+    return name_common_vibrations(each, null)
+
+
+def vibrations(found: dict[str, AxisSearchResult]) -> dict[str, CommonVibration]:
+    return {
+        name: effect
+        for name, one in found.items()
+        for effect in one.hypothesis.added
+        if isinstance(effect, CommonVibration)
+    }
+
+
+@pytest.mark.parametrize("names", [("gx", "gy"), GYRO_AXES], ids=len)
+def test_a_resonance_of_several_axes_has_one_name(names):
+    found = searched(vibrating(ringing(n, np.random.default_rng(5), 1.0, 17.0, 0.5), names=names))
+    named = vibrations(found)
+    assert set(named) == set(names)
+    assert {one.source_number for one in named.values()} == {1.0}
+    sign = np.sign(named["gx"].gain)  # the sign of the source is arbitrary
+    for name, one in named.items():
+        assert sign * one.gain == pytest.approx(GAINS[name], rel=0.2)
+        assert one.frequency == pytest.approx(17.0, abs=0.2)
+        assert [effect.name for effect in found[name].hypothesis.added] == ["common_vibration"]
+        assert found[name].final.findings["other_axes"].gain < STRICT["other_axes"].threshold
+
+
+def test_a_vibration_without_a_peak():
+    named = vibrations(searched(vibrating(correlated(n, np.random.default_rng(6), 1.0, 0.1))))
+    assert set(named) == set(GYRO_AXES)
+    for name, one in named.items():
+        assert one.frequency is None
+        assert abs(one.gain) == pytest.approx(abs(GAINS[name]), rel=0.2)
+        assert one.bandwidth == pytest.approx(1.0 / (np.pi * 0.1), rel=0.3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_equal_but_independent_resonances_are_no_common_vibration(seed):
+    rng = np.random.default_rng(seed + 50)
+    values = {name: y + GAINS[name] * ringing(n, rng, 1.0, 17.0, 0.5) for name, y in quiet(seed).items()}
+    assert vibrations(searched(values)) == {}
+
+
+def test_a_leak_is_no_common_vibration():
+    values = vibrating(ringing(n, np.random.default_rng(7), 1.0, 17.0, 0.5), names=("gx",))
+    found = searched(values | {"gy": values["gy"] + 0.3 * values["gx"]})
+    assert vibrations(found) == {}
+    assert any(isinstance(effect, CrossAxis) for effect in found["gy"].hypothesis.added)
+
+
+def test_a_knock_is_no_common_vibration():
+    knock = np.zeros(n)
+    knock[4000:4100] = 10.0 * np.random.default_rng(8).standard_normal(100)
+    assert vibrations(searched(vibrating(knock))) == {}
+
+
+@pytest.mark.parametrize("leak", [0.0, 0.1])
+def test_a_leak_beside_a_known_vibration_is_still_seen(leak):
+    unit = ringing(60_000, np.random.default_rng(9), 1.0, 17.0, 0.5)
+    rng = np.random.default_rng(3)
+    values = {name: white(60_000, rng) + GAINS[name] * unit for name in ("gx", "gy")}
+    values["gx"] -= leak * white(60_000, np.random.default_rng(11), N)
+    values["gy"] += white(60_000, np.random.default_rng(11), N) if leak else 0.0
+    effects = {
+        name: (WHITE, CommonVibration(source_number=1, gain=GAINS[name], bandwidth=0.5, frequency=17.0))
+        for name in values
+    }
+    one = axes(values, effects)["gx"]
+    gain = diagnose_leaks_from_other_axes(whiten_axis(fit_with_fixed_noise(one, effects["gx"]).fit)).gain
+    alone = diagnose_leaks_from_other_axes(whiten_axis(fit_with_fixed_noise(one, (WHITE,)).fit)).gain
+    assert alone > 100.0
+    assert (gain > 50.0) == (leak > 0.0)
+    assert leak or gain < 8.0

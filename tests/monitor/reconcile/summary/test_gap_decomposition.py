@@ -1,0 +1,113 @@
+"""The gap in parts: never negative, complete, and without the unbounded likelihood of equal values."""
+
+from functools import cache
+from math import sqrt
+
+import numpy as np
+import pytest
+
+from monitor.noise.effects import AngleRandomWalk, Narrowband, Outliers, Resolution, Sinusoidal
+from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fixed_noise
+from monitor.reconcile.result import DiagnosticGap, Location
+from monitor.reconcile.search.cross_validation import accept_without_validation
+from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
+from monitor.reconcile.search.trials import Trial
+from monitor.reconcile.summary.gap_decomposition import (
+    decompose_explained_gain,
+    fit_without,
+    measure_remaining_gaps,
+    value_artifact_gain,
+)
+from tests.monitor.reconcile.axes import WALK, WHITE, N, axis, time_s, walk, white
+
+n = 30_000
+MODEL = (WHITE, WALK)
+LINE, HUMP = Sinusoidal(amplitude=1e-4, frequency=17.3), Narrowband(sigma=1e-6, frequency=8.0, bandwidth=0.5)
+NOTHING = HypothesisDiagnostics({}, ())
+
+
+@cache
+def louder_with_line():
+    rng = np.random.default_rng(1)
+    y = 1.2 * white(n, rng) + walk(n, rng) + 1.5e-4 * np.sin(2 * np.pi * 17.3 * time_s(n))
+    one = axis(y, MODEL)
+    return Hypothesis(MODEL, one.fit((*MODEL, LINE, HUMP), frozenset({1})))
+
+
+def search(hypothesis, *trials):
+    rounds = tuple(
+        SearchRound(NOTHING, (one,), hypothesis, accept_without_validation("made by hand")) for one in trials
+    )
+    return AxisSearchResult(rounds, hypothesis, NOTHING, None)
+
+
+def test_the_parts_are_not_negative_and_make_the_whole():
+    hypothesis = louder_with_line()
+    gains = decompose_explained_gain(search(hypothesis), fitted_first=False)
+    assert set(gains) == {0, 2, 3}
+    start = fit_with_fixed_noise(hypothesis.axis, MODEL).fit.log_likelihood
+    assert sum(gains.values()) == pytest.approx(hypothesis.fit.log_likelihood - start, abs=1e-3)
+    assert gains[2] == pytest.approx(1.5e-4**2 * n / (4 * (1.2 * N) ** 2 * 100.0), rel=0.15)  # A²n/(4σ²)
+    assert gains[0] == pytest.approx(0.5 * n * (1.2**2 - 1.0 - 2 * np.log(1.2)), rel=0.15)
+    assert 0.0 <= gains[3] < 5.0
+
+
+def test_the_sizes_of_a_model_of_the_same_recording_have_no_gain():
+    gains = decompose_explained_gain(search(louder_with_line()), fitted_first=True)
+    assert set(gains) == {2, 3}
+
+
+def test_what_is_removed_has_its_old_size_or_is_left_out():
+    hypothesis = louder_with_line()
+    without = fit_without(hypothesis, {0, 2, 3})
+    assert without.effects[0] == WHITE
+    assert len(without.effects) == 2
+    free = fit_without(hypothesis, {2})
+    assert [type(effect) for effect in free.effects] == [AngleRandomWalk, type(WALK), Narrowband]
+    assert free.effects[0] != WHITE
+    assert free.effects[1] == WALK
+
+
+def test_outliers_have_the_gain_of_their_test():
+    hypothesis = louder_with_line()
+    with_outliers = Hypothesis(
+        MODEL, hypothesis.axis.fit((*MODEL, Outliers(fraction=1e-3, scale=1e-2)), frozenset({0, 1}))
+    )
+    trial = Trial("outliers", with_outliers.added[0], 200.0)
+    gains = decompose_explained_gain(search(with_outliers, trial), fitted_first=True)
+    assert gains == {2: pytest.approx(200.0)}
+
+
+@pytest.mark.parametrize(("step_to_noise", "share"), [(1.0, 1 / 13), (0.3, 0.0075)])
+def test_quantization_counts_with_its_noise(step_to_noise, share):
+    sigma = 1e-3
+    step = step_to_noise * sigma
+    y = step * np.rint(white(n, np.random.default_rng(2)) / step)
+    model = (AngleRandomWalk(N=1e-4),)
+    one = axis(y, model)
+    fit = one.fit((*model, Resolution(step=step)))
+    expected = 0.5 * n * (share / (1 - share) + np.log(1 - share))
+    assert value_artifact_gain(fit, Resolution) == pytest.approx(expected, rel=0.1)
+    assert one.value_artifacts.quantization.gain > 20.0 * value_artifact_gain(fit, Resolution)
+
+
+def gap(lens, gain):
+    return DiagnosticGap(lens, Location(), sqrt(2.0 * gain), 2.0, 5.0)
+
+
+def test_diagnostics_of_one_group_count_once():
+    hypothesis = louder_with_line()
+    left = (gap("lines", 40.0), gap("psd", 60.0), gap("tails", 30.0), gap("variance", 20.0), gap("level", 25.0))
+    found = measure_remaining_gaps(search(hypothesis), left)
+    assert [(one.group, one.strongest.lens) for one in found] == [
+        ("spectrum", "psd"), ("distribution", "tails"), ("level", "level"),
+    ]  # fmt: skip
+    assert [one.gain_nats for one in found] == [pytest.approx(gain) for gain in (60.0, 30.0, 25.0)]
+    assert measure_remaining_gaps(search(hypothesis), ()) == ()
+
+
+def test_a_spectrum_that_is_wrong_everywhere_counts_in_every_band():
+    rng = np.random.default_rng(3)
+    wrong = fit_with_fixed_noise(axis(1.2 * (white(n, rng) + walk(n, rng)), MODEL), MODEL)
+    (one,) = measure_remaining_gaps(search(wrong), (gap("psd", 60.0),))
+    assert one.gain_nats == pytest.approx(0.5 * n * (1.2**2 - 1.0 - 2 * np.log(1.2)), rel=0.15)

@@ -1,0 +1,114 @@
+"""One cause is one finding, and the findings stand in the order of their share."""
+
+from dataclasses import replace
+
+import pytest
+
+from monitor.noise.effects import AngleRandomWalk, Narrowband
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.result import (
+    AllanInfluence,
+    AxisModelDiagnostics,
+    AxisResult,
+    DiagnosticGap,
+    Location,
+    ParameterInterval,
+    Reconciliation,
+    RemainingGap,
+)
+from monitor.reconcile.summary.ranked_findings import rank_findings
+from tests.monitor.reconcile.runs_made import around, step
+
+EMPTY = AxisModelDiagnostics((), ())
+N = 1e-4
+
+
+def of(effect, gain, kind="added", ratio=1.0, **parameters):
+    return replace(step(effect, kind=kind, **parameters), gain_nats=gain, allan=AllanInfluence(ratio, 0.1))
+
+
+def left(group, gain, source=None):
+    return RemainingGap(group, DiagnosticGap("psd", Location(source=source), (2.0 * gain) ** 0.5, 1.0, 2.0), gain)
+
+
+def made(steps, remaining=None, effects=None, fitted_first=False) -> Reconciliation:
+    remaining = remaining or {}
+    axes = {
+        axis: AxisResult(axis, "explained", EMPTY, tuple(found), (), EMPTY, tuple(remaining.get(axis, ())))
+        for axis, found in steps.items()
+    }
+    given = NoiseModel({axis: (AngleRandomWalk(N=N), *(effects or ())) for axis in steps})
+    return Reconciliation("explained", axes, given, given, fitted_first, 100.0, 1000, 10.0, 1)
+
+
+def test_a_line_on_three_axes_is_one_finding():
+    r = made({
+        "gx": [of("sinusoidal", 100.0, frequency=around(17.3, 1e-3), ratio=1.1)],
+        "gy": [of("narrowband", 300.0, frequency=around(17.31, 1e-2), bandwidth=0.1, ratio=0.5)],
+        "gz": [of("sinusoidal", 50.0, frequency=around(25.0, 1e-3)), of("sinusoidal", 10.0, frequency=17.3)],
+    })  # fmt: skip
+    first, second = rank_findings(r).findings
+    assert (first.effect, first.axes, first.gain_nats) == ("narrowband", ("gx", "gy", "gz"), 410.0)
+    assert first.parameters["frequency"].value == 17.31
+    assert first.most_influenced_axis == "gy"
+    assert (second.effect, second.axes, second.share) == ("sinusoidal", ("gz",), 50.0 / 460.0)
+
+
+def test_steps_at_different_times_and_kinds_are_apart():
+    r = made({
+        "gx": [of("bias_step", 9.0, time=around(100.0, 0.1), height=1.0)],
+        "gy": [of("bias_step", 8.0, time=around(100.1, 0.1), height=2.0)],
+        "gz": [of("bias_step", 7.0, time=around(500.0, 0.1), height=2.0)],
+    })  # fmt: skip
+    assert [one.axes for one in rank_findings(r).findings] == [("gx", "gy"), ("gz",)]
+
+
+def test_changed_sizes_are_one_finding_if_their_factors_agree():
+    r = made({
+        axis: [of("angle_random_walk", 10.0, kind="retuned", N=factor * N)]
+        for axis, factor in (("gx", 1.2), ("gy", 1.21), ("gz", 1.5), ("ax", 1.2))
+    })  # fmt: skip
+    both, other, accelerometer = rank_findings(r).findings
+    assert (both.axes, both.size_ratio) == (("gx", "gy"), pytest.approx(1.2))
+    assert (other.axes, other.size_ratio) == (("gz",), pytest.approx(1.5))
+    assert accelerometer.axes == ("ax",)
+    assert rank_findings(replace(r, fitted_first=True)).findings == ()
+
+
+def test_an_absent_resonance_says_which_one():
+    effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
+    r = made({"gx": [of("narrowband", 10.0, kind="absent", sigma=ParameterInterval(0.0))]}, effects=effects)
+    gone = replace(r, model=NoiseModel({"gx": (effects[0], replace(effects[1], sigma=0.0))}))
+    (one,) = rank_findings(gone).findings
+    assert (one.kind, one.parameters["frequency"].value, one.size_ratio) == ("absent", 20.0, None)
+
+
+def test_a_retuned_resonance_is_compared_with_the_same_resonance():
+    effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
+    r = made({"gx": [of("narrowband", 10.0, kind="retuned", sigma=around(1e-3, 1e-5))]}, effects=effects)
+    changed = replace(r, model=NoiseModel({"gx": (replace(effects[0], sigma=3e-3), replace(effects[1], sigma=1e-3))}))
+    (one,) = rank_findings(changed).findings
+    assert (one.parameters["frequency"].value, one.size_ratio) == (20.0, pytest.approx(0.5))
+
+
+def test_the_shares_of_findings_and_remainders_make_one():
+    line = of("sinusoidal", 60.0, frequency=17.3)
+    r = made({"gx": [line], "gy": []}, {"gx": [left("spectrum", 30.0)], "gy": [left("distribution", 10.0)]})
+    ranking = rank_findings(r)
+    assert ranking.whole_nats == 100.0
+    assert [one.share for one in ranking.findings] == [0.6]
+    assert [(one.axis, one.share) for one in ranking.remainders] == [("gx", 0.3), ("gy", 0.1)]
+    assert ranking.explained_share == pytest.approx(0.6)
+
+
+def test_the_dependence_of_two_axes_on_each_other_counts_once():
+    leaks = {"gx": [left("other_axes", 30.0, "gy")], "gy": [left("other_axes", 40.0, "gx")]}
+    ranking = rank_findings(made({"gx": [], "gy": []}, leaks))
+    assert [(one.axis, one.gap.gain_nats) for one in ranking.remainders] == [("gy", 40.0)]
+    same = {axis: [left("other_axes", 30.0, source)] for axis, source in (("gx", "gy"), ("gy", "gx"))}
+    assert len(rank_findings(made({"gx": [], "gy": []}, same)).remainders) == 1
+
+
+def test_a_recording_without_a_gap_is_explained():
+    ranking = rank_findings(made({"gx": []}))
+    assert (ranking.whole_nats, ranking.findings, ranking.explained_share) == (0.0, (), 1.0)

@@ -1,0 +1,173 @@
+"""A search as people and programs read it: within the contract of the report, and true to what was hidden."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.axis_result_builder import build_axis_result
+from monitor.reconcile.diagnostics.null_distribution import NullDistribution
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
+from monitor.reconcile.json_report import encode_report
+from monitor.reconcile.result import Reconciliation
+from monitor.reconcile.search.search import search_missing_effects
+from monitor.reconcile.search.trials import Trial
+from tests.monitor.reconcile.axes import (
+    RATE_HZ,
+    STRICT,
+    WALK,
+    WHITE,
+    N,
+    axis,
+    check_report,
+    correlated,
+    time_s,
+    walk,
+    white,
+)
+
+n = 40_000
+MODEL = (WHITE, WALK)
+T = time_s(n)
+LINE = 2e-4 * np.sin(2 * np.pi * 17.3 * T + 0.7)
+UNREACHED = dict.fromkeys(DIAGNOSTICS, NullDistribution(1e6, 1e9))
+ALWAYS = dict.fromkeys(DIAGNOSTICS, NullDistribution(0.0, 0.0))
+
+
+def noise(seed=0):
+    rng = np.random.default_rng(seed)
+    return white(n, rng) + walk(n, rng)
+
+
+def hidden(name):
+    rng = np.random.default_rng(1)
+    return {
+        "nothing": noise(),
+        "line": noise() + LINE,
+        "louder": 1.15 * noise(),
+        "outliers": noise() + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
+        "correlated": noise() + correlated(n, rng, 3e-4, 0.5),
+        "filtered and coarse": 4e-4 * np.rint(noise() / 4e-4),
+    }[name]
+
+
+NAMES = ("nothing", "line", "louder", "outliers", "correlated", "filtered and coarse")
+
+
+@cache
+def found(name):
+    return search_missing_effects(axis(hidden(name), MODEL), MODEL, STRICT, np.random.default_rng(0))
+
+
+@cache
+def told(name):
+    return build_axis_result(found(name), STRICT, STRICT)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+def test_the_report_is_as_its_contract_says(name):
+    result = told(name)
+    model = NoiseModel({"gz": MODEL}, RATE_HZ)
+    whole = Reconciliation(result.verdict, {"gz": result}, model, model, False, RATE_HZ, n, n / RATE_HZ, 1)
+    report = json.loads(encode_report(whole))
+    check_report(report)
+    assert report["verdict"] == ("agrees" if name == "nothing" else "explained")
+    assert [score["lens"] for score in report["axes"]["gz"]["scores"]] == list(DIAGNOSTICS)
+
+
+def test_a_line_is_described_with_all_that_it_has():
+    (step,) = told("line").steps
+    assert (step.kind, step.effect) == ("added", "sinusoidal")
+    for name, true in (("frequency", 17.3), ("amplitude", 2e-4), ("phase", 0.7)):
+        bounds = step.parameters[name]
+        assert bounds.lo < bounds.value < bounds.hi
+        assert abs(bounds.value - true) < 4.0 * (bounds.hi - bounds.lo) / 3.92
+    assert step.confidence > 0.9
+    assert step.before.lens == "lines"
+    lo, hi = step.before.where.frequency
+    assert lo < 17.3 < hi
+    assert step.before.is_significant
+    assert not step.after.is_significant
+    assert step.after.gap < step.before.gap
+    assert step.held_out_before.gap > step.held_out_after.gap
+    assert "17.3 Hz" in step.because
+    assert "sinusoidal" in step.because
+
+
+def test_another_size_is_told_as_such():
+    steps = told("louder").steps
+    assert {step.kind for step in steps} == {"retuned"}
+    (of_white,) = (step for step in steps if step.effect == "angle_random_walk")
+    bounds = of_white.parameters["N"]
+    assert bounds.lo < 1.15 * N < bounds.hi
+    assert set(of_white.parameters) == {"N"}
+    assert "which the model has" in of_white.because
+
+
+def test_single_samples_are_counted():
+    (step,) = told("outliers").steps
+    assert step.effect == "outliers"
+    assert step.before.lens == "tails"
+    assert step.parameters["fraction"].lo < 1e-3 < step.parameters["fraction"].hi
+    assert step.parameters["scale"].lo < 1.5e-2 < step.parameters["scale"].hi
+    assert "detected events" in step.because
+
+
+def test_runners_up_are_other_names_and_never_certain():
+    (step,) = told("correlated").steps
+    assert step.effect == "exponentially_correlated"
+    bounds = step.parameters["correlation_time"]
+    assert bounds.lo < 0.5 < bounds.hi
+    chances = [one.confidence for one in step.runners_up]
+    assert chances == sorted(chances, reverse=True)
+    assert sum(chances) + step.confidence <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize(("rival_score", "confidence"), [(0.0, 0.5), (-3.0, 0.95)])
+def test_a_rival_of_another_group_reduces_the_confidence(rival_score, confidence):
+    search = found("line")
+    (done,) = search.rounds
+    rival = Trial("narrowband", None, done.trials[0].score + rival_score - 20.0, slow_noise_score=20.0)
+    changed = replace(search, rounds=(replace(done, trials=(done.trials[0], rival)),))
+    (step,) = build_axis_result(changed, STRICT, STRICT).steps
+    assert step.confidence == pytest.approx(confidence, abs=0.01)
+    assert step.runners_up[0].effect == "narrowband"
+
+
+def test_one_size_and_a_common_factor_of_white_noise_are_equally_likely():
+    y = 1.1 * white(n, np.random.default_rng(5))
+    search = search_missing_effects(axis(y), MODEL[:1], STRICT, np.random.default_rng(0))
+    (step,) = build_axis_result(search, STRICT, STRICT).steps
+    assert (step.kind, step.runners_up[0].effect) == ("retuned", "scale_factor")
+    assert 0.4 < step.confidence < 0.7
+
+
+def test_verdicts_follow_from_steps_and_what_is_left():
+    assert build_axis_result(found("nothing"), STRICT, STRICT).verdict == "agrees"
+    assert build_axis_result(found("nothing"), STRICT, ALWAYS).verdict == "unexplained"
+    assert build_axis_result(found("line"), STRICT, STRICT).verdict == "explained"
+    left = build_axis_result(found("line"), STRICT, ALWAYS)
+    assert left.verdict == "partly_explained"
+    assert {score.lens for score in left.left_over} == {
+        lens for lens, one in found("line").final.findings.items() if one.gain
+    }
+    assert build_axis_result(found("line"), STRICT, UNREACHED).left_over == ()
+
+
+def test_gaps_before_are_beside_the_model_that_decided_and_after_beside_the_new_one():
+    other = dict.fromkeys(DIAGNOSTICS, NullDistribution(8.0, 18.0))
+    (step,) = build_axis_result(found("line"), STRICT, other).steps
+    assert step.before.threshold == pytest.approx(30.0**0.5)
+    assert step.after.threshold == pytest.approx(36.0**0.5)
+    assert step.after.null95 == pytest.approx(4.0)
+
+
+def test_what_did_not_shrink_is_still_told():
+    """A search whose last look sees as much as its first has a step and is partly explained."""
+    one = found("line")
+    again = replace(one, final=one.rounds[0].before)
+    assert build_axis_result(again, STRICT, STRICT).verdict == "partly_explained"
