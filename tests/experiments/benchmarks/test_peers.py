@@ -19,7 +19,13 @@ TRUTH = {
     "seed": 0,
     "baseline": "exact",
     "hidden": [
-        {"axis": "gx", "effect": "cross_axis", "parameters": {"source": "gy", "coefficient": 0.1}, "gain": 60.0},
+        {
+            "axis": "gx",
+            "effect": "cross_axis",
+            "parameters": {"source": "gy", "coefficient": 0.1},
+            "gain": 60.0,
+            "margin": 20.0,
+        },
     ],
     "foreign": [],
 }
