@@ -95,7 +95,7 @@ class _Vibration:
     @property
     def penalty_nats(self) -> float:
         """Smallest gain of the correlations of a true vibration."""
-        return PENALTY_NATS[CommonVibration.name] + RESIZE_PENALTY_NATS * (int(np.count_nonzero(self.gains)) - 2)
+        return PENALTY_NATS[CommonVibration.name] + RESIZE_PENALTY_NATS * max(int(np.count_nonzero(self.gains)) - 2, 0)
 
 
 def correlation_gain(correlation: Floats, products: Floats, count: Floats) -> float:
@@ -152,6 +152,8 @@ def _with_strongest_vibration(
     whitened = [whiten_axis(one.fit) for one in hypotheses]
     shapes = _candidate_shapes(hypotheses)
     spectra = build_cross_spectra(whitened, shapes)
+    if not spectra.used.any():
+        return {}
     best = _fit_shape(spectra, shapes)
     if best.gain_nats < best.penalty_nats:
         return {}
@@ -298,7 +300,7 @@ def fit_correlations(spectra: CrossSpectra, shape: Shape) -> _Vibration:
                 gains[at] = (right[at] @ gains) / max(float(weight[at] @ gains**2), 1e-300)
         whole = spectra.gain_nats(unit, gains / scale)
         active = np.flatnonzero(gains)
-        if active.size == 2:
+        if active.size <= 2:
             return _Vibration(shape, gains / scale, whole)
         rest = [spectra.gain_nats(unit, gains / scale * (np.arange(scale.size) != at)) for at in active]
         if whole - max(rest) > RESIZE_PENALTY_NATS:

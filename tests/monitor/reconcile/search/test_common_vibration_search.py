@@ -95,6 +95,13 @@ def test_a_leak_is_no_common_vibration():
     assert any(isinstance(effect, CrossAxis) for effect in found["gy"].hypothesis.added)
 
 
+def test_two_axes_with_a_leak_are_not_searched():
+    values = {name: y for name, y in quiet(4).items() if name != "gz"}
+    found = searched(values | {"gy": values["gy"] + 0.3 * values["gx"]})
+    assert vibrations(found) == {}
+    assert any(isinstance(effect, CrossAxis) for one in found.values() for effect in one.hypothesis.added)
+
+
 def test_a_knock_is_no_common_vibration():
     knock = np.zeros(n)
     knock[4000:4100] = 10.0 * np.random.default_rng(8).standard_normal(100)
