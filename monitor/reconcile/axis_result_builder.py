@@ -130,8 +130,8 @@ def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKin
     return found
 
 
-def _gap_of(lens: str, snapshot: AxisModelDiagnostics) -> DiagnosticGap:
-    return next(gap for gap in snapshot.gaps if gap.lens == lens)
+def _gap_of(diagnostic: str, snapshot: AxisModelDiagnostics) -> DiagnosticGap:
+    return next(gap for gap in snapshot.gaps if gap.diagnostic == diagnostic)
 
 
 def _axis_decision(changed: bool, left_over: bool) -> Decision:
@@ -151,7 +151,7 @@ def _describe_step(
     effect, trial = search.hypothesis.effects[index], done.trials[0]
     moved = trial.moved == index
     gap = _triggering_gap(effect, "added" if moved else kind, before)
-    later = _gap_of(gap.lens, after)
+    later = _gap_of(gap.diagnostic, after)
     confidence, others = _confidence_and_runners_up(effect.name if kind == "added" or moved else RETUNE, done.trials)
     if kind != "added" and trial.name != RETUNE and not moved:  # an effect was added in the same round
         confidence, others = _resize_confidence(search.hypothesis, index), ()
@@ -179,8 +179,8 @@ def _held_out_gaps(
     if validation.reason:
         return None, None
     return (
-        DiagnosticGap(gap.lens, gap.where, validation.before, gap.null95, gap.threshold),
-        DiagnosticGap(gap.lens, gap.where, validation.after, later.null95, later.threshold),
+        DiagnosticGap(gap.diagnostic, gap.where, validation.before, gap.null95, gap.threshold),
+        DiagnosticGap(gap.diagnostic, gap.where, validation.after, later.null95, later.threshold),
     )
 
 
@@ -193,7 +193,7 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics
     significant = [gap for gap in before.gaps if gap.is_significant] or list(before.gaps)
     most_direct = MOST_DIRECT_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
     for gap in significant:
-        if gap.lens == most_direct:
+        if gap.diagnostic == most_direct:
             return gap
     return max(significant, key=lambda gap: gap.gap / max(gap.threshold, 1e-9))
 
@@ -292,7 +292,7 @@ def _justification(
     trial: Trial,
 ) -> str:
     gaps = f"the gap is {gap.gap:.1f}, and a true model stays below {gap.threshold:.1f}"
-    sentences = [f"{EVIDENCE_TEXT[gap.lens]}{_location_text(gap)}: {gaps}."]
+    sentences = [f"{EVIDENCE_TEXT[gap.diagnostic]}{_location_text(gap)}: {gaps}."]
     if not gap.is_significant:
         sentences = [f"{effect.name} explains a difference that no diagnostic alone detects: {gaps}."]
     if kind != "added":
@@ -321,6 +321,6 @@ def _location_text(gap: DiagnosticGap) -> str:
         return f" at {middle:.5g} Hz" if wide < 0.05 * middle else f" from {lo:.3g} to {hi:.3g} Hz"
     if place.source is not None:
         return f" ({place.source})"
-    if place.time is not None and gap.lens in ("level", "variance") and place.time[1] - place.time[0] < 1e3:
+    if place.time is not None and gap.diagnostic in ("level", "variance") and place.time[1] - place.time[0] < 1e3:
         return f" near {0.5 * (place.time[0] + place.time[1]):.5g} s"
     return ""

@@ -135,7 +135,7 @@ def _gap_entry(before: DiagnosticGap | None, after: DiagnosticGap | None) -> dic
 
 def _gap_and_location_entry(gap: DiagnosticGap) -> dict[str, Any]:
     return {
-        "lens": gap.lens,
+        "lens": gap.diagnostic,
         "where": _where_entry(gap.where),
         "gap": finite_or_none(gap.gap),
         "null95": finite_or_none(gap.null95),

@@ -347,7 +347,7 @@ def _add_sample_rate_step(
         confidence=float(expit(error.gain - SAMPLE_RATE_PENALTY_NATS)),
         runners_up=(),
         before=before,
-        after=next(score for score in result.start.gaps if score.lens == "lines"),
+        after=next(score for score in result.start.gaps if score.diagnostic == "lines"),
         held_out_before=None,
         held_out_after=None,
         held_out_reason="the sample rate is common to the whole recording",

@@ -46,7 +46,7 @@ class Location:
 class DiagnosticGap:
     """Difference between recording and model (gap) in one diagnostic."""
 
-    lens: str  # name of the diagnostic
+    diagnostic: str  # name of the diagnostic
     where: Location
     gap: float  # size of the difference in standard deviations
     null95: float  # 95 % quantile of the gap of a true model, for one diagnostic and one axis
@@ -91,7 +91,7 @@ class AlternativeEffect:
 class DiagnosticPlotData:
     """Data of one plot that compares a recorded axis with the expectation of a noise model."""
 
-    lens: str  # name of the diagnostic
+    diagnostic: str  # name of the diagnostic
     x_name: str  # quantity on the x axis: "frequency", "averaging time", "time", …
     x_unit: str
     y_name: str

@@ -447,9 +447,10 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
 
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:
     """Draw spectrum, Allan deviation and tails of one axis with one model, as in the report."""
-    views = {view.lens: view for view in getattr(result, when).plots}
+    views = {view.diagnostic: view for view in getattr(result, when).plots}
     drawn = [
-        diagnostic_comparison_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")
+        diagnostic_comparison_svg([("", views[diagnostic])], result.axis, 5.2, 3.3)
+        for diagnostic in ("psd", "allan", "tails")
     ]
     page = path.with_suffix(".html")
     style = "body{margin:8px;display:flex;font-family:sans-serif;background:white}svg{width:520px;height:330px}"

@@ -86,7 +86,7 @@ def test_mpu6050_summary_begins_with_the_resonance() -> None:
 
 def test_xsens_tails() -> None:
     result = compared("xsens-mtig/contaminated-gx", "gx", 0, 100_000)
-    left = {score.lens for score in result.axes["gx"].left_over}
+    left = {score.diagnostic for score in result.axes["gx"].left_over}
     assert "outliers" in added(result) or "tails" in left
     assert result.verdict != "agrees"
 

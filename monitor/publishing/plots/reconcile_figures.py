@@ -153,7 +153,7 @@ def select_diagnostic_view(
     where
         Range that the diagnostic found.
     """
-    own = [view for view in views if view.lens == diagnostic_id]
+    own = [view for view in views if view.diagnostic == diagnostic_id]
     return next(iter(own or [view for view in views if range_on_x_axis(view, where) is not None]), None)
 
 
@@ -356,13 +356,13 @@ def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap
     after
         Gaps with the next model. Empty if there is only one model.
     """
-    later = {score.lens: score for score in after}
+    later = {score.diagnostic: score for score in after}
     with style.figure_style():
-        figure, panel = _create_row_panel([diagnostic_name(score.lens) for score in before], "gap over threshold")
+        figure, panel = _create_row_panel([diagnostic_name(score.diagnostic) for score in before], "gap over threshold")
         panel.set_xscale("log")
         ratios = [1.0]
         for y, score in enumerate(before):
-            scores = [score] + ([later[score.lens]] if score.lens in later else [])
+            scores = [score] + ([later[score.diagnostic]] if score.diagnostic in later else [])
             x = [max(gap_to_threshold_ratio(one), MIN_GAP_RATIO) for one in scores]
             colours = [ABOVE_THRESHOLD_COLOUR if one.is_significant else BELOW_THRESHOLD_COLOUR for one in scores]
             panel.plot(x, [y] * len(x), color=style.GREY, linewidth=1.4, zorder=2)

@@ -85,7 +85,8 @@ def render_page(r: Reconciliation, title: str = "") -> str:
 def _draw_allan(result: AxisResult, ranking: GapRanking) -> str | None:
     """Draw the Allan deviation before and after the search. The marks are the numbers of the findings."""
     before, after = (
-        next((view for view in snapshot.plots if view.lens == "allan"), None) for snapshot in (result.start, result.end)
+        next((view for view in snapshot.plots if view.diagnostic == "allan"), None)
+        for snapshot in (result.start, result.end)
     )
     if before is None or after is None:
         return None
@@ -101,13 +102,16 @@ def _draw_allan(result: AxisResult, ranking: GapRanking) -> str | None:
 def _pair_scores(
     before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap]
 ) -> list[tuple[DiagnosticGap, DiagnosticGap | None]]:
-    later = {score.lens: score for score in after}
-    return [(score, later.get(score.lens)) for score in before]
+    later = {score.diagnostic: score for score in after}
+    return [(score, later.get(score.diagnostic)) for score in before]
 
 
 def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list[DiagnosticGap | None]]]:
-    known = [{score.lens: score for score in result.start.gaps} for result in results]
-    return [(lens, [scores.get(lens) for scores in known]) for lens in dict.fromkeys(one for k in known for one in k)]
+    known = [{score.diagnostic: score for score in result.start.gaps} for result in results]
+    return [
+        (diagnostic, [scores.get(diagnostic) for scores in known])
+        for diagnostic in dict.fromkeys(one for k in known for one in k)
+    ]
 
 
 def _draw_single(view: DiagnosticPlotData, axis: str) -> str:
@@ -115,13 +119,13 @@ def _draw_single(view: DiagnosticPlotData, axis: str) -> str:
 
 
 def _draw_pairs(before: AxisModelDiagnostics, after: AxisModelDiagnostics, axis: str) -> list[str]:
-    later = {view.lens: view for view in after.plots}
-    pairs = [(view, later[view.lens]) for view in before.plots if view.lens in later]
+    later = {view.diagnostic: view for view in after.plots}
+    pairs = [(view, later[view.diagnostic]) for view in before.plots if view.diagnostic in later]
     return before_and_after_svgs(pairs, axis, *PAIR_INCHES)
 
 
 def _draw_range(snapshot: AxisModelDiagnostics, found: DiagnosticGap, axis: str) -> list[str]:
-    view = select_diagnostic_view(snapshot.plots, found.lens, found.where)
+    view = select_diagnostic_view(snapshot.plots, found.diagnostic, found.where)
     if view is None:
         return []
     detail = zoomed_view(view, found.where)

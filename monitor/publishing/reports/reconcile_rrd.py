@@ -4,7 +4,8 @@ Each axis has a tab with the steps as text, the gap of each diagnostic divided b
 diagnostics. A diagnostic with logarithmic axes is drawn for the first model and for the model after the steps. The
 timeline ``step`` selects the model, and index 0 is the first model. Importing this module imports Rerun.
 
-Entities: ``/<axis>/steps``, ``/<axis>/gap/<lens>``, ``/<axis>/<lens>/before``, ``/<axis>/<lens>/after``, ``/overview``.
+Entities: ``/<axis>/steps``, ``/<axis>/gap/<diagnostic>``, ``/<axis>/<diagnostic>/before``,
+``/<axis>/<diagnostic>/after``, ``/overview``.
 """
 
 from collections.abc import Sequence
@@ -108,8 +109,8 @@ def _steps_text(r: Reconciliation, result: AxisResult) -> str:
             f"**Step {count}: {step.kind} {words.readable_name(step.effect)}** "
             f"({words.format_probability(step.confidence)})",
             "\n".join(f"- {words.readable_name(one.name)} **{one.short}**" for one in known),
-            f"{words.diagnostic_name(step.before.lens)}, {words.format_range(step.before.where, result.axis)}: gap "
-            f"**{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}**, "
+            f"{words.diagnostic_name(step.before.diagnostic)}, {words.format_range(step.before.where, result.axis)}: "
+            f"gap **{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}**, "
             f"threshold {words.format_gap(step.after.threshold)}",
             step.because,
             words.describe_alternatives(step),
@@ -128,7 +129,7 @@ def _snapshots_by_step(result: AxisResult) -> list[AxisModelDiagnostics]:
 
 
 def _drawn_diagnostics(result: AxisResult) -> list[str]:
-    return [view.lens for view in result.start.plots if view.log][:MAX_PLOTTED_DIAGNOSTICS]
+    return [view.diagnostic for view in result.start.plots if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
 def _tab(result: AxisResult) -> rrb.Container:
@@ -143,40 +144,40 @@ def _tab(result: AxisResult) -> rrb.Container:
     left = rrb.Vertical(text, gaps, row_shares=[5, 2]) if steps else text
     rows = [
         rrb.Horizontal(
-            *(_diagnostic_view(result, lens, when) for when in (("before", "after") if steps else ("before",)))
+            *(_diagnostic_view(result, diagnostic, when) for when in (("before", "after") if steps else ("before",)))
         )
-        for lens in _drawn_diagnostics(result)
+        for diagnostic in _drawn_diagnostics(result)
     ]
     name = f"{axis}: {words.RESULT_TEXTS[result.verdict]}"
     return rrb.Horizontal(left, rrb.Vertical(*rows), column_shares=[3, 7], name=name)
 
 
-def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
-    what = words.diagnostic_name(lens)
+def _diagnostic_view(result: AxisResult, diagnostic: str, when: str) -> rrb.View:
+    what = words.diagnostic_name(diagnostic)
     what = what[0].upper() + what[1:]
     names = {"before": f"{what}: first model", "after": f"{what}: after the steps"}
-    origin = f"/{result.axis}/{lens}/{when}"
+    origin = f"/{result.axis}/{diagnostic}/{when}"
     return drawing_view(origin, names[when], "$origin/**", (-1.7, WIDTH + 0.7), (-1.5, HEIGHT + 1.7))
 
 
 def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
     stream.log(f"{result.axis}/steps", markdown_document(_steps_text(r, result)), static=True)
-    for lens in _drawn_diagnostics(result):
-        _log_diagnostic(stream, result, lens)
+    for diagnostic in _drawn_diagnostics(result):
+        _log_diagnostic(stream, result, diagnostic)
     _log_gaps(stream, result)
 
 
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
     snapshots = [
-        {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.gaps}
+        {score.diagnostic: words.gap_to_threshold_ratio(score) for score in snapshot.gaps}
         for snapshot in _snapshots_by_step(result)
     ]
     path = f"{result.axis}/gap"
-    largest = sorted(snapshots[0], key=lambda lens: -max(snapshot.get(lens, 0.0) for snapshot in snapshots))
-    for lens, tint in zip(largest, GAP_LINE_COLOURS, strict=False):
-        line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.diagnostic_name(lens)])
-        stream.log(f"{path}/{lens}", line, static=True)
-        _log_by_step(stream, f"{path}/{lens}", [snapshot.get(lens, np.nan) for snapshot in snapshots])
+    largest = sorted(snapshots[0], key=lambda diagnostic: -max(snapshot.get(diagnostic, 0.0) for snapshot in snapshots))
+    for diagnostic, tint in zip(largest, GAP_LINE_COLOURS, strict=False):
+        line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.diagnostic_name(diagnostic)])
+        stream.log(f"{path}/{diagnostic}", line, static=True)
+        _log_by_step(stream, f"{path}/{diagnostic}", [snapshot.get(diagnostic, np.nan) for snapshot in snapshots])
     line = rr.SeriesLines(colors=[axis_colours.TEXT], widths=[1.0], names=["threshold"])
     stream.log(f"{path}/threshold", line, static=True)
     _log_by_step(stream, f"{path}/threshold", [1.0] * len(snapshots))
@@ -187,22 +188,23 @@ def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float])
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
-def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
+def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, diagnostic: str) -> None:
     axis = result.axis
     views = [
-        next((view for view in snapshot.plots if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
+        next((view for view in snapshot.plots if view.diagnostic == diagnostic), None)
+        for snapshot in _snapshots_by_step(result)
     ]
     plots = {step: to_displayed_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
     scale = ChartDecadeRange(decade_range(plot.x for plot in every), decade_range([np.array(common_y_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
-        _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
+        _log_grid(stream, f"{axis}/{diagnostic}/{when}", scale, plots[0], axis)
     stream.reset_time()
-    _log_curves(stream, f"{axis}/{lens}/before", scale, plots[0], axis, static=True)
-    _log_found_ranges(stream, f"{axis}/{lens}/before", scale, result, lens)
+    _log_curves(stream, f"{axis}/{diagnostic}/before", scale, plots[0], axis, static=True)
+    _log_found_ranges(stream, f"{axis}/{diagnostic}/before", scale, result, diagnostic)
     for step, plot in plots.items() if result.steps else ():
         stream.set_time(TIMELINE, sequence=step)
-        _log_curves(stream, f"{axis}/{lens}/after", scale, plot, axis, static=False)
+        _log_curves(stream, f"{axis}/{diagnostic}/after", scale, plot, axis, static=False)
 
 
 def _log_curves(
@@ -221,11 +223,13 @@ def _log_curves(
 
 
 def _log_found_ranges(
-    stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, result: AxisResult, lens: str
+    stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, result: AxisResult, diagnostic: str
 ) -> None:
-    view = next(view for view in result.start.plots if view.lens == lens)
+    view = next(view for view in result.start.plots if view.diagnostic == diagnostic)
     founds = [step.before for step in result.steps] + list(result.left_over)
-    marks = [to_displayed_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
+    marks = [
+        to_displayed_units("", view, result.axis, found.where) for found in founds if found.diagnostic == diagnostic
+    ]
     bounds = [mark.mark for mark in marks if mark.mark is not None]
     if not bounds:
         return

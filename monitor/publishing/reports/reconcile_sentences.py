@@ -181,7 +181,7 @@ def describe_gap(gap: DiagnosticGap, axis: str) -> str:
         Name of the axis, which determines the units.
     """
     sizes = f"gap {format_gap(gap.gap)}, threshold {format_gap(gap.threshold)}"
-    return f"{diagnostic_name(gap.lens)}, {format_range(gap.where, axis)}: {sizes}"
+    return f"{diagnostic_name(gap.diagnostic)}, {format_range(gap.where, axis)}: {sizes}"
 
 
 def format_gap(gap: float) -> str:

@@ -101,8 +101,9 @@ def run_diagnostics(whitened: WhitenedAxis) -> Findings:
 def all_simulations_have_improbable_gain(findings: Sequence[Findings]) -> bool:
     """Return True if a diagnostic has an improbably large gain in all simulated recordings of an axis."""
     return any(
-        lens not in NULL_GAINS or all(one[lens].gain > _quantile(lens, one[lens], IMPROBABLE) for one in findings)
-        for lens in DIAGNOSTICS
+        diagnostic not in NULL_GAINS
+        or all(one[diagnostic].gain > _quantile(diagnostic, one[diagnostic], IMPROBABLE) for one in findings)
+        for diagnostic in DIAGNOSTICS
     )
 
 
@@ -118,14 +119,16 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
     chance = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * max(len(simulated), 1))
     complete = [axis for axis, of in simulated.items() if len(of) >= SIMULATED_RECORDINGS]
     null: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
-    for lens in DIAGNOSTICS:
-        pooled = [one[lens].gain for axis in complete for one in simulated[axis]]
+    for diagnostic in DIAGNOSTICS:
+        pooled = [one[diagnostic].gain for axis in complete for one in simulated[axis]]
         for axis, of in simulated.items():
-            expected = [_quantile(lens, of[0][lens], p) if lens in NULL_GAINS else 0.0 for p in (0.05, chance)]
+            expected = [
+                _quantile(diagnostic, of[0][diagnostic], p) if diagnostic in NULL_GAINS else 0.0 for p in (0.05, chance)
+            ]
             if axis in complete:
-                own = _simulated_null_distribution(pooled, max(one[lens].gain for one in of), chance)
+                own = _simulated_null_distribution(pooled, max(one[diagnostic].gain for one in of), chance)
                 expected = [max(expected[0], own.null95), max(expected[1], own.threshold)]
-            null[axis][lens] = NullDistribution(*expected)
+            null[axis][diagnostic] = NullDistribution(*expected)
     return dict(null)
 
 
@@ -140,8 +143,8 @@ def _simulated_null_distribution(pooled: Sequence[float], largest: float, chance
     return NullDistribution(max(null95, largest), largest + AXIS_MARGIN_NATS)
 
 
-def _quantile(lens: str, found: Finding, probability: float) -> float:
-    return NULL_GAINS[lens].quantile(found.places, probability)
+def _quantile(diagnostic: str, found: Finding, probability: float) -> float:
+    return NULL_GAINS[diagnostic].quantile(found.places, probability)
 
 
 def compute_diagnostic_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:
@@ -155,6 +158,10 @@ def compute_diagnostic_gaps(findings: Findings, null: AxisNull) -> tuple[Diagnos
         Null distribution of each diagnostic.
     """
     return tuple(
-        DiagnosticGap(lens, one.where, *(sqrt(2.0 * x) for x in (one.gain, null[lens].null95, null[lens].threshold)))
-        for lens, one in findings.items()
+        DiagnosticGap(
+            diagnostic,
+            one.where,
+            *(sqrt(2.0 * x) for x in (one.gain, null[diagnostic].null95, null[diagnostic].threshold)),
+        )
+        for diagnostic, one in findings.items()
     )

@@ -108,7 +108,9 @@ _EFFECTS_BY_DIAGNOSTIC: Final = {
     "variance": ("noise_step", "variance_modulation"),
     "values": ("resolution", "saturation", "sample_hold"),
 }
-MOST_DIRECT_DIAGNOSTIC: Final = {effect: lens for lens, effects in _EFFECTS_BY_DIAGNOSTIC.items() for effect in effects}
+MOST_DIRECT_DIAGNOSTIC: Final = {
+    effect: diagnostic for diagnostic, effects in _EFFECTS_BY_DIAGNOSTIC.items() for effect in effects
+}
 """Diagnostic that is most sensitive to each effect."""
 
 

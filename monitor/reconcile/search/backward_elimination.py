@@ -112,8 +112,11 @@ def _accept_if_diagnostics_agree(
         return search
     whitened = whiten_axis(simpler.fit)
     findings = run_diagnostics(whitened)
-    for lens, one in findings.items():
-        if one.gain > null[lens].threshold and not search.final.findings[lens].gain > null[lens].threshold:
+    for diagnostic, one in findings.items():
+        if (
+            one.gain > null[diagnostic].threshold
+            and not search.final.findings[diagnostic].gain > null[diagnostic].threshold
+        ):
             return search
     rounds = search.rounds
     if replacement_reason:

@@ -173,7 +173,7 @@ def _with_strongest_vibration(
 
 def _significant_gain(search: AxisSearchResult, null: AxisNull) -> float:
     """Return the sum of the gains of the significant diagnostics of one axis, in nats."""
-    return sum(one.gain for lens, one in search.final.findings.items() if one.gain > null[lens].threshold)
+    return sum(one.gain for diagnostic, one in search.final.findings.items() if one.gain > null[diagnostic].threshold)
 
 
 def _acts_in_both_halves(joint: "_JointFit", whitened: Sequence[WhitenedAxis], shapes: Sequence[Shape]) -> bool:

@@ -154,11 +154,11 @@ def _next_round(
     of the search.
     """
     hypothesis, whitened = current.hypothesis, current.whitened
-    agrees = not any(one.gain > null[lens].threshold for lens, one in current.findings.items())
+    agrees = not any(one.gain > null[diagnostic].threshold for diagnostic, one in current.findings.items())
     better = (
         try_alternatives_to_slow_noise(hypothesis, whitened) if agrees and _has_fitted_slow_noise(hypothesis) else []
     )
-    conspicuous = any(one.gain > null[lens].search_threshold for lens, one in current.findings.items())
+    conspicuous = any(one.gain > null[diagnostic].search_threshold for diagnostic, one in current.findings.items())
     completed = None
     if better or conspicuous:
         current, completed = _try_groups(current, better, agrees, null, rng)
@@ -224,19 +224,19 @@ def _select_trial(
     for at, trial in enumerate(trials[:MAX_VALIDATION_ATTEMPTS]):
         if trial.score <= 0.0 or trial.is_rival_only:
             return None
-        lens = MOST_DIRECT_DIAGNOSTIC.get(trial.name, strongest)
+        diagnostic = MOST_DIRECT_DIAGNOSTIC.get(trial.name, strongest)
         after = _add_effect(current.hypothesis, trial, rng)
         added = None if trial.effect is None or trial.moved is not None else after.added[-1]
         if added is not None and _has_zero_size(added):
             continue
         whitened = whiten_axis(after.fit)
-        if trial.name in ONE_TIME_EFFECTS and DIAGNOSTICS[lens](whitened).gain >= findings[lens].gain:
+        if trial.name in ONE_TIME_EFFECTS and DIAGNOSTICS[diagnostic](whitened).gain >= findings[diagnostic].gain:
             continue
         tried = [trial, *trials[:at], *trials[at + 1 :]]  # a rejected trial still reduces the confidence
         if _is_gaussian_and_stationary(whitened, null):
             after, tried = replace_by_likelier_alternative(after, tried)
             whitened = whitened if after.fit is whitened.fit else whiten_axis(after.fit)
-        validation = cross_validate(current.hypothesis, after, added, lens, null[lens], rng)
+        validation = cross_validate(current.hypothesis, after, added, diagnostic, null[diagnostic], rng)
         if validation.kept:
             done = SearchRound(current.findings_and_plots(), tuple(tried), after, validation)
             return done, _diagnose(after, whitened)
@@ -261,7 +261,9 @@ def _add_effect(hypothesis: Hypothesis, trial: Trial, rng: np.random.Generator) 
 
 def _is_gaussian_and_stationary(whitened: WhitenedAxis, null: AxisNull) -> bool:
     """Return True if the diagnostics find neither outliers nor variance changes."""
-    return all(DIAGNOSTICS[lens](whitened).gain <= null[lens].threshold for lens in DISTRIBUTION_DIAGNOSTICS)
+    return all(
+        DIAGNOSTICS[diagnostic](whitened).gain <= null[diagnostic].threshold for diagnostic in DISTRIBUTION_DIAGNOSTICS
+    )
 
 
 def drop_unneeded_effects(hypothesis: Hypothesis) -> Hypothesis:
@@ -288,8 +290,10 @@ def _gains_by_type(rounds: list[SearchRound]) -> dict[type[Effect], float]:
         if one.hypothesis.added:
             kind = type(one.hypothesis.added[-1])
             most_direct_only = issubclass(kind, (AxisLeak, BiasStep, BiasCurve, PulseTrain, *SMOOTH_SPECTRA))
-            lenses = (MOST_DIRECT_DIAGNOSTIC[kind.name],) if most_direct_only else tuple(one.before.findings)
-            found[kind] = max(found.get(kind, 0.0), *(one.before.findings[lens].gain for lens in lenses))
+            diagnostics = (MOST_DIRECT_DIAGNOSTIC[kind.name],) if most_direct_only else tuple(one.before.findings)
+            found[kind] = max(
+                found.get(kind, 0.0), *(one.before.findings[diagnostic].gain for diagnostic in diagnostics)
+            )
     return found
 
 

@@ -77,9 +77,9 @@ def keep_uncontradicted_effects(
         Null distribution of each diagnostic.
     """
 
-    def significant_gain(lens: str) -> float:
-        gain = findings[lens].gain
-        return gain if gain > null[lens].threshold else 0.0
+    def significant_gain(diagnostic: str) -> float:
+        gain = findings[diagnostic].gain
+        return gain if gain > null[diagnostic].threshold else 0.0
 
     def contradicted_effects(kinds: type[Effect] | tuple[type[Effect], ...], gain: float, share: float) -> set[int]:
         return {
@@ -89,10 +89,10 @@ def keep_uncontradicted_effects(
         }
 
     withdrawn = _overlapping_features(added) | _harmonic_comb(added) | _pulses_with_lines(added)
-    for lens in FREQUENCY_DIAGNOSTICS:
-        place = findings[lens].where.frequency
+    for diagnostic in FREQUENCY_DIAGNOSTICS:
+        place = findings[diagnostic].where.frequency
         if place is not None:
-            candidates = contradicted_effects(Effect, significant_gain(lens), MAX_REMAINING_SHARE)
+            candidates = contradicted_effects(Effect, significant_gain(diagnostic), MAX_REMAINING_SHARE)
             withdrawn |= {at for at in candidates if _overlaps(added[at], place)}
     withdrawn |= contradicted_effects(AxisLeak, significant_gain("other_axes"), MAX_REMAINING_LEAK_SHARE)
     withdrawn |= contradicted_effects(PulseTrain, significant_gain("lines"), MAX_REMAINING_SHARE)

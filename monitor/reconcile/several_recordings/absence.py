@@ -64,9 +64,9 @@ def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[M
         return "may_differ", "an effect that happens once need not happen in another recording"
     if rival := _confused_effect(step, axis_result, there):
         return "other_name", f"the difference was named {rival} there, and the two effects are hard to distinguish"
-    gap = next((gap for gap in there.end.gaps if gap.lens == step.before.lens), None)
-    if any(gap.lens == step.before.lens for gap in there.left_over):
-        return "unnamed", f"the same diagnostic ({step.before.lens}) leaves a difference without a name there"
+    gap = next((gap for gap in there.end.gaps if gap.diagnostic == step.before.diagnostic), None)
+    if any(gap.diagnostic == step.before.diagnostic for gap in there.left_over):
+        return "unnamed", f"the same diagnostic ({step.before.diagnostic}) leaves a difference without a name there"
     if step.effect in LEAK_EFFECTS:
         source = step.parameters["source"].value
         if source not in other.axes:
@@ -75,7 +75,7 @@ def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[M
     if gap is None or not shown.gap > 0.0:
         return (
             "may_differ",
-            f"the diagnostic that found the effect ({step.before.lens}) does not determine a size there",
+            f"the diagnostic that found the effect ({step.before.diagnostic}) does not determine a size there",
         )
     growth = _gap_ratio(step, shown.duration_s, other.duration_s, gap)
     if growth is None:
@@ -87,7 +87,7 @@ def _compare_expected_gap(expected: float, growth: float, gap: DiagnosticGap, se
     """Compare the expected difference with the threshold, and return the meaning with an explanation."""
     said = (
         f"with the size in the other recording, {seconds:.6g} s of data would show a gap of about {expected:.1f} "
-        f"({gap.lens}), and the threshold of {gap.threshold:.1f} is not passed"
+        f"({gap.diagnostic}), and the threshold of {gap.threshold:.1f} is not passed"
     )
     # both the expected gap before scaling and the observed gap have a standard deviation of one
     enough = gap.threshold + MIN_EXCESS_SIGMA * hypot(1.0, growth)

@@ -165,7 +165,7 @@ def measure_remaining_gaps(search: AxisSearchResult, left_over: Sequence[Diagnos
     fit = search.hypothesis.fit
     found = []
     for name, diagnostics in GROUPS.items():
-        seen = [one for one in left_over if one.lens in diagnostics]
+        seen = [one for one in left_over if one.diagnostic in diagnostics]
         if not seen:
             continue
         strongest = max(seen, key=lambda one: one.gap)

@@ -1,11 +1,16 @@
-"""What each rule of ``reconcile`` is for: the blind set with one rule switched off at a time.
+"""Measure what each rule of ``reconcile`` contributes: run the blind set with one rule switched off at a time.
 
     python -m tests.experiments.blind.ablations [--seeds 2] [--seconds 1200]
 
-Switched off are: the simulated null (each lens gets the 99 % point of χ² with one degree of freedom, as if it looked at
-one place once), the held-out halves (whatever is worth its price is taken), the joint refit (a candidate is fitted
-beside the model as it stands: no known size may move), and the names that are withdrawn at the end. Counted are names
-on recordings of a true model, hidden effects that are named, false names beside them, and foreign effects that get one.
+The following rules are switched off:
+
+- the simulated null distribution: each diagnostic has the 99 % point of χ² with one degree of freedom as threshold
+- cross-validation: every effect that exceeds its penalty is accepted
+- the joint fit: a candidate effect is fitted beside the model, and no known size may change
+- the withdrawal of contradicted effects
+
+The tables count false names on recordings of a true model, hidden effects that are named, false names beside them, and
+foreign effects that get a name.
 """
 
 import argparse

@@ -31,7 +31,11 @@ def report(
         axis: {"verdict": "agrees", "steps": [], "left_over": []} for axis in ("gx", "gy", "gz", "ax", "ay", "az")
     }
     for axis, steps in {**(more or {}), **axes}.items():
-        told[axis] = {"verdict": verdict, "steps": steps, "left_over": [{"lens": lens} for lens in left_over]}
+        told[axis] = {
+            "verdict": verdict,
+            "steps": steps,
+            "left_over": [{"lens": diagnostic} for diagnostic in left_over],
+        }
     return {"schema": "imu-monitor/reconcile/1", "verdict": verdict, "axes": told}
 
 

@@ -19,21 +19,21 @@ from monitor.reconcile.result import (
 from monitor.reconcile.several_recordings.comparison import NamedResult
 from tests.monitor.reconcile import samples
 
-LENS = DiagnosticGap("lines", Location(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)
-"""What a lens shows of an axis of which nothing is to be said."""
+DIAGNOSTIC = DiagnosticGap("lines", Location(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)
+"""What a diagnostic shows of an axis of which nothing is to be said."""
 
 
 def step(
     effect: str, gap: float = 30.0, rivals: Sequence[str] = (), kind: str = "added", **given: ParameterInterval | float
 ) -> AddedOrResizedEffect:
-    """Found through ``LENS`` with that gap; a bare number has an interval of one in a hundred."""
-    before = replace(LENS, gap=gap)
+    """Found through ``DIAGNOSTIC`` with that gap; a bare number has an interval of one in a hundred."""
+    before = replace(DIAGNOSTIC, gap=gap)
     parameters = {
         name: one if isinstance(one, ParameterInterval) else around(one, 0.01 * abs(one)) for name, one in given.items()
     }
     return AddedOrResizedEffect(
         kind, effect, parameters, 0.99, tuple(AlternativeEffect(one, 0.01) for one in rivals),  # type: ignore[arg-type]
-        before, LENS, None, None, "made by hand", "it was made by hand", AxisModelDiagnostics((LENS,), ()),
+        before, DIAGNOSTIC, None, None, "made by hand", "it was made by hand", AxisModelDiagnostics((DIAGNOSTIC,), ()),
     )  # fmt: skip
 
 
@@ -60,7 +60,12 @@ def run(
     """A recording of one axis with these steps; its model has their effects."""
     verdict: Decision = ("partly_explained" if steps else "unexplained") if left else "explained" if steps else "agrees"
     result = AxisResult(
-        axis, verdict, AxisModelDiagnostics((LENS,), ()), steps, tuple(left), AxisModelDiagnostics((LENS,), ())
+        axis,
+        verdict,
+        AxisModelDiagnostics((DIAGNOSTIC,), ()),
+        steps,
+        tuple(left),
+        AxisModelDiagnostics((DIAGNOSTIC,), ()),
     )
     whole = samples.agrees()
     given = whole.baseline.effects[axis]

@@ -56,7 +56,7 @@ def look(
     known_line: bool = False,
     hump: bool = False,
 ) -> AxisModelDiagnostics:
-    """One axis beside a model through four lenses; ``line`` is measured, ``known_line`` is in the model too."""
+    """One axis beside a model through four diagnostics; ``line`` is measured, ``known_line`` is in the model too."""
     rng = np.random.default_rng(AXES.index(axis))  # the same measurement beside every model
     size = 1.0 if axis.startswith("g") else ACCELEROMETER
     views = (

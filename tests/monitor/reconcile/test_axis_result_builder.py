@@ -87,7 +87,7 @@ def test_a_line_is_described_with_all_that_it_has():
         assert bounds.lo < bounds.value < bounds.hi
         assert abs(bounds.value - true) < 4.0 * (bounds.hi - bounds.lo) / 3.92
     assert step.confidence > 0.9
-    assert step.before.lens == "lines"
+    assert step.before.diagnostic == "lines"
     lo, hi = step.before.where.frequency
     assert lo < 17.3 < hi
     assert step.before.is_significant
@@ -111,7 +111,7 @@ def test_another_size_is_told_as_such():
 def test_single_samples_are_counted():
     (step,) = told("outliers").steps
     assert step.effect == "outliers"
-    assert step.before.lens == "tails"
+    assert step.before.diagnostic == "tails"
     assert step.parameters["fraction"].lo < 1e-3 < step.parameters["fraction"].hi
     assert step.parameters["scale"].lo < 1.5e-2 < step.parameters["scale"].hi
     assert "detected events" in step.because
@@ -152,8 +152,8 @@ def test_verdicts_follow_from_steps_and_what_is_left():
     assert build_axis_result(found("line"), STRICT, STRICT).verdict == "explained"
     left = build_axis_result(found("line"), STRICT, ALWAYS)
     assert left.verdict == "partly_explained"
-    assert {score.lens for score in left.left_over} == {
-        lens for lens, one in found("line").final.findings.items() if one.gain
+    assert {score.diagnostic for score in left.left_over} == {
+        diagnostic for diagnostic, one in found("line").final.findings.items() if one.gain
     }
     assert build_axis_result(found("line"), STRICT, UNREACHED).left_over == ()
 

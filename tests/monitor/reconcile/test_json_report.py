@@ -77,9 +77,9 @@ def test_what_was_compared_stands_beside_it() -> None:
     about = {name: report[name] for name in ("rate", "samples", "seconds", "seed", "fitted_first")}
     assert about == {"rate": 100.0, "samples": 360_000, "seconds": 3600.0, "seed": 7, "fitted_first": False}
     assert report["notes"] == ["12 missing samples <in 1 gap> & filled"]
-    lenses = ["psd", "allan", "level", "distribution", "other_axes"]
-    assert [score["lens"] for score in report["axes"]["gx"]["scores"]] == lenses
-    assert [score["lens"] for score in report["axes"]["gz"]["steps"][1]["scores"]] == lenses
+    diagnostics = ["psd", "allan", "level", "distribution", "other_axes"]
+    assert [score["lens"] for score in report["axes"]["gx"]["scores"]] == diagnostics
+    assert [score["lens"] for score in report["axes"]["gz"]["steps"][1]["scores"]] == diagnostics
 
 
 def test_what_happens_once_has_a_reason_instead_of_a_held_out_gap() -> None:

@@ -10,7 +10,7 @@ from drivers.errors import ConfigError
 from monitor.publishing.reports.comparison_page import render_page
 from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
 from tests.monitor.publishing.reports.test_reconcile_page import Text
-from tests.monitor.reconcile.runs_made import LENS, line, run, step, with_axes
+from tests.monitor.reconcile.runs_made import DIAGNOSTIC, line, run, step, with_axes
 
 pytest.importorskip("jinja2")
 
@@ -19,7 +19,11 @@ def made() -> Comparison:
     own = step("bias_step", time=350.0, height=1e-3)
     first = with_axes(run("cold <1>", line(1.5e-4)), run("cold <1>", axis="gx"))
     return compare_results(
-        [first, run("warm", line(1.52e-4), own), run("c", line(1.3e-4), seconds=60.0, left=[replace(LENS, gap=9.0)])],
+        [
+            first,
+            run("warm", line(1.52e-4), own),
+            run("c", line(1.3e-4), seconds=60.0, left=[replace(DIAGNOSTIC, gap=9.0)]),
+        ],
         fitted_to="cold <1>",
         without_result={"short": "200 samples; too few"},
     )

@@ -94,7 +94,7 @@ def test_parameters_have_intervals_units_and_what_the_model_had() -> None:
     assert ["N", "0.6188", "0.6174 … 0.6202", "°/√h", "0.516 °/√h"] in rows
 
 
-def test_every_lens_stands_before_and_after_each_step() -> None:
+def test_every_diagnostic_stands_before_and_after_each_step() -> None:
     made = samples.explained()
     rows = read("explained").rows
     assert ["spectrum", "17.1 … 17.5 Hz", "41.2", "4.60", "2.60", "1.90"] in rows
@@ -109,9 +109,9 @@ def test_what_agrees_is_short_and_shows_its_lenses() -> None:
     assert text.count("<svg ") == sum(len(result.start.plots) for result in made.axes.values())
     assert "Step" not in text
     assert "Left over" not in text
-    lenses = {row[0]: row[1:] for row in Text(text).rows[7:]}
-    assert lenses["spectrum"] == ["0.60 of 2.60"] * 6
-    assert lenses["diagnostic"] == ["gx", "gy", "gz", "ax", "ay", "az"]
+    diagnostics = {row[0]: row[1:] for row in Text(text).rows[7:]}
+    assert diagnostics["spectrum"] == ["0.60 of 2.60"] * 6
+    assert diagnostics["diagnostic"] == ["gx", "gy", "gz", "ax", "ay", "az"]
 
 
 def test_what_is_unexplained_has_its_place_and_no_name() -> None:

@@ -39,11 +39,11 @@ def explained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[object
 
 
 def test_the_curves_after_each_step_stand_on_the_timeline(explained: dict[str, list[object]]) -> None:
-    for lens in ("psd", "allan"):
+    for diagnostic in ("psd", "allan"):
         for part in ("expected", "measured", "band"):
-            assert sorted(set(explained[f"/gz/{lens}/after/{part} step"])) == [0, 1, 2]
-            assert f"/gz/{lens}/before/{part} step" not in explained  # static
-            assert explained[f"/gz/{lens}/before/{part} LineStrips2D:strips"]
+            assert sorted(set(explained[f"/gz/{diagnostic}/after/{part} step"])) == [0, 1, 2]
+            assert f"/gz/{diagnostic}/before/{part} step" not in explained  # static
+            assert explained[f"/gz/{diagnostic}/before/{part} LineStrips2D:strips"]
     assert not any(name.startswith("/gx/psd/after") for name in explained)
 
 
@@ -62,18 +62,18 @@ def test_a_curve_stands_in_the_decades_of_its_box(explained: dict[str, list[obje
             assert y.max() < HEIGHT + 1e-4, name
 
 
-def test_the_gap_of_each_lens_has_a_course_over_its_threshold(explained: dict[str, list[object]]) -> None:
+def test_the_gap_of_each_diagnostic_has_a_course_over_its_threshold(explained: dict[str, list[object]]) -> None:
     assert np.ravel(explained["/gz/gap/psd Scalars:scalars"]) == pytest.approx([41.2 / 2.6, 4.6 / 2.6, 0.6 / 2.6])
     assert np.ravel(explained["/gz/gap/threshold Scalars:scalars"]).tolist() == [1.0, 1.0, 1.0]
 
 
-def test_of_many_lenses_those_with_the_largest_gaps_have_a_course(tmp_path: Path) -> None:
+def test_of_many_diagnostics_those_with_the_largest_gaps_have_a_course(tmp_path: Path) -> None:
     made = samples.unexplained()
-    more = tuple(replace(made.axes["ax"].start.gaps[0], lens=f"lens_{i}", gap=0.1 * i) for i in range(30))
+    more = tuple(replace(made.axes["ax"].start.gaps[0], diagnostic=f"diagnostic_{i}", gap=0.1 * i) for i in range(30))
     start = replace(made.axes["ax"].start, gaps=more)
     reconcile_rrd.write_rrd(replace(made, axes={"ax": replace(made.axes["ax"], start=start)}), tmp_path / "a.rrd")
-    shown = {name.split()[0] for name in cells(tmp_path / "a.rrd") if name.startswith("/ax/gap/lens")}
-    assert shown == {f"/ax/gap/lens_{i}" for i in range(24, 30)}
+    shown = {name.split()[0] for name in cells(tmp_path / "a.rrd") if name.startswith("/ax/gap/diagnostic")}
+    assert shown == {f"/ax/gap/diagnostic_{i}" for i in range(24, 30)}
 
 
 def test_the_steps_are_told_in_words(explained: dict[str, list[object]]) -> None:

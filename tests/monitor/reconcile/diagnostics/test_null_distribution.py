@@ -23,8 +23,8 @@ from tests.monitor.reconcile.axes import WALK, WHITE, axis, seen, walk, warmth, 
 PLACES = 500.0
 
 
-def quartile(lens):
-    law = NULL_GAINS[lens]
+def quartile(diagnostic):
+    law = NULL_GAINS[diagnostic]
     return law.offset + law.slope * np.log(PLACES)
 
 
@@ -33,19 +33,22 @@ def simulated(count, rng, shift=0.0):
     found = []
     for _ in range(count):
         excess = rng.exponential(size=len(DIAGNOSTICS)) - np.log(4.0) + shift
-        gains = {lens: quartile(lens) + NULL_GAINS[lens].scale * e for lens, e in zip(DIAGNOSTICS, excess, strict=True)}
-        found.append({lens: Finding(float(g), Location(), PLACES) for lens, g in gains.items()})
+        gains = {
+            diagnostic: quartile(diagnostic) + NULL_GAINS[diagnostic].scale * e
+            for diagnostic, e in zip(DIAGNOSTICS, excess, strict=True)
+        }
+        found.append({diagnostic: Finding(float(g), Location(), PLACES) for diagnostic, g in gains.items()})
     return found
 
 
 def test_levels_are_those_of_an_exponential():
     null = estimate_null_distributions({name: simulated(1, np.random.default_rng(0)) for name in ("gx", "gy", "gz")})
-    for lens in DIAGNOSTICS:
-        start, scale = quartile(lens), NULL_GAINS[lens].scale
-        assert null["gx"][lens].null95 == pytest.approx(start + scale * (expon.isf(0.05) - np.log(4.0)))
-        # once in 100 recordings, of all lenses and axes together
+    for diagnostic in DIAGNOSTICS:
+        start, scale = quartile(diagnostic), NULL_GAINS[diagnostic].scale
+        assert null["gx"][diagnostic].null95 == pytest.approx(start + scale * (expon.isf(0.05) - np.log(4.0)))
+        # once in 100 recordings, of all diagnostics and axes together
         chance = expon.isf(0.01 / (len(DIAGNOSTICS) * 3)) - np.log(4.0)
-        assert null["gx"][lens].threshold == pytest.approx(start + scale * chance)
+        assert null["gx"][diagnostic].threshold == pytest.approx(start + scale * chance)
 
 
 def test_a_true_model_is_rarely_accused():
@@ -61,7 +64,11 @@ def test_a_true_model_is_rarely_accused():
             simulations += len(found[name])
         null = estimate_null_distributions(found)
         tested = {name: simulated(1, rng)[0] for name in names}
-        accused += any(tested[name][lens].gain > null[name][lens].threshold for name in names for lens in DIAGNOSTICS)
+        accused += any(
+            tested[name][diagnostic].gain > null[name][diagnostic].threshold
+            for name in names
+            for diagnostic in DIAGNOSTICS
+        )
     assert 0.3 * FALSE_ALARM_PROBABILITY < accused / recordings < 2.0 * FALSE_ALARM_PROBABILITY
     assert simulations < 1.1 * recordings * len(names)
 
@@ -70,9 +77,11 @@ def test_more_axes_ask_for_more():
     few = simulated(1, np.random.default_rng(3))
     one = estimate_null_distributions({"gx": few})["gx"]
     six = estimate_null_distributions(dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), few))["gx"]
-    for lens in DIAGNOSTICS:
-        assert six[lens].null95 == one[lens].null95
-        assert six[lens].threshold - one[lens].threshold == pytest.approx(NULL_GAINS[lens].scale * np.log(6.0))
+    for diagnostic in DIAGNOSTICS:
+        assert six[diagnostic].null95 == one[diagnostic].null95
+        assert six[diagnostic].threshold - one[diagnostic].threshold == pytest.approx(
+            NULL_GAINS[diagnostic].scale * np.log(6.0)
+        )
 
 
 def test_an_axis_of_its_own_kind_has_its_own_threshold():
@@ -80,11 +89,11 @@ def test_an_axis_of_its_own_kind_has_its_own_threshold():
     odd = simulated(SIMULATED_RECORDINGS, rng, shift=200.0)
     assert all(all_simulations_have_improbable_gain(odd[:count]) for count in range(1, SIMULATED_RECORDINGS))
     found = estimate_null_distributions({"gx": simulated(1, rng), "gz": odd})
-    for lens in DIAGNOSTICS:
-        smallest, largest = (pick(one[lens].gain for one in odd) for pick in (min, max))
-        assert found["gz"][lens].threshold > max(largest, found["gz"][lens].null95)
-        assert found["gz"][lens].null95 > smallest
-        assert found["gx"][lens].threshold < quartile(lens) + 20.0
+    for diagnostic in DIAGNOSTICS:
+        smallest, largest = (pick(one[diagnostic].gain for one in odd) for pick in (min, max))
+        assert found["gz"][diagnostic].threshold > max(largest, found["gz"][diagnostic].null95)
+        assert found["gz"][diagnostic].null95 > smallest
+        assert found["gx"][diagnostic].threshold < quartile(diagnostic) + 20.0
 
 
 def test_one_improbable_gain_is_chance_if_the_next_simulation_is_probable():
@@ -95,8 +104,8 @@ def test_one_improbable_gain_is_chance_if_the_next_simulation_is_probable():
     assert estimate_null_distributions({"gz": [odd, usual]}) == estimate_null_distributions({"gz": [usual]})
 
 
-def test_a_lens_that_never_sees_anything_has_a_threshold():
-    nothing = [{lens: Finding(0.0, Location()) for lens in DIAGNOSTICS}] * SIMULATED_RECORDINGS
+def test_a_diagnostic_that_never_sees_anything_has_a_threshold():
+    nothing = [{diagnostic: Finding(0.0, Location()) for diagnostic in DIAGNOSTICS}] * SIMULATED_RECORDINGS
     for one in estimate_null_distributions({"gz": nothing})["gz"].values():
         assert 0.0 < one.null95 < one.threshold < np.inf
 
@@ -116,19 +125,21 @@ def test_gains_of_true_models_follow_the_expected_law(model, n):
     for seed in range(runs):
         rng = np.random.default_rng([n, seed])
         y = white(n, rng) + sum(walk(n, rng, one.K) for one in model if isinstance(one, RateRandomWalk))
-        for lens, found in run_diagnostics(seen(axis(y, (), warmth(n)), model)).items():
-            above[lens] += found.gain > NULL_GAINS[lens].quantile(found.places, 0.25)
-            beyond += found.gain > NULL_GAINS[lens].quantile(found.places, FALSE_ALARM_PROBABILITY / 60.0)
+        for diagnostic, found in run_diagnostics(seen(axis(y, (), warmth(n)), model)).items():
+            above[diagnostic] += found.gain > NULL_GAINS[diagnostic].quantile(found.places, 0.25)
+            beyond += found.gain > NULL_GAINS[diagnostic].quantile(found.places, FALSE_ALARM_PROBABILITY / 60.0)
     assert beyond <= 1
-    for lens, count in above.items():
-        assert count <= 22, lens
-        assert count >= 1 or lens in ("values", "other_axes"), lens  # one axis of continuous values has neither
+    for diagnostic, count in above.items():
+        assert count <= 22, diagnostic
+        assert count >= 1 or diagnostic in ("values", "other_axes"), (
+            diagnostic
+        )  # one axis of continuous values has neither
 
 
 def test_a_gap_is_in_standard_deviations():
-    seen = {lens: Finding(0.5 * k**2, Location(tau=(1.0, 2.0))) for k, lens in enumerate(DIAGNOSTICS)}
+    seen = {diagnostic: Finding(0.5 * k**2, Location(tau=(1.0, 2.0))) for k, diagnostic in enumerate(DIAGNOSTICS)}
     found = compute_diagnostic_gaps(seen, dict.fromkeys(DIAGNOSTICS, NullDistribution(2.0, 8.0)))
-    assert [score.lens for score in found] == list(DIAGNOSTICS)
+    assert [score.diagnostic for score in found] == list(DIAGNOSTICS)
     assert [score.gap for score in found] == pytest.approx(np.arange(len(DIAGNOSTICS)))
     assert {(score.null95, score.threshold) for score in found} == {(2.0, 4.0)}
     assert [score.is_significant for score in found] == [k > 4 for k in range(len(DIAGNOSTICS))]

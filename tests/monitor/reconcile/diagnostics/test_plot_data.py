@@ -19,7 +19,7 @@ def noise(seed=0):
 
 
 def drawn(y, model=MODEL, temperature_c=None):
-    return {view.lens: view for view in build_plot_data(seen(axis(y, model, temperature_c), model))}
+    return {view.diagnostic: view for view in build_plot_data(seen(axis(y, model, temperature_c), model))}
 
 
 def test_every_view_can_be_drawn():
@@ -42,7 +42,7 @@ def test_every_view_can_be_drawn():
 
 
 def test_units_are_those_of_the_axis():
-    units = {view.lens: view.y_unit for view in build_plot_data(seen(axis(noise()), MODEL))}
+    units = {view.diagnostic: view.y_unit for view in build_plot_data(seen(axis(noise()), MODEL))}
     assert units["psd"] == "(rad/s)²/Hz"
     assert units["allan"] == units["level"] == "rad/s"
 

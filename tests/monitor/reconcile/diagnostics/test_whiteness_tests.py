@@ -1,4 +1,4 @@
-"""Gains of single lenses beside brute force: least squares, periodograms and sums that are written out."""
+"""Gains of single diagnostics beside brute force: least squares, periodograms and sums that are written out."""
 
 import numpy as np
 import pytest

@@ -47,9 +47,9 @@ def noise(seed=0):
     return white(n, rng) + walk(n, rng)
 
 
-def proven(one, effect, lens, model=MODEL):
+def proven(one, effect, diagnostic, model=MODEL):
     before, after = fit_with_fixed_noise(one, model), fit_with_fewest_changes(one, (effect,), model)
-    return cross_validate(before, after, after.effects[-1], lens, NULL, np.random.default_rng(0))
+    return cross_validate(before, after, after.effects[-1], diagnostic, NULL, np.random.default_rng(0))
 
 
 LINE = 3e-4 * np.sin(2 * np.pi * 17.3 * time_s(n))
@@ -68,9 +68,9 @@ REAL = {
 
 @pytest.mark.parametrize("name", REAL)
 def test_what_is_there_in_both_halves_is_kept(name):
-    hidden, effect, lens = REAL[name]
+    hidden, effect, diagnostic = REAL[name]
     one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
-    found = proven(one, effect, lens)
+    found = proven(one, effect, diagnostic)
     assert found.reason == ""
     assert found.kept
     assert found.after < 0.7 * found.before
@@ -91,13 +91,13 @@ BY_CHANCE = {
 
 @pytest.mark.parametrize("name", BY_CHANCE)
 def test_what_one_half_contradicts_is_not_kept(name):
-    hidden, effect, lens = BY_CHANCE[name]
-    hidden = hidden * HALF if lens == "psd" else hidden
+    hidden, effect, diagnostic = BY_CHANCE[name]
+    hidden = hidden * HALF if diagnostic == "psd" else hidden
     one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
     before, after = fit_with_fixed_noise(one, MODEL), fit_with_fewest_changes(one, (effect,), MODEL)
     # on the data that chose it, it is worth its name
     assert after.fit.log_likelihood - before.fit.log_likelihood > 20.0
-    found = cross_validate(before, after, effect, lens, NULL, np.random.default_rng(0))
+    found = cross_validate(before, after, effect, diagnostic, NULL, np.random.default_rng(0))
     assert not found.kept
 
 
@@ -147,15 +147,15 @@ def test_single_samples_are_looked_at_in_each_half(kind):
     y = noise(8)
     if kind == "outliers":
         y = y + (rng.random(n) < 2e-3) * 1e-2 * rng.standard_normal(n)
-        effect, lens = Outliers(fraction=2e-3, scale=1e-2), "tails"
+        effect, diagnostic = Outliers(fraction=2e-3, scale=1e-2), "tails"
     else:
         y = 6e-4 * np.rint(y / 6e-4)
-        effect, lens = Resolution(step=6e-4), "values"
+        effect, diagnostic = Resolution(step=6e-4), "values"
     plain = axis(y, MODEL)
     one = repair_axis_again(plain, (*MODEL, effect), rng)
     before = fit_with_fewest_changes(plain, (), MODEL)
     after = fit_with_fewest_changes(one, (effect,), MODEL)
-    found = cross_validate(before, after, effect, lens, NULL, rng)
+    found = cross_validate(before, after, effect, diagnostic, NULL, rng)
     assert found.kept
     assert found.reason == ""
     assert found.after < 0.5 * found.before

@@ -91,8 +91,8 @@ def test_what_was_hidden_is_named(name):
     found = looked(noise(2) + HIDDEN[name], temperature_c=warmth(n))
     assert names(found) == [name]
     first = found.rounds[0]
-    assert any(one.gain > STRICT[lens].threshold for lens, one in first.before.findings.items())
-    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
+    assert any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in first.before.findings.items())
+    assert not any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
     assert first.trials[0].name == name
     assert first.trials[0].score > 0.0
     assert found.hypothesis.effects[:2] == MODEL  # what is right stays as it is
@@ -193,7 +193,7 @@ def test_what_nobody_knows_has_no_name():
     """A chirp through the whole band, and Laplace's distribution: both stay to be seen."""
     chirp = 1.5 * SIGMA * np.sin(2 * np.pi * (2.0 * T + 0.5 * (40.0 / T[-1]) * T**2))
     found = looked(noise(9) + chirp)
-    assert any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
+    assert any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
     laplace = looked(SIGMA * np.random.default_rng(10).laplace(size=n) / np.sqrt(2.0), (WHITE,))
     assert names(laplace) == []
     assert laplace.final.findings["tails"].gain > STRICT["tails"].threshold
@@ -259,7 +259,7 @@ def test_what_is_worth_nothing_is_dropped():
 
 
 def test_candidates_on_a_true_model_are_not_worth_their_price():
-    """As none is asked for unless a lens passes its threshold, this is the second of two doors."""
+    """As none is asked for unless a diagnostic passes its threshold, this is the second of two doors."""
     wrong = 0
     for seed in range(6):
         one = axis(noise(20 + seed), MODEL)
@@ -287,7 +287,7 @@ def test_a_line_of_the_model_that_has_moved_is_no_new_line(known, new_hz):
     assert [trial.moved for trial in (one.trials[0] for one in found.rounds)] == [2]
     assert found.hypothesis.effects[2].frequency == pytest.approx(new_hz, abs=0.1)
     assert found.hypothesis.effects[3].frequency == 5.0
-    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
+    assert not any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
 
 
 def test_a_new_line_beside_a_line_of_the_model_is_added():
@@ -307,7 +307,7 @@ def test_a_filter_with_noise_behind_is_one_effect(kind):
     limit = found.hypothesis.effects[-1]
     assert limit.cutoff == pytest.approx(12.0, rel=0.05)
     assert limit.floor == pytest.approx(0.15 * N, rel=0.2)  # the kinds differ most above the cutoff
-    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
+    assert not any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
 
 
 def test_noise_behind_a_known_filter_is_its_floor():

@@ -16,8 +16,8 @@ from monitor.reconcile.diagnostics.whiteness_tests import Finding
 from monitor.reconcile.result import Location
 from monitor.reconcile.search.withdrawal_of_contradicted_effects import keep_uncontradicted_effects
 
-QUIET = {lens: Finding(1.0, Location(frequency=(1.0, 2.0))) for lens in ("psd", "lines", "spectrogram")}
-QUIET |= {lens: Finding(1.0, Location()) for lens in ("level", "other_axes", "tails", "variance")}
+QUIET = {diagnostic: Finding(1.0, Location(frequency=(1.0, 2.0))) for diagnostic in ("psd", "lines", "spectrogram")}
+QUIET |= {diagnostic: Finding(1.0, Location()) for diagnostic in ("level", "other_axes", "tails", "variance")}
 NULL = dict.fromkeys(QUIET, NullDistribution(6.0, 12.0))
 
 

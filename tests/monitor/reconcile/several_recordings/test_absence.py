@@ -9,7 +9,7 @@ from monitor.reconcile.likelihood.effect_roles import ONE_TIME_EFFECTS
 from monitor.reconcile.result import AddedOrResizedEffect, DiagnosticGap, Location, ParameterInterval, Reconciliation
 from monitor.reconcile.several_recordings.absence import Absence, ClearestOccurrence, explain_absence
 from monitor.reconcile.several_recordings.comparison import NamedResult
-from tests.monitor.reconcile.runs_made import LENS, line, run, step
+from tests.monitor.reconcile.runs_made import DIAGNOSTIC, line, run, step
 
 
 def shown(one: AddedOrResizedEffect, gap: float = 30.0, seconds: float = 600.0) -> ClearestOccurrence:
@@ -21,7 +21,7 @@ def said(one: ClearestOccurrence, other: NamedResult) -> Absence:
 
 
 def seen_through(score: DiagnosticGap, seconds: float = 600.0) -> Reconciliation:
-    """An axis that agrees, with one lens."""
+    """An axis that agrees, with one diagnostic."""
     agreeing = run("two", seconds=seconds).result
     gz = agreeing.axes["gz"]
     seen = replace(gz.end, gaps=(score,))
@@ -70,10 +70,10 @@ def test_a_rival_name_is_told_only_where_one_was_the_others_runner_up() -> None:
     assert said(one, run("two", step("random_telegraph", **telegraph))).meaning == "contradiction"
 
 
-def test_what_is_left_over_through_the_same_lens_is_no_contradiction() -> None:
-    left = replace(LENS, gap=9.0)
+def test_what_is_left_over_through_the_same_diagnostic_is_no_contradiction() -> None:
+    left = replace(DIAGNOSTIC, gap=9.0)
     assert said(shown(line()), run("two", left=[left])).meaning == "unnamed"
-    assert said(shown(line()), run("two", left=[replace(left, lens="tails")])).meaning == "contradiction"
+    assert said(shown(line()), run("two", left=[replace(left, diagnostic="tails")])).meaning == "contradiction"
 
 
 def test_a_leak_needs_its_source() -> None:
@@ -100,7 +100,7 @@ def test_a_ramp_fades_faster_with_the_length() -> None:
     assert said(shown(line(), 30.0), run("two", seconds=200.0)).meaning == "contradiction"
 
 
-def test_nothing_is_said_without_the_lens_or_the_axis() -> None:
-    assert explain_absence(shown(line()), seen_through(replace(LENS, lens="psd")))[0] == "may_differ"
+def test_nothing_is_said_without_the_diagnostic_or_the_axis() -> None:
+    assert explain_absence(shown(line()), seen_through(replace(DIAGNOSTIC, diagnostic="psd")))[0] == "may_differ"
     assert said(shown(line()), run("two", axis="gx")).because == "the recording does not contain gz"
     assert said(shown(line(), gap=0.0), run("two")).meaning == "may_differ"

@@ -13,7 +13,7 @@ from monitor.reconcile.several_recordings.comparison import (
     compare_results,
 )
 from tests.monitor.reconcile import samples
-from tests.monitor.reconcile.runs_made import LENS, around, known_lines, line, run, step, with_axes
+from tests.monitor.reconcile.runs_made import DIAGNOSTIC, around, known_lines, line, run, step, with_axes
 
 
 def gz(*runs: NamedResult) -> AxisComparison:
@@ -173,7 +173,7 @@ def test_a_clock_is_one_for_all_axes() -> None:
 
 
 def test_the_verdict_is_that_of_all() -> None:
-    left = replace(LENS, gap=9.0)
+    left = replace(DIAGNOSTIC, gap=9.0)
     assert compare_results([run("a"), run("b")]).verdict == "agrees"
     assert compare_results([run("a"), run("b", line())]).verdict == "explained"
     assert compare_results([run("a"), run("b", left=[left])]).verdict == "unexplained"

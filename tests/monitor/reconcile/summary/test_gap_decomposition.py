@@ -91,15 +91,15 @@ def test_quantization_counts_with_its_noise(step_to_noise, share):
     assert one.value_artifacts.quantization.gain > 20.0 * value_artifact_gain(fit, Resolution)
 
 
-def gap(lens, gain):
-    return DiagnosticGap(lens, Location(), sqrt(2.0 * gain), 2.0, 5.0)
+def gap(diagnostic, gain):
+    return DiagnosticGap(diagnostic, Location(), sqrt(2.0 * gain), 2.0, 5.0)
 
 
 def test_diagnostics_of_one_group_count_once():
     hypothesis = louder_with_line()
     left = (gap("lines", 40.0), gap("psd", 60.0), gap("tails", 30.0), gap("variance", 20.0), gap("level", 25.0))
     found = measure_remaining_gaps(search(hypothesis), left)
-    assert [(one.group, one.strongest.lens) for one in found] == [
+    assert [(one.group, one.strongest.diagnostic) for one in found] == [
         ("spectrum", "psd"), ("distribution", "tails"), ("level", "level"),
     ]  # fmt: skip
     assert [one.gain_nats for one in found] == [pytest.approx(gain) for gain in (60.0, 30.0, 25.0)]
