@@ -13,7 +13,7 @@ from monitor.cli.shared import output
 def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True)] = False) -> None:
     """Compile the numerical kernels and store the compiled kernels on disk for a quick start."""
     from monitor.common.compiled import kernel_cache_folder
-    from monitor.daemon.kernels import kernel_compilation, kernel_parts
+    from monitor.daemon.kernels import kernel_compilation, kernel_groups
 
     if from_stdin:
         kernel_compilation.compile_from_stdin(sys.stdin, sys.stdout)
@@ -23,7 +23,7 @@ def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True
             "compiled kernels cannot be stored, because no cache folder can be written; set NUMBA_CACHE_DIR to a "
             "writable folder"
         )
-    cold = [group for group in kernel_parts.GROUPS if not kernel_compilation.is_warm(group)]
+    cold = [group for group in kernel_groups.GROUPS if not kernel_compilation.is_warm(group)]
     begun_s = time.monotonic()
     with output.show_progress_bar() as show:
 

@@ -488,7 +488,7 @@ def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
 def _check_kernels() -> Finding:
     from monitor.common.compiled import kernel_cache_folder
     from monitor.daemon.kernels.kernel_compilation import is_warm
-    from monitor.daemon.kernels.kernel_parts import SERVICE
+    from monitor.daemon.kernels.kernel_groups import SERVICE
 
     folder = kernel_cache_folder()
     if folder is None:

@@ -24,7 +24,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
 from drivers.number_ranges import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, NumberRange
-from monitor.noise.spectrum import Spectrum
+from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 QUANTITIES: Final = {"s": DELAY_S, "Hz": EFFECT_FREQUENCY_HZ, "1/s": EFFECT_FREQUENCY_HZ}
 """Allowed number range by unit of the parameter. For other units, the range is ``PARAMETER``."""
@@ -232,6 +232,16 @@ class Source(Effect):
             Sample interval, s.
         """
         return self.spectrum(tau0_s).density(f_hz)
+
+
+class NonstationaryBias(Source):
+    """Bias whose spectrum is not defined, because it depends on the temperature or on the length of the recording."""
+
+    __slots__ = ()
+
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return NaN for all frequencies, because the bias has no spectrum of its own."""
+        return nan_spectrum(tau0_s)
 
 
 class AxisLeak(Effect):

@@ -55,13 +55,13 @@ from monitor.reconcile.result import (
 from monitor.reconcile.search.backward_elimination import MapFunction, eliminate_unneeded_effects
 from monitor.reconcile.search.candidate_effects import PENALTY_NATS
 from monitor.reconcile.search.common_vibration_search import name_common_vibrations
-from monitor.reconcile.search.repaired_axes import build_repaired_axes
 from monitor.reconcile.search.sample_rate_from_spectrum import (
     SAMPLE_RATE_PENALTY_NATS,
     SampleRateErrorEstimate,
     convert_effect_to_stated_time,
     detect_sample_rate_error,
 )
+from monitor.reconcile.search.sample_repair import build_repaired_axes
 from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
 
 MIN_TERM_GAIN_NATS: Final = 3.0

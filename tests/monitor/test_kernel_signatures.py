@@ -18,7 +18,7 @@ PROGRAM = """
     import numpy as np
 
     from drivers.data_types import make_block
-    from monitor.daemon.kernels import kernel_parts
+    from monitor.daemon.kernels import kernel_groups
     from monitor.common.compiled import Kernel
     from monitor.drift.compensation.compensator import Compensator
     from monitor.drift.thermal import thermal_response
@@ -36,7 +36,7 @@ PROGRAM = """
         return {name: (len(one.signatures), len(one.intermediate.signatures)) for name, one in found.items()}
 
 
-    for part in kernel_parts.SERVICE.parts:
+    for part in kernel_groups.SERVICE.parts:
         part.prepare()
     before = compiled()
 

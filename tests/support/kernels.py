@@ -7,7 +7,7 @@ workers of pytest-xdist and the processes that tests start then load them from t
 
 from collections.abc import Callable
 
-from monitor.daemon.kernels import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_groups
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:
@@ -18,6 +18,6 @@ def compile_kernels(say: Callable[[str], None]) -> None:
     say
         Called with a line for each part that is being compiled.
     """
-    for group in kernel_parts.GROUPS:
+    for group in kernel_groups.GROUPS:
         for _ in kernel_compilation.prepare_kernels(group, lambda progress: say(str(progress))):
             pass

@@ -84,9 +84,9 @@ def show_progress_bar() -> Iterator[ProgressCallback]:
 
 def compile_analysis_kernels(report_progress: ProgressCallback) -> None:
     """Compile the numerical kernels that analyze recordings, unless the disk cache already contains them."""
-    from monitor.daemon.kernels import kernel_compilation, kernel_parts
+    from monitor.daemon.kernels import kernel_compilation, kernel_groups
 
-    for group in kernel_parts.GROUPS:
+    for group in kernel_groups.GROUPS:
         if not kernel_compilation.is_warm(group):
             with contextlib.suppress(OSError):  # without a disk cache, kernels are compiled at the first call
                 for _ in kernel_compilation.prepare_kernels(

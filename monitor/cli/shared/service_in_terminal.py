@@ -57,8 +57,8 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     from monitor.daemon.outputs.log_output import EventAndStatusLogOutput
     from monitor.daemon.outputs.table_output import TableOutput
     from monitor.daemon.service import STATUS_INTERVAL_S, Service
-    from monitor.publishing.remote_devices import RemoteDeviceRegistry
-    from monitor.publishing.terminal.live_table import LiveTable
+    from monitor.publishing.remote_device_states import RemoteDeviceRegistry
+    from monitor.publishing.terminal.live_device_table import LiveTable
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
     unit = SystemdNotifier.from_environment(os.environ)

@@ -25,7 +25,7 @@ from llvmlite import binding
 
 from monitor.common.compiled import hash_module_with_imports, kernel_cache_folder
 from monitor.common.program import PROGRAM
-from monitor.daemon.kernels.kernel_parts import GROUPS, KernelGroup, KernelPart
+from monitor.daemon.kernels.kernel_groups import GROUPS, KernelGroup, KernelPart
 
 MAX_PROCESSES: Final = 2
 """Maximum number of compiling processes. Each process needs about 200 MB of memory."""

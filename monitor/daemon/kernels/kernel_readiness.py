@@ -7,7 +7,7 @@ from typing import Final
 
 import structlog
 
-from monitor.daemon.kernels import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_groups
 
 MAX_INTERPRETED_HZ: Final = 250.0
 """Maximum total sample rate of devices with interpreted kernels, which need up to 0.8 ms per sample."""
@@ -51,8 +51,8 @@ class KernelReadiness:
             wake.set()
 
         try:
-            for part in kernel_compilation.prepare_kernels(kernel_parts.SERVICE, show_progress):
-                flag = {kernel_parts.WINDOW: self.window, kernel_parts.FIT: self.fit}.get(part)
+            for part in kernel_compilation.prepare_kernels(kernel_groups.SERVICE, show_progress):
+                flag = {kernel_groups.WINDOW: self.window, kernel_groups.FIT: self.fit}.get(part)
                 if flag is not None:
                     flag.set()
                     wake.set()

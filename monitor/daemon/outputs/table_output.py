@@ -18,7 +18,7 @@ from monitor.publishing.messages.results import (
     ModelGapMessage,
     StatusMessage,
 )
-from monitor.publishing.remote_devices import RemoteDeviceRegistry
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry
 
 PREFIX: Final = "imu"
 """First part of the keys of the messages for the table in the terminal."""

@@ -26,14 +26,14 @@ from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
-from monitor.daemon.storage.device_recording import (
+from monitor.daemon.storage.recording_tail import RecordingTail, read_recording_tail
+from monitor.daemon.storage.recording_track import (
     RETRY_S,
     Opening,
     RecorderEvent,
     RecordingTrack,
     recording_stopped_text,
 )
-from monitor.daemon.storage.recording_tail import RecordingTail, read_recording_tail
 from monitor.settings.loading import Storage
 
 WRITE_INTERVAL_S: Final = 0.5

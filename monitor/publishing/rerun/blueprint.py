@@ -22,7 +22,6 @@ from monitor.common.unit_formatting import (
 )
 from monitor.publishing.rerun import dynamic_heat_map
 from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
-from monitor.publishing.rerun.panel_scene import PANELS
 from monitor.publishing.rerun.shared_views import (
     RAW_SAMPLES_S,
     TIMELINE,
@@ -31,6 +30,7 @@ from monitor.publishing.rerun.shared_views import (
     temperature_view,
     time_series_view,
 )
+from monitor.publishing.rerun.viewer_scene import PANELS
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 
 NOW_COEFFICIENTS: Final = ("N", "B")

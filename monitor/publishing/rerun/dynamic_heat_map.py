@@ -17,7 +17,7 @@ from drivers.data_types import AXES, Floats
 from monitor.common.unit_formatting import format_utc
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.rerun.allan_drawing import Log, label_points
-from monitor.publishing.rerun.allan_history_table import COLUMNS, AllanHistory
+from monitor.publishing.rerun.bounded_allan_history import COLUMNS, AllanHistory
 
 HEIGHT: Final = 60  # approximate height of a heat map [pixels]; three heat maps fit into a tab
 COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median

@@ -14,7 +14,7 @@ from drivers.zenoh.sample_message import decode_samples
 from monitor.common import topics
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
-from monitor.publishing.remote_devices import RemoteDeviceRegistry, split_device_and_topic
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry, split_device_and_topic
 from monitor.publishing.rerun.panels.panel_text import fleet_text
 from monitor.publishing.rerun.queued_view import RerunView
 from monitor.publishing.result_kinds import AllDevicesTableText, SampleBatch

@@ -28,8 +28,8 @@ from monitor.publishing.rerun.viewer_settings_and_errors import (
 from monitor.publishing.result_kinds import RESULT_KINDS, DrawingRule, TimedResult, kind_of
 
 if TYPE_CHECKING:
-    from monitor.publishing.rerun.panel_scene import Scene
     from monitor.publishing.rerun.sinks import RerunStreamWithSink, ViewerProcess
+    from monitor.publishing.rerun.viewer_scene import Scene
 
 BACKLOG_BYTES: Final = 16_000_000  # enough for about 25 s of samples of 16 six-axis devices at 1 kHz
 CONFIRM_PERIOD_S: Final = 1.0  # interval between two checks that the viewer has received the drawn data
@@ -164,8 +164,8 @@ class RerunView:
         return settings, attempt
 
     def _show(self, settings: ViewerSettings) -> None:
-        from monitor.publishing.rerun import panel_scene as rerun_scene
         from monitor.publishing.rerun import sinks
+        from monitor.publishing.rerun import viewer_scene as rerun_scene
 
         output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self.url = output.child, output.url

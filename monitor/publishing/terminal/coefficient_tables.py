@@ -24,7 +24,7 @@ from monitor.publishing.coefficient_cells import (
     format_coefficient,
     mark_temperature_axis,
 )
-from monitor.publishing.remote_devices import DeviceCoefficients
+from monitor.publishing.remote_device_states import DeviceCoefficients
 from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
 
 K_OR_R: Final = "K or R"

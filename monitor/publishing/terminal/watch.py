@@ -9,8 +9,8 @@ from typing import Final, TextIO, cast
 
 from rich.console import Console
 
-from monitor.publishing.remote_devices import RemoteDeviceRegistry
-from monitor.publishing.terminal.live_table import LiveTable, device_overview
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry
+from monitor.publishing.terminal.live_device_table import LiveTable, device_overview
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.subscriber import KEYEXPR, ZenohSubscriber
 

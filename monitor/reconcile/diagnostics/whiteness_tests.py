@@ -29,7 +29,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.reconcile.likelihood.axis_fit import Regressor
-from monitor.reconcile.likelihood.variance_history import count_variance_blocks
+from monitor.reconcile.likelihood.variance_change_tests import count_variance_blocks
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.cosine_bins import SMOOTHING_BINS, build_frequency_bins, inverse_cosine_transform
 from monitor.reconcile.result import Location

@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.reconcile.likelihood.state_space_comparison import (
+from monitor.reconcile.likelihood.event_process_likelihood import (
     TARGET_BLOCKS,
     BackgroundNoise,
     EventProcessComparison,

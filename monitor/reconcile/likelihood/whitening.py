@@ -16,7 +16,7 @@ from monitor.noise.effects import HeavyTails
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.outlier_fit import OutlierFit, convert_student_to_gaussian, fit_outliers
 from monitor.reconcile.likelihood.periodic_pulse_search import HarmonicSeries, find_harmonic_series
-from monitor.reconcile.likelihood.variance_history import (
+from monitor.reconcile.likelihood.variance_change_tests import (
     SpectrogramChange,
     VarianceChangeGains,
     compare_variance_change_forms,

@@ -35,7 +35,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
 from monitor.reconcile.preparation.value_artifacts import ValueArtifacts
-from monitor.reconcile.search.repaired_axes import repair_axis_again
+from monitor.reconcile.search.sample_repair import repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest log-likelihood gain of an effect in one half of the recording, in nats."""

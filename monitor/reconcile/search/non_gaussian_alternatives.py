@@ -20,10 +20,10 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.likelihood.axis_fit import AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size
+from monitor.reconcile.likelihood.event_process_likelihood import BackgroundNoise
 from monitor.reconcile.likelihood.hypothesis_fit import RESIZE_PENALTY_NATS, Hypothesis
 from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
 from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
-from monitor.reconcile.likelihood.state_space_comparison import BackgroundNoise
 from monitor.reconcile.likelihood.telegraph_vs_correlated_noise import compare_telegraph_with_correlated_noise
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import ParameterInterval

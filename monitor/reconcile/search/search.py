@@ -49,7 +49,7 @@ from monitor.reconcile.search.non_gaussian_alternatives import (
     compare_poisson_with_added_noise,
     replace_by_likelier_alternative,
 )
-from monitor.reconcile.search.repaired_axes import repair_axis_again
+from monitor.reconcile.search.sample_repair import repair_axis_again
 from monitor.reconcile.search.trials import Trial, generate_trial_groups, try_alternatives_to_slow_noise
 from monitor.reconcile.search.withdrawal_of_contradicted_effects import SMOOTH_SPECTRA, keep_uncontradicted_effects
 

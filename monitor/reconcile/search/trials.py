@@ -46,7 +46,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     refit_correlation_times,
 )
 from monitor.reconcile.likelihood.outlier_fit import convert_student_to_gaussian, student_misfit_z
-from monitor.reconcile.likelihood.variance_history import compare_variance_change_forms
+from monitor.reconcile.likelihood.variance_change_tests import compare_variance_change_forms
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.value_artifacts import ValueWithInterval
 from monitor.reconcile.result import ParameterInterval

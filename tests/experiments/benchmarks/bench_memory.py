@@ -34,10 +34,10 @@ said("NumPy")
 import numba
 said("Numba")
 from drivers.data_types import make_block
-from monitor.daemon.kernels import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_groups
 from monitor.estimation.estimator import Estimator
 said("drivers and monitor.estimation")
-for _ in kernel_compilation.prepare_kernels(kernel_parts.SERVICE, lambda _: None, processes=0):
+for _ in kernel_compilation.prepare_kernels(kernel_groups.SERVICE, lambda _: None, processes=0):
     pass
 said("compiled kernels")
 estimator = Estimator(rate_hz, window_s)

@@ -55,10 +55,10 @@ class Recorder(event.Listener):  # type: ignore[misc]
 
 def stages() -> Iterator[str]:
     """Yield the name of each part after it has been compiled by this process."""
-    from monitor.daemon.kernels import kernel_parts
+    from monitor.daemon.kernels import kernel_groups
 
     yield "imports"
-    for group in kernel_parts.GROUPS:
+    for group in kernel_groups.GROUPS:
         for part in group.parts:
             part.prepare()
             yield part.name

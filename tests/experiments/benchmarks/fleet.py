@@ -27,7 +27,7 @@ import psutil
 import zenoh
 
 from drivers.zenoh.session_config import build_session_config
-from monitor.publishing.remote_devices import RemoteDeviceRegistry
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from tests.support.ports import free_port
 

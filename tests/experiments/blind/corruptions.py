@@ -40,8 +40,8 @@ from monitor.reconcile.recording_checks.sample_rate_from_features import (  # no
     estimate_sample_rate_error,
 )
 from monitor.reconcile.result import RecordingFinding  # noqa: E402
-from monitor.reconcile.search.repaired_axes import build_repaired_axes  # noqa: E402
 from monitor.reconcile.search.sample_rate_from_spectrum import detect_sample_rate_error  # noqa: E402
+from monitor.reconcile.search.sample_repair import build_repaired_axes  # noqa: E402
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise  # 
 from monitor.reconcile.likelihood.whitening import whiten_axis  # noqa: E402
 from monitor.reconcile.preparation.reconcile_input import Recording  # noqa: E402
 from monitor.reconcile.reconcile import SIMULATED_RECORDINGS  # noqa: E402
-from monitor.reconcile.search.repaired_axes import build_repaired_axes  # noqa: E402
+from monitor.reconcile.search.sample_repair import build_repaired_axes  # noqa: E402
 from tests.experiments.blind.tables import markdown, share  # noqa: E402
 
 RATE_HZ: Final = 100.0

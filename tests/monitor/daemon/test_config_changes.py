@@ -22,8 +22,8 @@ from monitor.daemon.outputs.output import Output
 from monitor.daemon.outputs.table_output import TableOutput
 from monitor.daemon.service import Service
 from monitor.noise.model_loading import read_model
-from monitor.publishing.remote_devices import RemoteDeviceRegistry
-from monitor.publishing.terminal import live_table
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry
+from monitor.publishing.terminal import live_device_table
 from monitor.settings import loading
 from tests.monitor.daemon.operations.test_systemd import Listening
 from tests.monitor.publishing import made
@@ -270,7 +270,7 @@ def test_a_device_that_is_gone_has_no_row() -> None:
         table.publish_event(name, 0.0, 1, Event("moved", 0, f"{name} was moved"))
     table.remove_device("first")
     with (console := Console(width=200)).capture() as captured:
-        console.print(live_table.device_overview(board, 0.0))
+        console.print(live_device_table.device_overview(board, 0.0))
     assert "second was moved" in captured.get()
     assert "first" not in captured.get()
 

@@ -10,9 +10,9 @@ import pytest
 from drivers.errors import ConfigError
 from monitor.cli.warm_up import warm_up
 from monitor.common import compiled
-from monitor.daemon.kernels import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_groups
 from monitor.daemon.kernels.kernel_compilation import CompilationProgress
-from monitor.daemon.kernels.kernel_parts import KernelGroup, KernelPart
+from monitor.daemon.kernels.kernel_groups import KernelGroup, KernelPart
 from tests.support.waiting import PATIENCE_S
 
 ANSWERS_ALL = "import sys\nfor line in sys.stdin: print(line, end='', flush=True)"
@@ -22,11 +22,11 @@ COUNT_COMPILATIONS = """
 import sys
 from drivers.errors import ConfigError
 from monitor.common import compiled
-from monitor.daemon.kernels import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_groups
 from monitor.cli.warm_up import warm_up
 from numba.core import event
 with event.install_recorder("numba:compile") as recorder:
-    for group in kernel_parts.GROUPS:
+    for group in kernel_groups.GROUPS:
         for part in group.parts:
             part.prepare()
 print([str(each.data["dispatcher"]) for _, each in recorder.buffer if each.is_start])
@@ -116,8 +116,8 @@ def test_the_child_ends_with_its_parent() -> None:
     with child:
         assert child.stdin is not None
         assert child.stdout is not None
-        print(kernel_parts.WINDOW, file=child.stdin, flush=True)
-        assert child.stdout.readline() == f"{kernel_parts.WINDOW}\n"
+        print(kernel_groups.WINDOW, file=child.stdin, flush=True)
+        assert child.stdout.readline() == f"{kernel_groups.WINDOW}\n"
         child.stdin.close()
         assert child.wait(PATIENCE_S) == 0
 

@@ -15,7 +15,7 @@ from structlog.testing import capture_logs
 from drivers.data_types import Event
 from drivers.recordings import save_samples
 from monitor.common.device_health import Health
-from monitor.daemon.kernels import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_groups
 from monitor.daemon.outputs.output import Output
 from monitor.daemon.outputs.table_output import TableOutput
 from monitor.daemon.service import Service
@@ -25,8 +25,8 @@ from monitor.estimation.fit.coefficient_values import Status
 from monitor.history import history_table as past
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.remote_devices import RemoteDeviceRegistry
-from monitor.publishing.terminal import live_table
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry
+from monitor.publishing.terminal import live_device_table
 from monitor.settings import loading
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -74,7 +74,7 @@ def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
             before = rounds.healths
             wait_for(lambda: rounds.healths >= before + 2, "two more rounds of the status")
             with (console := Console(width=200)).capture() as captured:
-                console.print(live_table.device_overview(board, time.monotonic()))
+                console.print(live_device_table.device_overview(board, time.monotonic()))
         finally:
             service.request_stop()
             thread.join(PATIENCE_S)
@@ -123,7 +123,7 @@ def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_ti
     n, compiled, prepare = 2000, threading.Event(), kernel_compilation.prepare_kernels
 
     def held_back(
-        group: kernel_parts.KernelGroup, tell: Callable[[kernel_compilation.CompilationProgress], None]
+        group: kernel_groups.KernelGroup, tell: Callable[[kernel_compilation.CompilationProgress], None]
     ) -> Iterator[str]:
         compiled.wait(PATIENCE_S)
         yield from prepare(group, tell)
@@ -280,9 +280,9 @@ def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
 
 def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(
-        _group: kernel_parts.KernelGroup, _tell: Callable[[kernel_compilation.CompilationProgress], None]
+        _group: kernel_groups.KernelGroup, _tell: Callable[[kernel_compilation.CompilationProgress], None]
     ) -> Iterator[str]:
-        yield kernel_parts.WINDOW
+        yield kernel_groups.WINDOW
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(kernel_compilation, "prepare_kernels", full_disk)

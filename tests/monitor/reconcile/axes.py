@@ -17,7 +17,7 @@ from monitor.reconcile.likelihood.axis_fit import Axis, RegressorCache
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.reconcile_input import Recording
-from monitor.reconcile.search.repaired_axes import build_repaired_axes
+from monitor.reconcile.search.sample_repair import build_repaired_axes
 
 RATE_HZ = 100.0
 N, B, K = 1e-4, 2e-5, 2e-6  # rad/√s, rad/s, rad/s/√s

@@ -20,7 +20,7 @@ mode = "none"
 """
 WATCH = """
 import contextlib, sys, time
-from monitor.publishing.remote_devices import RemoteDeviceRegistry
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 
 board = RemoteDeviceRegistry()

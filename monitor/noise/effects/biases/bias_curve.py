@@ -7,12 +7,11 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import ConfigError
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
-from monitor.noise.spectrum import Spectrum, nan_spectrum
+from monitor.noise.effect import NoiseSeries, NonstationaryBias, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class BiasCurve(Source):
+class BiasCurve(NonstationaryBias):
     """Curved drift b = s t + c t² + a ln(1 + t/τ), which starts at zero.
 
     The logarithm describes the ageing of quartz resonators (MIL-PRF-55310).
@@ -29,13 +28,9 @@ class BiasCurve(Source):
     description: ClassVar[str] = "The bias drifts along a curve, for example while a sensor ages."
 
     def __post_init__(self) -> None:
-        Source.__post_init__(self)
+        NonstationaryBias.__post_init__(self)
         if (self.logarithmic is None) != (self.time_constant is None):
             raise ConfigError(f"{self.name}: logarithmic and time_constant need each other")
-
-    def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the effect of a curve depends on the length of the recording."""
-        return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Curve":
         """Start a drift at the next sample."""

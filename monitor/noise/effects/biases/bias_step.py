@@ -6,12 +6,17 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, first_sample_at_or_after, parameter_field
-from monitor.noise.spectrum import Spectrum, nan_spectrum
+from monitor.noise.effect import (
+    NonstationaryBias,
+    SampleBlockContext,
+    StatelessSeries,
+    first_sample_at_or_after,
+    parameter_field,
+)
 
 
 @dataclass(frozen=True, slots=True)
-class BiasStep(Source):
+class BiasStep(NonstationaryBias):
     """Step of the bias by ``height`` at the first sample at or after ``time``.
 
     >>> bool(np.isnan(BiasStep(time=60.0, height=1e-3).avar(np.array([1.0]), 0.01)[0]))
@@ -22,10 +27,6 @@ class BiasStep(Source):
     height: float = parameter_field("rad/s", "m/s²", signed=True)
 
     description: ClassVar[str] = "The bias jumps once and keeps the new value, for example after a knock."
-
-    def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the effect of a step depends on the length of the recording."""
-        return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
         """Start a series with a step. ``time`` is relative to the first sample of the stream."""

@@ -6,12 +6,11 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, parameter_field
-from monitor.noise.spectrum import Spectrum, nan_spectrum
+from monitor.noise.effect import NonstationaryBias, SampleBlockContext, StatelessSeries, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureBias(Source):
+class TemperatureBias(NonstationaryBias):
     """Bias that is a polynomial of the temperature: b = c (T − T_r) + q (T − T_r)² + k (T − T_r)³ (IEEE Std 952).
 
     >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).two_sided_psd(np.array([1.0]), 0.01)[0]))
@@ -25,10 +24,6 @@ class TemperatureBias(Source):
 
     description: ClassVar[str] = "The bias depends on the temperature of the sensor, without delay."
     uses_temperature: ClassVar[bool] = True
-
-    def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the spectrum depends on the temperature."""
-        return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
         """Start a series that depends on the temperature of each sample."""

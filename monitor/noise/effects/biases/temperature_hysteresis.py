@@ -7,12 +7,11 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
-from monitor.noise.spectrum import Spectrum, nan_spectrum
+from monitor.noise.effect import NoiseSeries, NonstationaryBias, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureHysteresis(Source):
+class TemperatureHysteresis(NonstationaryBias):
     """Hysteresis between the heating branch and the cooling branch (stop operator of Prandtl).
 
     The bias is b = h x. The state x follows dx = dT/r, limited to −½ … ½. It is ½ on the heating branch and −½ on the
@@ -31,10 +30,6 @@ class TemperatureHysteresis(Source):
 
     description: ClassVar[str] = "The bias differs between rising and falling temperature."
     uses_temperature: ClassVar[bool] = True
-
-    def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the spectrum depends on the temperature."""
-        return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Hysteresis":
         """Start a series in the middle between both branches."""

@@ -8,12 +8,11 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
-from monitor.noise.spectrum import Spectrum, nan_spectrum
+from monitor.noise.effect import NoiseSeries, NonstationaryBias, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureLag(Source):
+class TemperatureLag(NonstationaryBias):
     """Bias that follows the temperature with a first-order lag (Newton's law of cooling).
 
     The bias is b = c (T_l − T_r), where dT_l/dt = (T − T_l)/τ. The lagged temperature T_l starts at the first
@@ -30,10 +29,6 @@ class TemperatureLag(Source):
 
     description: ClassVar[str] = "The bias follows the temperature of the sensor with a delay."
     uses_temperature: ClassVar[bool] = True
-
-    def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the spectrum depends on the temperature."""
-        return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
         """Start a series whose lagged temperature starts at the first temperature."""

@@ -8,12 +8,11 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
-from monitor.noise.spectrum import Spectrum, nan_spectrum
+from monitor.noise.effect import NoiseSeries, NonstationaryBias, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class TurnOnTransient(Source):
+class TurnOnTransient(NonstationaryBias):
     """Exponential transient A exp(−t/τ) that starts at the first sample (warm-up term of IEEE Std 952).
 
     >>> bool(np.isnan(TurnOnTransient(amplitude=1e-3, time_constant=60.0).avar(np.array([1.0]), 0.01)[0]))
@@ -24,10 +23,6 @@ class TurnOnTransient(Source):
     time_constant: float = parameter_field("s", positive=True)
 
     description: ClassVar[str] = "After the sensor is switched on, the bias decays exponentially to its final value."
-
-    def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the effect of a transient depends on the length of the recording."""
-        return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
         """Start a transient at the next sample."""

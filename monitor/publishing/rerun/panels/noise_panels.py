@@ -21,13 +21,13 @@ from monitor.history.history_table import HistoryTable
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.style import omit_wide_intervals
 from monitor.publishing.rerun import allan_drawing, dynamic_heat_map
-from monitor.publishing.rerun.allan_history_table import AllanHistory
+from monitor.publishing.rerun.bounded_allan_history import AllanHistory
 from monitor.publishing.rerun.panels import history_points
 from monitor.publishing.rerun.panels.panel import Panel
 from monitor.publishing.rerun.panels.panel_text import noise_text
 
 if TYPE_CHECKING:
-    from monitor.publishing.rerun.panel_scene import Scene
+    from monitor.publishing.rerun.viewer_scene import Scene
 
 MAX_INTERMEDIATE_POINTS: Final = 20
 """Largest number of points that are drawn between two estimates. More points would overload the viewer."""

@@ -23,7 +23,7 @@ from monitor.publishing.rerun.shared_views import markdown_document
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 
 if TYPE_CHECKING:
-    from monitor.publishing.rerun.panel_scene import Scene
+    from monitor.publishing.rerun.viewer_scene import Scene
     from monitor.publishing.result_kinds import CompensatedRateBatch, SampleBatch
 
 

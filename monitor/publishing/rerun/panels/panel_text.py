@@ -26,7 +26,7 @@ from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import measured_axes
-from monitor.publishing.remote_devices import RemoteDevice
+from monitor.publishing.remote_device_states import RemoteDevice
 
 FLEET_AXES: Final = ("gx", "gy", "gz")
 """Axes whose angle random walk N the table of all devices shows."""

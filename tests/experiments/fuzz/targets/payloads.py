@@ -16,8 +16,8 @@ from monitor.cli.shared import options
 from monitor.commands import thermal
 from monitor.common import topics
 from monitor.publishing.exporters import FORMATS, export, from_analysis_json
-from monitor.publishing.remote_devices import RemoteDeviceRegistry
-from monitor.publishing.terminal.live_table import device_overview
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry
+from monitor.publishing.terminal.live_device_table import device_overview
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
 from monitor.simulator.effect_option_parser import parse_effects

@@ -20,7 +20,7 @@ from drivers.recordings import load_samples, segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
-from monitor.daemon.storage import device_recording, recorder, retention
+from monitor.daemon.storage import recorder, recording_track, retention
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.settings.loading import BuiltLinkAndDecoder, Device, Storage
 from tests.support.loopback_link import LoopbackLink
@@ -52,7 +52,7 @@ def all_written(keeper: Recorder) -> None:
 def _brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder, "WRITE_INTERVAL_S", 0.02)
     monkeypatch.setattr(recorder, "RETRY_S", 0.1)
-    monkeypatch.setattr(device_recording, "RETRY_S", 0.1)
+    monkeypatch.setattr(recording_track, "RETRY_S", 0.1)
     monkeypatch.setattr(recorder, "DELETE_INTERVAL_S", 0.05)
 
 
@@ -217,7 +217,7 @@ def test_a_disk_that_fails_stops_the_recording_with_an_event_until_it_can_go_on(
 
 
 def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, monkeypatch) -> None:
-    monkeypatch.setattr(device_recording, "MAX_QUEUE_BYTES", 500 * device_recording.SAMPLE_BYTES)
+    monkeypatch.setattr(recording_track, "MAX_QUEUE_BYTES", 500 * recording_track.SAMPLE_BYTES)
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES], Broken)
     keeper.start()
     for first in range(0, 20_000, 2000):
@@ -670,7 +670,7 @@ def test_something_else_in_place_of_the_folder_is_said_until_it_is_gone(tmp_path
 
 
 def test_a_folder_that_cannot_be_used_costs_only_what_has_no_room_in_memory(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(device_recording, "MAX_QUEUE_BYTES", 500 * device_recording.SAMPLE_BYTES)
+    monkeypatch.setattr(recording_track, "MAX_QUEUE_BYTES", 500 * recording_track.SAMPLE_BYTES)
     (tmp_path / "store").write_text("in the way")
     keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()

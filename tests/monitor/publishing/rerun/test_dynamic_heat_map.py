@@ -17,8 +17,8 @@ import rerun as rr
 from PIL import Image
 
 from monitor.publishing.rerun import blueprint, dynamic_heat_map
-from monitor.publishing.rerun.allan_history_table import COLUMNS
-from monitor.publishing.rerun.panel_scene import Scene
+from monitor.publishing.rerun.bounded_allan_history import COLUMNS
+from monitor.publishing.rerun.viewer_scene import Scene
 
 T0 = 1.76e9
 

@@ -11,7 +11,7 @@ from drivers.data_types import Event, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.publishing.messages.results import AllanMessage, CoefficientsMessage, EventMessage, StatusMessage
-from monitor.publishing.remote_devices import RemoteDeviceRegistry
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry
 from monitor.publishing.rerun.fleet import FleetView, full_device_key
 from monitor.publishing.rerun.panels.panel_text import fleet_text
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings

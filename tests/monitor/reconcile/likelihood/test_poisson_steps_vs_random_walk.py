@@ -7,12 +7,12 @@ import pytest
 from scipy.special import logsumexp
 
 from monitor.reconcile.likelihood import poisson_steps_vs_random_walk
-from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
-from monitor.reconcile.likelihood.state_space_comparison import (
+from monitor.reconcile.likelihood.event_process_likelihood import (
     BackgroundNoise,
     build_state_space_noise,
     kalman_log_likelihood,
 )
+from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, walk, white
 
 RATE, HEIGHT = 0.05, 2.0  # of the short series, beside white noise of density one

@@ -5,12 +5,12 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from monitor.reconcile.likelihood import poisson_steps_vs_single_steps
-from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
-from monitor.reconcile.likelihood.state_space_comparison import (
+from monitor.reconcile.likelihood.event_process_likelihood import (
     BackgroundNoise,
     build_state_space_noise,
     compute_block_means,
 )
+from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, white
 
 REST = BackgroundNoise(1.0, walk=0.01, correlated=((1.0, 30.0),))

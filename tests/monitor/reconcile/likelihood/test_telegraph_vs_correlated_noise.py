@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from monitor.reconcile.likelihood import telegraph_vs_correlated_noise
-from monitor.reconcile.likelihood.state_space_comparison import (
+from monitor.reconcile.likelihood.event_process_likelihood import (
     BackgroundNoise,
     build_state_space_noise,
     compute_block_means,

@@ -20,7 +20,7 @@ from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import find_peak_gains_and_frequencies
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_fixed_noise
 from monitor.reconcile.search.cross_validation import cross_validate
-from monitor.reconcile.search.repaired_axes import repair_axis_again
+from monitor.reconcile.search.sample_repair import repair_axis_again
 from tests.monitor.reconcile.axes import (
     WALK,
     WHITE,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from monitor.common import topics
-from monitor.publishing import remote_devices
+from monitor.publishing import remote_device_states
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import CoefficientsMessage, ModelGapMessage, ResetReply, StatusMessage
-from monitor.publishing.remote_devices import DeviceCoefficients, RemoteDevice
+from monitor.publishing.remote_device_states import DeviceCoefficients, RemoteDevice
 from tests.monitor.publishing import made
 
 
@@ -84,13 +84,13 @@ def test_a_device_that_speaks_is_what_it_says() -> None:
 
 def test_silence() -> None:
     one = device()
-    assert one.state(100.0 + remote_devices.SILENCE_TIMEOUT_S - 0.1) == "running"
-    assert one.state(100.0 + remote_devices.SILENCE_TIMEOUT_S + 0.1) == "silent"
+    assert one.state(100.0 + remote_device_states.SILENCE_TIMEOUT_S - 0.1) == "running"
+    assert one.state(100.0 + remote_device_states.SILENCE_TIMEOUT_S + 0.1) == "silent"
     one.token_exists = True
-    assert one.state(100.0 + remote_devices.SILENCE_TIMEOUT_S + 0.1) == "silent"
+    assert one.state(100.0 + remote_device_states.SILENCE_TIMEOUT_S + 0.1) == "silent"
     one.token_exists = False
-    assert one.state(100.0 + remote_devices.GONE_TIMEOUT_S - 0.1) == "running"
-    assert one.state(100.0 + remote_devices.GONE_TIMEOUT_S + 0.1) == "gone"
+    assert one.state(100.0 + remote_device_states.GONE_TIMEOUT_S - 0.1) == "running"
+    assert one.state(100.0 + remote_device_states.GONE_TIMEOUT_S + 0.1) == "gone"
 
 
 def test_a_replay_that_has_ended_is_not_missed() -> None:
@@ -121,10 +121,10 @@ def test_ranks_and_words_of_trouble() -> None:
 
 
 def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
-    assert remote_devices.split_device_and_topic("a/b/c/command/reset") == ("a/b/c", topics.RESET)
-    assert remote_devices.split_device_and_topic("status") is None
-    assert remote_devices.split_device_and_topic("/status") is None
-    assert remote_devices.split_device_and_topic("imu/bench-1/statuses") is None
+    assert remote_device_states.split_device_and_topic("a/b/c/command/reset") == ("a/b/c", topics.RESET)
+    assert remote_device_states.split_device_and_topic("status") is None
+    assert remote_device_states.split_device_and_topic("/status") is None
+    assert remote_device_states.split_device_and_topic("imu/bench-1/statuses") is None
 
 
 def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() -> None:

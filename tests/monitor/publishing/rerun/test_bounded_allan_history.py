@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.rerun.allan_history_table import COLUMNS, AllanHistory
+from monitor.publishing.rerun.bounded_allan_history import COLUMNS, AllanHistory
 from tests.monitor.publishing import made
 
 ESTIMATE = made.estimate()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from monitor.reconcile.likelihood.state_space_comparison import (
+from monitor.reconcile.likelihood.event_process_likelihood import (
     MAX_LOG_PARAMETER_RANGE,
     BackgroundNoise,
     _flicker_processes,

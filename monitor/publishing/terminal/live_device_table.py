@@ -30,7 +30,7 @@ from monitor.common.unit_formatting import (
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import EventMessage
-from monitor.publishing.remote_devices import MAX_DEVICES, MAX_EVENTS, RemoteDevice, RemoteDeviceRegistry
+from monitor.publishing.remote_device_states import MAX_DEVICES, MAX_EVENTS, RemoteDevice, RemoteDeviceRegistry
 from monitor.publishing.terminal.coefficient_tables import coefficient_tables
 from monitor.publishing.terminal.tables import plain_table, unwrapped_table_width
 

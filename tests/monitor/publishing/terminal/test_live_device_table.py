@@ -13,10 +13,10 @@ from rich.console import Console
 from drivers.data_types import Event
 from drivers.errors import ConfigError
 from monitor.common import topics
-from monitor.publishing import remote_devices
+from monitor.publishing import remote_device_states
 from monitor.publishing.messages.results import CoefficientsMessage, EventMessage, ModelGapMessage, StatusMessage
-from monitor.publishing.remote_devices import MAX_EVENTS, RemoteDeviceRegistry
-from monitor.publishing.terminal import live_table
+from monitor.publishing.remote_device_states import MAX_EVENTS, RemoteDeviceRegistry
+from monitor.publishing.terminal import live_device_table
 from monitor.publishing.terminal.coefficient_tables import analysis_table
 from monitor.publishing.terminal.watch import watch
 from tests.monitor.publishing import made
@@ -64,7 +64,7 @@ def shown(
     board: RemoteDeviceRegistry, width: int = 120, now_s: float = NOW_S, height: int = 50, is_terminal: bool = False
 ) -> str:
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=is_terminal, record=True)
-    console.print(live_table.device_overview(board, now_s))
+    console.print(live_device_table.device_overview(board, now_s))
     return console.export_text()
 
 
@@ -169,7 +169,7 @@ def test_hostile_messages_leave_a_bounded_board(board: RemoteDeviceRegistry) -> 
 def test_devices_beyond_the_bound_are_passed_over_until_others_have_been_silent_for_long(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(remote_devices, "MAX_DEVICES", 3)
+    monkeypatch.setattr(remote_device_states, "MAX_DEVICES", 3)
     clock = [0.0]
     board = RemoteDeviceRegistry(lambda: clock[0])
     payload = StatusMessage.from_result("a", 1.0, 0, made.health()).encode()
@@ -178,14 +178,14 @@ def test_devices_beyond_the_bound_are_passed_over_until_others_have_been_silent_
         board.set_liveliness_token(f"imu/{device}/alive", True)
     assert list(board._devices) == ["imu/a", "imu/b", "imu/c"]
     assert board.ignored == 4
-    clock[0] = remote_devices.FORGET_AFTER_S + 1.0
+    clock[0] = remote_device_states.FORGET_AFTER_S + 1.0
     board.process_message("imu/a/status", payload)
     board.process_message("imu/e/status", payload)
     assert sorted(board._devices) == ["imu/a", "imu/c", "imu/e"]
 
 
 def test_states_have_different_signs_for_different_ranks() -> None:
-    signs = {state: sign for state, (sign, _) in live_table.STATES.items()}
+    signs = {state: sign for state, (sign, _) in live_device_table.STATES.items()}
     assert len({signs[state] for state in ("running", "waiting", "lost", "silent", "ended", "present")}) == 6
 
 
@@ -302,7 +302,7 @@ def test_a_sender_cannot_steer_the_terminal(board: RemoteDeviceRegistry) -> None
     status(board, "a" + evil.replace("\n", ""), state=evil, text=evil, outputs={evil: evil})
     event(board, "a", evil)
     console = Console(width=200, file=io.StringIO(), force_terminal=False)
-    console.print(live_table.device_overview(board, NOW_S))
+    console.print(live_device_table.device_overview(board, NOW_S))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "[red]x[/red]" in text
     assert all(character.isprintable() or character == "\n" for character in text)

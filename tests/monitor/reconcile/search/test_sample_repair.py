@@ -6,7 +6,7 @@ import pytest
 from drivers.data_types import AXES
 from monitor.noise.effects import AngleRandomWalk, Outliers, RandomSampleHold, Resolution, Saturation
 from monitor.reconcile.preparation.value_artifacts import ValueArtifacts
-from monitor.reconcile.search.repaired_axes import (
+from monitor.reconcile.search.sample_repair import (
     _may_leak,
     _repair_samples,
     repair_axis_again,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.likelihood.variance_history import compare_variance_change_forms, find_spectrogram_change
+from monitor.reconcile.likelihood.variance_change_tests import compare_variance_change_forms, find_spectrogram_change
 
 N = 60_000
 TAU0 = 0.01
