@@ -75,6 +75,7 @@ def _ranked_entry(finding: RankedGapCause) -> dict[str, Any]:
         "axes": finding.axes,
         "parameters": {name: parameter_entry(bounds) for name, bounds in finding.parameters.items()},
         "size_ratio": finite_or_none(finding.size_ratio),
+        "old_frequency": finding.old_frequency,
         "confidence": finite_or_none(finding.confidence),
         "gain_nats": finite_or_none(finding.gain_nats),
         "share": finite_or_none(finding.share),

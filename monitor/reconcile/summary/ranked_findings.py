@@ -15,6 +15,8 @@ from math import log
 from typing import Final
 
 from drivers.data_types import AXES
+from monitor.noise.effect import Effect
+from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.reconcile.likelihood.effect_roles import NOISE_SIZE_PARAMETERS
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
@@ -47,6 +49,7 @@ class RankedGapCause:
     axes: tuple[str, ...]
     parameters: dict[str, ParameterInterval]  # of the axis with the largest gain
     size_ratio: float | None  # new size relative to the size in the model, on this axis
+    old_frequency: float | None  # Hz, of a line or resonance that has moved, on this axis
     confidence: float  # of the name, on this axis
     gain_nats: float  # explained part of the gap, over all axes
     share: float  # of the whole gap of the recording
@@ -157,11 +160,27 @@ def _size_ratio(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> flo
         return now.value
     if step.kind != "retuned":
         return None
-    known = [effect for effect in r.baseline.effects.get(axis, ()) if effect.name == step.effect]
-    place = find_identifying_parameter(step, axis, r.model)
-    parameters = {name: now.value} if place is None else {identifying_parameter_name(step.effect): place.value}
-    old = getattr(find_closest_effect(known, step.effect, parameters), name) if known else 0.0
+    before = _effect_before(axis, step, r, name)
+    old = getattr(before, name) if before is not None else 0.0
     return now.value / old if old > 0.0 else None
+
+
+def _old_frequency(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> float | None:
+    """Return the frequency in the model, in Hz, of a line or resonance that has moved, or None for other steps."""
+    before, place = _effect_before(axis, step, r, "frequency"), find_identifying_parameter(step, axis, r.model)
+    if step.kind != "retuned" or not isinstance(before, Sinusoidal | Narrowband) or place is None:
+        return None
+    return before.frequency if before.frequency != place.value else None
+
+
+def _effect_before(axis: str, step: AddedOrResizedEffect, r: Reconciliation, size_name: str) -> Effect | None:
+    """Return the effect of the model under test that a step has changed, or None if the model lacks the effect."""
+    known = [effect for effect in r.baseline.effects.get(axis, ()) if effect.name == step.effect]
+    identity = find_identifying_parameter(step, axis, r.model)
+    name, compared = size_name, step.parameters.get(size_name)
+    if identity is not None:
+        name, compared = identifying_parameter_name(step.effect), identity
+    return find_closest_effect(known, step.effect, {name: compared.value}) if known and compared is not None else None
 
 
 def _describe_group(group: Sequence[_AxisStep], whole_nats: float, r: Reconciliation) -> RankedGapCause:
@@ -174,6 +193,7 @@ def _describe_group(group: Sequence[_AxisStep], whole_nats: float, r: Reconcilia
         axes=tuple(name for name in AXES if name in dict(group)),
         parameters=identity | dict(strongest.parameters),
         size_ratio=_size_ratio(axis, strongest, r),
+        old_frequency=_old_frequency(axis, strongest, r),
         confidence=strongest.confidence,
         gain_nats=gain,
         share=_share(gain, whole_nats),

@@ -17,6 +17,8 @@ MAIN_SHARE: Final = 0.95
 MAX_LISTED: Final = 5
 """Largest number of listed findings."""
 MAX_LISTED_REMAINDERS: Final = 2
+UNMENTIONED_SIZE_CHANGE: Final = 0.05
+"""Largest relative change of the size of a moved line that is not described."""
 MIN_REMAINDER_SHARE: Final = 0.01
 """Smallest share of a remaining difference that is described."""
 EFFECT_PHRASES: Final = {
@@ -144,11 +146,17 @@ def describe_finding(finding: RankedGapCause) -> str:
     ]
     if source is not None:
         details.append(f"from {source.value}")
-    if finding.kind == "retuned":
+    if finding.old_frequency is not None:
+        details[0] = f"moved from {finding.old_frequency:.4g} to {numbers['frequency']:.4g} Hz"
+    if finding.kind == "retuned" and not (finding.old_frequency is not None and _is_nearly_one(finding.size_ratio)):
         details.append(f"times {finding.size_ratio:.3g}" if finding.size_ratio else "of another size")
     elif finding.kind == "absent":
         phrase = f"no {phrase}"
     return " ".join([phrase, *details]) + _on_axes(finding.axes)
+
+
+def _is_nearly_one(ratio: float | None) -> bool:
+    return ratio is None or abs(ratio - 1.0) < UNMENTIONED_SIZE_CHANGE
 
 
 def _describe_remainders(ranking: GapRanking) -> str:

@@ -89,6 +89,15 @@ def test_a_retuned_resonance_is_compared_with_the_same_resonance():
     changed = replace(r, model=NoiseModel({"gx": (replace(effects[0], sigma=3e-3), replace(effects[1], sigma=1e-3))}))
     (one,) = rank_findings(changed).findings
     assert (one.parameters["frequency"].value, one.size_ratio) == (20.0, pytest.approx(0.5))
+    assert one.old_frequency is None
+
+
+def test_a_moved_resonance_states_the_old_frequency():
+    effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
+    moved = of("narrowband", 10.0, kind="retuned", sigma=around(2e-3, 1e-5), frequency=around(19.5, 0.01))
+    model = NoiseModel({"gx": (effects[0], replace(effects[1], frequency=19.5))})
+    (one,) = rank_findings(replace(made({"gx": [moved]}, effects=effects), model=model)).findings
+    assert (one.old_frequency, one.size_ratio) == (20.0, pytest.approx(1.0))
 
 
 def test_the_shares_of_findings_and_remainders_make_one():

@@ -87,6 +87,8 @@ def test_vibration_and_disturbances_have_their_own_advice() -> None:
         ({"effect": "cross_axis", "parameters": {"source": around(0.0, 0.0)}}, "leak from 0.0 on gz"),
         ({"kind": "absent"}, "no line at 17.3 Hz on gz"),
         ({"kind": "retuned", "size_ratio": 0.5}, "line at 17.3 Hz times 0.5 on gz"),
+        ({"kind": "retuned", "size_ratio": 1.01, "old_frequency": 17.0}, "line moved from 17 to 17.3 Hz on gz"),
+        ({"kind": "retuned", "size_ratio": 2.0, "old_frequency": 17.0}, "line moved from 17 to 17.3 Hz times 2 on gz"),
         ({"kind": "retuned"}, "line at 17.3 Hz of another size on gz"),
         ({"effect": "scale_factor", "parameters": {"factor": around(1.25, 0.1)}, "axes": ("gx", "gy", "gz")},
          "scale factor of 1.25 on gx, gy and gz"),
