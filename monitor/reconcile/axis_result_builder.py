@@ -13,6 +13,7 @@ from monitor.noise.effects import (
     BiasStep,
     ExponentiallyCorrelated,
     Narrowband,
+    Outliers,
     PowerLaw,
     PulseTrain,
     ScaleFactor,
@@ -84,7 +85,7 @@ def build_axis_result(
         True if the original model was fitted to the same recording.
     """
     snapshots = [_snapshot(one.before, null) for one in search.rounds]
-    end = _snapshot(search.final, final_null)
+    end = _snapshot(_with_outlier_misfit(search), final_null)
     snapshots.append(end if search.before_withdrawal is None else _snapshot(search.before_withdrawal, null))
     changes = _remaining_changes(search)
     gains = decompose_explained_gain(search, fitted_first)
@@ -100,6 +101,16 @@ def build_axis_result(
     decision = _axis_decision(bool(steps), bool(left_over))
     remaining = measure_remaining_gaps(search, left_over)
     return AxisResult(search.hypothesis.axis.name, decision, snapshots[0], tuple(steps), left_over, end, remaining)
+
+
+def _with_outlier_misfit(search: AxisSearchResult) -> HypothesisDiagnostics:
+    """Return the final diagnostics with the misfit that the replacement of outliers hides."""
+    if not any(isinstance(effect, Outliers) for effect in search.hypothesis.added):
+        return search.final
+    misfit = max((one.trials[0].misfit_nats for one in search.rounds), default=0.0)
+    tails = search.final.findings["tails"]
+    findings = {**search.final.findings, "tails": replace(tails, gain=tails.gain + misfit)}
+    return replace(search.final, findings=findings)
 
 
 def _snapshot(diagnostics: HypothesisDiagnostics, null: AxisNull) -> AxisModelDiagnostics:

@@ -7,7 +7,6 @@ in this order:
 2. Outliers, and a step or a periodic variation of the noise.
 3. Deterministic effects, with the gain over the best slow noise. Slow noise can resemble a deterministic effect.
 4. Noise effects and a common factor for all noise effects of the model.
-
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -83,7 +82,7 @@ MAX_OUTLIER_Z: Final = 4.0
 MIN_DISTANT_SCALE: Final = 4.0
 """Smallest standard deviation of distant outliers, relative to the noise. Other heavy tails have a smaller ratio."""
 MAX_MISFIT_SHARE: Final = 0.1
-"""Largest misfit of distant outliers, relative to the gain. The misfit remains without a name."""
+"""Largest misfit of distant outliers, relative to the gain."""
 MAX_VARIANCE_SHARE: Final = 0.3
 """Largest gain of a variance change after heavy tails are removed, relative to the gain of the heavy tails."""
 ALTERNATIVE_MARGIN_NATS: Final = 1.0
@@ -112,6 +111,7 @@ class Trial:
         default_factory=dict
     )  # parameters that the fit does not determine
     event_count: int = 0  # number of events that were detected
+    misfit_nats: float = 0.0  # difference from the data that ``effect`` hides from the diagnostics
     moved: int | None = None  # index of the model effect that ``effect`` replaces; None for an additional effect
 
     @property
@@ -210,19 +210,25 @@ def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
 
 
 def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try outliers, unless another cause of heavy tails is as likely."""
+    """Try outliers, unless another cause of heavy tails is as likely.
+
+    Samples that are marked as outliers are replaced, so that the diagnostics no longer see a misfit of distant
+    outliers. The trial keeps this misfit.
+    """
     far = whitened.outlier_fit
     if far is None or Outliers in whitened.effect_types or far.gain_over_student <= MIN_STUDENT_GAIN_NATS:
         return []
     misfit_nats = 0.5 * (far.clustering_z**2 + far.misfit_z**2)
     core = np.sqrt(max(1.0 - far.fraction.value * far.scale.value**2, 1e-3))  # standard deviation without outliers
     is_distant = far.scale.value > MIN_DISTANT_SCALE * core and misfit_nats < MAX_MISFIT_SHARE * far.gain
-    if max(far.clustering_z, far.misfit_z) >= MAX_OUTLIER_Z and not is_distant:
+    is_misfit = max(far.clustering_z, far.misfit_z) >= MAX_OUTLIER_Z
+    if is_misfit and not is_distant:
         return []
     unit = _whitened_unit(hypothesis)
     effect = Outliers(fraction=min(far.fraction.value, 1.0), scale=unit * far.scale.value)
     intervals = {"fraction": _scaled_bounds(far.fraction), "scale": _scaled_bounds(far.scale, unit)}
-    return [_penalised_trial(effect, far.gain, intervals, far.count)]
+    trial = _penalised_trial(effect, far.gain, intervals, far.count)
+    return [replace(trial, misfit_nats=misfit_nats if is_misfit else 0.0)]
 
 
 def _variance_modulation_trial(whitened: WhitenedAxis) -> list[Trial]:

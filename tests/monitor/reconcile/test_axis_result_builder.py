@@ -49,6 +49,7 @@ def hidden(name):
         "line": noise() + LINE,
         "louder": 1.15 * noise(),
         "outliers": noise() + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
+        "clustered outliers": noise() + np.repeat(rng.random(n // 4) < 1e-3, 4) * 1.5e-2 * rng.standard_normal(n),
         "correlated": noise() + correlated(n, rng, 3e-4, 0.5),
         "filtered and coarse": 4e-4 * np.rint(noise() / 4e-4),
     }[name]
@@ -115,6 +116,17 @@ def test_single_samples_are_counted():
     assert step.parameters["fraction"].lo < 1e-3 < step.parameters["fraction"].hi
     assert step.parameters["scale"].lo < 1.5e-2 < step.parameters["scale"].hi
     assert "detected events" in step.because
+
+
+def test_the_misfit_of_clustered_outliers_remains():
+    result = told("clustered outliers")
+    assert [step.effect for step in result.steps] == ["outliers"]
+    assert found("clustered outliers").final.findings["tails"].gain < STRICT["tails"].threshold
+    assert [gap.diagnostic for gap in result.left_over] == ["tails"]
+    assert result.verdict == "partly_explained"
+    (rest,) = result.remaining
+    assert 0.0 < rest.gain_nats < 0.1 * result.steps[0].gain_nats
+    assert told("outliers").verdict == "explained"
 
 
 def test_runners_up_are_other_names_and_never_certain():
