@@ -21,7 +21,7 @@ class ScaleFactor(Transform):
     factor: float = parameter_field("1")
 
     description: ClassVar[str] = (
-        "All values of the axis are multiplied by a constant, for example after an error of units."
+        "All values of the axis are multiplied by a constant, for example because of a wrong unit."
     )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
