@@ -89,7 +89,7 @@ class NewestSampleTimeLowerBound:
         assert self._clock_s is not None
         self._clock_s += step_s
         delay_s = arrived_s - self._clock_s
-        # Without a known period, the clock does not advance, so the earlier delays cannot be compared.
+        # The clock does not advance before a period is known, so earlier delays cannot be compared with this delay.
         self._delay_s = delay_s if self.period_s is None else min(self._delay_s, delay_s)
         passed_s = max(min(arrived_s - self._arrived_s, MAX_STEP_S), 0.0)
         self._window_s += passed_s
