@@ -149,7 +149,7 @@ EVENT_KINDS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Event of a device, such as a lost link or a change of the noise."""
+    """Event of a device, such as a lost link or a change in the noise."""
 
     kind: str  # one of EVENT_KINDS
     t_ns: int

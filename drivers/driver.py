@@ -30,7 +30,10 @@ MAX_RETRY_PAUSE_S: Final = 5.0
 MAX_UNDECODED_BYTES: Final = 2000
 """Number of bytes without a sample after which the status names a probable cause, such as a wrong baud rate."""
 MIN_UNDECODED_S: Final = 3.0
-"""A running device counts as lost if no sample can be decoded for this time and for ten sample periods."""
+"""Minimum time in s without a decoded sample after which a running device counts as lost.
+
+If ten sample periods are longer than this time, ten sample periods apply instead.
+"""
 MAX_QUEUED_EVENTS: Final = 1000
 """Maximum number of events in the queue. If the queue is full, the oldest event is dropped."""
 LOSS_REPORT_INTERVAL_S: Final = 1.0

@@ -38,7 +38,7 @@ def make_printable_and_shorten(text: str) -> str:
 
 
 def describe_error(error: Exception) -> str:
-    """Return the text of an exception in one line. The text of an OSError does not include the path."""
+    """Return the text of an exception as a single line. The text of an OSError does not include the path."""
     return " ".join(str(getattr(error, "strerror", None) or error).split())
 
 

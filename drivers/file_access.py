@@ -1,4 +1,4 @@
-"""Safe opening and reading of files that users name or that are found in folders.
+"""Safe functions for opening and reading files that are named by users or found in folders.
 
 ``open_regular_file`` raises an error, and never blocks, if the path is a FIFO, a socket, a device or a directory.
 ``read_small_file`` reads a complete small file, such as a configuration, a model or a CAN database.
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, Final
 
 MAX_BYTES: Final = 32_000_000
-"""Maximum size of a file for ``read_small_file``. CAN databases of complete vehicles have a few megabytes."""
+"""Maximum size of a file for ``read_small_file``. CAN databases of complete vehicles are a few megabytes in size."""
 FILE_KINDS: Final = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFSOCK: "a socket",
@@ -30,13 +30,13 @@ def expand_user(name: str) -> Path:
 def real_path(path: Path) -> Path:
     """Return the absolute path without symbolic links.
 
-    Unlike ``Path.resolve``, this function accepts a loop of links.
+    Unlike ``Path.resolve``, this function raises no error if symbolic links form a loop.
     """
     return Path(os.path.realpath(path))
 
 
 def is_file(path: Path) -> bool:
-    """Return True if the path is an existing file. Unlike ``Path.is_file``, the result for an invalid name is False."""
+    """Return True if the path is an existing file. Unlike ``Path.is_file``, return False for an invalid name."""
     return os.path.isfile(path)
 
 
@@ -107,8 +107,8 @@ def read_small_file(path: Path, *, allow_pipe: bool = False) -> bytes:
     path
         Name of the file.
     allow_pipe
-        True if the path may also be a pipe, such as ``/dev/stdin`` or ``<(command)``. Reading a pipe waits for the
-        program that writes to the pipe.
+        True if the path may also be a pipe, such as ``/dev/stdin`` or ``<(command)``. Reading from a pipe blocks until
+        the other program closes it.
 
     Returns
     -------

@@ -71,7 +71,7 @@ def format_suggestion(word: str, known: Sequence[str]) -> str:
 
 
 def format_choices_by_similarity(word: str, known: Sequence[str]) -> str:
-    """Return all known words as the end of an error message, beginning with the most similar word.
+    """Return the end of an error message that lists all known words, beginning with the most similar word.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Base class of the settings in a configuration file, and validation of one table of a configuration file.
 
-Each field of a settings model describes one key with its type, supported range, default and description. A field
-without a default also has an example, as does a field whose default turns a function off. ``check_table`` finds all
-mistakes in a table.
+Each field of a settings model describes one key with its type, supported range, default and description. A field also
+has an example if it has no default, or if its default disables a feature. ``check_table`` finds all mistakes in a
+table.
 """
 
 import contextlib
@@ -125,7 +125,7 @@ class TableCheckResult(Generic[Model]):
     partial: dict[str, object] = field(default_factory=dict)  # ``TableError.partial`` for each table path
 
     def has_no_problem(self, *key_paths: str) -> bool:
-        """Return True if the given keys, their parent tables and their subkeys have no problem."""
+        """Return True if no problem was found in the given keys, their parent tables and their subkeys."""
         return not any(_nested(key_path, wrong.key_path) for key_path in key_paths for wrong in self.problems)
 
     def add_problem(self, key_path: str, text: str) -> None:
@@ -239,7 +239,7 @@ def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
 
 
 def _field_at(kind: type[SettingsModel], location: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:
-    """Return the settings model that contains the last key of a path, and the field.
+    """Return the settings model that contains the last key of a path, and the field of this key.
 
     The field is None for an unknown key.
     """
@@ -272,7 +272,7 @@ def _nested(one: str, other: str) -> bool:
 
 
 ListOf = Annotated[tuple[T, ...], Strict(False)]
-"""List in the configuration file that becomes a tuple. The items are not converted to other types."""
+"""Tuple that is written as a list in the configuration file. The items are not converted to other types."""
 
 
 class ConvertedFrom:
@@ -387,6 +387,6 @@ def _beside(value: str, info: ValidationInfo) -> Path | None:
 
 
 FilePath = Annotated[str, AfterValidator(_existing_file)]
-"""Path of an existing file. A relative path refers to the folder of the configuration file."""
+"""Path of an existing file, absolute or relative to the folder of the configuration file."""
 FileOrName = Annotated[str, AfterValidator(_file_or_name)]
 """Path of a file, or name of a file that is part of the program."""

@@ -1,1 +1,1 @@
-"""Numbers to meaning: noise models, estimation, and what is published of it."""
+"""Noise monitor: noise models, estimation, and publication of the results."""

@@ -204,8 +204,8 @@ class Frames:
     def select_frames(self, indices: Sequence[int]) -> "Frames":
         """Return the frames at the given indices.
 
-        The rejected frames before an omitted frame are added to ``bad_before`` of the next selected frame, or to
-        ``bad_after``.
+        The number of rejected frames before an omitted frame is added to ``bad_before`` of the next selected frame, or
+        to ``bad_after`` if no selected frame follows.
         """
         if len(indices) == len(self.data):
             return self
@@ -352,7 +352,7 @@ class FrameBuffer:
         return b"".join((self._buffer, *[chunk.data for chunk in chunks]))
 
     def _count_rejected(self, at: int) -> None:
-        """Count a rejected candidate frame. Candidates closer than one frame length are counted once."""
+        """Count a rejected candidate frame. Candidates less than one frame length apart are counted once."""
         offset = self._buffer_offset + at
         if offset - self._last_rejected >= max(self._frame_length, 1):
             self._rejected += 1
@@ -458,7 +458,7 @@ def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, Ints]]:
 
 
 def nan_to_infinity(values: Floats) -> Floats:
-    """Replace NaN by infinity, because ``BlockBuilder`` rejects infinite values but accepts NaN as not measured."""
+    """Replace NaN with infinity, because ``BlockBuilder`` rejects infinite values but treats NaN as not measured."""
     return np.where(np.isnan(values), np.inf, values)
 
 

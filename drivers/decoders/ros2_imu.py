@@ -46,7 +46,7 @@ SEQUENCE_OFFSETS: Final = {77: 16, 33: 0}
 In the labelled layout, the string "sequence_number" with its length byte precedes the number.
 """
 MAX_GAP_MESSAGES: Final = 1_000_000_000
-"""Largest number of lost messages, eleven days at 1 kHz. A larger step of the sequence number means a restart."""
+"""Maximum number of lost messages (eleven days at 1 kHz). A larger step of the sequence number indicates a restart."""
 GID_BYTES: Final = 16  # the publisher identifier ends both attachment layouts
 BYTE_ORDERS: Final = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
@@ -124,7 +124,7 @@ class Ros2ImuDecoder(RejectingDecoder):
         return chunks
 
     def _read_sequence(self, attachment: bytes) -> int:
-        """Return the sequence number of a message, and add the lost messages before the message to ``_lost``."""
+        """Return the sequence number of a message, and add the number of messages lost before it to ``_lost``."""
         at = SEQUENCE_OFFSETS.get(len(attachment))
         if at is None:
             return NO_TICK

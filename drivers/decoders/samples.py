@@ -1,9 +1,9 @@
 """Decoder of the sample messages that imu-monitor publishes.
 
 ``drivers.zenoh.sample_message`` defines the format. A message contains samples with Unix times, and the total number of
-samples that the publisher has received since its start. Messages were lost if the total increases by more than the
-number of samples in the message. The field ``lost`` of the next sample block includes the samples of lost messages. If
-the total decreases, the publisher was restarted, and no samples are counted as lost.
+samples that the publisher has received since its start. If the total has increased by more than the number of samples
+in the message, messages were lost. The field ``lost`` of the next sample block includes the samples of lost messages.
+If the total has decreased, the publisher was restarted, and no samples are counted as lost.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from drivers.settings_model import SettingsModel
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 
 MAX_GAP_SAMPLES: Final = 1_000_000_000
-"""Largest number of lost samples, eleven days at 1 kHz. A larger step of the total means a restart of the publisher."""
+"""Maximum number of lost samples (eleven days at 1 kHz). A larger step of the total indicates a restart."""
 
 
 class Settings(SettingsModel):

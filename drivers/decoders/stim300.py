@@ -171,8 +171,8 @@ class Stim300Decoder(base.FrameStreamDecoder):
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return datagrams with the configured identifier.
 
-        If the identifier is "auto", the datagrams contain accelerations, and also temperatures if ``samples`` has any.
-        The status byte reports a channel error if an axis is not measured.
+        If the identifier is "auto", the datagrams contain rates and accelerations. Temperatures are included if
+        ``samples`` contains any. The status byte reports a channel error if an axis is not measured.
         """
         identifier = self._settings.identifier
         if identifier == "auto":

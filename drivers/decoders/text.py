@@ -2,7 +2,7 @@
 
 The format has no standard. ``columns`` names the content of each column, and the numbers are converted from the
 configured units to SI. A line ends in LF, CR or CR LF. With ``delimiter = "auto"``, fields are separated by commas,
-semicolons or tabs. In a line without commas, semicolons and tabs, fields are separated by blanks. An empty field or
+semicolons or tabs. In a line without commas, semicolons or tabs, fields are separated by blanks. An empty field or
 ``nan`` means that the value was not measured. Empty lines and lines that begin with the comment prefix are skipped. A
 line is rejected if it has the wrong number of columns, or if a field is not a number. With ``nmea = true``, a line is
 ``$fields*CC``. The checksum CC is the exclusive or of the characters between ``$`` and ``*``, in two hexadecimal
@@ -152,7 +152,7 @@ class TextDecoder(base.RejectingDecoder):
         return self._build_blocks(table, np.array(t_ns, np.int64)[counted])
 
     def _split_lines(self, data: bytes) -> list[bytes]:
-        """Return the completed lines without line ends and surrounding blanks. Empty lines are omitted."""
+        """Return the completed lines without line endings or surrounding blanks. Empty lines are omitted."""
         *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         if lines and self._overlong:
             lines[0], self._overlong = OVERLONG_LINE, False
@@ -233,7 +233,7 @@ class TextDecoder(base.RejectingDecoder):
         return body.replace(b",", b"?").replace(self._delimiter, b",") if self._delimiter != b"," else body
 
     def _parse_line(self, body: bytes) -> tuple[list[float] | None, str]:
-        """Return the numbers in one line and "". If the line is rejected, return None and the reason."""
+        """Return the numbers of a line and an empty text, or None and the reason if the line is rejected."""
         if body == OVERLONG_LINE:
             return None, OVERLONG_HINT
         fields = self._comma_separated(body).split(b",")

@@ -7,8 +7,8 @@ packet without the other packet of the pair is dropped. The packets contain no c
 0x51, since the fourth word of 0x52 is not a temperature on every model (WT901 data sheet v20-0702, section 5.1). The
 decoder uses g = 9.80665 m/s², while the manual uses 9.8 m/s².
 
-Damage to a packet of another type (angles, magnetic field) loses no sample. The number of lost samples is therefore
-computed from the number of packets between two samples.
+If a packet of another type (angles, magnetic field) is damaged, no sample is lost. The number of lost samples is
+therefore computed from the number of packets between two samples.
 
 Bluetooth packets have 20 bytes without a checksum: ``55 61 | a xyz | w xyz | angles``. A Bluetooth packet is accepted
 only if the header of another packet follows. Samples are therefore delayed by one packet.
@@ -77,7 +77,7 @@ class WitmotionDecoder(base.FrameStreamDecoder):
 
     @property
     def bad(self) -> int:
-        """Number of packets with a wrong checksum, and of implausible samples."""
+        """Total number of packets with a wrong checksum and of implausible samples."""
         return super().bad + self._harmless_rejects
 
     @property

@@ -2,8 +2,8 @@
 
 The format is ``FA FF 36 | LEN | payload | CS``, big-endian. If LEN is 0xFF, the length follows as u16. The sum of all
 bytes after 0xFA is 0 modulo 256. The payload is a list of items ``DID u16 | size u8 | data``. The two low bits of the
-data identifier (DID) state the number format: float32, fixed 12.20, fixed 16.32 or float64. The next two bits state the
-coordinate frame and are ignored. In a fixed 16.32 number, the 32-bit fraction precedes the 16-bit integer part, and
+data identifier (DID) specify the number format: float32, fixed 12.20, fixed 16.32 or float64. The next two bits specify
+the coordinate frame and are ignored. In a fixed 16.32 number, the 32-bit fraction precedes the 16-bit integer part, and
 each part is big-endian. The byte order of fixed 16.32 numbers was taken from three independent public parsers. Source:
 Movella, MT low level communication protocol (MT0101P).
 
@@ -11,7 +11,7 @@ The decoder reads the acceleration 0x4020 or 0x4040 (high-rate), the rate of tur
 clock 0x1060 or 0x1020, and the temperature 0x0810. Free acceleration 0x4030 is not used, since the orientation filter
 has removed gravity. If a packet contains only accelerations or only rates, the other axes are marked as not measured
 (NaN). A packet without accelerations and rates is ignored. Temperatures often arrive in separate packets at a lower
-rate. Each sample gets the newest temperature since the link was opened.
+rate. Each sample contains the newest temperature that has been received since the link was opened.
 """
 
 import struct

@@ -2,12 +2,11 @@
 
 The hardware, the kernel or python-can passes on only frames with the identifiers that the decoder needs.
 
-``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. If a read is delayed, the frames in the queue
-have arrived earlier than the time of the read. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each frame on
-arrival with the system clock of the host. For these interfaces, the age of a frame is subtracted from the time of the
-read. An age outside the range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts relative to
-the clock of the host. For other interfaces, ``Chunk.t_ns`` is the time of the read, and the sample clock removes the
-jitter by regression.
+``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. If a read is delayed, the queued frames arrived
+some time before the read. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each frame on arrival with the system
+clock of the host. For these interfaces, the age of a frame is subtracted from the time of the read. An age outside the
+range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts relative to the clock of the host. For
+other interfaces, ``Chunk.t_ns`` is the time of the read, and the sample clock removes the jitter by regression.
 
 ``LinkLost`` is raised if the bus is off, the interface is down or the adapter is unplugged. Other error frames are
 counted and ignored. Remote frames are ignored. The link sends nothing except commands that configure an adapter.
@@ -38,16 +37,16 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = "dbc"
 MAX_FRAMES: Final = 1000
-"""Maximum number of frames per read, 65 ms of a fully loaded bus at 1 Mbit/s."""
+"""Maximum number of frames per read, equivalent to 65 ms on a fully loaded bus at 1 Mbit/s."""
 NEXT_FRAME_WAIT_S: Final = 0.0005
 """Time in s to wait for another frame after a frame has been received.
 
-With a time of 0, python-can would stop at the first rejected frame, although more frames may follow.
+With a timeout of 0, python-can would stop at the first rejected frame, although more frames may follow.
 """
 MAX_READ_S: Final = 0.01
 """Longest time in s from the arrival of the first frame to the end of a read."""
 MAX_WAIT_S: Final = 0.1
-"""Longest single wait for a frame in s. A waiting read ends at most this long after the link has been closed."""
+"""Longest single wait for a frame in s. A blocked read returns within this time after the link has been closed."""
 HOST_STAMPED_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces that stamp a frame with the system clock of the host when the frame arrives."""
 MAX_FRAME_AGE_S: Final = 1.0

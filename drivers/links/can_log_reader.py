@@ -26,7 +26,7 @@ MAX_FRAME_BYTES: Final = 64  # maximum payload of CAN FD
 READ_BYTES: Final = 4096
 MAX_LINE_BYTES: Final = 1 << 20
 MAX_BYTES_WITHOUT_FRAME: Final = 8_000_000
-"""Maximum number of bytes between two frames, such as comments. python-can needs seconds to read this much text."""
+"""Maximum number of bytes, such as comments, between two frames. python-can needs seconds to read this much text."""
 MAX_OBJECT_BYTES: Final = 64_000_000
 """Maximum compressed or uncompressed size of an object in a BLF log. Typical objects have a few hundred kilobytes."""
 MAX_OBJECTS_WITHOUT_FRAME_BYTES: Final = 256_000_000

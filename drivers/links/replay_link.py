@@ -9,9 +9,9 @@ The chunks depend on the type of the file:
 - Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages,
   depending on the original link.
 
-The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. A chunk of
-captured bytes gets the time at which a device with the byte rate ``bytes_per_second`` would send the chunk. Without
-``bytes_per_second``, the chunk gets the time of the read.
+The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. Each chunk is
+therefore assigned the time at which a device with the byte rate ``bytes_per_second`` would have sent it. Without
+``bytes_per_second``, each chunk is assigned the time of the read.
 
 ``wait_for_chunks_or_timeout`` raises ``LinkEnded`` after all data have been returned. If a file is truncated, the
 intact part is replayed, and the final message mentions the truncation. ``build`` reads the header of a CSV file to
@@ -68,7 +68,7 @@ Kind = Literal["recording", "log", "capture", "raw"]
 TimedChunk = tuple[float, Chunk]
 """Chunk, and the time at which it is due, in s since the start of the file."""
 CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
-"""Type of chunk that each kind of file contains. A segment of raw data states the type itself."""
+"""Type of chunk that each kind of file contains. For raw data, the segment file contains the type."""
 
 DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": "", "raw": ""}
 """Default decoder of each kind of file; "" if the settings must name the decoder."""
@@ -242,7 +242,7 @@ def _raw_carrier(path: Path) -> Carrier:
 
 
 def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[TimedChunk]:
-    """Yield captured bytes with due times according to the byte rate. Without a byte rate, all due times are 0."""
+    """Yield captured bytes with the times at which they are due. Without a byte rate, all due times are 0."""
     start_ns = time.monotonic_ns()
     size = CHUNK_BYTES if bytes_per_second is None else min(max(1, round(bytes_per_second * STEP_S)), CHUNK_BYTES)
     given = 0

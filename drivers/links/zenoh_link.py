@@ -4,7 +4,8 @@ Each link opens its own zenoh session. The session connects only to the configur
 programs or accepting connections. A session with one endpoint is a zenoh client, because a router does not forward data
 from one peer to another peer. A client session can be opened only if the endpoint answers. A session with several
 endpoints is a zenoh peer, because a client would use only the first endpoint that answers. A peer session opens
-immediately, and zenoh connects in the background. A missing publisher therefore causes silence and not ``LinkLost``.
+immediately, and zenoh connects in the background. While there is no publisher, no messages arrive, but ``LinkLost`` is
+not raised.
 
 zenoh writes messages to a ring channel, which overwrites the oldest message when the channel is full. The decoder
 detects lost messages from the sequence numbers. A thread takes the messages from the channel and adds the arrival
@@ -39,9 +40,12 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = "samples"
 MAX_MESSAGES: Final = 4096
-"""Maximum number of queued messages, four seconds at 1 kHz."""
+"""Maximum number of queued messages (four seconds at 1 kHz)."""
 MAX_QUEUED_BYTES: Final = 128_000_000
-"""Maximum total size of the queued messages, twice the size of the longest message that a session accepts."""
+"""Maximum total size of the queued messages in bytes.
+
+The value is twice the size of the longest message that a session accepts.
+"""
 
 
 class Settings(LinkSettings):

@@ -15,7 +15,7 @@ from typing import IO, Any, Final
 
 CONTINUATION: Final = 0xFFFFFFFF
 MAX_METADATA_BYTES: Final = 64_000_000
-"""Maximum size of the metadata of one message. A schema with 10 000 columns has about 2 MB."""
+"""Maximum size of the metadata of one message. A schema with 10 000 columns takes about 2 MB."""
 SCHEMA: Final = 1  # values of the Arrow enumeration MessageHeader
 DICTIONARY_BATCH: Final = 2
 RECORD_BATCH: Final = 3
@@ -87,8 +87,8 @@ def check_batch_buffer_sizes(size: StatedBatchSize, buffer_counts: Sequence[int 
     size
         Stated size of the batch.
     buffer_counts
-        Number of buffers of each column in schema order. The number is negative for a column that is not read, and None
-        if it is unknown. The buffers of all columns after an unknown number are checked as well.
+        Number of buffers of each column in schema order. The number is negative for a column that is not read. If the
+        number is unknown (None), all remaining buffers of the batch are checked.
     slack_bytes
         Allowed size in addition to eight bytes per row.
 

@@ -3,7 +3,7 @@
 An empty field or ``nan`` is a missing value. Blank lines and comment lines before the header line are skipped.
 
 NumPy parses text in large pieces. A piece with a damaged line is parsed line by line, so that only the damaged line is
-lost. A last line without a line end is skipped, because the last number may be incomplete.
+lost. If the last line has no line ending, it is skipped, because its last number may be incomplete.
 
 Lines are counted before parsing, so that ``drivers.recordings.memory_check`` can reject a file that is too large.
 """

@@ -101,7 +101,7 @@ def available_system_bytes(meminfo: Path = MEMINFO) -> int | None:
 
 
 def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
-    """Return the memory in bytes that the control groups of this process leave available, or None without a limit.
+    """Return the memory in bytes that the control groups of this process still allow, or None if there is no limit.
 
     The page cache counts as available memory, because the kernel can free it at any time.
 
@@ -117,7 +117,7 @@ def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int
 
 
 def available_rlimit_bytes(statm: Path = STATM) -> int | None:
-    """Return the memory in bytes that the resource limits of this process leave available, or None without a limit."""
+    """Return the memory in bytes that the resource limits of this process still allow, or None if there is no limit."""
     try:
         pages = [int(n) for n in statm.read_text().split()]
     except (OSError, ValueError):

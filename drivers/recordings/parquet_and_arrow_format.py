@@ -22,7 +22,7 @@ METADATA_KEY: Final = b"imu-monitor"
 SEGMENT_COLUMNS: Final = ("ticks", "lost")
 """Columns of a segment that are not measurements. The reader does not report these columns as unused."""
 SLACK_BYTES: Final = 1 << 20
-"""Number of bytes that a compressed buffer may unpack to beyond the bytes that the rows need."""
+"""Number of bytes by which an unpacked buffer may exceed the size that its rows need."""
 MAX_DICTIONARY_BYTES: Final = 64_000_000
 MAX_INDEX_BYTES: Final = 10_000_000
 """Maximum size in bytes of the index of a Parquet file.
@@ -67,7 +67,7 @@ def read_parquet(path: Path) -> table.Table:
 
 
 def count_parquet_rows(path: Path) -> int:
-    """Return the number of rows that the index of a Parquet file states."""
+    """Return the number of rows according to the index of a Parquet file."""
     with _open_parquet(path) as file:
         return _check_parquet(path, file, [])[1]
 

@@ -69,7 +69,7 @@ class DaemonState(msgspec.Struct, frozen=True):
     since: tuple[float | None, ...] = (None,) * 6
     """Unix time in s of the oldest sample in use for each axis.
 
-    The time is set after a noise change or a cleared window.
+    The time is set when a noise change restarts the axis or the window is cleared. Otherwise, it is None.
     """
     tick_step: float | None = None  # ticks of the device counter per sample
     theta: tuple[float | None, ...] = ()

@@ -16,7 +16,7 @@ COLUMNS: Final = ("t", *AXES, "temperature")
 """Names of the columns that the readers recognize."""
 
 ALIASES: Final = {"temp": "temperature"}
-"""Alternative column names, with the name in COLUMNS."""
+"""Alternative column names, each mapped to the name in COLUMNS."""
 
 EXAMPLE_HEADER: Final = "t,gx,gy,gz,ax,ay,az"
 """Example of a header line, quoted in error messages."""

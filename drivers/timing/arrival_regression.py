@@ -29,9 +29,7 @@ residuals. In simulations with stalls, bursts and slowly varying delays, the err
 for slowly varying delays in the first seconds.
 """
 STANDARD_RATE_TOLERANCE: Final = 0.002
-"""Largest relative difference at which a measured rate is replaced with the nearest standard rate.
-
-"""
+"""Maximum relative difference at which a measured rate is replaced with the nearest standard rate."""
 # fmt: off
 STANDARD_RATES_HZ: Final = np.array([
     1, 2, 4, 5, 8, 10, 12.5, 16, 20, 25, 26, 32, 40, 50, 52, 62.5, 64, 80, 100, 104, 120, 125, 128, 200, 208, 238, 240,

@@ -29,13 +29,15 @@ PERIOD_TOLERANCE: Final = 0.05
 MAX_RATE_HZ: Final = 32_000.0
 """Highest plausible sample rate of an inertial sensor, which limits the number of missing samples."""
 MAX_GAP_SAMPLES: Final = 10**10
-"""Maximum number of consecutive missing samples, which lasts 116 days at 1 kHz."""
+"""Maximum number of consecutive missing samples (116 days at 1 kHz)."""
 MAX_OFFSET_S: Final = 4.6e9
 """Largest time in s since the first sample. The value is half of the range of int64 nanoseconds."""
 
 
 class ArrivalTimeline:
-    """Line fitted to arrival time against sample index, which gives the sample times and missing samples of one device.
+    """Estimator of the sample times and missing samples of one device.
+
+    The estimator fits a line to the arrival time as a function of the sample index.
 
     Parameters
     ----------
@@ -181,7 +183,7 @@ class ArrivalTimeline:
 
 @dataclass(slots=True)
 class _Delay:
-    """Sudden delay of the arrivals, which missing samples may have caused."""
+    """Sudden delay of the arrivals, possibly caused by missing samples."""
 
     since_ns: int  # time of the first delayed arrival, or of the last reported gap
     least_s: float  # minimum delay of the arrivals since ``since_ns`` relative to the fitted line

@@ -26,9 +26,9 @@ from drivers.timing.event_rate_limiter import EventRateLimiter
 Mask = NDArray[np.bool_]
 
 MIN_NEW_KEYS: Final = 20
-"""Minimum number of rows with different keys after which repeats are detected."""
+"""Minimum number of rows with different keys before repeats are detected."""
 MAX_SHARED_FRACTION: Final = 0.05
-"""Largest fraction of rows with equal keys but different values at which repeats are detected."""
+"""Fraction of rows with equal keys but different values above which no row is treated as a repeat."""
 SHARED_FRACTION_ROWS: Final = 2000
 """Number of recent rows over which the fraction of shared keys is computed."""
 SEARCH_ROWS: Final = 256

@@ -11,14 +11,14 @@ from typing import Final
 from drivers.timing.arrival_regression import snap_to_standard_rate
 
 AGREEMENT_LIMIT: Final = 0.005
-"""Largest relative difference at which two rates agree. The resulting error of N and K is at most 0.25 %."""
+"""Maximum relative difference between two rates that agree. The resulting error of N and K is at most 0.25 %."""
 CONTRADICTION_LIMIT: Final = 0.02
 """Relative difference above which the measured rate contradicts the configured rate.
 
 Sensor oscillators are more accurate.
 """
 HYSTERESIS_FACTOR: Final = 0.75
-"""Ratio of the threshold that ends a contradiction to the threshold that starts a contradiction."""
+"""Ratio of the threshold at which a contradiction ends to the threshold at which it starts."""
 UPDATE_THRESHOLD: Final = 0.001
 """Relative change of the measured rate above which the sample rate in use is updated."""
 

@@ -31,7 +31,7 @@ RATE_CHECK_S: Final = 30.0
 RATE_CHECK_SAMPLES: Final = (2 * MIN_SAMPLES, round(MIN_SPAN_S * MAX_RATE_HZ))
 """Number of samples after which the rate check is abandoned if no rate has been measured.
 
-The first value applies after the time RATE_CHECK_S, and the second value applies before.
+The first value applies after RATE_CHECK_S has elapsed, and the second value applies before.
 """
 
 
@@ -210,7 +210,7 @@ class SampleClock:
             self._check.compare_with_measured_rate(*found)
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Assign times and numbers of missing samples according to the timing of the wire format."""
+        """Assign sample times and count missing samples according to the timing of the wire format."""
         if self._sender is not None:
             return self._sender.split_at_missing_samples(samples)
         if self._paused and self.configured_or_measured_rate_hz is None:

@@ -1,8 +1,9 @@
 """Lower bound of the time at which the newest sample of a device was taken.
 
-The arrival time is only an upper bound of the sample time, because samples may wait in buffers. The lower bound is
-computed from a clock that advances by one sample period per sample, plus the minimum delay of the arrivals after this
-clock. Source: Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements", 1999.
+The arrival time is only an upper bound of the sample time, because samples may wait in buffers. A clock advances by one
+sample period per sample. The lower bound is the time of this clock plus the minimum delay of the arrivals relative to
+the clock. Source: Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements",
+1999.
 
 The minimum delay is computed over two consecutive windows of length WINDOW_S, which limits the effect of an incorrect
 sample period. The bound is valid if at least one sample in the two windows was read without delay.
@@ -14,17 +15,17 @@ from typing import Final
 WINDOW_S: Final = 60.0
 """Length in s of each of the two windows over which the minimum delay is computed."""
 MAX_STEP_S: Final = 1.0
-"""Maximum time in s that one arrival adds to a window.
+"""Maximum time in s by which one arrival extends a window.
 
-A long pause between arrivals therefore does not fill a window.
+Without this limit, a single long pause between arrivals could fill a window.
 """
 SETTLED_S: Final = 10.0
-"""Minimum duration in s of the arrivals for an estimate of the sample period.
+"""Minimum time in s over which samples must arrive before the sample period is estimated.
 
 Over a shorter time, a single late arrival would distort the estimated period.
 """
 MAX_PROMPT_DELAY_S: Final = 0.05
-"""Largest delay in s, relative to the minimum delay, of an arrival at which a new sample period is adopted."""
+"""Maximum delay of an arrival, in s above the minimum delay, for a new sample period to be adopted."""
 
 
 class NewestSampleTimeLowerBound:
@@ -63,7 +64,7 @@ class NewestSampleTimeLowerBound:
         return self._total_s >= SETTLED_S
 
     def start_clock(self, previous_sample_not_before_s: float) -> None:
-        """Start the clock at the earliest possible time of the previous sample in s."""
+        """Start the clock at the earliest possible time of the previous sample, in s."""
         self._clock_s = self._arrived_s = previous_sample_not_before_s
         self._start_delay_s = 0.0
 
@@ -88,7 +89,7 @@ class NewestSampleTimeLowerBound:
         assert self._clock_s is not None
         self._clock_s += step_s
         delay_s = arrived_s - self._clock_s
-        # Without a known period, the clock does not advance, so the earlier delays cannot be compared.
+        # The clock does not advance before a period is known, so earlier delays cannot be compared with this delay.
         self._delay_s = delay_s if self.period_s is None else min(self._delay_s, delay_s)
         passed_s = max(min(arrived_s - self._arrived_s, MAX_STEP_S), 0.0)
         self._window_s += passed_s

@@ -1,7 +1,7 @@
 """Detection of missing, late and reordered rows from sender times.
 
 If sender times are irregular, a long step does not necessarily mean that samples are missing. Samples therefore count
-as missing only if most other steps are regular.
+as missing only if most of the time steps are regular.
 
 Samples are sorted by time only if sorting makes the times evenly spaced. Late samples that were already counted as
 missing are dropped.
@@ -27,7 +27,7 @@ STEP_TOLERANCE: Final = 0.25
 CERTAIN_GAP_PERIODS: Final = 4.0
 """Time step in sample periods above which samples are missing, even if the step is not a whole number of periods."""
 MAX_LATENESS_RATIO: Final = 8.0
-"""Largest deviation of a time step without missing samples, as a multiple of the upper quartile of the deviations."""
+"""Maximum deviation of a time step that is not a gap, as a multiple of the upper quartile of the deviations."""
 MAX_PERIOD_NS: Final = float(1 << 54)
 """Longest sample period in ns (about 200 days) for which the times of missing samples fit into int64."""
 

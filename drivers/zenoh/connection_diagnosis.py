@@ -1,4 +1,4 @@
-"""Diagnosis of connection errors, because zenoh does not report their cause.
+"""Diagnosis of connection errors. zenoh itself does not report the cause of a connection error.
 
 The functions connect to an endpoint with the configuration of the failed attempt. For TLS, the test includes the
 handshake with the same certificates. The result is one line of text, or "" if no program listens at the endpoint or the
@@ -36,7 +36,7 @@ _TLS_REASONS: Final = {
 
 
 def explain_refusals(endpoints: Sequence[str], config: "zenoh.Config") -> str:
-    """Return the reasons why endpoints refuse a connection. An endpoint without a known reason is omitted.
+    """Return the reasons why endpoints refuse a connection. An endpoint is omitted if the reason is unknown.
 
     Parameters
     ----------

@@ -29,14 +29,17 @@ MAX_ROWS: Final = 1_000_000
 MAX_COLUMNS: Final = 64
 MAX_BYTES: Final = 1 << 26  # enough for a million samples with seven columns
 MAX_GRID_DEVIATION_NS: Final = 500
-"""Largest deviation in ns of a sample time from an even grid, twice the resolution of Unix seconds in float64."""
+"""Maximum deviation in ns of a sample time from an evenly spaced grid.
+
+The value is twice the resolution of Unix seconds in float64.
+"""
 T_LIMIT_S: Final = 4.6e9
 """Largest absolute Unix time in s (years 1824 to 2115). The difference of two times fits into int64 nanoseconds."""
 RATE_LIMITS_HZ: Final = (1e-6, 1e9)
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
 Lost = Annotated[int, msgspec.Meta(ge=0, le=1_000_000_000)]
-"""Number of lost samples, up to eleven days at 1 kHz."""
+"""Number of lost samples. The maximum corresponds to eleven days at 1 kHz."""
 
 
 class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):

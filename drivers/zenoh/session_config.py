@@ -85,7 +85,7 @@ def build_session_config(
 
 
 def format_zenoh_error(error: Exception) -> str:
-    """Return the text of a zenoh error in one line.
+    """Return the text of a zenoh error as a single line.
 
     Source code positions are removed. Quotations from a configuration file are also removed, because they may contain
     passwords.

@@ -32,7 +32,7 @@ def reconcile(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
 ) -> None:
-    """Compare recordings with a noise model, and find the effects that are missing in the model."""
+    """Compare recordings with a noise model, and find the effects that are missing from the model."""
     require_extra("reconcile", "reconcile")
     from rich.console import Console
 

@@ -465,7 +465,7 @@ def version_satisfies(version: str, bounds: str) -> bool:
 
 
 def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
-    """Check that Python does not find another module with the name of a package of the program first."""
+    """Check that no other module on the import path shadows a package of the program."""
     own = Path(__file__).resolve().parents[2]
     found = []
     for entry in module_path:

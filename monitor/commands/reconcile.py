@@ -211,7 +211,7 @@ def _write_report(result: Reconciliation, folder: Path, title: str) -> None:
 
 
 def _encode_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
-    """Return the content of ``report.json`` if the data do not support an answer."""
+    """Return the content of ``report.json`` for data that do not support an answer."""
     return msgspec.json.encode({"schema": schema, "verdict": None, "why": why, "samples": samples})
 
 

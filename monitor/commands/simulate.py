@@ -1,4 +1,4 @@
-"""Command ``simulate``: writes a recording of a noise model.
+"""Command ``simulate``: writes a recording that is simulated with a noise model.
 
 The samples are simulated and written in blocks, so that the required memory does not depend on the length. The
 recording contains only the axes of the noise model. The truth file contains the noise model, the seed, and random

@@ -4,7 +4,7 @@ Without a writable cache folder, kernels are compiled at every start of the prog
 
 A cached kernel becomes invalid if the source file of the kernel or any imported module changes.
 
-By default, Numba generates machine code for every function that a kernel calls, although Python never calls the
+By default, Numba generates machine code for every function that a kernel calls, even if Python never calls the
 function. ``Kernel`` keeps such functions as intermediate code, which shortens the first start by more than a quarter
 (``docs/benchmarks-service.md``).
 
@@ -54,7 +54,7 @@ IMPORT_STATEMENT: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]
 
 
 class _IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """LLVM module that is linked into other modules, without machine code."""
+    """LLVM module without machine code, which is linked into other modules."""
 
     def _optimize_final_module(self) -> None: ...
 

@@ -12,7 +12,7 @@ MAX_PROBLEMS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Health of one device at one moment. Numbers of samples are counted since the start of the device."""
+    """Health of one device at one moment. Samples are counted from the start of the device."""
 
     state: str  # running | waiting | lost | ended
     rate_hz: float | None  # measured; None until known

@@ -111,8 +111,8 @@ def _expanded(a: Floats, z: float) -> Floats:
 def _coefficients(z: float) -> tuple[float, ...]:
     """Return the coefficients y_k(z) of the Cornish-Fisher expansion of a gamma quantile.
 
-    With shape a, normal quantile z and ε = 1/√a, the expansion is x = a (1 + ε Σ y_k ε^k). The differential equation x'
-    = φ(z)/f(x) of the normal density φ and the gamma density f gives y_0 = z and y_k'' − z y_k' − y_k = r_k. The
+    With shape a, normal quantile z and ε = 1/√a, the expansion is x = a (1 + ε Σ y_k ε^k). For the normal density φ and
+    the gamma density f, the differential equation x' = φ(z)/f(x) gives y_0 = z and y_k'' − z y_k' − y_k = r_k. The
     coefficient y_k is the only polynomial solution of the equation of order k. The first five coefficients agree with
     Goldberg & Levine (Annals of Mathematical Statistics 17, 1946).
     """

@@ -21,7 +21,7 @@ from drivers.file_access import FILE_KINDS, check_folder_or_absent
 RECORDING_LOCK: Final = "recording.lock"
 HISTORY_LOCK: Final = "history.lock"
 LOCKS_UNSUPPORTED_ERRNOS: Final = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
-"""Error numbers of ``flock`` on a file system without locks."""
+"""Error numbers of ``flock`` on a file system that does not support locks."""
 RETRY_S: Final = 0.05
 """Pause before the second attempt, because the ``doctor`` command holds the lock for a short time."""
 HOLDER_BYTES: Final = 300
@@ -29,7 +29,7 @@ HOLDER_BYTES: Final = 300
 
 
 class FolderLock:
-    """Lock of a folder for one purpose, such as recordings or history.
+    """Lock on a folder for one purpose, such as recordings or history.
 
     Parameters
     ----------

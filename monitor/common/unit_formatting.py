@@ -247,7 +247,7 @@ def format_utc(t_s: float) -> str:
 
 
 def format_count(count: int, noun: str) -> str:
-    """Format a number of objects with the singular or plural of a noun.
+    """Format a count together with the singular or plural of a noun.
 
     >>> format_count(1, "frame"), format_count(2000, "frame")
     ('1 frame', '2,000 frames')
@@ -263,7 +263,7 @@ def format_count(count: int, noun: str) -> str:
 
 
 def format_short_count(count: int) -> str:
-    """Format a number of objects with at most five characters.
+    """Format a count with at most five characters.
 
     >>> format_short_count(9_999), format_short_count(123_456), format_short_count(999_999)
     ('9999', '123k', '1M')

@@ -101,7 +101,10 @@ def _restart_tables(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str
 
 
 def _merge(running: Config, new: Config, restart: tuple[str, ...]) -> Config:
-    """Return the new configuration with the old tables that need a restart, so that the next reload reports them."""
+    """Return the new configuration, but keep the old contents of the tables that take effect only after a restart.
+
+    The next reload therefore reports these tables again.
+    """
     table = {key: value for key, value in new.table.items() if key not in restart}
     table |= {key: running.table[key] for key in restart if key in running.table}
     if "log.format" in restart:

@@ -1,4 +1,4 @@
-"""Decoder for CAN sensors that a DBC file describes. The settings assign a CAN signal to each axis.
+"""Decoder for CAN sensors that are described by a DBC file. The settings assign a CAN signal to each axis.
 
 A sample may consist of several CAN messages, which ``drivers.decoders.dbc.sample_assembly`` joins. A sample is rejected
 if a frame is missing or too short, or if the signal ``valid`` is not 1. With ``partial = true``, a sample with a
@@ -8,9 +8,9 @@ lower rate than the samples. Each sample then contains the newest temperature.
 
 J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by the parameter group. The priority and the
 source address are not part of the parameter group. The decoder accepts the first source address that it receives,
-unless the key ``source`` is set. A J1939 value in the top 2/256 of the range means "error" or "not available" (SAE
-J1939-71: 0xFE00 to 0xFFFF of 16 bits), and the axis is marked as not measured. With ``not_available = true``, other
-messages are treated in the same way.
+unless the key ``source`` is set. A J1939 value in the top 2/256 of its range means "error" or "not available", so the
+axis is marked as not measured. For 16-bit values, this part is 0xFE00 to 0xFFFF (SAE J1939-71). Other messages are
+treated in the same way if ``not_available = true``.
 """
 
 from collections.abc import Sequence

@@ -54,7 +54,7 @@ class ConfiguredDbcMessages:
 
     @property
     def messages(self) -> list[CanMessage]:
-        """CAN messages with the configured signals. A message that contains only the counter is the first one."""
+        """CAN messages with the configured signals. A message that contains only the counter comes first."""
         return sorted(self._used.values(), key=lambda m: not m.contains_only_counter)
 
     @contextlib.contextmanager
@@ -140,7 +140,7 @@ class ConfiguredDbcMessages:
         return message, signal
 
     def _register_message(self, message: Any, bits: SignalCodec) -> CanMessage:
-        """Return the entry of a CAN message, and create it if necessary. Extend ``size`` to the end of the signal."""
+        """Return the entry of a CAN message, and create it if necessary. Increase ``size`` to include the signal."""
         extended, j1939 = bool(message.is_extended_frame), self._is_j1939(message)
         new = CanMessage(message.name, message.frame_id, extended, j1939, size=0, length=message.length, columns=[])
         entry = self._used.setdefault(message.name, new)

@@ -6,10 +6,10 @@ frame with a new counter value also starts the next sample. An incomplete sample
 True. Frames before the first complete sample are ignored, since the link may have been opened in the middle of a
 sample.
 
-A frame that arrives more than the time ``window`` after the first frame of the current sample is either late or starts
+A frame that arrives more than ``window`` seconds after the first frame of the current sample either is late or starts
 the next sample. A frame with the counter value of the current sample is late. Without counter values, the order of the
 messages decides whether the frame is late. The first message of a sample is the message with the longest median pause
-before the frame. A frame of the first message starts the next sample. A frame of any other message is late, unless a
+before its frames. A frame of the first message starts the next sample. A frame of any other message is late, unless a
 complete sample period has passed. A frame waits in a queue while the order of the messages is unknown. If all frames of
 a sample have arrived but some were late, the sample is dropped and counted as late, but not as bad.
 """
@@ -33,7 +33,7 @@ MIN_PAUSES: Final = 3
 MAX_UNDECIDED_PER_MESSAGE: Final = 8
 """Maximum number of queued frames per message.
 
-If more frames wait, the message order is estimated from the pauses so far.
+Once the queue is full, the order of the messages is estimated from the pauses measured so far.
 """
 
 

@@ -75,7 +75,7 @@ class Settings(SettingsModel):
     )
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:
-        """Yield a conflict if no axis is configured, or if ``join = "counter"`` has no counter."""
+        """Yield a conflict if no axis is configured, or if ``join = "counter"`` is set without ``counter``."""
         if not self.signals:
             yield Conflict("signals", 'empty; it maps axes to signals: gz = "Message.Signal"')
         elif set(self.signals) == {TEMPERATURE}:

@@ -64,7 +64,7 @@ def _cause(error: Exception) -> str:
 
 
 def _system_error(error: OSError) -> str:
-    """Return the text of a system error. A missing working directory gives a special text."""
+    """Return the text of a system error, or advice if the current folder has been removed or cannot be read."""
     if error.filename is None:
         try:
             os.getcwd()

@@ -187,7 +187,7 @@ def with_viewer_history_length(config: "Config", history_s: float | None) -> "Co
     Raises
     ------
     ConfigError
-        If the configuration stores no history.
+        If no history is stored with this configuration.
     """
     import dataclasses
 

@@ -325,7 +325,7 @@ class DeviceWorker:
 
 
 def _arrivals_are_timed(device: Device, link: Link) -> bool:
-    """Return True if the arrival times of samples show the sample rate."""
+    """Return True if the sample rate can be measured from the arrival times of the samples."""
     simulated = isinstance(device.link, VirtualTable) and device.link.speed != 1.0
     captured = isinstance(link, ReplayLink) and link.epoch == "monotonic"
     return not simulated and not captured

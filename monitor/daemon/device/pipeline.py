@@ -151,7 +151,7 @@ class DevicePipeline:
             self._update_thermal()
 
     def process_samples_held_by_motion_detector(self) -> None:
-        """Process the samples that the motion detector holds back, after the last sample."""
+        """After the last sample, process the samples that the motion detector still holds back."""
         self._update_estimator(self.signal_monitor.flush_delayed_samples() if self.signal_monitor is not None else [])
         self._restart_changed_axes()
         self._update_thermal()
@@ -165,9 +165,9 @@ class DevicePipeline:
             self.arma_worker.adopt_and_start_models(live)
 
     def replay_samples(self, samples: SampleBlock, rate_hz: float) -> None:
-        """Process recorded samples without events, to rebuild the window after a restart of the program.
+        """Process recorded samples without reporting events, to rebuild the window after a restart of the program.
 
-        A change of the noise restarts no axis, because the start of each axis is read from the recording.
+        A noise change does not restart any axis, because the start of each axis is read from the recording.
 
         Parameters
         ----------

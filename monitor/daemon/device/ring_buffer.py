@@ -1,7 +1,7 @@
 """Ring buffer for samples between the reader thread and the worker of a device.
 
 The writer never waits, and a full buffer overwrites the oldest samples. ``RingBuffer.overflowed`` counts the
-overwritten samples. The overwritten samples are also counted as missing before the next block.
+overwritten samples. The field ``lost`` of the next block also includes the overwritten samples.
 """
 
 import threading

@@ -1,4 +1,4 @@
-"""Timeline of the samples of one device: Unix time, present time, and events that wait for a time.
+"""Timeline of the samples of one device: Unix time, present time, and events whose time is not yet known.
 
 The samples of a live sensor carry host monotonic times, which ``SlewedClock`` converts to Unix time. The samples of a
 recording, or of a device with its own time stamps, carry Unix times. Events of a recording wait for the first sample,
@@ -106,7 +106,7 @@ class DeviceTimeline:
             self._events.append(Event(kind, now_ns, text))
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call, except events that still wait for a time."""
+        """Return the events since the last call, except events whose time is not yet known."""
         now_ns = self._now_ns() if self._untimed else None
         if now_ns is not None:
             self._events += [Event(kind, now_ns, text) for kind, text in self._untimed]

@@ -1,7 +1,7 @@
-"""Restore of the estimation window after a restart of the program, from the end of the recording.
+"""Restoration of the estimation window from the end of the recording after a restart of the program.
 
-The pipeline processes the recorded samples of the last window again, without events. The start of each axis and the
-fitted values are read from the recorded state (``segment.DaemonState``).
+The pipeline processes the recorded samples of the last window again, without reporting events. The start of each axis
+and the fitted values are read from the recorded state (``segment_file.DaemonState``).
 """
 
 import time
@@ -20,11 +20,11 @@ from monitor.daemon.storage.recording_tail import RecordingTail
 from monitor.settings.loading import Device
 
 MIN_REPLAY_S: Final = 600.0
-"""Minimum duration of the replayed recording, which change detection needs."""
+"""Minimum duration in s of the replayed recording. Change detection needs this duration."""
 
 
 class WindowRestore:
-    """Restore of the estimation window of one device after a restart of the program.
+    """Restoration of the estimation window of one device after a restart of the program.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Parts of the numerical kernels, each with a function that calls all kernels of the part."""
+"""Groups and parts of the numerical kernels. Each part has a function that calls all its kernels."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -102,9 +102,9 @@ def _call_reconciliation() -> None:
 
 
 WINDOW: Final = "Allan deviation"
-"""Name of the part with the kernels of the sliding window."""
+"""Name of the part that contains the kernels of the sliding window."""
 FIT: Final = "noise coefficients"
-"""Name of the part with the kernels of the fit."""
+"""Name of the part that contains the kernels of the fit."""
 SERVICE: Final = KernelGroup(
     "service",
     (

@@ -1,4 +1,4 @@
-"""Flags of the compiled kernels of the service, and their compilation in the background."""
+"""Compilation of the service kernels in the background, with flags that show which kernels are compiled."""
 
 import threading
 import time
@@ -20,11 +20,11 @@ class KernelReadiness:
     """Flags that show which kernels are compiled."""
 
     window: threading.Event = field(default_factory=threading.Event)
-    """Set if the kernels of the Allan deviation are compiled."""
+    """Set once the kernels for the Allan deviation are compiled."""
     fit: threading.Event = field(default_factory=threading.Event)
-    """Set if the kernels of the noise coefficients are compiled."""
+    """Set once the kernels for the noise coefficients are compiled."""
     all: threading.Event = field(default_factory=threading.Event)
-    """Set if all kernels of the service are compiled."""
+    """Set once all kernels of the service are compiled."""
     progress: str = ""
     """Progress of the compilation as one line of text, or "" after the compilation."""
     interpretable_hz: float = MAX_INTERPRETED_HZ

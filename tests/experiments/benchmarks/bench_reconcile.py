@@ -49,7 +49,7 @@ REAL: Final = "adis16405/run1.npz"
 
 
 def hidden_effects(duration_s: float) -> dict[str, tuple[Effect, ...]]:
-    """Return 20 effects on six axes that are missing in the model."""
+    """Return 20 effects on six axes that are missing from the model."""
     return {
         "gx": (
             Sinusoidal(amplitude=5e-5, frequency=17.3),
