@@ -33,7 +33,7 @@ SMALL_RESULT_BYTES: Final = 1000
 """Approximate memory size of a result without large arrays."""
 
 TimedResult = tuple[float, Any]
-"""Pair of a Unix time [s] and the result of that time."""
+"""Unix time [s] and the result at this time."""
 Merge = Callable[[list[TimedResult], TimedResult], None]
 """Function that merges a new result into the results that wait to be drawn."""
 
@@ -81,9 +81,10 @@ def keep_newest(waiting: list[TimedResult], new: TimedResult) -> None:
 
 
 def keep_newest_and_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
-    """Append the new result, and drop the previous result if it is less than POINT_INTERVAL_S after the result before.
+    """Append the new result, and drop the previous result if the remaining results are closely spaced.
 
-    The new estimate takes over the coefficient history of a dropped estimate. The parameters are those of ``keep_all``.
+    The previous result is dropped if the result before it is less than POINT_INTERVAL_S older than the new result. The
+    new estimate takes over the coefficient history of a dropped estimate. The parameters are those of ``keep_all``.
     """
     if len(waiting) > 1 and new[0] - waiting[-2][0] < POINT_INTERVAL_S:
         _, previous = waiting.pop()

@@ -212,8 +212,8 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics
 def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[AlternativeEffect, ...]]:
     """Return the probability of the selected effect, and the most probable alternative effects.
 
-    Each probability is proportional to exp(score), and all trials of the search round count. The hypothesis without
-    any effect has the score 0.
+    Each probability is proportional to exp(score) and is normalised over all effects tried in the search round. The
+    hypothesis without any effect has the score 0.
     """
     best: dict[str, float] = {"": 0.0}
     for trial in trials:

@@ -112,8 +112,8 @@ def reconcile(
     map_function : callable, optional
         Function with the signature of ``map`` that distributes the work on axes.
     report_stage : callable, optional
-        Function that is called with the name of each stage. During the search, the function is called with the
-        completed share after each axis, possibly from another thread.
+        Function that is called with the name of each stage. During the search, the function is also called after each
+        axis with the fraction completed so far, possibly from another thread.
 
     Returns
     -------
@@ -196,7 +196,7 @@ def _fit_terms(axis: Axis) -> Effects:
 def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
     """Return the effects of each recorded axis without constant biases, because the mean is always fitted.
 
-    The search may add a floor to a low-pass filter without floor, so such a filter has the floor 0.
+    The search may add a floor to a low-pass filter that has none, so such a filter is given a floor of 0.
     """
     return {
         axis: tuple(

@@ -23,7 +23,7 @@ FindingKind = Literal[
     "repeated_rows",
     "too_short",
 ]
-"""Kind of a fault of the recording, the most serious kind first."""
+"""Kinds of faults of a recording, the most serious first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +144,7 @@ class AddedOrResizedEffect:
 class RemainingGap:
     """Part of the gap of an axis that no effect explains."""
 
-    group: str  # group of diagnostics that see the same difference
+    group: str  # group of diagnostics that detect the same difference
     strongest: DiagnosticGap  # strongest diagnostic of the group
     gain_nats: float
 

@@ -297,7 +297,7 @@ class Storage(SettingsModel):
     history: bool = Field(True, description="keep results, events and status for years, thinned with age")
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:
-        """Yield a conflict if segments would be deleted before completion."""
+        """Yield a conflict if segments would be deleted before they are complete."""
         if self.keep_s < self.segment_s:
             text = f"{self.keep_s:g} s is shorter than a segment of {self.segment_s:g} s"
             yield Conflict("keep", text, ("segment",))

@@ -50,7 +50,7 @@ class FaultCounts:
         return self.sent + self.lost + self.flipped + self.cut + self.dropped
 
     def count_sample(self, kind: FaultKind, all_sent: bool) -> None:
-        """Add one sample to the number of samples with the same fault.
+        """Increment the counter for the fault of a sample.
 
         Parameters
         ----------

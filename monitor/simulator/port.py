@@ -36,7 +36,7 @@ class Port:
         raise NotImplementedError
 
     def unplug(self) -> None:
-        """Disconnect the simulated sensor from the link, like pulling a cable."""
+        """Disconnect the simulated sensor from the link, as if a cable were pulled."""
         raise NotImplementedError
 
     def send_and_count_chunks(self, chunks: Sequence[Chunk]) -> int:

@@ -21,7 +21,7 @@ from monitor.simulator.faults import DrawnFaults, FaultCounts, Faults
 from monitor.simulator.port import create_port
 
 BURST_S: Final = 0.01
-"""Time between bursts of samples in s, similar to a USB adapter."""
+"""Time between bursts of samples in s, chosen to resemble a USB adapter."""
 MAX_DELAY_S: Final = 1.0
 """Delay in s above which the sensor skips samples instead of catching up."""
 

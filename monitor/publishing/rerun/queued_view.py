@@ -97,7 +97,7 @@ class RerunView:
         self._thread.start()
 
     def set_detailed_devices(self, devices: Sequence[ViewerDeviceDescription]) -> None:
-        """Set the devices to show in detail. A new device must be set before its first result is queued."""
+        """Set the devices to show in detail. A new device must be included before its first result is queued."""
         self._devices = tuple(devices)
 
     def put(self, device: str, unix_s: float, result: Any) -> None:

@@ -1,8 +1,8 @@
 """Outputs of a Rerun stream: a viewer window, a web page or a file.
 
-A window and a web page use a Rerun server in a separate process, so that the data of the viewer do not use the memory
-of the daemon. The viewer program is started directly, because it would continue to run if its Python wrapper were
-killed. The program listens only on the loopback interface and sends no usage statistics.
+A window and a web page use a Rerun server in a separate process, so that the viewer data do not take up memory in the
+daemon. The viewer program is started directly, because it would continue to run if its Python wrapper were killed. The
+program listens only on the loopback interface and sends no usage statistics.
 
 Rerun raises no error if a port is in use, so ports are checked first. If a Rerun server already listens on the port of
 a window, the daemon connects to this server. If the port of the web page is in use, the next free port is used.
@@ -164,7 +164,7 @@ def viewer_program_path() -> Path:
 
 
 def _death_signal_prefix() -> list[str]:
-    """Return a command prefix with which a program ends as soon as the thread that started it ends (Linux only).
+    """Return a command prefix that makes a program end as soon as the thread that started it ends (Linux only).
 
     Without the program ``setpriv`` (util-linux), the viewer continues to run after the daemon has been killed.
     """
@@ -277,7 +277,7 @@ def _open_file(path: Path, recording_id: str) -> RerunStreamWithSink:
             raise ViewerError(f"cannot lock {path}: {error.strerror}") from error
     try:
         stream = _stream(recording_id)
-        # For a footer, Rerun would keep data about every chunk in memory while the daemon runs.
+        # To write a footer, Rerun would keep data about every chunk in memory while the daemon runs.
         stream.set_sinks(rr.FileSink(path, write_footer=False))
     except BaseException:
         lock.close()

@@ -1,8 +1,8 @@
-"""Text output to a terminal, a pipe or a file in a separate thread, so that a blocked output delays no other thread.
+"""Text output to a terminal, a pipe or a file in a separate thread, so that a blocked write delays no other thread.
 
-A write call blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) or no program reads a pipe.
-``QueuedWriter`` queues lines, drops the oldest lines if the queue is full, and can redraw a table periodically. The
-property ``state`` reports the number of lost lines and of lost drawings of the table (frames).
+A write call blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) or while no program reads from a
+pipe. ``QueuedWriter`` queues lines, drops the oldest lines if the queue is full, and can redraw a table periodically.
+The property ``state`` reports how many lines and table frames were lost.
 
 The thread writes to the file descriptor and not to ``sys.stdout``, because a blocked write to ``sys.stdout`` holds the
 lock of the stream. If this lock is held, the interpreter aborts at exit.
@@ -118,7 +118,7 @@ class QueuedWriter:
         self._queue.push(text, len(text))
 
     def request_redraw(self) -> None:
-        """Request a call of ``render`` before the current period ends."""
+        """Request that ``render`` be called before the current period ends."""
         self._queue.wake()
 
     def finish_writing(self, stop: threading.Event) -> None:

@@ -75,7 +75,7 @@ def print_thermal_prediction(report: ThermalPredictionReport, console: Console) 
 
 
 def notes_on_temperature_dependence(removal: TemperatureRemovalComparison) -> list[str]:
-    """Return a note for each axis on which temperature explains much of the slow variance, of K or of R."""
+    """Return a note for each axis on which temperature explains much of the variance of means, of K or of R."""
     notes = []
     for axis, one in removal.dependences.items():
         fallen = [

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MAX_QUEUED_QUERIES: Final = 64
 """Capacity of the command queue and of each zenoh channel that receives queries."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Time [s] for which another program with the same key is reported after its last message."""
+"""Time [s] for which another program with the same key is still reported after its last message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,7 +363,7 @@ class _DuplicatePublishers:
         self._subscribers, self._heard_s = {}, {}
 
     def duplicate_publisher_message(self, now_s: float) -> str:
-        """Return a warning if another program has published the status of a device in the last DUPLICATE_REPORT_S."""
+        """Return a warning if another program published a device's status in the last DUPLICATE_REPORT_S seconds."""
         for device, one in self._subscribers.items():
             with contextlib.suppress(*zenoh_errors()):  # the session is being closed
                 if one.handler.try_recv() is not None:
@@ -400,7 +400,7 @@ def _reply_error(query: Any, error: ImuError) -> None:
 
 
 def _free_port(endpoint: str) -> str:
-    """Return a TCP endpoint with a free port instead of its own port. Other endpoints are returned unchanged."""
+    """Return a TCP endpoint with its port replaced by a free port. Other endpoints are returned unchanged."""
     match = re.fullmatch(r"tcp/\[?([^\]]+?)\]?:\d+", endpoint)
     if match is None:
         return endpoint

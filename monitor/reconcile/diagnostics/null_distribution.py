@@ -5,9 +5,9 @@ maximum over many places, such as frequencies or times. If the noise is Gaussian
 depends only on the effective number of independent places (``NULL_GAINS``). Let q be the upper quartile of the gain.
 Above q, the density of a gain g is modelled as exp(−(g − q)/s).
 
-One simulated recording checks that the noise model is Gaussian enough. If a gain is improbably large, more recordings
-are simulated. The gains of all recordings increase the thresholds if they stay improbably large. A model that is not
-Gaussian is always simulated ``SIMULATED_RECORDINGS`` times.
+One simulated recording is used to check that the noise model is Gaussian enough. If a gain is improbably large, more
+recordings are simulated. If a gain is improbably large in all ``SIMULATED_RECORDINGS`` recordings, the simulated gains
+can increase the thresholds. A model that is not Gaussian is always simulated this number of times.
 
 If the noise model is true, 1 % of all recordings exceed a threshold in any diagnostic on any axis.
 """
@@ -32,7 +32,7 @@ UPPER_QUANTILE: Final = 0.25
 EXCESS_RANGE_NATS: Final = (1.0, 1.3)
 """Range of the mean excess of simulated gains over the upper quartile."""
 IMPROBABLE: Final = 0.002
-"""Probability of a gain that asks for another simulated recording."""
+"""Probability below which a gain is improbably large, so that another recording is simulated."""
 AXIS_MARGIN_NATS: Final = 3.0
 """Margin between the largest simulated gain of an axis and the threshold, in nats."""
 
@@ -51,8 +51,8 @@ class NullDistribution:
     def search_threshold(self) -> float:
         """Gain above which the search tests the effects one by one, in nats.
 
-        A true model exceeds the mean of both quantiles in about one of six recordings. The penalties of the effects
-        then prevent wrong names.
+        With a true model, a gain exceeds the mean of both quantiles in about one of six recordings. The penalties of
+        the effects then prevent wrong effects.
         """
         return 0.5 * (self.null95 + self.threshold)
 
@@ -113,8 +113,8 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
     Parameters
     ----------
     simulated : mapping of str to sequence of Findings
-        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. The gains of the axes with all
-        recordings can increase the thresholds of these axes.
+        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. If an axis has all recordings, the
+        gains can increase the thresholds of this axis.
     """
     chance = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * max(len(simulated), 1))
     complete = [axis for axis, of in simulated.items() if len(of) >= SIMULATED_RECORDINGS]
@@ -133,7 +133,10 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
 
 
 def _simulated_null_distribution(pooled: Sequence[float], largest: float, chance: float) -> NullDistribution:
-    """Return the null distribution from the gains of several axes, unless the largest gain of the axis is larger."""
+    """Return the null distribution from the gains of several axes.
+
+    The threshold is raised if it would be less than ``AXIS_MARGIN_NATS`` above the largest gain of the axis.
+    """
     quartile = float(np.quantile(pooled, 1.0 - UPPER_QUANTILE))
     excess = [gain - quartile for gain in pooled if gain > quartile]
     scale = float(np.clip(np.mean(excess) if excess else EXCESS_RANGE_NATS[0], *EXCESS_RANGE_NATS))

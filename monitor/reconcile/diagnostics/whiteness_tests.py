@@ -43,7 +43,7 @@ FIRST_LINE_BIN: Final = 4
 TRANSIENT_TIME_FRACTIONS: Final = 0.3 / 3.0 ** np.arange(6)
 TEMPERATURE_DELAYS_S: Final = (10.0, 30.0, 90.0, 270.0, 810.0)
 HYSTERESIS_FRACTIONS: Final = (0.05, 0.2)
-"""Reversals of the tested hystereses, as fractions of the temperature range."""
+"""Values of the parameter ``reversal`` of the tested hysteresis, as fractions of the temperature range."""
 MAX_STEP_GRID: Final = 1 << 15
 """Number of times on a coarse grid for the weights of steps in a long recording."""
 STEP_MARGIN_FRACTION: Final = 0.001
@@ -312,11 +312,11 @@ def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> Finding:
 
 
 def _common_vibration_columns(whitened: WhitenedAxis, source: Floats) -> list[Floats]:
-    """Return the best prediction of each common vibration of the axis from another axis, up to a factor.
+    """Return the best prediction of each common vibration of the axis from another axis, up to a constant factor.
 
-    If both axes contain the vibration with the variance c of a coefficient, the prediction from the other axis Y with
-    the variance v is proportional to Y c/v. The variance is estimated from the other coefficients nearby, because the
-    ratio Y/v would otherwise be biased.
+    Let c be the variance of a coefficient of the vibration, Y the coefficient of the other axis, and v the variance of
+    Y. If both axes contain the vibration, the prediction is proportional to Y c/v. The variance v is estimated from the
+    other coefficients nearby, because the ratio Y/v would otherwise be biased.
     """
     vibrations = [at for at, effect in enumerate(whitened.effects) if isinstance(effect, CommonVibration)]
     if not vibrations:

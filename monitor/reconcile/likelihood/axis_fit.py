@@ -57,7 +57,7 @@ MIN_CACHED_SERIES: Final = 8
 """Smallest number of cached series that are not smooth."""
 MAX_CACHED_SMOOTH_SERIES: Final = 128
 SMOOTH_EFFECTS: Final = (RateRamp, BiasCurve, TemperatureBias, TemperatureLag, TurnOnTransient)
-"""Deterministic effects that change slowly, unless the time constant is short."""
+"""Deterministic effects that change slowly if the time constant is not short."""
 MIN_BLOCKS_PER_TIME_CONSTANT: Final = 16
 """Smallest time constant of a smooth effect, in blocks of the smooth transform."""
 WHOLE_RECORDING: Final = slice(None)
@@ -65,7 +65,7 @@ MAX_CACHED_PRODUCTS: Final = 2048
 MAX_CACHED_BASES: Final = 512
 MAX_CACHED_UNIT_EFFECTS: Final = 4096
 INITIAL_FLOOR_RATIO: Final = 1e-3
-"""Smallest starting value of the white noise behind a low-pass filter, relative to the total power."""
+"""Smallest starting value of the white noise added after a low-pass filter, relative to the total power."""
 Effects = tuple[Effect, ...]
 """Effects of one axis."""
 Regressor = tuple[Effect, int]
@@ -109,7 +109,7 @@ class RegressorCache:
         self._transform_smooth = lru_cache(MAX_CACHED_SMOOTH_SERIES)(compute_smooth_transforms)
 
     def restrict_to_part(self, part: slice) -> "RegressorCache":
-        """Return the cache for a part of the recording, which is kept for the next call.
+        """Return the cache for a part of the recording, and keep the cache for the next call.
 
         The regressors still begin at the start of the recording.
         """
@@ -301,7 +301,7 @@ class Axis:
 
     def _compute_variance_basis(self, effect: Effect, gains: Effects, transforms: Sequence[Transform]) -> Floats:
         tau0_s = 1.0 / self.rate_hz
-        if isinstance(effect, BandwidthLimit):  # the floor is white noise behind the filter
+        if isinstance(effect, BandwidthLimit):  # the floor is white noise added after the filter
             transforms = transforms[transforms.index(replace(effect, floor=None)) + 1 :]
             source = white_noise_spectrum(1.0 / tau0_s, tau0_s)
         else:
@@ -442,7 +442,7 @@ def _with_fitted_sizes(
 
 
 def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bins: FrequencyBins) -> Floats:
-    """Return the spectral density, shape (m,), of a noise source behind the signal chain of an axis.
+    """Return the spectral density, shape (m,), that a noise source has after the signal chain of an axis.
 
     If the source is None, only the noise of the signal chain is returned. Saturation is ignored, because clipped
     samples were replaced.
@@ -458,12 +458,12 @@ def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bin
 
 @lru_cache(MAX_CACHED_UNIT_EFFECTS)
 def _with_unit_noise_size(effect: Effect) -> Effect:
-    """Return a noise effect with the size one, as a part of a key of the cache."""
+    """Return a noise effect of size one, for use in a cache key."""
     return with_effect_size(effect, 1.0)
 
 
 @lru_cache(MAX_CACHED_UNIT_EFFECTS)
 def _with_unit_size(regressor: Regressor) -> Regressor:
-    """Return a regressor whose effect has the size one, as a key of the cache."""
+    """Return the regressor with an effect of size one, for use as a cache key."""
     effect, at = regressor
     return with_regressor_factors(effect, np.ones(MAX_REGRESSORS)), at

@@ -90,7 +90,7 @@ MAX_REGRESSORS: Final = 3
 
 NON_GAUSSIAN_NOISES: Final = (PoissonSteps, RandomTelegraph)
 GAUSSIAN_TRANSFORMS: Final = (BandwidthLimit, ConstantBias, Resolution, SampleRateError, ScaleFactor)
-"""Effects without a size that keep Gaussian noise Gaussian and stationary. Quantization does so if the step is fine."""
+"""Effects without a size that keep Gaussian noise Gaussian and stationary. Quantization does so with small steps."""
 
 ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient", "bias_curve"})
 """Names of the effects that happen at most once in a recording."""
@@ -198,7 +198,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
 
 
 def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
-    """Return a copy of an effect that equals the sum of the regressors times the given factors.
+    """Return a copy of an effect whose series is the sum of the regressors multiplied by the given factors.
 
     Parameters
     ----------

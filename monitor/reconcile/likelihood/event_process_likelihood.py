@@ -199,8 +199,9 @@ def _flicker_processes(background: BackgroundNoise, block_s: float, duration_s: 
     """Return the standard deviations and correlation times of processes whose sum is flicker noise.
 
     The sum has the spectral density B²/(2πf) from the inverse of the recording length up to the frequency at which
-    white noise dominates. For processes of equal variance s and correlation times of ratio ρ, the sum has the density
-    (s π/ln ρ)/(2πf) (Keshner, "1/f noise", Proc. IEEE 70, 1982). The variance is therefore s = B² ln ρ/π.
+    white noise dominates. If all processes have the variance s and successive correlation times have the ratio ρ, the
+    sum has the density (s π/ln ρ)/(2πf) (Keshner, "1/f noise", Proc. IEEE 70, 1982). The variance s is therefore
+    B² ln ρ/π.
     """
     if background.flicker <= 0.0:
         return []

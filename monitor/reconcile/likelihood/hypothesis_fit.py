@@ -23,8 +23,8 @@ from monitor.reconcile.result import ParameterInterval
 RESIZE_PENALTY_NATS: Final = 7.0
 """Smallest log-likelihood gain, in nats, for a new size of a noise effect of the model.
 
-By chance, the size of a true noise effect gains more than 7 nats with the probability P(χ²₁ > 14) = 0.02 %. A recording
-with six axes has about 24 sizes, so one of 200 recordings contains such a size.
+If the size in the model is true, the gain exceeds 7 nats by chance with the probability P(χ²₁ > 14) = 0.02 %. A
+recording with six axes has about 24 sizes, so this occurs in about one of 200 recordings.
 """
 GOLDEN: Final = 0.6180339887498949
 SHAPE_ITERATIONS: Final = 12

@@ -24,8 +24,7 @@ LINEAR_RANGE_SIGMA: Final = 6.0
 """Magnitude, in standard deviations, up to which the bins have equal width."""
 TOTAL_BINS: Final = 1024
 BINS_PER_LOG_UNIT: Final = 34.0
-"""Number of bins per factor e beyond the linear range.
-"""
+"""Number of bins per factor of e beyond the linear range."""
 BIN_EDGES: Final = np.concatenate(
     [
         np.arange(LINEAR_BINS) * LINEAR_RANGE_SIGMA / LINEAR_BINS,
@@ -141,7 +140,7 @@ def student_misfit_z(residuals: Floats, fit: StudentFit) -> float:
 
 
 def convert_student_to_gaussian(values: Floats, nu: float) -> Floats:
-    """Convert values with Student's t distribution to values with a standard normal distribution.
+    """Convert values that follow Student's t distribution to values that follow a standard normal distribution.
 
     Parameters
     ----------

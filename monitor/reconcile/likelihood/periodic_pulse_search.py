@@ -148,7 +148,7 @@ def _fold_and_fit(series: Floats, period: float) -> _FoldedPulse:
 
 
 def _fold_bin_count(n: int, period: float) -> int:
-    """Return a number of bins with nearly equal numbers of samples. ``period`` is in samples."""
+    """Return a number of bins such that all bins contain nearly equally many samples. ``period`` is in samples."""
     whole = max(round(period), 2)
     drift = abs(period - whole) * n / period  # in samples, until the end of the recording
     return int(min(whole if drift < 1.0 else BINS_PER_SAMPLE * whole, MAX_FOLD_BINS))

@@ -37,7 +37,7 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
 BLOCKS_PER_CROSSING_TIME: Final = 3.0
 """Number of blocks in the time N/K, after which a random walk exceeds white noise."""
 JUMP_AGES: Final = 16
-"""Number of hypotheses about the block of the last jump, which cover five times N/K.
+"""Number of hypotheses about the age of the last jump. The ages cover five times N/K.
 
 With a coverage of 2.7 times N/K, the estimated rate would be 5 to 10 % too low.
 """

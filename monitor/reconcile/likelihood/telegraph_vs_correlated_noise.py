@@ -34,10 +34,9 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
 BLOCKS_PER_CORRELATION_TIME: Final = 8.0
 """Number of blocks in a correlation time."""
 MAX_FINE_BLOCKS: Final = 20_000.0
-"""Largest number of blocks to which a recording is divided to resolve the switches."""
+"""Largest number of blocks into which a recording is divided to resolve the switches."""
 MIN_SAMPLES_PER_BLOCK: Final = 20
-"""Smallest number of samples in a block, unless the correlation time is too short.
-"""
+"""Smallest number of samples in a block. Blocks are shorter if the correlation time or the recording is short."""
 START_AMPLITUDE_FACTORS: Final = np.geomspace(0.5, 2.0, 7)
 """Starting amplitudes as multiples of 2 σ, because the likelihood has several maxima."""
 START_DWELL_FACTORS: Final = (0.35, 1.0)
@@ -226,7 +225,7 @@ def _weigh_cases(
 
 @compiled
 def _merge_returning_case(weight: Floats, pull: Floats, known: Floats) -> None:
-    """Merge the case of a level change and return into the case of a constant level."""
+    """Merge the case in which the level changes and returns with the case of a constant level."""
     back = weight[1] / (weight[0] + weight[1])
     apart = pull[1] - pull[0]
     pull[0] += back * apart

@@ -46,7 +46,7 @@ MIN_SQUARES_FOR_DECREASE: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class VarianceStep:
-    """Step of the noise variance at one time."""
+    """Single step of the noise variance."""
 
     gain: float  # log-likelihood gain over a constant variance, nats
     time: ValueWithInterval  # s from the first sample
@@ -82,7 +82,7 @@ class VarianceChangeGains:
 class SpectrogramChange:
     """Tile and row of a spectrogram with the largest change of power over time."""
 
-    gain: float  # log-likelihood gain of a separate power for the tile, nats
+    gain: float  # log-likelihood gain from fitting a separate power to the tile, nats
     time: tuple[float, float]  # time range of the tile, s from the first sample
     frequency: tuple[float, float]  # frequency range of the tile, Hz
     row_gain: float  # −ln of the probability that a row of constant power varies as much, nats
@@ -269,8 +269,8 @@ def _fit_modulation(energy: Floats, angle: Floats) -> Floats:
 def _slow_variation_gain(scores: Floats, length: int) -> float:
     """Return the log-likelihood gain of a slow random variation of the variance.
 
-    Let p be the mean power of the K lowest frequencies. A separate variance for these frequencies has the gain K (p − 1
-    − ln p). The result is the largest gain of all K = 2^j with p > 1.
+    Let p be the mean power of the K lowest frequencies. Fitting a separate variance to these frequencies has the gain K
+    (p − 1 − ln p). The result is the largest gain of all K = 2^j with p > 1.
     """
     ordinates = np.abs(np.fft.rfft(scores)[1 : scores.size // 2]) ** 2 * length / (2.0 * scores.size)
     ends = 2 ** np.arange(2, int(np.log2(max(ordinates.size, 4))) + 1)
@@ -280,7 +280,7 @@ def _slow_variation_gain(scores: Floats, length: int) -> float:
 
 
 class _TileScore(NamedTuple):
-    """Spectrogram tile with the log-likelihood gain of a separate power."""
+    """Spectrogram tile with the log-likelihood gain from fitting a separate power to the tile."""
 
     gain: float  # nats
     piece_samples: int
@@ -363,10 +363,11 @@ def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]
 
 @compiled
 def _best_contrast(x: Floats, total: Floats, inside: int, whole: int) -> tuple[float, int]:
-    """Return the largest gain of a separate power for one tile of each row, and the index of the row.
+    """Return the largest gain from fitting a separate power to one tile of each row, and the index of the row.
 
     Let x be the sum of c squares in the tile, and R the sum of the other d squares of the row. The gain is (c+d)/2
-    ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d). A low power of only a few squares is ignored.
+    ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d). A low power is ignored if the tile has fewer than
+    ``MIN_SQUARES_FOR_DECREASE`` squares.
     """
     outside = whole - inside
     best, place = -1.0, 0

@@ -1,4 +1,4 @@
-"""Whitening of an axis by a fitted noise model.
+"""Whitening of an axis with a fitted noise model.
 
 If the model is true, the whitened coefficients are independent and have a variance of one.
 """
@@ -28,14 +28,14 @@ SLOW_BAND_FRACTION: Final = 0.01
 """Fraction of the frequency range, from zero, that the tests for outliers and variance changes ignore.
 """
 MIN_NOISE_GAIN: Final = 1e-3
-"""Smallest gain of the white noise by which a series is divided."""
+"""Lower limit of the gain of the white noise. A series is divided by this gain."""
 MIN_DENSITY_RATIO: Final = 1e-3
 """Smallest spectral density of a bin relative to the median. Bins below this limit are stop bands."""
 
 
 @dataclass(frozen=True, eq=False)
 class WhitenedAxis:
-    """Axis whitened by a fitted noise model."""
+    """Axis whitened with a fitted noise model."""
 
     fit: AxisFit
     coefficients: Floats  # [n − 1] coefficients divided by the standard deviation; random draws in stop bands
@@ -83,7 +83,7 @@ class WhitenedAxis:
 
     @cached_property
     def unexplained_spectrogram_change(self) -> SpectrogramChange:
-        """Largest change of power in the spectrogram that no noise step and no heavy tails of the model explain."""
+        """Largest change of power in the spectrogram that noise steps and heavy tails of the model do not explain."""
         return find_spectrogram_change(_with_constant_gaussian_noise(self.series, self.fit), 1.0 / self.axis.rate_hz)
 
     @cached_property
@@ -93,7 +93,7 @@ class WhitenedAxis:
 
 
 def whiten_axis(fit: AxisFit) -> WhitenedAxis:
-    """Whiten an axis by a fitted noise model."""
+    """Whiten an axis with a fitted noise model."""
     axis = fit.axis
     weight = axis.bins.expand_to_coefficients(axis.used_bins / np.sqrt(fit.whittle.variance))
     whitened = fit.cosine_transform_without_deterministic_effects() * weight

@@ -231,6 +231,9 @@ def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> flo
 
 
 def _brownian_bridge(length: int, variance: float, rng: np.random.Generator) -> Floats:
-    """Return a random walk with zero at both ends. ``variance`` is the variance per sample."""
+    """Return a random walk that is zero just before the first sample and just after the last sample.
+
+    ``variance`` is the variance per sample.
+    """
     walk = np.cumsum(rng.standard_normal(length + 1)) * variance**0.5
     return np.asarray(walk[:-1] - walk[-1] * np.arange(1, length + 1) / (length + 1))

@@ -366,8 +366,8 @@ def _continuous_clipping_gain(values: Floats, end: float, step: float, noise: fl
 def _stepped_clipping_gain(values: Floats, end: float, step: float, noise: float) -> float:
     """Return the gain of clipping at the highest level for values on a grid.
 
-    The gain is the smaller gain of two tests. The first test compares the counts of the highest levels. The second test
-    predicts each sample from the neighbouring samples.
+    The gain is the smaller of the gains of two tests. The first test compares the counts of the highest levels. The
+    second test predicts each sample from the neighbouring samples.
     """
     if noise < MIN_NOISE_TO_STEP_CLIPPING * step:
         return 0.0
@@ -440,8 +440,9 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: f
 def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: int) -> RepeatedSamples | None:
     """Return the repeated samples in values on a grid.
 
-    Repeats, outliers and modulated noise all increase the number of zero differences between neighbours. Only repeats
-    have little influence on the differences over two samples. The result has the smaller gain of both tests.
+    Repeats, outliers and modulated noise all increase the number of zero differences between neighbours. Unlike
+    outliers and modulated noise, repeats have little influence on the differences over two samples. The result has the
+    smaller of the gains of two tests, with and without the differences over two samples.
     """
     most = int(np.clip(np.ceil(SIGMA_PER_MEAN_DISTANCE * 2.0**0.5 * differences.mean()), 2, 64))
     counts, chance, gain = _zero_difference_excess(differences, most)

@@ -1,4 +1,4 @@
-"""Check whether the axes of a triad are in another order than in the model.
+"""Check whether the axes of a triad are in a different order than in the model.
 
 The spectrum of each recorded axis is compared with the spectrum of each axis of a simulation. One common factor of the
 three axes is fitted, because the unit may also be wrong. The noise of a real sensor varies from run to run, so the
@@ -25,9 +25,9 @@ LEVEL_LOG_SIGMA: Final = 0.12
 BAND_LOG_SIGMA: Final = 0.2
 """Standard deviation of the logarithm of the power in one band, relative to the axis, between runs (empirical)."""
 MAX_BAND_COST_NATS: Final = 10.0
-"""Largest cost of one band in nats. The limit keeps the cost of a moved line small."""
+"""Largest cost in nats of a different power in one band. The limit keeps the cost of a moved line small."""
 MAX_AXIS_COST_NATS: Final = 32.0
-"""Largest cost of the level of one axis in nats."""
+"""Largest cost in nats of a different noise level on one axis."""
 CORRELATED_BANDS: Final = 3.0
 """Number of neighbouring bands with correlated deviations (empirical)."""
 SWAP_PENALTY_NATS: Final = 1.0
@@ -137,7 +137,7 @@ def describe_axis_order(triad: Sequence[str], found: TriadOrder) -> RecordingFin
     return RecordingFinding(
         "axes_permuted",
         tuple(moved),
-        f"The columns of the {_sensor_name(triad)} are in another order than in the model: {pairs}. "
+        f"The columns of the {_sensor_name(triad)} are in a different order than in the model: {pairs}. "
         f"The columns were put in the order of the model.",
         {column: ParameterInterval(axis) for column, axis in moved.items()},
         {"gain_nats": found.gain},

@@ -41,7 +41,7 @@ SIMULATION_SEED_OFFSET: Final = 1_000_003
 
 @dataclass(frozen=True, slots=True)
 class CheckedRecording:
-    """Corrected recording with the faults that were found."""
+    """Corrected recording, and the faults that were found."""
 
     recording: Recording
     findings: tuple[RecordingFinding, ...]  # the most serious fault first
@@ -55,7 +55,7 @@ def check_recording(recording: Recording, model: NoiseModel | None, seed: int) -
     recording : Recording
         Recording to check.
     model : NoiseModel or None
-        Model under test. If None, only the checks that need no model run.
+        Model under test. If None, only the checks that do not need a model are run.
     seed : int
         Seed of the simulation of the model.
     """

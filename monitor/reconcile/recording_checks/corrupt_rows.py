@@ -36,11 +36,11 @@ SIMULATED_HEAD_SAMPLES: Final = 256
 """Number of samples in a simulation of the first rows."""
 HEAD_SIMULATIONS: Final = 8
 MAX_HEAD_RATIO: Final = 3.0
-"""Largest distance of a first row that the model explains, relative to the largest simulated distance."""
+"""Largest distance of a first row, relative to the largest simulated distance, that the model can explain."""
 NEIGHBOURS: Final = 5
 """Number of samples on each side that contribute to the median."""
 PREFILTER_DISTANCE: Final = 4.0
-"""Smallest difference of successive samples, in standard deviations, for which a sample is examined."""
+"""Difference between successive samples, in standard deviations, above which the samples are examined."""
 SIGMA_PER_MEAN_STEP: Final = 0.8862269254527580
 """√π/2, the ratio of σ to the mean absolute difference of two samples of Gaussian noise."""
 BLOCK_SAMPLES: Final = 64
@@ -122,9 +122,9 @@ def compute_distances_from_neighbours(y: Floats) -> tuple[Ints, Floats]:
 
 
 def estimate_sample_noise(y: Floats) -> float:
-    """Estimate the standard deviation of the sample noise as the median over blocks, or return 0 without blocks.
+    """Estimate the standard deviation of the sample noise as the median over blocks.
 
-    Blocks with missing samples are not used.
+    Blocks with missing samples are not used. If no block remains, the result is 0.
     """
     steps = np.abs(np.diff(y))
     blocks = steps[: steps.size // BLOCK_SAMPLES * BLOCK_SAMPLES].reshape(-1, BLOCK_SAMPLES).mean(axis=1)
@@ -159,7 +159,7 @@ def _find_corrupt_rows(distance: Floats) -> Ints:
 
 
 def _exclude_outliers(rows: Ints, of_axes: Floats, model: NoiseModel | None) -> Ints:
-    """Return the rows without the rows between the ends that may be outliers.
+    """Return the corrupt rows, except for rows that may be outliers. Rows at the ends are kept.
 
     Outliers occur at several times. Without a model, a moderate distance on a single axis may also be an outlier.
     """

@@ -41,7 +41,7 @@ class RobustBandSpectrum:
 
 
 def compute_robust_spectrum(y: Floats, rate_hz: float) -> RobustBandSpectrum | None:
-    """Compute the robust spectrum of one axis, or return None without noise or with too few complete blocks.
+    """Compute the robust spectrum of one axis, or return None if there is no noise or too few complete blocks.
 
     Parameters
     ----------

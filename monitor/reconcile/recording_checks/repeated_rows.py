@@ -21,7 +21,7 @@ MIN_AXES: Final = 3
 MIN_SHARE: Final = 0.02
 """Smallest share of repeated rows that is reported."""
 MAX_CHANCE_SHARE: Final = 0.1
-"""Largest product of the shares of repeats of the axes. Values with a coarser resolution repeat too often by chance."""
+"""Largest share of rows that repeat by chance. If the resolution is too coarse, the share is larger."""
 
 
 def check_repeated_rows(

@@ -2,8 +2,8 @@
 
 A wrong sample rate multiplies the frequencies of all features on all axes by the same ratio.
 ``search.sample_rate_from_spectrum`` estimates this ratio from the likelihood of all axes. The noise levels and lines of
-a real sensor vary from run to run, which can change the likelihood like a wrong sample rate. This module therefore
-tests each feature separately, relative to the surrounding spectrum.
+a real sensor vary from run to run, which can change the likelihood in the same way as a wrong sample rate. This module
+therefore tests each feature separately, relative to the surrounding spectrum.
 
 - Features of the same frequency on several axes belong to one group, because they have the same cause. Harmonics
   belong to the group of the fundamental frequency.
@@ -13,8 +13,8 @@ tests each feature separately, relative to the surrounding spectrum.
   group remains at the stated frequency.
 
 The noise level is no evidence for a wrong sample rate. An error of 20 % changes the level by 10 %, and the noise of
-many sensors varies as much from run to run. The cutoff of a low-pass filter is too weak as evidence. For a sample rate
-that is wrong by 5 %, the gain of the cutoff is at most 7 nats in 60 000 samples of a real sensor.
+many sensors varies as much from run to run. The cutoff of a low-pass filter is too weak to count as evidence. For a
+sample rate that is wrong by 5 %, the gain of the cutoff is at most 7 nats in 60 000 samples of a real sensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +56,7 @@ MIN_STATED_GAIN_NATS: Final = 12.0
 MAX_SPREAD: Final = 0.25
 """Largest deviation of a group from the common log ratio, as a fraction of the common log ratio."""
 MAX_PEAK_LOG_DISTANCE: Final = 0.02
-"""Largest distance of the peak of a group from the log ratio of the likelihood."""
+"""Largest distance of the peak of a group from the log ratio that was estimated from the likelihood."""
 SAME_GROUP_RATIO: Final = 1.01
 """Largest frequency ratio of the same feature on different axes."""
 HARMONIC_TOLERANCE: Final = 0.003
@@ -125,8 +125,8 @@ def correct_impossible_sample_rate(
 ) -> tuple[Recording, RecordingFinding] | None:
     """Correct a stated sample rate at which the features of the model are impossible.
 
-    A feature above half the stated sample rate is impossible. The model may state a higher rate. If the features have
-    the frequencies of the model at this higher rate, the stated rate is wrong.
+    A feature above half the stated sample rate is impossible. The model may state a higher rate. If the features match
+    the model at this higher rate, the stated rate is wrong.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ def _max_gain_near(gains: Floats, x: float, reach: float) -> float:
 
 
 def _estimate_stated_ratio(groups: Sequence[FeatureGroup], x: float) -> SampleRateErrorEstimate | None:
-    """Estimate the ratio if the features move by the ratio that the model states."""
+    """Return the ratio that the model states, or None if the features do not move by this ratio."""
     if not 10.0 * LOG_RATIO_STEP < abs(x) <= MAX_LOG_RATIO:
         return None
     reach = min(MAX_STATED_FREQUENCY_DRIFT, 0.5 * abs(x))
@@ -288,7 +288,7 @@ def _estimate_stated_ratio(groups: Sequence[FeatureGroup], x: float) -> SampleRa
 
 
 def _estimate_common_ratio(groups: Sequence[FeatureGroup]) -> SampleRateErrorEstimate | None:
-    """Estimate the ratio by which at least two groups move and no group remains."""
+    """Estimate the ratio by which at least two groups move, if no group remains at the stated frequency."""
     wide = [maximum_filter1d(one.gains, 2 * round(MAX_FREQUENCY_DRIFT / LOG_RATIO_STEP) + 1) for one in groups]
     total = np.where(np.abs(LOG_RATIOS) > MAX_FREQUENCY_DRIFT, np.sum(wide, axis=0), 0.0)
     best = int(total.argmax())

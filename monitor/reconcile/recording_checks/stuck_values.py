@@ -18,9 +18,9 @@ from monitor.reconcile.result import ParameterInterval, RecordingFinding
 MIN_RUN_SAMPLES: Final = 16
 """Smallest number of equal samples in a run that is reported."""
 WINDOW_SAMPLES: Final = 256
-"""Number of samples in a window for the share of chance repeats."""
+"""Number of samples in a window for the estimate of how often values repeat by chance."""
 MAX_CHANCE: Final = 1e-9
-"""Largest probability of a reported run by chance."""
+"""Largest probability that a reported run occurs by chance."""
 MIN_SIMULATED_RATIO: Final = 3.0
 """Smallest length of a run relative to the longest run in a simulation of the model."""
 SAME_RUN_SHARE: Final = 0.8

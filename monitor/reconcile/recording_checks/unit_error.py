@@ -46,17 +46,20 @@ FACTORS_FROM_GRAVITY_ALONE: Final = ("1/9.80665", "1000/9.80665", "1000", "2", "
 UNLIKELY_PENALTY: Final = 0.15
 """Penalty for an unlikely factor, added to the logarithmic distance."""
 MAX_DISTANCE: Final = log(1.35)
-"""Largest logarithmic distance of the common factor from a conversion. Noise varies from run to run."""
+"""Largest logarithmic distance between the common factor and a conversion factor. Noise varies from run to run."""
 MAX_SPREAD: Final = log(1.8)
-"""Largest logarithmic ratio of the factors of the three axes."""
+"""Largest logarithm of the ratio between the factors of two axes."""
 MAX_FULL_SCALE_DISTANCE: Final = log(1.12)
-"""Largest logarithmic distance from a power of two. Vibration of the surroundings may also double the noise."""
+"""Largest logarithmic distance between the common factor and a power of two.
+
+Vibration of the surroundings may also double the noise.
+"""
 MAX_FULL_SCALE_SPREAD: Final = log(1.12)
-"""Largest logarithmic ratio of the factors of the three axes for a wrong full scale."""
+"""Largest logarithm of the ratio between the factors of two axes at which a wrong full scale is reported."""
 MAX_SUPPORTED_DISTANCE: Final = log(1.8)
-"""Largest logarithmic distance of the common factor from a factor of gravity or of the quantization steps."""
+"""Largest logarithmic distance between the common factor and the factor found from gravity or quantization steps."""
 MAX_GRAVITY_DISTANCE: Final = log(1.12)
-"""Largest logarithmic distance of gravity from a factor.
+"""Largest logarithmic distance between the measured gravity ratio and a known factor.
 
 The errors of the bias and scale factor of a MEMS accelerometer may reach 10 %.
 """
@@ -142,7 +145,7 @@ def _factor_from_noise(triad: Sequence[str], evidence: TriadEvidence) -> str | N
     common, spread = float(np.median(evidence.noise.log_ratios)), float(np.ptp(evidence.noise.log_ratios))
     confirmed = _factor_from_steps(evidence) or _factor_from_gravity(triad, evidence)
     if confirmed is not None and spread < MAX_SPREAD:
-        # The noise of the model may be wrong, so the noise only has to be nearer to the factor than to 1.
+        # The noise of the model may be wrong, so the noise ratio only has to be closer to the factor than to 1.
         factor = log({**CONVERSIONS, **FULL_SCALES}[confirmed])
         if abs(common - factor) < min(abs(common), MAX_SUPPORTED_DISTANCE):
             return confirmed
@@ -207,7 +210,7 @@ def _gravity_ratio(values: Mapping[str, Floats], triad: Sequence[str], model: No
 def _step_ratio(y: Floats, axis: str, model: NoiseModel) -> float | None:
     """Return the ratio of the quantization step in the recording to the step in the model, or None.
 
-    The largest known ratio that fits is returned, because the values also fit to fractions of the true step.
+    The largest known ratio that fits is returned, because the values are also multiples of fractions of the true step.
     """
     step = next((effect.step for effect in model.effects.get(axis, ()) if isinstance(effect, Resolution)), None)
     values = y[np.isfinite(y)]

@@ -1,7 +1,8 @@
 """Check for slow terms of the model that cannot be tested because the recording is too short.
 
-A term with a time constant needs a recording of several time constants. The rate random walk and the bias instability
-are compared with the white noise at the lowest frequency, which is the inverse of the duration of the recording.
+A term with a time constant needs a recording that is several time constants long. The rate random walk and the bias
+instability are compared with the white noise at the lowest frequency, which is the inverse of the duration of the
+recording.
 """
 
 from typing import Final
@@ -20,7 +21,7 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 MIN_TIME_CONSTANTS: Final = 5.0
-"""Smallest duration of a recording in time constants of a term."""
+"""Shortest duration of a recording, as a multiple of the time constant of a term."""
 MIN_POWER_RATIO: Final = 0.05
 """Smallest power of a visible term at the lowest frequency, relative to the white noise."""
 

@@ -73,7 +73,8 @@ def eliminate_unneeded_effects(
     null : mapping of str to AxisNull
         Null distributions of each axis.
     fitted_first : bool
-        True if the model was fitted to the same recording. The old sizes are then no reference for a common factor.
+        True if the model was fitted to the same recording. The old sizes then cannot serve as a reference for a common
+        factor.
     map_function : callable, optional
         Function with the signature of ``map`` that distributes the work on axes.
     """
@@ -106,7 +107,7 @@ def _accept_if_diagnostics_agree(
 ) -> AxisSearchResult:
     """Return the result with a simpler hypothesis, unless a diagnostic becomes significant.
 
-    If ``replacement_reason`` is given, the last added effect is new and becomes a round of the search.
+    If ``replacement_reason`` is given, the last added effect is new and is recorded as a round of the search.
     """
     if simpler is search.hypothesis:
         return search
@@ -153,9 +154,9 @@ def _without_unneeded_effects(hypothesis: Hypothesis, others: Sequence[Effect]) 
 
 
 def share_frequency_or_time(a: Effect, b: Effect) -> bool:
-    """Return True if two effects on different axes have one location in frequency or time.
+    """Return True if two effects on different axes have nearly the same frequency or time.
 
-    A line and a resonance at one frequency have the same cause.
+    A line and a resonance at the same frequency have the same cause.
 
     Parameters
     ----------

@@ -81,8 +81,8 @@ PENALTY_NATS: Final[dict[str, float]] = {
 """Penalty of each effect in nats.
 
 On an axis without the effect, the gain exceeds the penalty with a probability of about 4e-5. With six axes and twenty
-effects, one of 200 true recordings then gets a wrong name. The values come from simulated recordings of a true model.
-For one fitted size without a location, the value is close to the quantile of χ²₁/2.
+effects, a wrong effect is then found in about one of 200 recordings of a true model. The values come from simulated
+recordings of a true model. For one fitted size without a location, the value is close to the quantile of χ²₁/2.
 """
 SHAPES_PER_DECADE: Final = 4
 """Number of shape values per decade in the first search."""
@@ -95,7 +95,7 @@ PEAK_SEPARATION_STEPS: Final = 24
 MIN_DELAY_FRACTION: Final = 0.002
 """Shortest temperature delay, as a fraction of the recording length."""
 REVERSAL_FRACTIONS: Final = (0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)
-"""Reversals of a hysteresis in the first search, as fractions of the temperature range."""
+"""Values of the hysteresis parameter ``reversal`` in the first search, as fractions of the temperature range."""
 MIN_AGEING_FRACTION: Final = 0.003
 """Shortest time constant of a logarithmic drift, as a fraction of the recording length."""
 MAX_PEAKS: Final = 2
@@ -107,7 +107,7 @@ FILTERS: Final = (
 )
 """Kind and order of each filter that is tried."""
 FLOOR_PENALTY_NATS: Final = 2.0
-"""Smallest log-likelihood gain, in nats, of the white noise behind a filter."""
+"""Smallest log-likelihood gain, in nats, of white noise added after a filter."""
 LINE_BLOCKS: Final = 4096
 """Approximate number of blocks over which the series is summed to refine the frequency of a line."""
 LINE_SEARCH_ITERATIONS: Final = 16
@@ -250,7 +250,7 @@ def _line_frequency(whitened: WhitenedAxis, f_hz: float) -> float:
 
 
 def propose_pulse_trains(whitened: WhitenedAxis) -> list[Effect]:
-    """Propose periodic pulses, unless another shape than a rectangle fits clearly better."""
+    """Propose periodic pulses, unless a shape other than a rectangle fits clearly better."""
     if PulseTrain in whitened.effect_types or whitened.harmonic_series.gain < PENALTY_NATS["pulse_train"] / 4.0:
         return []
     found = fit_pulses(whitened.series, whitened.axis.rate_hz, whitened.harmonic_series)

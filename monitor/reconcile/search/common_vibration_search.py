@@ -47,14 +47,14 @@ MIN_CYCLES: Final = 40.0
 """Smallest bandwidth of a low-pass vibration, in cycles per recording."""
 MAX_CORRELATION: Final = 0.995
 MAX_DEVIATION: Final = 1e100
-"""Largest standard deviation of a coefficient. Stop bands have a larger value, because they are not compared."""
+"""Largest standard deviation of a coefficient. A larger value marks a stop band, which is not compared."""
 BALANCE_ITERATIONS: Final = 20
 GAIN_ITERATIONS: Final = 12
 GAIN_SWEEPS: Final = 2
 MAX_LOG_GAIN_CHANGE: Final = 1.5
-"""Largest logarithmic change of a gain in one sweep of the fit."""
+"""Largest change of the logarithm of a gain in one sweep of the fit."""
 MAX_LOG_BANDWIDTH_CHANGE: Final = 1.0
-"""Largest logarithmic change of a bandwidth of the first search."""
+"""Largest change of the logarithm of a bandwidth from the first search."""
 MIN_HALF_SHARE: Final = 0.2
 """Smallest share of the gain that each half of the recording must contribute."""
 MAX_SAME_BANDWIDTH_RATIO: Final = 4.0
@@ -189,7 +189,7 @@ def _acts_in_both_halves(joint: "_JointFit", whitened: Sequence[WhitenedAxis], s
 
 
 def _candidate_shapes(hypotheses: Sequence[Hypothesis]) -> list[Shape]:
-    """Return the shapes of the known resonances and correlated noises, and low-pass shapes."""
+    """Return low-pass shapes, and the shapes of known resonances and known correlated noise."""
     axis = hypotheses[0].axis
     widths = np.geomspace(MIN_CYCLES / axis.length_s, 4.0 * axis.rate_hz, LOW_PASS_BANDWIDTHS)
     shapes: list[Shape] = [(None, float(width)) for width in widths]
@@ -209,7 +209,7 @@ def build_cross_spectra(
     Parameters
     ----------
     whitened : sequence of WhitenedAxis
-        Axes, each whitened by its own model.
+        Axes, each whitened with its own model.
     shapes : sequence of Shape
         Shapes of vibrations. The bins are finer around resonances.
     part : slice or None, optional

@@ -1,4 +1,4 @@
-"""Alternatives to Gaussian effects with the same spectrum and another distribution.
+"""Non-Gaussian alternatives that have the same spectrum as a Gaussian effect.
 
 A random telegraph can replace correlated noise. Poisson steps can replace a random walk or single steps. The Gaussian
 effect is replaced if the full log-likelihood of the alternative is larger by ``MIN_ALTERNATIVE_GAIN_NATS``.
@@ -44,14 +44,14 @@ STEP_PENALTY_NATS: Final = 3.0
 MIN_FITTED_STEPS: Final = 5
 """Smallest number of single steps that the comparison with Poisson steps may fit."""
 MIN_SWITCHES: Final = 10
-"""Smallest number of switches of a telegraph that replaces Poisson steps. A few jumps can alternate by chance."""
+"""Smallest number of switches at which a telegraph may replace Poisson steps. A few jumps can alternate by chance."""
 WALK_EFFECTS: Final = (BiasStep, RateRandomWalk)
 """Effects that Poisson steps or a telegraph can replace."""
 
 
 @dataclass(frozen=True, slots=True)
 class NonGaussianAlternative:
-    """Alternative to an added effect, with the same spectrum and another distribution."""
+    """Non-Gaussian alternative that has the same spectrum as an added effect."""
 
     added: Effects  # added effects; the alternative is the last one and replaces the original effect
     gain: float  # log-likelihood gain over the original effect, nats
@@ -110,7 +110,7 @@ def replace_by_likelier_alternative(hypothesis: Hypothesis, trials: list[Trial])
 
 
 def choose_poisson_steps_or_telegraph(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
-    """Return the more likely of Poisson steps and a slow random telegraph, or None if neither process applies."""
+    """Return Poisson steps or a slow random telegraph, whichever is more likely, or None if neither applies."""
     steps = fit_poisson_alternative(hypothesis)
     if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps

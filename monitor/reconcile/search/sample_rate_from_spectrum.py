@@ -25,8 +25,7 @@ from monitor.reconcile.search.candidate_effects import find_broad_spectral_peaks
 MAX_LOG_RATIO: Final = 0.15
 """Largest absolute logarithm of the ratio of sample rates."""
 MIN_OTHER_GAIN_NATS: Final = 6.0
-"""Smallest log-likelihood gain without the strongest feature, and largest loss of any feature, in nats.
-"""
+"""Smallest log-likelihood gain of all features except the strongest, and largest loss of a single feature, in nats."""
 SAME_FEATURE_RATIO: Final = 1.01
 """Largest frequency ratio of the same feature on different axes."""
 MAX_TRIAL_RATIOS: Final = 12
@@ -197,7 +196,7 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
 
 
 def _line_power(whitened: WhitenedAxis, features: list[Feature], factors: Floats) -> Floats:
-    """Return, for each factor, the total power at all line frequencies times the factor."""
+    """For each factor, return the total power at the line frequencies multiplied by this factor."""
     power = np.zeros(factors.size)
     spectrum = whitened.periodogram
     spacing_hz = whitened.axis.rate_hz / (2 * (spectrum.size - 1))

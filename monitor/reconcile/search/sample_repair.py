@@ -1,7 +1,7 @@
-"""Repair of the samples of an axis, by replacement of missing and altered samples.
+"""Replacement of the missing and altered samples of an axis.
 
-Missing samples are always replaced. Repeated, outlying and clipped samples are replaced if the effects of the axis
-include the cause. Measured and simulated recordings are repaired in the same way.
+Missing samples are always replaced. Repeated, outlying and clipped samples are replaced if an effect of the axis causes
+such samples. Measured and simulated recordings are repaired in the same way.
 """
 
 from collections.abc import Mapping
@@ -88,7 +88,7 @@ def _may_leak(source: str, axis: str) -> bool:
 
 
 def _repair_samples(y: Floats, statistics: ValueArtifacts, effects: Effects, rng: np.random.Generator) -> Floats:
-    """Replace missing samples, and repeated or clipped samples if the effects include the cause."""
+    """Replace missing samples. Also replace repeated or clipped samples if one of the effects causes them."""
     missing = ~np.isfinite(y)
     types = {type(effect) for effect in effects}
     if RandomSampleHold in types and statistics.repeats:

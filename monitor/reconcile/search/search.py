@@ -1,6 +1,6 @@
 """Search for missing effects on one axis, by forward selection.
 
-In each round, the axis is whitened by the current hypothesis and all diagnostics are run. The search ends if no
+In each round, the axis is whitened with the current hypothesis and all diagnostics are run. The search ends if no
 difference is significant. Otherwise, the best candidate effect that passes cross-validation is added. Added effects
 that no longer contribute are dropped. After the last round, effects that the diagnostics contradict are withdrawn.
 """
@@ -168,7 +168,7 @@ def _next_round(
 
 
 def _has_fitted_slow_noise(hypothesis: Hypothesis) -> bool:
-    """Return True if a noise of the model was resized, or if correlated noise or a random walk was added."""
+    """Return True if a noise effect of the model was resized, or if correlated noise or a random walk was added."""
     slow = (ExponentiallyCorrelated, RateRandomWalk)
     return hypothesis.resized_model_effect_count > 0 or any(isinstance(effect, slow) for effect in hypothesis.added)
 
@@ -176,7 +176,7 @@ def _has_fitted_slow_noise(hypothesis: Hypothesis) -> bool:
 def _try_groups(
     current: _DiagnosedHypothesis, better: list[Trial], agrees: bool, null: AxisNull, rng: np.random.Generator
 ) -> tuple[_DiagnosedHypothesis, _CompletedRound | None]:
-    """Select the first acceptable trial. If all diagnostics agree, only an effect with a name is acceptable."""
+    """Select the first acceptable trial. If all diagnostics agree, skip groups whose best trial only changes sizes."""
     current = _with_finer_bins(current)
     for trials in [better] if better else generate_trial_groups(current.hypothesis, current.whitened):
         if agrees and trials and trials[0].effect is None:

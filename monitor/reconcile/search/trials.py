@@ -4,9 +4,11 @@ The **score** of a trial is the gain in log-likelihood less the penalties. ``gen
 in this order:
 
 1. Quantization, clipping and repeated samples.
-2. Outliers, and a step or a periodic variation of the noise.
+2. Outliers, heavy tails, and steps or periodic variations of the noise level.
 3. Deterministic effects, with the gain over the best slow noise. Slow noise can resemble a deterministic effect.
 4. Noise effects and a common factor for all noise effects of the model.
+
+If a noise effect is much better, group 4 comes before group 3.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -66,23 +68,25 @@ MIN_RESIZE_GAIN_NATS: Final = 1.0
 SCALE_FACTOR_MARGIN_NATS: Final = 3.0
 """Smallest advantage of separate sizes over a common factor, in nats."""
 SINGLE_SIZE_MARGIN_NATS: Final = 1.5
-"""Smallest advantage of a common factor over one new size, in nats. One size differs more often than all sizes."""
+"""Smallest advantage of a common factor over one new size, in nats. Often, only one size differs."""
 SCALE_SEARCH_ITERATIONS: Final = 16
 FREQUENCY_BANDS: Final = 8
 """Number of frequency bands in the test for a constant leak coefficient."""
 MIN_LEAK_PROBABILITY: Final = 1e-5
-"""Smallest probability of the scatter of a leak coefficient between frequency bands.
-"""
+"""A leak is rejected if the scatter of its coefficient between frequency bands is less probable than this value."""
 COEFFICIENT_PENALTY_NATS: Final = 3.3
-"""Penalty for each further coefficient of a polynomial, in nats. By chance, 1 % of all coefficients gain more (χ²)."""
+"""Penalty for each further coefficient of a polynomial, in nats.
+
+By chance, the gain exceeds the penalty for 1 % of all coefficients (χ² distribution).
+"""
 MIN_STUDENT_GAIN_NATS: Final = 2.0
 """Smallest log-likelihood gain of outliers over Student's t, in nats."""
 MAX_OUTLIER_Z: Final = 4.0
-"""Largest z value of clusters of large samples and of the misfit."""
+"""Largest accepted z value, both for the clustering of large samples and for the misfit."""
 MIN_DISTANT_SCALE: Final = 4.0
 """Smallest standard deviation of distant outliers, relative to the noise. Other heavy tails have a smaller ratio."""
 MAX_MISFIT_SHARE: Final = 0.1
-"""Largest misfit of distant outliers, relative to the gain."""
+"""Largest accepted misfit of distant outliers, relative to the gain."""
 MAX_VARIANCE_SHARE: Final = 0.3
 """Largest gain of a variance change after heavy tails are removed, relative to the gain of the heavy tails."""
 ALTERNATIVE_MARGIN_NATS: Final = 1.0
@@ -90,11 +94,11 @@ ALTERNATIVE_MARGIN_NATS: Final = 1.0
 MAX_BAND_FRACTION: Final = 0.25
 """Largest width of a narrow frequency band, as a fraction of the sample rate."""
 MOVE_ADVANTAGE_NATS: Final = 4.0
-"""Advantage in nats of a line that has moved over an additional line, which has two more fitted sizes."""
+"""Score advantage, in nats, of a moved line. An additional line would have two more fitted sizes."""
 MAX_MOVED_SIZE_RATIO: Final = 3.0
 """Largest ratio of the sizes of a line before and after a change of the frequency."""
 NOISE_PRIORITY_NATS: Final = 5.0
-"""Score advantage, in nats, with which noise effects are tried before deterministic effects."""
+"""Smallest score advantage, in nats, at which noise effects are tried before deterministic effects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +120,7 @@ class Trial:
 
     @property
     def total_score(self) -> float:
-        """Score over the hypothesis before the round, comparable between all trials of the round, in nats."""
+        """Score relative to the hypothesis before the round, in nats. Scores of the same round are comparable."""
         return self.score + self.slow_noise_score
 
 
@@ -128,7 +132,7 @@ def generate_trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Ite
     hypothesis : Hypothesis
         Fitted effects.
     whitened : WhitenedAxis
-        Axis whitened by ``hypothesis``.
+        Axis whitened with ``hypothesis``.
     """
     yield _value_trials(whitened)
     samples = _outlier_trial(hypothesis, whitened) + _heavy_tails_trial(whitened)
@@ -148,7 +152,8 @@ def _is_deterministic_first(deterministic: Sequence[Trial], noises: Sequence[Tri
     """Return True if the deterministic effects are tried before the noise effects.
 
     With a wrong spectrum, the residuals contain apparent steps and slopes. A much better noise effect is therefore
-    tried first. New sizes alone are not tried first if a deterministic effect together with slow noise is more likely.
+    tried first. If the best noise trial only changes sizes and a deterministic effect with slow noise is more likely,
+    the deterministic effect is tried first.
     """
     if not deterministic:
         return False
@@ -166,7 +171,7 @@ def try_alternatives_to_slow_noise(hypothesis: Hypothesis, whitened: WhitenedAxi
     hypothesis : Hypothesis
         Fitted effects.
     whitened : WhitenedAxis
-        Axis whitened by ``hypothesis``.
+        Axis whitened with ``hypothesis``.
     """
     trials = [one for one in _deterministic_trials(hypothesis, whitened) if one.score_without_slow_noise > 0.0]
     slow = [*propose_correlated_noise(whitened), *propose_power_law(whitened)]
@@ -183,7 +188,7 @@ def _as_rivals(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def _as_rivals_of_noise(deterministic: Sequence[Trial]) -> list[Trial]:
-    """Return the rivals of a noise effect: the deterministic effects without additional slow noise."""
+    """Convert deterministic trials to rivals of the noise effects, with the scores without additional slow noise."""
     return [
         replace(one, score=one.score_without_slow_noise, slow_noise_score=0.0, is_rival_only=True)
         for one in deterministic
@@ -326,7 +331,7 @@ def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]
 def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> list[Trial]:
     """Try lines and resonances of the model at the frequencies of new lines and resonances of similar size.
 
-    A line that has moved has nearly the same likelihood as an additional line beside a line without amplitude.
+    A moved line has nearly the same likelihood as an additional line if the amplitude of the old line becomes zero.
     """
     found: list[Trial] = []
     for new in (trial.effect for trial in trials if trial.score > 0.0):
@@ -347,7 +352,7 @@ def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> li
 
 
 def _prefer_single_size(trials: list[Trial]) -> list[Trial]:
-    """Move one new size before a common factor that is hardly better."""
+    """Move the trial of one new size to the start if a common factor is hardly better."""
     size = next(one for one in trials if one.name == RETUNE)
     if trials[0].name != "scale_factor" or trials[0].score >= size.score + SINGLE_SIZE_MARGIN_NATS:
         return trials
@@ -397,7 +402,7 @@ def _has_flat_coefficient(whitened: WhitenedAxis, leak: AxisLeak) -> bool:
 
 
 def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float]]:
-    """Return functions that compute the score of given effects with an additional slow noise."""
+    """Return functions that compute the score of given effects with additional slow noise."""
     axis, small = hypothesis.axis, initial_effect_size(hypothesis.axis)
     fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
 
@@ -415,7 +420,8 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     """Try a common factor for all noise effects of the model.
 
-    If several sizes changed and the factor fits nearly as well, the factor has at least the score of separate sizes.
+    If several sizes changed and the factor fits nearly as well, the factor gets at least the score of the separate
+    sizes.
     """
     effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_effect_indices(hypothesis.model)
 

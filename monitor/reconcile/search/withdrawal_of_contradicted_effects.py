@@ -35,13 +35,13 @@ from monitor.reconcile.likelihood.axis_fit import Effects
 MIN_COMB_LINES: Final = 4
 MAX_HARMONIC: Final = 60
 MIN_PULSE_LINES: Final = 2
-"""Smallest number of lines beside pulses that show another shape."""
+"""Smallest number of additional harmonic lines that contradict rectangular pulses."""
 MAX_PULSE_DIVISOR: Final = 4
-"""Largest divisor of the pulse frequency of which lines are harmonics."""
+"""Largest divisor of the pulse frequency. The lines may be harmonics of the divided frequency."""
 PULSE_ORDER_TOLERANCE: Final = 0.005
 """Largest distance of a line from a multiple of the divided pulse frequency, in units of this frequency."""
 DIFFERENCE_DIVISORS: Final = (1, 2, 3)
-"""Divisors that convert the distance of two lines to a possible fundamental frequency."""
+"""Divisors that convert the distance between two lines to a possible fundamental frequency."""
 HARMONIC_TOLERANCE: Final = 2e-4
 """Largest distance of a line from a harmonic, relative to the highest line frequency."""
 RESONANCE_REACH_HALF_WIDTHS: Final = 2.0
@@ -134,9 +134,9 @@ def _overlapping_features(added: Effects) -> set[int]:
 
 
 def _pulses_with_lines(added: Effects) -> set[int]:
-    """Return the indices of pulses, and of lines at harmonics of a part of the pulse frequency, if there are several.
+    """Return the indices of pulses and lines if several lines are harmonics of a fraction of the pulse frequency.
 
-    Pulses with additional lines are a periodic signal of another shape.
+    Such pulses and lines belong to a periodic signal with a different shape.
     """
     found: set[int] = set()
     for at, pulses in enumerate(added):

@@ -1,8 +1,8 @@
-"""Explanation why one recording does not show an effect that another recording of the same sensor shows.
+"""Explanation of why one recording does not show an effect that another recording of the same sensor shows.
 
 The difference due to a permanent effect grows with the square root of the recording length. The difference due to a
 temperature effect also grows with the temperature range. If the expected difference clearly exceeds the threshold, the
-absence is a contradiction.
+absence of the effect is a contradiction.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ Meaning = Literal["contradiction", "too_faint", "other_name", "unnamed", "may_di
 - ``may_differ``: the recording need not contain the effect.
 """
 MIN_EXCESS_SIGMA: Final = 2.0
-"""Smallest excess of the expected gap over the threshold for a contradiction, in standard deviations."""
+"""Number of standard deviations by which the expected gap must exceed the threshold for a contradiction."""
 LEAK_EFFECTS: Final = ("g_sensitivity", "cross_axis")
 TEMPERATURE_EFFECTS: Final = ("temperature_bias", "temperature_lag", "temperature_hysteresis")
 
@@ -84,7 +84,7 @@ def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[M
 
 
 def _compare_expected_gap(expected: float, growth: float, gap: DiagnosticGap, seconds: float) -> tuple[Meaning, str]:
-    """Compare the expected difference with the threshold, and return the meaning with an explanation."""
+    """Compare the expected difference with the threshold, and return the meaning of the absence with an explanation."""
     said = (
         f"with the size in the other recording, {seconds:.6g} s of data would show a gap of about {expected:.1f} "
         f"({gap.diagnostic}), and the threshold of {gap.threshold:.1f} is not passed"
@@ -112,9 +112,9 @@ def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, gap: 
 
 
 def _confused_effect(step: AddedOrResizedEffect, axis_result: AxisResult, other_axis_result: AxisResult) -> str:
-    """Return an effect of the other recording that is hard to distinguish from the effect of ``step``, or "".
+    """Return the name of an effect in the other recording that is hard to distinguish from ``step``, or "".
 
-    Two effects are hard to distinguish if one effect was a runner-up of the other effect.
+    Two effects are hard to distinguish if one effect was a runner-up to the other.
     """
     mine = {one.effect for one in axis_result.steps}
     for one in other_axis_result.steps:

@@ -66,7 +66,7 @@ class EffectInRecordings:
 
     @property
     def sizes_agree(self) -> bool | None:
-        """True if the sizes in all recordings agree, or None with fewer than two sizes."""
+        """True if the sizes in all recordings agree, or None if there are fewer than two sizes."""
         return None if self.p is None else self.p >= MIN_AGREEMENT_PROBABILITY
 
     def step_with_pooled_parameters(self) -> AddedOrResizedEffect:

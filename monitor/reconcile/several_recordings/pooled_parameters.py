@@ -21,7 +21,7 @@ from monitor.reconcile.result import ParameterInterval
 MIN_AGREEMENT_PROBABILITY: Final = 0.01
 """Probability below which recordings disagree. The value is small, because a report contains many parameters."""
 MIN_RELATIVE_ERROR: Final = 1e-6
-"""Smallest standard deviation relative to the value, because numbers in files are rounded."""
+"""Smallest assumed standard deviation relative to the value, because numbers in files are rounded."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from monitor.reconcile.result import AllanInfluence
 from monitor.reconcile.search.backward_elimination import changed_sizes
 
 MAX_LOG_RATIO: Final = 10.0
-"""Largest logarithm of a ratio, for a change without which the model has no noise."""
+"""Largest absolute logarithm of a ratio. The ratio is infinite if the model without the change has no noise."""
 
 
 def compute_allan_influences_of_changes(hypothesis: Hypothesis, changed: Iterable[int]) -> dict[int, AllanInfluence]:
@@ -38,8 +38,8 @@ def compute_allan_influences_of_changes(hypothesis: Hypothesis, changed: Iterabl
     Returns
     -------
     dict of int to AllanInfluence
-        Influence of each effect, by its index. A changed size is compared with the old size. A moved line and an added
-        effect are compared with an Allan deviation without this effect.
+        Influence of each effect, by its index. A changed size is compared with the old size. For a moved line or an
+        added effect, the reference is the model without this line or effect.
     """
     resized = changed_sizes(hypothesis)
     axis, effects = hypothesis.axis, hypothesis.effects

@@ -5,15 +5,15 @@ distributed among the changes of the model: in each step, the change whose remov
 sizes are fitted again, and the loss is the gain of this change. The gains are never negative, and their sum is the
 explained gap.
 
-Outliers, heavy tails, changes of the variance and random jumps are not fully visible in the likelihood of the
-spectrum. The gain of the test that found them is added. A line that has moved has the gain of its trial. The
-likelihood of quantized, clipped or repeated values is unbounded, because a continuous distribution never yields equal
-values. The gain of these effects is the gain of their influence on the noise (``value_artifact_gain``). If the model
-was fitted to the same recording, only added effects have a gain, because the sizes of the model are no reference.
+Outliers, heavy tails, changes of the variance and random jumps are not fully visible in the likelihood of the spectrum.
+The gain of the test that found them is added. The gain of a moved line is the score of its trial. The likelihood of
+quantized, clipped or repeated values is unbounded, because a continuous distribution never yields equal values. The
+gain of these effects is the gain of their influence on the noise (``value_artifact_gain``). If the model was fitted to
+the same recording, only added effects have a gain, because the sizes of the model cannot serve as a reference.
 
-The **remaining gap** is the sum over the groups of diagnostics in ``GROUPS``. Diagnostics of one group see the same
-difference, so that a group has the gain of its strongest significant diagnostic. For the spectrum, the gain of a free
-power in each of ``SATURATED_BANDS`` frequency bands is used if this gain is larger.
+The **remaining gap** is the sum over the groups of diagnostics in ``GROUPS``. The diagnostics of a group detect the
+same difference, so the gain of a group is that of its strongest significant diagnostic. For the spectrum, the gain from
+fitting the power in each of ``SATURATED_BANDS`` frequency bands is used if it is larger.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -49,11 +49,11 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "distribution": ("tails", "variance", "spectrogram"),
     "values": ("values",),
 }
-"""Diagnostics that see the same difference, by the name of the group."""
+"""Diagnostics that detect the same difference, by the name of the group."""
 EFFECTS_OUTSIDE_SPECTRUM: Final = (Outliers, HeavyTails, NoiseStep, VarianceModulation, PoissonSteps, RandomTelegraph)
 """Effects that are not fully visible in the likelihood of the spectrum."""
 SATURATED_BANDS: Final = 64
-"""Number of frequency bands with a free power, equally wide on a logarithmic scale."""
+"""Number of frequency bands with a separately fitted power, equally wide on a logarithmic scale."""
 MAX_STEP_NOISE_SHARE: Final = 0.9
 """Largest share of the variance that quantization noise is assumed to have."""
 
@@ -88,14 +88,14 @@ def decompose_explained_gain(search: AxisSearchResult, fitted_first: bool) -> di
 def fit_without(hypothesis: Hypothesis, removed: Collection[int]) -> AxisFit:
     """Fit a hypothesis without some of its changes.
 
-    A removed effect of the model has its old size again, and a removed added effect is left out.
+    An effect of the model is reset to its old size, and an added effect is left out.
 
     Parameters
     ----------
     hypothesis : Hypothesis
         Hypothesis with all changes.
     removed : collection of int
-        Indices of the effects that are removed.
+        Indices of the effects whose changes are removed.
     """
     effects: list[Effect] = []
     fixed: set[int] = set()
@@ -129,8 +129,8 @@ def value_artifact_gain(fit: AxisFit, kind: type[Effect]) -> float:
     """Return the gain, in nats, of the influence of quantization, clipping or repeats on the noise.
 
     Quantization noise of the variance r·v in a total variance v has the gain n/2·(ρ − 1 − ln ρ) with ρ = 1/(1 − r).
-    Clipped samples count with one nat each. A fraction f of repeats is an autocorrelation f with the gain
-    −n/2·ln(1 − f²).
+    Clipped samples count with one nat each. A fraction f of repeats produces an autocorrelation of f, which has the
+    gain −n/2·ln(1 − f²).
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def measure_remaining_gaps(search: AxisSearchResult, left_over: Sequence[Diagnos
 
 
 def _saturated_spectrum_gain(fit: AxisFit) -> float:
-    """Return the gain of a free power in each frequency band, less the expectation of a true model, in nats."""
+    """Return the gain in nats from fitting the power in each frequency band, less the expected gain of a true model."""
     bins, used = fit.axis.bins, np.flatnonzero(fit.axis.used_bins)
     f = np.log(bins.f_hz[used])
     band = np.floor((f - f[0]) / max(f[-1] - f[0], 1e-9) * SATURATED_BANDS)

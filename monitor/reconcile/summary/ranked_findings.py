@@ -1,9 +1,10 @@
 """Findings of a whole recording, ranked by the share of the gap that each finding explains.
 
-The steps of all axes are grouped: steps of one cause on several axes are one finding. Effects with an identifying
-parameter, such as a frequency or a time, must agree in this parameter. Changed sizes of the model must belong to one
-triad and agree in the ratio of new to old size. All other effects of one name are one finding. The gap of a finding is
-the sum over its axes. If the model was fitted to the same recording, changed sizes are no findings.
+The steps of all axes are grouped, so that steps with the same cause on several axes form one finding. Effects with an
+identifying parameter, such as a frequency or a time, must agree in this parameter. Changed sizes of the model must
+belong to the same triad and have nearly the same ratio of new to old size. All other effects with the same name form
+one finding. The gap of a finding is the sum over its axes. If the model was fitted to the same recording, changed sizes
+do not count as findings.
 
 The whole gap is the sum of the explained and the remaining gaps of all axes. Each share lies between 0 and 1, and the
 sum of all shares is 1. The measure is described in ``gap_decomposition``.
@@ -36,7 +37,7 @@ from monitor.reconcile.several_recordings.effect_matching import (
 PEAK_NAMES: Final = ("sinusoidal", "narrowband")
 """Effects that one oscillation produces on different axes."""
 MAX_LOG_RATIO_DIFFERENCE: Final = log(1.1)
-"""Largest logarithmic difference of two ratios of sizes that belong to one finding."""
+"""Largest difference between the logarithms of two size ratios in the same finding."""
 _SIZE_NAMES: Final = {effect.name: size for effect, size in NOISE_SIZE_PARAMETERS.items()} | {"scale_factor": "factor"}
 
 
@@ -80,7 +81,7 @@ class GapRanking:
 
     @property
     def explained_share(self) -> float:
-        """Share of the gap that the findings explain. A recording without a gap has the share 1."""
+        """Share of the gap that the findings explain. For a recording without a gap, the share is 1."""
         return 1.0 - sum(one.share for one in self.remainders)
 
 

@@ -20,7 +20,7 @@ MAX_LISTED_REMAINDERS: Final = 2
 UNMENTIONED_SIZE_CHANGE: Final = 0.05
 """Largest relative change of the size of a moved line that is not described."""
 MIN_REMAINDER_SHARE: Final = 0.01
-"""Smallest share of a remaining difference that is described."""
+"""Smallest share of the gap at which a remaining difference is described."""
 EFFECT_PHRASES: Final = {
     "angle_random_walk": "white noise N",
     "bias_instability": "bias instability B",
@@ -39,7 +39,7 @@ EFFECT_PHRASES: Final = {
     "sample_hold": "repeated samples",
     "sinusoidal": "line",
 }
-"""Phrase for each effect whose name is not a phrase."""
+"""Phrase for each effect whose name cannot be used as a phrase."""
 GROUP_PHRASES: Final = {
     "spectrum": "a difference in the spectrum",
     "level": "a change of the mean",

@@ -55,7 +55,7 @@ class DriftPanel(Panel):
 
     @classmethod
     def tab_layout(cls, device: ViewerDeviceDescription) -> rrb.Container | None:
-        """Return the layout of the tab Drift, or None if the gyroscope drift of the device is not compensated."""
+        """Return the layout of the Drift tab, or None if the gyroscope drift of the device is not compensated."""
         if not device.compensated:
             return None
         name = device.name

@@ -1,8 +1,8 @@
 """Points that the viewer draws for the stored history of a device.
 
-The history divides time into intervals (buckets). Each bucket gives a point at its end, which shows the last value with
-its confidence interval. If the smallest or largest value lies outside the confidence interval, the bucket gives an
-additional point.
+The history divides time into intervals (buckets). Each bucket is drawn as a point at its end, which shows the last
+value with its confidence interval. If the smallest or largest value lies outside the confidence interval, an additional
+point is drawn.
 """
 
 import numpy as np

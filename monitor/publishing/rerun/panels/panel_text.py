@@ -29,7 +29,7 @@ from monitor.publishing.messages.results import measured_axes
 from monitor.publishing.remote_device_states import RemoteDevice
 
 FLEET_AXES: Final = ("gx", "gy", "gz")
-"""Axes whose angle random walk N the table of all devices shows."""
+"""Axes whose angle random walk N is shown in the table of all devices."""
 STATE_TEXTS: Final = {
     "running": "RUNNING",
     "waiting": "WAITING for the device",

@@ -56,7 +56,7 @@ class ThermalPredictionPanel(Panel):
 
     @classmethod
     def tab_layout(cls, device: ViewerDeviceDescription) -> rrb.Container | None:
-        """Return the layout of the tab Temperature, or None if the bias is not predicted from temperature."""
+        """Return the layout of the Temperature tab, or None if the bias is not predicted from temperature."""
         if not device.has_thermal:
             return None
         columns = []
