@@ -30,7 +30,7 @@ MAX_BATCH_S: Final = 0.1
 TOTAL_INTERVAL_S: Final = 0.1
 """Minimum interval between two steps of the total and Hadamard deviations."""
 TOTAL_CPU_SHARE: Final = 0.005
-"""Maximum fraction of one processor for the total and Hadamard deviations of a device."""
+"""Maximum fraction of one processor that is spent on the total and Hadamard deviations of a device."""
 INTERPRETED_REFIT_S: Final = 1.0
 """Minimum interval between two fits with interpreted kernels."""
 

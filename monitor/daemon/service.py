@@ -130,7 +130,7 @@ class Service:
         self._wake.set()
 
     def run(self, seconds: float | None = None) -> None:
-        """Run the service until ``request_stop``, the end of all replays, or a number of seconds has passed."""
+        """Run the service until ``request_stop`` is called, all replays have ended, or ``seconds`` have passed."""
         threading.Thread(target=self._ready.compile_kernels, args=(self._wake,), name="warm-up", daemon=True).start()
         try:
             self._start()

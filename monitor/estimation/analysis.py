@@ -1,8 +1,7 @@
 """Analysis of a whole recording, which gives Allan deviations, noise coefficients and events.
 
-The function ``analyze`` computes the Allan variance and fits the noise coefficients. The function
-``detect_disturbances`` searches the recording for motion, noise changes, spectral lines and outliers, which takes more
-time.
+The function ``analyze`` computes the Allan variance and fits the noise coefficients. The slower function
+``detect_disturbances`` searches the recording for motion, noise changes, spectral lines and outliers.
 
 By default, the Allan variance includes samples in motion, because the motion detector may mistake samples at rest for
 motion. The search for events always ignores samples in motion.

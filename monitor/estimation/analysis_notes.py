@@ -39,7 +39,7 @@ MIN_EXPLAINING_SHARE: Final = 0.05
 MIN_Q_SHARE: Final = 0.2
 """Minimum share of the Allan variance that a spectral line must contribute to be mistaken for quantization noise."""
 Q_ROWS: Final = 3
-"""Number of averaging times, from the shortest, that determine the quantization noise coefficient Q."""
+"""Number of shortest averaging times that mainly determine the quantization noise coefficient Q."""
 BANDWIDTH_OR_VIBRATION: Final = "the likely cause is the bandwidth of the sensor or a vibration"
 BELOW_WHITE_NOISE: Final = (
     "the Allan variance at the shortest averaging times is below white noise, as after a low-pass filter; N is the "
@@ -49,7 +49,7 @@ MOTION_LEFT_IN: Final = "motion of the sensor may be the cause; --rest removes t
 UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be the cause"
 ORDINALS: Final = ("", "first", "second", "third", "fourth")
 MIN_DEPARTURE_RATIO: Final = 0.5
-"""Minimum residual of an averaging time that is reported, relative to the largest residual of the axis."""
+"""Minimum residual at which an averaging time is reported, relative to the largest residual of the axis."""
 
 
 def describe_unexplained_curve(
@@ -250,8 +250,8 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
     """Return the range of averaging times at which the Allan variance and the fit differ by the largest factor.
 
     Only residuals above ``DEPARTURE_SIGMA`` standard deviations are considered. The largest residual in standard
-    deviations would often be misleading. If noise outside the five terms raises the fit, the Allan variance is below
-    the fit at other averaging times.
+    deviations would often be misleading. If noise that the five terms do not describe raises the fit, the Allan
+    variance is below the fit at other averaging times.
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -45,7 +45,7 @@ from monitor.estimation.fit.per_sample_refit import ContinuousRefit
 from monitor.estimation.window_sample_snapshot import WindowSnapshot, copy_window
 
 SETTLING_FITS: Final = 10
-"""Number of successive fits until the fit has converged. Each fit reduces the error to about a quarter."""
+"""Number of successive fits that are needed for convergence. Each fit reduces the error to about a quarter."""
 MIN_SAMPLES: Final = 8
 """Minimum number of samples from which an estimate is computed."""
 SPECTRUM_SAMPLES: Final = 65_536
@@ -95,7 +95,7 @@ class Estimator:
         self._history_samples = 0  # total number of samples in ``_history``
         self._total_hadamard = LiveTotalAndHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
-        # Inputs of the fit for axes whose Allan variance the five noise terms do not explain, otherwise None.
+        # Fit inputs of each axis whose Allan variance the five noise terms do not explain, and None for other axes.
         self._contradicting: list[tuple[CovarianceTable, MeasuredVariancesAndSlopes] | None] = [None] * 6
         self._low_passes: list[LowPass | None] = [None] * 6
         self._search_axis = 0  # axis that is searched for a low-pass filter
@@ -252,7 +252,7 @@ class Estimator:
         )
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
-        """Fit all axes, but each restarted axis separately, because it has fewer samples."""
+        """Fit all axes together, except for restarted axes, which have fewer samples and are fitted separately."""
         lengths = np.minimum(self._lengths, self._window.samples_in_window)
         slope, slopes = self._window.drift_slopes_by_axis_and_tau(lengths)
         before = self._entered if self._refit is None else self._refit.terms_in_fit

@@ -35,9 +35,9 @@ MAX_RATE_VARIATION: Final = 0.01
 A delay that decreases faster indicates a sender that catches up.
 """
 STRETCH_ROWS: Final = (256, 128, 64, 32, 16, 8, 4, 2)
-"""Numbers of samples between the two time stamps from which the period is computed, in order of preference."""
+"""Lengths, in samples, of the intervals from which the period is computed, in order of preference."""
 MIN_STRETCH_RATIO: Final = 4
-"""A number from ``STRETCH_ROWS`` is used if at least a quarter of all intervals of this length contain no gap."""
+"""A length from ``STRETCH_ROWS`` is used if at least a quarter of all intervals of this length contain no gap."""
 
 
 def count_missing_before_gaps(

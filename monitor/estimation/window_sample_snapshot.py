@@ -28,7 +28,7 @@ MAX_GROUP_UNITS: Final = 2.0
 MIN_GROUP_DISTANCE_UNITS: Final = 16.0
 """Minimum distance between neighbouring groups of values, in units of phase."""
 MIN_FLOAT32_EVIDENCE: Final = 20
-"""Minimum number of samples from which float32 values are detected."""
+"""Minimum number of samples that are needed to detect float32 values."""
 MAX_GRID_DIVISOR: Final = 6
 """Maximum number of grid steps between the two closest groups of values."""
 
@@ -90,7 +90,7 @@ def _restore(units: Floats, unit: float, rng: np.random.Generator) -> Floats:
 
 
 def _merge_groups(units: Floats, rng: np.random.Generator) -> Floats:
-    """Replace each group of close values by a single value. Without groups, add uniform random numbers of one unit."""
+    """Replace each group of close values by a single value. Without groups, add random numbers from −½ to ½ unit."""
     known = np.flatnonzero(~np.isnan(units))
     order = known[np.argsort(units[known], kind="stable")]
     ordered = units[order]

@@ -4,9 +4,9 @@ Each noise coefficient of a measured axis has four columns. For example, the col
 value of N on axis gz. The columns ``gz.N.lo`` and ``gz.N.hi`` contain the ends of the confidence interval. If only an
 upper bound of N is known, it is stored in ``gz.N.bound``.
 
-Allan deviations are stored in columns such as ``gz.sigma.0.3``, for averaging times of 1 and 3 times powers of ten in
-seconds. They are interpolated between the neighbouring averaging times of the estimate, linearly on logarithmic scales.
-For a noise model with five terms and averaging times in octaves, the interpolation error is below 1 %.
+Allan deviations are stored in columns such as ``gz.sigma.0.3``, for averaging times of 10ⁿ and 3·10ⁿ seconds. They are
+interpolated between the neighbouring averaging times of the estimate, linearly on logarithmic scales. For a noise model
+with five terms and averaging times in octaves, the interpolation error is below 1 %.
 """
 
 from typing import Final
@@ -65,7 +65,7 @@ class EstimateToColumnsConverter:
         self._coefficient_count = len(self._coefficient_indices)
 
     def matches_axes_and_taus(self, estimate: Estimate) -> bool:
-        """Return True if an estimate has the measured axes and averaging times of the first estimate."""
+        """Return True if an estimate has the same measured axes and averaging times as the first estimate."""
         tau_s = estimate.curve.tau_s
         same = tau_s is self._tau_s or np.array_equal(tau_s, self._tau_s)
         return same and bool((_measured(estimate) == self._measured).all())

@@ -29,7 +29,7 @@ BUCKET_WIDTHS_S: Final = (
     *(60, 300, 900, 1800, 3600, 10_800, 21_600, 43_200),
     *(days * DAY_S for days in (1, 2, 4, 7, 30, 90, 365)),
 )
-"""Allowed widths of time buckets [s]. Each width is a multiple of all row widths that are not larger."""
+"""Allowed widths of time buckets [s]. Each width is a multiple of all row widths that do not exceed it."""
 
 
 @dataclass(frozen=True, slots=True)

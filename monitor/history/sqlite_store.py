@@ -330,7 +330,7 @@ class HistoryFileWriter:
 
 
 class HistoryReader:
-    """Reader of a history file, whose results refer to the moment at which the file was opened."""
+    """Reader of a history file that returns the contents as they were when the file was opened."""
 
     def __init__(self, db: sqlite3.Connection, path: Path) -> None:
         self._db = db
@@ -499,7 +499,7 @@ def _identifier(db: sqlite3.Connection, table: str, column: str, text: str) -> i
 
 
 def _open_read_only(path: Path) -> sqlite3.Connection:
-    """Open a database for reading. Without a log in a read-only folder, the database is opened as immutable."""
+    """Open a database for reading. If a read-only folder contains no log, the database is opened as immutable."""
     uri = f"{path.resolve().as_uri()}?mode=ro"
     db = sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
     try:
@@ -534,7 +534,7 @@ def _check_files(path: Path) -> None:
 
 @contextlib.contextmanager
 def _damage_as_unusable(path: Path) -> Iterator[None]:
-    """Convert errors that a damaged file causes to UnusableHistory, but not temporary errors."""
+    """Convert errors caused by a damaged file to UnusableHistory, but leave temporary errors unchanged."""
     try:
         yield
     except sqlite3.OperationalError:

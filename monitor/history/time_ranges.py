@@ -2,8 +2,8 @@
 
 In a zenoh selector (request address), a time range is written as ``_time=[<start>..<end>]`` or
 ``_time=[<start>;<duration>]``. The start or the end may be omitted. A bracket that points outwards excludes the start
-or the end from the range. Times in a selector have the form ``now()``, ``now(-1h)`` or RFC 3339. Times in command
-options have a form such as ``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or ``now``.
+or the end from the range. Times in a selector are written as ``now()``, as ``now(-1h)`` or in RFC 3339 format. Times in
+command options are written, for example, as ``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or ``now``.
 """
 
 import math
@@ -63,7 +63,7 @@ class TimeRange:
         return f"{'[' if self.start_included else ']'}{'..'.join(ends)}{']' if self.end_included else '['}"
 
     def overlaps(self, start_s: float, end_s: float) -> bool:
-        """Return True if the time range overlaps a history row from ``start_s`` (included) to ``end_s`` (excluded).
+        """Return True if the time range overlaps a history row from ``start_s`` (inclusive) to ``end_s`` (exclusive).
 
         >>> TimeRange(60.0, 120.0).overlaps(0.0, 60.0), TimeRange(60.0, 120.0).overlaps(120.0, 180.0)
         (False, True)

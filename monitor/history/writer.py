@@ -4,7 +4,7 @@ The thread writes all queued data in one transaction and then merges a few old r
 because the disk is full, the data remain in the queue and the write is repeated. If the queue is full, new data is
 dropped and counted.
 
-A file of a newer version is not modified. An unusable file is renamed and replaced by a new file, unless
+A file written by a newer version is not modified. An unusable file is renamed and replaced by a new file, unless
 MAX_RENAMED_FILES files have already been renamed. Before each write and every CHECK_S seconds, the thread checks
 whether another program has deleted, replaced or emptied the file. If so, the thread opens or creates the file again.
 
@@ -46,7 +46,7 @@ RETRY_S: Final = 5.0
 CHECK_S: Final = 10.0
 """Interval in seconds at which the file is checked while the queue is empty."""
 MAX_RENAMED_FILES: Final = 10
-"""Maximum number of renamed files. When it is reached, a user must remove an unusable file."""
+"""Maximum number of renamed files. When this number is reached, the user must move the renamed files away."""
 BATCH_SIZE: Final = 256
 MERGES_PER_STEP: Final = 50
 CLOSE_TIMEOUT_S: Final = 10.0
@@ -76,7 +76,7 @@ class HistoryWriter:
         self._note = ""  # description of the latest change that another program made to the file
         self._folder = FolderLock(path.parent, HISTORY_LOCK)
         self._excluded = False  # True if another process writes the history files in the folder
-        # Devices whose first row has been discarded, or None if no rows must be discarded.
+        # Devices whose first row has been discarded, or None if no rows need to be discarded.
         self._resumed_devices: set[str] | None = None
         self._waiting: deque[tuple[str, HistoryRow | StoredEvent]] = deque()
         self._lock = threading.Lock()

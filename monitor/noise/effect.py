@@ -4,7 +4,7 @@ An effect is a frozen dataclass of parameters. There are five kinds of effects.
 
 - A ``Source`` adds noise or a bias to an axis.
 - An ``AxisLeak`` adds the measurement of another axis, multiplied by a coefficient.
-- A A ``WhiteNoiseGain`` and ``HeavyTails`` multiply the white noise of an axis by a factor.
+- ``WhiteNoiseGain`` and ``HeavyTails`` multiply the white noise of an axis by a factor.
 - An ``AxisPermutation`` replaces the output of an axis by the output of another axis.
 - A ``Transform`` modifies the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
 
@@ -349,7 +349,7 @@ def source_axis_field() -> Any:
 
 
 def choice_field(*choices: str) -> Any:
-    """Return a dataclass field for one of several words. The field may be absent."""
+    """Return an optional dataclass field whose value is one of the given words."""
     return field(default=None, metadata={"units": ("text", "text"), "choices": choices, "optional": True})
 
 

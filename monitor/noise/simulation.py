@@ -159,8 +159,8 @@ class ModelStream:
     def add_effect(self, axis: str, effect: Effect) -> None:
         """Add an effect that starts with the next sample.
 
-        Random walks, ramps and transients also start with the next sample. A parameter ``time`` counts from the first
-        sample of the simulation.
+        Random walks, ramps and transients also start with the next sample. The parameter ``time`` of an effect is
+        measured from the first sample of the simulation.
 
         Parameters
         ----------

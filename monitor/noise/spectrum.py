@@ -29,10 +29,13 @@ MIN_FREQUENCY_CYCLES: Final = 1e-5
 """Lower limit of the numerical integral, as the product of frequency and longest averaging time.
 
 Below this frequency, the density continues as a power of f.
-For a random walk, frequencies below the limit contribute a share of 3·10⁻⁵ to the Allan variance.
+For a random walk, frequencies below the limit contribute a fraction of 3·10⁻⁵ of the Allan variance.
 """
 MIN_INTEGRAL_EXPONENT: Final = 0.05
-"""Smallest exponent of f in the integral below the lowest frequency. The exponent is 3 − α for a density f^(−α)."""
+"""Smallest exponent of f that is assumed for the integral below the lowest frequency.
+
+The exponent is 3 − α for a density f^(−α).
+"""
 MAX_SMOOTH_CYCLES: Final = 0.1
 """Maximum f·τ for which the trapezoidal rule is sufficiently accurate."""
 

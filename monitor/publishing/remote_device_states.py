@@ -81,7 +81,7 @@ class DeviceCoefficients:
 
 @dataclass(slots=True)
 class RemoteDevice:
-    """State of a device of another process. All times refer to the monotonic clock of the process that receives it."""
+    """State of a device of another process. All times refer to the monotonic clock of the receiving process."""
 
     key: str  # zenoh key of the device without the topic, such as imu/bench-1
     last_message_s: float  # time of the newest message of any topic
@@ -167,7 +167,7 @@ class RemoteDeviceRegistry:
     def process_message(self, key: str, payload: bytes) -> Message | None:
         """Update the state of a device from a message, and return the decoded message.
 
-        Return None if the message is malformed or device tables do not show its topic.
+        Return None if the message is malformed, or if its topic is not shown in device tables.
 
         Parameters
         ----------
@@ -221,7 +221,7 @@ class RemoteDeviceRegistry:
                 self._events.remove(one)
 
     def devices_with_problems_first(self, now_s: float) -> list[RemoteDevice]:
-        """Return copies of all device states, and list devices with problems at the time ``now_s`` [s] first."""
+        """Return copies of all device states, starting with devices that have problems at the time ``now_s`` [s]."""
         with self._lock:
             found = [copy.copy(one) for one in self._devices.values()]
         return sorted(found, key=lambda one: (one.problems_first_rank(now_s), one.key))

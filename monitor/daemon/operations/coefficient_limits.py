@@ -3,7 +3,7 @@
 An upper limit is crossed if the lower end of the confidence interval is above the limit. A lower limit is crossed if
 the upper end of the confidence interval is below the limit. If every estimate during ``hold_s`` seconds of samples
 crosses the limit, the event ``limit_crossed`` is raised. If the value stays within the limit for ``hold_s`` seconds of
-samples, the event ``limit_back`` is raised. An estimate without value and upper bound restarts the hold time.
+samples, the event ``limit_back`` is raised. An estimate with neither a value nor an upper bound restarts the hold time.
 
 The hold time is counted in samples, so a replayed recording and the live sensor give the same events.
 """
@@ -25,9 +25,9 @@ from monitor.publishing.exporters.exported_coefficients import from_model
 from monitor.settings.loading import Device, Limit
 
 LIMIT_CROSSED: Final = "limit_crossed"
-"""Kind of the event when a limit is crossed."""
+"""Kind of event that is raised when a limit is crossed."""
 LIMIT_BACK: Final = "limit_back"
-"""Kind of the event when a coefficient returns within a crossed limit."""
+"""Kind of event that is raised when a coefficient returns within a crossed limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class AxisLimit:
 
 @dataclass(frozen=True, slots=True)
 class _Measured:
-    """Coefficient of one estimate with the confidence interval; NaN if the coefficient is unknown."""
+    """One estimated coefficient with its confidence interval. All values are NaN if the coefficient is unknown."""
 
     value: float
     lo: float
@@ -137,7 +137,7 @@ def read_model_in_force(device: Device) -> NoiseModel | None:
 
 
 def make_axis_limits(limits: Sequence[Limit], model: NoiseModel | None) -> list[AxisLimit]:
-    """Return the limits of single coefficients and axes from the user limits of a device.
+    """Convert the user limits of a device to limits for individual coefficients and axes.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ OUTPUT_BYTES: Final = 4096
 MAX_LINE_CHARS: Final = 200
 """Maximum length of an output line in a message, in characters."""
 POLL_S: Final = 0.05
-"""Interval at which the end of a command is checked."""
+"""Interval between two checks of whether a command has ended."""
 CLOSE_TIMEOUT_S: Final = 2.0
 """Longest wait for running commands when the service stops."""
 PRIVATE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
@@ -110,7 +110,7 @@ class Hooks(Output):
                 self._start(_Job(hook, payload + b"\n", named))
 
     def close(self) -> None:
-        """Wait up to CLOSE_TIMEOUT_S for the commands, and kill the commands that still run."""
+        """Wait up to CLOSE_TIMEOUT_S for the commands, and kill the commands that are still running."""
         for _ in self._threads:
             try:
                 self._jobs.put_nowait(None)
@@ -244,7 +244,10 @@ class _Pipes:
                 return
 
     def last_output_line_text(self) -> str:
-        """Return ``: `` and the last output line in printable characters, or "" without output."""
+        """Return ``: `` followed by the last output line, or "" if there is no output.
+
+        Unprintable characters are replaced.
+        """
         lines = self._tail.decode("utf-8", "replace").strip().splitlines()
         if not lines:
             return ""

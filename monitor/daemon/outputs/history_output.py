@@ -22,7 +22,7 @@ from monitor.publishing.messages.results import event_start_s
 
 
 class HistoryOutput(Output):
-    """Output that writes results per minute and events to the history file.
+    """Output that writes events and per-minute results to the history file.
 
     Parameters
     ----------

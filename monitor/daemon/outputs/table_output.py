@@ -21,7 +21,7 @@ from monitor.publishing.messages.results import (
 from monitor.publishing.remote_device_states import RemoteDeviceRegistry
 
 PREFIX: Final = "imu"
-"""First part of the keys of the messages for the table in the terminal."""
+"""Key prefix of the messages for the table in the terminal."""
 _log = structlog.get_logger("imu-monitor")
 
 

@@ -1,7 +1,7 @@
 """Recorder of the daemon: writes the samples of each device, and optionally the raw bytes, to segment files.
 
-The reader threads put blocks and chunks into bounded queues (``RecordingTrack``). The recorder thread writes the queues
-to segment files twice a second, compresses finished segments, and deletes old segments. A slow disk does not delay
+The reader threads put blocks and chunks into bounded queues (``RecordingTrack``). The recorder thread writes the queued
+data to segment files twice a second, compresses finished segments, and deletes old segments. A slow disk does not delay
 samples.
 
 If a write fails, an event reports the reason, the service continues, and the recorder tries again every few seconds.
@@ -45,7 +45,7 @@ DELETE_INTERVAL_S: Final = 30.0
 MAX_PACKING_S: Final = 0.1
 """Maximum time for compression in one round."""
 FOLDER_IN_USE_ADVICE: Final = "end it, or choose another folder in [storage]"
-"""Advice in the message that another process uses the folder."""
+"""Advice to the user if another process uses the folder."""
 
 
 class Recorder:
@@ -131,7 +131,7 @@ class Recorder:
         self._thread.start()
 
     def close(self, timeout_s: float = 10.0) -> None:
-        """Write the queues and close the files, within ``timeout_s`` seconds."""
+        """Write the queued data and close the files, within ``timeout_s`` seconds."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join(timeout_s)

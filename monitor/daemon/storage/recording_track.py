@@ -30,11 +30,11 @@ MAX_QUEUE_BYTES: Final = 16_000_000
 TIME_RESOLUTION_NS: Final = 1000
 """Resolution of the Unix times in a recording, in nanoseconds."""
 MAX_SAME_SAMPLE_NS: Final = 500_000_000
-"""Maximum time difference of two rows of the same sample, in nanoseconds."""
+"""Maximum time difference between two rows of the same sample, in nanoseconds."""
 SAMPLE_BYTES: Final = 80
 """Memory of one sample in the queue, in bytes."""
 CHUNK_OVERHEAD_BYTES: Final = 100
-"""Memory of a chunk in the queue in addition to the data, in bytes."""
+"""Memory overhead of a queued chunk, in bytes."""
 RAW_FOLDER: Final = "raw"
 """Name of the subfolder for raw bytes."""
 
@@ -153,7 +153,7 @@ class RecordingTrack:
             self._queue_bytes = sum(_size(one) for one in waiting)
 
     def _take_queue(self) -> None:
-        """Move the queued rows to the rows to write, and mark dropped rows as missing."""
+        """Move the queued rows to the list of rows to write, and mark dropped rows as missing."""
         with self._lock:
             self._taken = list(self._queue)
             self._queue.clear()

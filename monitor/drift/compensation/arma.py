@@ -32,7 +32,7 @@ Order = tuple[int, int]
 _Triple = tuple[float, float, float]
 
 ORDERS: Final[tuple[Order, ...]] = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1))
-"""Orders (p, q) among which the fit selects. Yuan et al. (2010) use (2, 1). The order (0, 0) means white noise."""
+"""Orders (p, q) from which the fit selects. Yuan et al. (2010) use (2, 1). The order (0, 0) means white noise."""
 MIN_VALUES: Final = 30
 """Minimum number of interval means from which an ARMA model is identified."""
 MAX_PARTIAL_AUTOCORRELATION: Final = 0.99999
@@ -243,7 +243,7 @@ def _start_parameters(white: float, order: Order) -> list[Floats]:
 def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
     """Return the log-likelihood, maximised over the mean.
 
-    Without white noise, the innovation variance is maximised too.
+    Without white noise, the log-likelihood is also maximised over the innovation variance.
     """
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     count, logs, square, _ = compute_likelihood_sums(z, phi1, phi2, theta, variance, white)

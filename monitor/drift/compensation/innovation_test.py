@@ -11,7 +11,7 @@ from typing import Final
 INTERVALS: Final = 64
 """Number of intervals over which the squared normalised innovations are averaged."""
 FALSE_ALARM_PROBABILITY: Final = 1e-8
-"""Probability that a correct model exceeds LIMIT at a single test."""
+"""Probability that a correct model exceeds LIMIT in a single test."""
 LIMIT: Final = 2.327393746165351
 """Quantile of χ²/n with n = INTERVALS degrees of freedom, for the probability 1 − FALSE_ALARM_PROBABILITY."""
 RESET_LIMIT: Final = 1.3

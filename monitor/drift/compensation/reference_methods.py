@@ -118,8 +118,8 @@ def _steady_covariance(step: Floats, new: float) -> Floats:
     """Return the steady-state covariance matrix of a Kalman prediction.
 
     The function uses the structure-preserving doubling algorithm, which converges quadratically (Chu, Fan, Lin & Wang,
-    Int. J. Control 77, 2004). The transition matrix ``step`` has the shape (p, p). In each time step, the variance
-    ``new`` is added to the first state, and the first state is measured with unit variance.
+    Int. J. Control 77, 2004). The transition matrix ``step`` has the shape (p, p). In each time step, ``new`` is added
+    to the variance of the first state, and the first state is measured with unit variance.
     """
     p = step.shape[0]
     a, g, h = step.T.copy(), np.zeros((p, p)), np.zeros((p, p))
@@ -155,7 +155,7 @@ def _run_filter(x: Floats, phi: Floats, gain: Floats) -> Floats:
 
 
 def _filter_noise_modes(x: Floats) -> Floats:
-    """Return the sum of the empirical modes of x [n], in which the noise modes are filtered."""
+    """Filter the noise modes among the empirical modes of x [n], and return the sum of all modes."""
     try:
         from PyEMD import EMD
     except ImportError as error:

@@ -31,7 +31,7 @@ MIN_VARIANCE_SHARE: Final = 0.05
 OUTLIER_SIGMAS: Final = 6.0
 """Maximum innovation of an accepted interval, in predicted standard deviations."""
 MAX_SCATTER_RATIO: Final = (16.0, 10.0)
-"""Maximum ratio of the variance within an interval to the average, and minimum number of averaged intervals.
+"""Maximum ratio of the variance within an interval to its running average, and minimum number of averaged intervals.
 
 White noise exceeds the maximum ratio with a probability of at most 1e-6.
 """
@@ -192,7 +192,7 @@ def _update_scatter(drift: np.void, scatter: float, least: float) -> bool:
 
 @compiled
 def _model_level_only(drift: np.void, z: float, least: float) -> None:
-    """Set the noise variances of a slowly varying level with white noise, before a model is identified."""
+    """Set the noise variances for a slowly varying level plus white noise, until an ARMA model is identified."""
     drift["white_variance"] = max(drift["scatter"], least)
     drift["level_variance"] = drift["white_variance"] / MIN_LEVEL_MEMORY**2
     if drift["rest_count"] == 0.0:

@@ -31,7 +31,7 @@ GATE: Final = 5.0
 MAX_GATE_EXCEEDANCES: Final = 3
 """Number of successive samples beyond GATE after which a filter is reset."""
 SETTLING_SAMPLES: Final = (6, 48)
-"""Age from which a filter uses the steady-state gains: multiple of the memory length, and minimum in samples."""
+"""Minimum age at which a filter uses the steady-state gains, in memory lengths and in samples."""
 MIN_REST_INTERVALS: Final = 5
 """Number of intervals at rest that are required before the output of the filters is used."""
 NOISE_MEMORY_INTERVALS: Final = 60

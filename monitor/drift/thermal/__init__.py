@@ -1,1 +1,1 @@
-"""Fit, online update and prediction of thermal models, which describe the bias as a function of temperature."""
+"""Fitting and online updating of thermal models, which describe the bias as a function of temperature."""

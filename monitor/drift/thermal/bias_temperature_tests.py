@@ -39,7 +39,7 @@ MAX_MEANS: Final = 150
 MIN_FREE: Final = 4
 """Minimum number of residual degrees of freedom of a regression."""
 MAX_LIKELIHOOD_LOSS: Final = 2.0
-"""Maximum difference of the restricted log-likelihood between the best and a plausible noise model."""
+"""Maximum amount by which the restricted log-likelihood of a plausible noise model is below the maximum."""
 WALK_RATIOS: Final = (0.0, *np.geomspace(1e-3, 1e3, 9).tolist())
 """Grid of the variance of the random walk increments, divided by the variance of the white noise."""
 INCREMENT_CORRELATIONS: Final = (0.0, 0.5, 0.8, 0.95)
@@ -59,7 +59,7 @@ FOLDS: Final = 6
 MIN_NEW_SHARE: Final = 1e-4
 """Minimum fraction of a regressor that must be linearly independent of the preceding regressors."""
 CURVE_ORDER: Final = 3
-"""Order of the polynomial in temperature that is tested for a dependence."""
+"""Order of the polynomial in temperature that is used to test for a dependence."""
 HYSTERESIS_CURVE_ORDER: Final = 5
 """Order of the polynomial in temperature to which regressors for hysteresis are added."""
 
@@ -82,7 +82,7 @@ class TemperatureDependence:
 
 @dataclass(frozen=True, slots=True)
 class Hysteresis:
-    """Difference of a bias between heating and cooling."""
+    """Difference in bias between heating and cooling."""
 
     size: float  # largest bias difference at one temperature, including a drift in between; rad/s or m/s²
     p_value: float  # p-value of the null hypothesis that there is no difference
@@ -210,7 +210,8 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
         return [one for one in tested if one is not None]
 
     tests = test_candidates(np.hstack([_linear_drift(x.size), curve]))
-    # In a single temperature cycle, drift and hysteresis are nearly collinear, so the size is fitted without drift.
+    # In a single temperature cycle, drift and hysteresis are nearly collinear, so the size of the hysteresis is fitted
+    # without a drift term.
     fits = test_candidates(curve)
     if not tests or not fits:
         return None
@@ -249,7 +250,7 @@ def _scaled(means: IntervalMeans) -> tuple[Floats, Floats]:
 
 
 def _rose_and_fell(direction: Floats) -> bool:
-    """Return True if the temperature rose and fell in at least three intervals each."""
+    """Return True if the temperature rose in at least three intervals and fell in at least three intervals."""
     return min(int((direction > 0.0).sum()), int((direction < 0.0).sum())) >= 3
 
 

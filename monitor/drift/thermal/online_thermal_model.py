@@ -31,7 +31,7 @@ from monitor.drift.thermal.thermal_model import ThermalModel
 MAX_INTERVALS: Final = 1000
 """Maximum number of stored intervals. A thousand intervals of ten minutes cover a week."""
 REFIT_GROWTH: Final = 1.25
-"""Growth factor of the number of known intervals after which a new model is selected."""
+"""Factor by which the number of known intervals must grow before a new model is selected."""
 OFFSET_INTERVALS: Final = 3
 """Number of intervals from which a new bias offset is determined."""
 STEP_AICC_MARGIN: Final = 10.0
@@ -155,7 +155,7 @@ class OnlineThermalModel:
         return True
 
     def take_unexplained_changes(self) -> list[UnexplainedChange]:
-        """Return the confirmed bias changes since the last call that temperature does not explain."""
+        """Return the unexplained bias changes that have been confirmed since the last call."""
         told, self._settled = self._settled, []
         return told
 

@@ -1,8 +1,8 @@
-"""Alarm for a bias that lies outside the prediction from temperature more often than by chance.
+"""Detection of biases that lie outside the prediction interval of the thermal model too often.
 
 If the model is correct, the bias lies above the 95 % prediction interval in 2.5 % of the intervals, and below it in
-another 2.5 %. A change is suspected if the bias lies outside on the same side in MIN_OUTSIDE of the last
-WINDOW_INTERVALS intervals. The measured false alarm rate is given in docs/thermal-measurements.md.
+another 2.5 %. A change is suspected if the bias lies outside the prediction interval, on the same side, in MIN_OUTSIDE
+of the last WINDOW_INTERVALS intervals. The measured false alarm rate is given in docs/thermal-measurements.md.
 """
 
 from collections import deque
@@ -16,7 +16,7 @@ from monitor.common.distributions import Z95
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 
 MIN_OUTSIDE: Final = 4
-"""Number of intervals with a bias outside the prediction interval, on the same side, that raises a suspicion."""
+"""Number of intervals with a bias outside the prediction interval, on the same side, at which a change is suspected."""
 WINDOW_INTERVALS: Final = 6
 """Number of recent intervals with a known bias that are considered."""
 FAR_HALF_WIDTHS: Final = 2.0
@@ -53,7 +53,7 @@ class UnexplainedBiasChangeDetector:
 
     @property
     def recent_intervals_fit_prediction(self) -> bool:
-        """Return True if the last bias agrees with its prediction, and few recent biases lie outside."""
+        """Return True if the last bias agrees with its prediction and at most one recent bias per side lies outside."""
         return not (self._recent and self._recent[-1].side) and all(self._count_outside(side) < 2 for side in (-1, 1))
 
     @property

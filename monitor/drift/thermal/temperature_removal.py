@@ -55,7 +55,7 @@ class TemperatureRemovalComparison:
         Returns
         -------
         float or None
-            Share of at least 0, or None if the coefficient is not known both before and after the removal.
+            Share from 0 to 1, or None if the coefficient is not known both before and after the removal.
         """
         at = SYMBOLS.index(letter), AXES.index(axis)
         if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:

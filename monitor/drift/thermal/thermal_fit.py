@@ -75,7 +75,7 @@ class CandidateModel:
     """Fitted thermal model that was considered in a model selection."""
 
     shape: ThermalModelForm
-    aicc: float  # AICc minus that of the selected form; negative if a margin was not reached
+    aicc: float  # AICc minus the AICc of the selected form; negative if a form with a lower AICc was rejected
     rms: float  # rms residual of the multi-step prediction, rad/s or m/s²
     validated: float  # cross-validated rms error, rad/s or m/s²
 

@@ -80,8 +80,8 @@ def predict_interval_means(
 ) -> ThermalPrediction:
     """Predict interval means of the bias by multi-step or one-step prediction.
 
-    Outside the temperature range of the fit, each power of the temperature is continued as a straight line. The
-    extrapolated change is added to the uncertainty.
+    Outside the temperature range of the fit, each power of the temperature is extrapolated linearly. The extrapolated
+    change is added to the uncertainty.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ temperature without delay. Each root also has an initial-state response p^n, whi
 before the first interval.
 
 A polynomial describes a bias that follows the temperature without delay. Outside the temperature range of the fit, each
-power of the temperature is continued as a straight line.
+power of the temperature is extrapolated linearly.
 """
 
 from dataclasses import dataclass
@@ -82,8 +82,8 @@ def build_regressors(
         True to add the initial-state response of each lag, False to assume a constant temperature before the first
         interval.
     range_c : (float, float) or None
-        Temperature range of the fit, relative to the reference temperature, °C. Outside the range, powers are continued
-        as straight lines.
+        Temperature range of the fit, relative to the reference temperature, °C. Outside the range, powers are
+        extrapolated linearly.
 
     Examples
     --------
@@ -114,7 +114,7 @@ def temperature_beyond_range(excess_c: Floats, range_c: tuple[float, float]) -> 
 
 
 def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
-    """Return a power of x, continued outside the range ``ends`` as a straight line with the mean slope inside."""
+    """Return a power of x, extrapolated linearly outside the range ``ends`` with the mean slope over the range."""
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])

@@ -38,9 +38,9 @@ EachAxis = Callable[[Callable[[Floats], Column], Iterable[Floats]], Iterable[Col
 MIN_PRESENT_SHARE: Final = 0.98
 """Minimum share of samples that must be present to compute a slope."""
 BLOCK: Final = 16_384
-"""Number of phase points in a block. Three blocks of 0.4 MB in total fit a second-level cache."""
+"""Number of phase points in a block. Three blocks, 0.4 MB in total, fit into a second-level cache."""
 LANES: Final = 512
-"""Number of partial sums of squares per τ. The partial sums fit the first-level cache."""
+"""Number of partial sums of squares per τ. The partial sums fit into the first-level cache."""
 
 
 def overlapping_avar(values: Floats, factors: Ints, map_axes: EachAxis = map) -> tuple[Floats, Ints]:

@@ -1,8 +1,8 @@
 """Total and Hadamard variance of a sliding window of live samples, computed one averaging time at a time.
 
 If both variances were computed for all averaging times at once, new samples would have to wait. Each call of
-``compute_next_tau`` therefore computes one variance at one averaging time. The results become available when both
-variances have been computed at all averaging times, which is called a round.
+``compute_next_tau`` therefore computes one variance at one averaging time. A round computes both variances at all
+averaging times, and the results become available at the end of a round.
 
 The results are therefore slightly out of date. For 3.6 million samples and ten calls per second, a round of 43 calls
 takes 4.3 s. The values that ``curves_of_last_round`` returns are then up to 8.6 s old.
@@ -38,7 +38,7 @@ TOTAL, HADAMARD = 0, 1
 MIN_SAMPLES: Final = 8
 """Minimum number of samples in the window from which the variances are computed."""
 MOMENTS_RENEWAL_RATIO: Final = 1.02
-"""Growth factor of the number of samples after which the bias and the degrees of freedom are recomputed."""
+"""Factor by which the number of samples must grow before the bias and the degrees of freedom are recomputed."""
 MAX_ROUNDING_SQUARE: Final = (9.0, 16.0)
 """Largest squared difference of the total and the Hadamard variance that rounding can cause, in squared units of phase.
 

@@ -59,7 +59,7 @@ def _integrate_to_phase(values: Floats) -> PhaseRing:
     rate[:] = values
     absent = ~np.isfinite(rate)
     rate[absent] = 0.0
-    # Without the mean of the rates, the phase stays small and loses less precision.
+    # Subtracting the mean of the rates keeps the phase small, so it loses less precision.
     rate -= rate.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
     rate[absent] = 0.0
     np.cumsum(rate, axis=0, out=rate)
@@ -70,7 +70,7 @@ def _integrate_to_phase(values: Floats) -> PhaseRing:
 def variance_from_squared_differences(
     values: Floats, factors: Ints, squared_weights: float, add_squares: Callable[[PhaseRing, int, Floats, Ints], None]
 ) -> tuple[Floats, Ints]:
-    """Return a variance of rates that is defined as a mean of squared phase differences, and the number of differences.
+    """Return a variance of rates, computed as a mean of squared phase differences, and the number of differences.
 
     Parameters
     ----------

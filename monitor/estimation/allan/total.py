@@ -1,9 +1,9 @@
 """Total variance of a rate, which is the Allan variance of a recording that is extended by reflection at both ends.
 
-The rate must be reflected as a rate and not as a phase, see "Applications of total variance method in random error
-analysis of the fiber optic gyro signal". The total variance equals Howe's TOTVAR of the integrated rate (NIST SP 1065
-eq. 25). The variance is the mean of d_i² / (2 m²) over the inner phase points i. Here d_i = x*_{i-m} − 2 x*_i +
-x*_{i+m} is a second difference of the extended phase x*. Before the start of the recording, x*_{-j} = 2 x_0 − x_j.
+The rate must be reflected as a rate and not as a phase ("Applications of total variance method in random error analysis
+of the fiber optic gyro signal"). The total variance equals Howe's TOTVAR of the integrated rate (NIST SP 1065 eq. 25).
+The variance is the mean of d_i² / (2 m²) over the inner phase points i. Here d_i = x*_{i-m} − 2 x*_i + x*_{i+m} is a
+second difference of the extended phase x*. Before the start of the recording, x*_{-j} = 2 x_0 − x_j.
 
 The function ``total_variance`` returns biased variances, and ``compute_total_curve`` corrects the bias. For τ ≤ T/2,
 the expectation of the total variance is the Allan variance times 1 − a τ/T. The factor a is 0 for white noise, 0.481

@@ -43,10 +43,10 @@ TAIL: Final = 8.0
 """Lag in units of m_i + m_j beyond which differences of t² ln t are computed from a series expansion."""
 
 UNLIMITED_SAMPLES: Final = 1 << 62
-"""Number of samples that stands for "without limit"."""
+"""Number of samples that means "unlimited"."""
 
 TABLE_STEP: Final = 1.1
-"""Growth factor of the number of samples after which the covariance table is recomputed."""
+"""Factor by which the number of samples must grow before the covariance table is recomputed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class CovarianceTable:
 
 
 class CovarianceTablesByAxis:
-    """Covariance tables of six axes whose number of samples grows.
+    """Covariance tables for six axes with a growing number of samples.
 
     All axes that use the whole window share one covariance table.
 

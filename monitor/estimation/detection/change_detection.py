@@ -112,7 +112,7 @@ NOISE_NAMES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Detected change on one axis. Times are numbers of samples since the start of the detector."""
+    """Detected change on one axis. Times are given in samples since the start of the detector."""
 
     kind: str  # noise_changed, bias_stepped, outlier_burst
     axis: int  # index into AXES
@@ -257,7 +257,7 @@ class NoiseAndBiasChangeDetector:
         return bool(self._bulk_variance_ratio(axis, after) < 1.0 + 0.5 * (after[UNIT_RAW] / n / before - 1.0))
 
     def _bulk_variance_ratio(self, axis: int, after: Floats) -> float:
-        """Return the ratio of the variances after and before an alarm without the effect of outliers.
+        """Return the ratio of the variance after an alarm to the variance before it, without the effect of outliers.
 
         The variances are computed from the share of differences below a fixed limit, which outliers hardly affect. For
         Gaussian noise, this share determines the variance.

@@ -1,7 +1,7 @@
 """Compiled part of the change detector, which computes Haar differences, cumulative sums (CUSUM) and alarms.
 
 Samples are processed in ticks of 32 samples. Processing stops when a decision about an alarm is due. The decision
-therefore does not depend on how the samples are divided into calls.
+therefore does not depend on how the samples are distributed over calls.
 
 - **Haar differences.** In octave j, the means of two successive blocks of m = 2^j samples give the Haar difference z =
   (mean − mean')/√2. The mean square of z is the Allan variance at cluster size m. For white noise and random walk, the
@@ -38,7 +38,7 @@ GAIN: Final = 1.0 - 1.0 / RATIOS
 HALF_LOG: Final = 0.5 * np.log(RATIOS)
 """Term ½ ln r for each variance ratio r."""
 TICK_SAMPLES: Final = 32
-"""Number of samples in a tick. To save the time of computing logarithms, the evidence is updated once per tick."""
+"""Number of samples in a tick. To compute fewer logarithms, the evidence is updated once per tick."""
 SHORT: Final = 5
 """Number of octaves whose clusters are shorter than a tick."""
 RAREST: Final = 1e-6
@@ -61,8 +61,8 @@ SETTLED: Final = 256
 MIN_REFERENCE_TERMS: Final = 64
 """Minimum number of squared differences in a reference that can raise an alarm, if the factor F is 1.
 
-The number is multiplied by F². The first factor F accounts for the information of correlated squares. The second factor
-F ensures that sums much longer than the correlation have been observed.
+The number is multiplied by F². The first factor F accounts for the reduced information in correlated squares. The
+second factor F ensures that the observed sums are much longer than the correlation time.
 """
 MIN_BAND_TERMS: Final = 16
 """Minimum number of squared differences in a longer octave from which slow noise is estimated."""
@@ -75,7 +75,7 @@ CONFIRM_PAIRS: Final = 2
 SLOTS: Final = 4
 """Number of copies that each level of ``ChangeState.snap`` stores."""
 NEVER: Final = 1 << 62
-"""Sample number that stands for "no decision is due"."""
+"""Sample number that means "no decision is due"."""
 
 N, S, LIMIT, SEEDED, F = range(5)
 """Columns of ``ChangeState.band``, which contains the reference."""

@@ -36,9 +36,9 @@ from monitor.noise.spectrum import MIN_FREQUENCY_CYCLES, Spectrum, frequency_gri
 from monitor.noise.standard_terms import STANDARD_TERMS
 
 MIN_EDF: Final = 2.0
-"""Minimum number of degrees of freedom at an averaging time that is compared."""
+"""Minimum number of degrees of freedom that is required to compare an averaging time."""
 MIN_SAMPLES: Final = 1000
-"""Minimum number of samples of an axis that is compared. With 1000 samples, the error of N is 3 %."""
+"""Minimum number of samples that is required to compare an axis. With 1000 samples, the error of N is 3 %."""
 FALSE_ALARM: Final = 0.01
 """Probability that the gap of any axis exceeds ``threshold`` in an independent window if the model is true."""
 FALSE_ALARM_WATCHED: Final = 0.001
@@ -192,11 +192,11 @@ def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Float
 
 
 def _excess_variance(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rate_hz: float) -> Floats:
-    """Return the additional variance of the Allan variance that effects beyond Q, N, B and K cause.
+    """Return the additional variance of the Allan variance due to effects other than Q, N, B and K.
 
-    The variance is per second difference and in units with τ0 = 1. It is 4 ∫ (S² − S_standard²) G² dν, where S is the
-    spectral density and G = 2 sin⁴(πνm)/(m sin πν)² (Parseval's theorem). A spectral line of mean square P contributes
-    4 P S G² at the frequency of the line.
+    The variance is that of a single second difference, in units with τ0 = 1. It is 4 ∫ (S² − S_standard²) G² dν, where
+    S is the spectral density and G = 2 sin⁴(πνm)/(m sin πν)² (Parseval's theorem). A spectral line of mean square P
+    contributes 4 P S G² at the frequency of the line.
     """
     (axis,) = classic.effects
     f_hz = frequency_grid(MIN_FREQUENCY_CYCLES * rate_hz / float(factors.max()), 1.0 / rate_hz, spectrum.peaks)

@@ -5,10 +5,10 @@ long recordings. Segments in which more than ``MAX_MISSING_SHARE`` of the sample
 
 - **Spectral lines.** The periodograms of all segments are computed with a Hann window and averaged (Welch 1967). A peak
   must exceed the medians of the neighbouring bins on both sides by ``MIN_PEAK_SIGMA`` standard deviations and by the
-  factor ``MIN_PEAK_RATIO``. Lines are searched in single bins, and resonances in bins that are ``WIDE_BINS`` times
-  wider. A line of amplitude A contributes A² sin⁴(πfτ) / (m sin(πf/rate))² to the Allan variance (IEEE Std 952 annex C,
-  for a mean of m samples). A peak is not reported if its share of the Allan variance is below ``MIN_LINE_SHARE`` at
-  every averaging time.
+  factor ``MIN_PEAK_RATIO``. Single bins are searched for lines, and bins that are ``WIDE_BINS`` times wider are
+  searched for resonances. A line of amplitude A contributes A² sin⁴(πfτ) / (m sin(πf/rate))² to the Allan variance
+  (IEEE Std 952 annex C, for a mean of m samples). A peak is not reported if its share of the Allan variance is below
+  ``MIN_LINE_SHARE`` at every averaging time.
 - **Outliers.** An outlier deviates by more than ``OUTLIER_SIGMA`` σ from the median of a block of ``BLOCK`` samples. To
   exclude slopes, an outlier must also deviate by ``OUTLIER_SIGMA``/2 σ from the median of the neighbouring samples. The
   standard deviation σ is computed from the median absolute deviation, and is at least one quantization step.
@@ -39,9 +39,9 @@ MIN_STRETCHES: Final = 8
 MAX_STRETCHES: Final = 128
 """Maximum number of segments over which a spectrum is averaged."""
 MAX_OUTLIER_STRETCHES: Final = 32
-"""Maximum number of segments in which outliers are searched.
+"""Maximum number of segments that are searched for outliers.
 
-In these 131 072 samples, a share of outliers of 0.001 is measured with a relative error of 10 %.
+With these 131 072 samples, an outlier share of 0.001 is measured with a relative error of 10 %.
 """
 MAX_MISSING_SHARE: Final = 0.05
 """Maximum share of missing samples in a segment."""
@@ -58,7 +58,7 @@ MIN_PEAK_RATIO: Final = 1.6
 A sloping spectrum or the edge of a filter has a smaller ratio.
 """
 WIDE_BINS: Final = 16
-"""Width of the bins in which resonances are searched, in bins of the spectrum."""
+"""Width of the bins that are searched for resonances, in bins of the spectrum."""
 FIRST_BIN: Final = 6
 """First bin of the spectrum that is searched for peaks."""
 MIN_BINS: Final = 64
@@ -68,7 +68,7 @@ NEAR_BINS: Final = 3
 SIDE_BINS: Final = 16
 """Number of neighbouring bins on each side with which a peak is compared. Wide bins use a quarter of this number."""
 FOOT_SIGMA: Final = 2.0
-"""Minimum decrease in standard deviations over ``NEAR_BINS`` bins at the flank of a peak."""
+"""Minimum decrease, in standard deviations, over ``NEAR_BINS`` bins at the flank of a peak."""
 MIN_LINE_SHARE: Final = 0.002
 """Minimum share of the Allan variance that a reported line contributes."""
 MAX_LINES: Final = 3

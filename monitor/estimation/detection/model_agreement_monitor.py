@@ -1,10 +1,11 @@
 """Monitor that decides whether each axis of a sensor agrees with the noise model, and reports changes as events.
 
 The sliding window is compared with the noise model ten times per second, so successive comparisons are strongly
-correlated. An axis disagrees with the model if the largest difference exceeds ``AxisModelComparison.alarm`` while 1/8
-of the window is replaced by new samples. If the difference is larger than twice this limit, ``MIN_SAMPLES`` new samples
-are sufficient. An axis agrees again if the largest difference stays below ``null95`` while 1/8 of the window is
-replaced. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was rejected three times.
+correlated. An axis disagrees with the model if the largest difference stays above ``AxisModelComparison.alarm`` until
+1/8 of the window has been replaced. If the difference exceeds twice ``AxisModelComparison.threshold``, ``MIN_SAMPLES``
+new samples are sufficient. An axis agrees again if the largest difference stays below ``null95`` until 1/8 of the
+window has been replaced. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was
+rejected three times.
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ KIND: Final = "model_disagrees"
 RENEWED_SHARE: Final = 0.125
 """Share of the samples in the window that must be new before a decision changes."""
 CLEAR_FACTOR: Final = 2.0
-"""Ratio of the difference to the alarm limit above which fewer new samples are sufficient."""
+"""Ratio of the difference to ``threshold`` above which fewer new samples are sufficient for a disagreement."""
 
 
 @dataclass(slots=True)

@@ -10,7 +10,7 @@ If the mean stays constant at a new value, the orientation has changed, and the 
 stays constant becomes the new reference. A much smaller variance also starts a new reference, because the old reference
 must have been learned in motion.
 
-The index of a sample determines its block, so decisions do not depend on how the samples are divided into calls.
+The index of a sample determines its block, so decisions do not depend on how the samples are distributed over calls.
 """
 
 from math import exp, inf, log, nan, sqrt
@@ -73,7 +73,7 @@ REMOVED_AFTER: Final = 2
 EPISODE_GAP_BLOCKS: Final = 4
 """Number of blocks at rest that end an episode of motion."""
 LOOK_EVERY: Final = 20
-"""Number of blocks between two tests whether a disturbance is constant."""
+"""Number of blocks between two tests of whether a disturbance is constant."""
 WANDER: Final = 4.0
 """Maximum scatter of the block means, relative to the scatter expected from the noise within blocks."""
 MIN_VARIANCE: Final = 1e-30
@@ -299,7 +299,7 @@ def _band(a: int, n: int, size: int, s: MotionState) -> float:
 
 @compiled
 def _take_over(now: Floats, s: MotionState) -> None:
-    """Shift the means of the reference to the current means, without a change of their scatter."""
+    """Shift the means of the reference to the current means without changing their scatter."""
     for a in range(AXES):
         n = min(s.seen[a], REFERENCE_BLOCKS)
         if now[MEAN, a] == now[MEAN, a] and n > 0:
@@ -395,7 +395,7 @@ def _begin_anew(blocks: int, s: MotionState) -> None:
 def _steady(size: int, s: MotionState) -> bool:
     """Return True if the signal has been statistically constant during the last ``REFERENCE_BLOCKS`` blocks.
 
-    The first and the second half of the blocks must agree, without bursts of noise and without drift of the mean.
+    The two halves of the blocks must agree, and there must be no bursts of noise and no drift of the mean.
     """
     half, ordered = REFERENCE_BLOCKS // 2, np.empty(REFERENCE_BLOCKS)
     for a in range(AXES):

@@ -26,7 +26,7 @@ def estimate_stale_sample_share(values: Floats) -> float:
     """Return the share of samples [n, 6] that repeat the previous sample because the sensor had no new measurement.
 
     Let s be the share of repeated measurements, and q_a the probability that the value of axis a repeats by chance.
-    Axis a then repeats in a share s + (1 - s) q_a of all samples, and all axes repeat in a share s + (1 - s) Π q_a. The
+    The share of repeated samples is then s + (1 - s) q_a on axis a, and s + (1 - s) Π q_a on all axes at once. The
     function solves these equations for s. NaN means missing. For fewer than two measured axes, the share is 0.
 
     >>> noise = np.random.default_rng(0).normal(size=(5000, 6)).round()

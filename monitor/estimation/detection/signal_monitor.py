@@ -164,5 +164,5 @@ class SignalMonitor:
         return Event(change.kind, found_ns, change.text, AXES[change.axis], what, since_ns, change.sigma)
 
     def _t_ns(self, index: int) -> int:
-        """Return the time of a sample from its index since the restart, at most the time of the newest sample."""
+        """Return the time of a sample from its index since the restart, no later than the time of the newest sample."""
         return self._newest_ns - round(max(self._received - self._began - 1 - index, 0) / self._rate_hz * 1e9)

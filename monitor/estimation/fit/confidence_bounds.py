@@ -75,8 +75,8 @@ def limit_terms_by_measured_avar(
 ) -> None:
     """Limit each coefficient so that no noise term alone exceeds a measured Allan variance.
 
-    N is only limited at τ of more than ``filter_memory`` samples. At shorter τ, a low-pass filter in the sensor may
-    have removed white noise.
+    N is limited only by the Allan variance at τ of more than ``filter_memory`` samples. At shorter τ, a low-pass filter
+    in the sensor may have removed white noise.
 
     Parameters
     ----------

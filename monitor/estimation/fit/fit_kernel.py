@@ -49,12 +49,12 @@ MISFIT_SIGMA: Final = 4.0
 REPEATED_MISFIT_SIGMA: Final = 2.5
 """Residual in σ above which the Allan variance at a short τ contradicts a fit with a negative Q².
 
-This limit is lower than ``MISFIT_SIGMA`` to prevent a bias of N.
+This limit is lower than ``MISFIT_SIGMA`` to prevent a bias in N.
 """
 TOTAL_MISFIT_SIGMA: Final = 6.0
 """Deviation of χ² in σ above which the five noise terms do not explain the Allan variances."""
 SHORT_ROWS: Final = 4
-"""Number of averaging times, from the shortest τ, at which the residuals are tested."""
+"""Number of shortest averaging times at which the residuals are tested."""
 FILTER_MEMORY: Final = 16
 """Largest cluster size in samples that can be left out of a fit."""
 WHITE: Final = PAIRS.index((N, N))
@@ -165,7 +165,7 @@ def _fit_or_fall_back(
 ) -> tuple[int, bool]:
     """Fit with the full covariance matrix, or with the variances alone if the misfit is too large.
 
-    Return the number of the shortest τ that are left out, and True if Q² may be negative.
+    Return how many of the shortest τ are left out, and whether Q² may be negative.
     """
     full_covariance, theta = options.full_covariance, output.theta[axis]
     while True:
@@ -189,7 +189,7 @@ def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats
             model += columns[i, a] * theta[a]
             positive += columns[i, a] * max(theta[a], 0.0)
         output.fitted[axis, i] = model if k >= output.left_out[axis] and model > 0.0 else np.nan
-        # The product of linear drift and noise in the mean second difference adds the variance 4 R² (m²/2)² Var(slope).
+        # The cross term of drift and noise in the squared second differences adds the variance 4 R² (m²/2)² Var(slope).
         variance[i] += 4.0 * theta[R] * columns[i, R] ** 2 * noise
         output.edf[axis, i] = 2.0 * positive * positive / variance[i]
 
@@ -206,7 +206,7 @@ def _fit_terms(
 ) -> tuple[int, bool]:
     """Fit Q, N, B and K iteratively with recomputed weights.
 
-    Return the number of the shortest τ that are left out, and True if Q² may be negative.
+    Return how many of the shortest τ are left out, and whether Q² may be negative.
     """
     first, free = 0, False
     warm = warm and theta[N] > 0.0

@@ -54,7 +54,7 @@ def compute_observation_variances(problem: LeastSquares, tau_indices: Ints, thet
 
 @compiled
 def compute_weights(problem: LeastSquares, tau_indices: Ints, theta: Floats, full_covariance: bool) -> None:
-    """Compute the weights V⁻¹ X from the covariance matrix V of the observations that a noise model predicts.
+    """Compute the weights V⁻¹ X, where V is the covariance matrix of the observations predicted by a noise model.
 
     Parameters
     ----------

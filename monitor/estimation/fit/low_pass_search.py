@@ -34,11 +34,11 @@ from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, avar_upper_l
 from monitor.estimation.fit.least_squares import N, Q
 
 Kind = Literal["digital", "sampled"]
-"""Kind of a low-pass filter: "digital" at the sample rate, or analogue before the signal is "sampled"."""
+"""Kind of low-pass filter: "digital" at the sample rate, or "sampled" for an analogue filter before sampling."""
 FAMILIES: Final[tuple[tuple[Kind, int], ...]] = tuple(
     (kind, order) for order in (1, 2, 3, 4) for kind in ("digital", "sampled")
 )
-"""Kinds and orders of the low-pass filters among which the search selects."""
+"""Kinds and orders of low-pass filters from which the search selects."""
 CUTOFFS: Final = np.geomspace(0.005, 0.49, 56)
 """Grid of cutoff frequencies, as fractions of the sample rate."""
 SPECTRUM_BINS: Final = 1 << 13

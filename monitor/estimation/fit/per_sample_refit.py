@@ -102,7 +102,7 @@ class ContinuousRefit:
         self.restart_all_fits()
 
     def restart_all_fits(self) -> None:
-        """Restart the fits of all axes with no noise terms."""
+        """Restart the fits of all axes from an empty set of noise terms."""
         output = empty_fit_output(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
         self._state = RefitState(self._curves, output, empty_solution_maps(AXES, self._rows), self._ages)
         self._used: list[CovarianceTable | None] = [None] * AXES  # covariance tables from which ``_known`` was computed

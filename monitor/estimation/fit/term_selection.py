@@ -37,7 +37,7 @@ from monitor.estimation.fit.least_squares import (
 MAX_THETA_CHANGE: Final = 0.4
 """Relative change of θ above which the linear map is recomputed, provided that it also exceeds ``MAX_THETA_SIGMA``."""
 MAX_THETA_SIGMA: Final = 1.0
-"""Change of θ in standard deviations up to which the linear map is not recomputed."""
+"""Largest change of θ, in standard deviations, for which the linear map is kept."""
 DETECTABLE_SIGMA: Final = 3.0
 """Size of a squared coefficient, in σ, at which the noise term is detected."""
 

@@ -32,7 +32,7 @@ FORMATS: Final[dict[str, Callable[..., str]]] = {
     "gyroparams": export_gyroparams,
     "kalman": export_kalman_process_noise,
 }
-"""Function that exports noise coefficients, for each file format."""
+"""Functions that export noise coefficients, by file format."""
 
 
 def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, **options: Any) -> str:

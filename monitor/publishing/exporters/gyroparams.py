@@ -1,10 +1,10 @@
 """Export of noise coefficients as a MATLAB script for the MathWorks model ``imuSensor``.
 
 The property ``NoiseDensity`` is N of IEEE Std 952 if the noise type is ``single-sided``, because the standard deviation
-of a sample is then NoiseDensity·√rate. The default noise type of MathWorks would give noise that is smaller by √2. The
-property ``BiasInstability`` is the standard deviation of the white noise at the input of a filter. With the filter
-``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995), the bias has the spectrum B²/(2πf) of IEEE Std 952. The default filter
-of MathWorks has one pole at 0.5 and does not generate flicker noise.
+of a sample is then NoiseDensity·√rate. With the default noise type of MathWorks, the noise would be too small by a
+factor of √2. The property ``BiasInstability`` is the standard deviation of the white noise at the input of a filter.
+With the filter ``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995), the bias has the spectrum B²/(2πf) of IEEE Std 952.
+The default filter of MathWorks has one pole at 0.5 and does not generate flicker noise.
 
 If only an upper bound of a coefficient is known, the coefficient is set to 0, because the script is meant for
 simulation.
@@ -67,7 +67,7 @@ def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
 
 
 def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit: str, inflation: float) -> str:
-    """Return a property with the values of three axes. An unknown coefficient is 0, and a comment names its axis."""
+    """Return a property with the values of three axes. Unknown coefficients are written as 0, with a comment."""
     known, values, said = noise.coefficient_by_axis(kind, letter), [], ""
     for axis in axes_of(kind):
         term = known.get(axis)

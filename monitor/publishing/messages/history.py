@@ -49,7 +49,7 @@ class MinMaxLastHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return cls(value=_nine_digits(column.last), low=_nine_digits(column.low), high=_nine_digits(column.high))
 
     def to_column(self, *shape: int) -> ColumnStatistics:
-        """Return the statistics of one quantity, or of several quantities for a shape [buckets, columns]."""
+        """Return the statistics of one quantity, or of several quantities if the shape is [buckets, columns]."""
         low, high, last = (_checked(one, shape) for one in (self.low, self.high, self.value))
         return ColumnStatistics((~np.isnan(last)).astype(np.int64), low, high, last)
 

@@ -2,7 +2,7 @@
 
 The publisher, ``watch``, ``view`` and history queries use the same message classes. The order of the fields in a class
 is the order of the JSON keys. NaN is written as null, because JSON cannot represent NaN. In an array, null is read as
-NaN. Unknown keys are ignored, so that messages of newer daemons remain readable.
+NaN. Unknown keys are ignored, so that messages from newer daemons remain readable.
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ from drivers.data_types import Ints
 from monitor.common.topics import Topic
 
 MAX_PAYLOAD_BYTES: Final = 1_000_000
-"""Largest accepted payload. A typical message about six axes has a few kilobytes."""
+"""Largest accepted payload. A typical message for six axes is a few kilobytes long."""
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
 

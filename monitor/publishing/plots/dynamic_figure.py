@@ -1,8 +1,8 @@
 """Plot of the Allan deviation over time (dynamic Allan deviation), with heat maps and noise coefficients.
 
-The time axis shows the end of the sliding window. The colour of a heat map is the Allan deviation divided by its median
-over time. Cells are pale if the 95 % interval of the Allan deviation contains the median. A noise coefficient has a
-panel if it is estimated in at least 5 % of the time steps. A vertical line marks a detected change.
+The time axis shows the end of the sliding window. The colours of a heat map show the Allan deviation divided by its
+median over time. Cells are pale if the 95 % interval of the Allan deviation contains the median. A noise coefficient
+has a panel if it is estimated in at least 5 % of the time steps. A vertical line marks a detected change.
 """
 
 import warnings

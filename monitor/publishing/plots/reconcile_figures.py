@@ -98,7 +98,7 @@ def before_and_after_svgs(
 ) -> list[str]:
     """Draw each diagnostic with a panel before and a panel after a step, and return the figures as SVG elements.
 
-    All figures use the same panels, because matplotlib needs much time to create panels and ticks.
+    All figures use the same panels, because matplotlib takes a long time to create panels and ticks.
 
     Parameters
     ----------

@@ -184,7 +184,7 @@ def format_tick(value: float) -> str:
 def style_log_axis(panel: "Axes", which: str, minor_grid: bool = True) -> None:
     """Label a logarithmic axis with plain numbers and draw the grid lines.
 
-    Powers of ten have labels. If the axis covers few decades, their multiples by 2 and 5 also have labels.
+    Powers of ten are labelled. If the axis covers few decades, 2 and 5 times each power of ten are also labelled.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
 
 
 def choose_y_scale_and_limits(panel: "Axes", smallest: float, largest: float, margin: float) -> None:
-    """Set the scale and the limits of the y axis. A wide range of values gives a logarithmic scale.
+    """Set the scale and the limits of the y axis. A logarithmic scale is used if the values span a wide range.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) ->
 
 
 def _draw_intervals(seen: EffectInRecordings, axis: str) -> str:
-    """Return a drawing of the first effect parameter that has intervals, or an empty string if none has intervals."""
+    """Return a chart of the first effect parameter that has intervals, or an empty string if no parameter has any."""
     name = next((name for name, one in seen.parameters.items() if one.freedom), "")
     rows = [(run, step.parameters[name]) for run, step in _rows(seen) if name in step.parameters]
     if not any(one.lo is not None and one.hi is not None and one.hi > one.lo for _, one in rows):

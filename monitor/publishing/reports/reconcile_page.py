@@ -1,8 +1,8 @@
 """HTML report of a reconciliation, ``report.html``.
 
 The page is self-contained. It begins with the summary, the Allan deviation of each axis that differs, and the ranked
-findings. A folded part contains a table of the axes, and a section for each step with all diagnostics before and after
-the step.
+findings. A collapsible section contains a table of the axes and, for each step, all diagnostics before and after the
+step.
 """
 
 from collections.abc import Sequence

@@ -44,7 +44,7 @@ RESULT_TEXTS: Final = {
 }
 """Text for each possible result of an axis or a recording."""
 DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
-"""Displayed names of diagnostics with an abbreviated identifier."""
+"""Displayed names of diagnostics whose identifiers are abbreviations."""
 SAMPLE_SI_UNITS: Final[dict[Kind, str]] = {"gyro": "rad/s", "accel": "m/s²"}
 GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
 SMALL_UNIT_BELOW: Final = 0.1  # in °/s or m/s²; smaller values are displayed in °/h or µg
@@ -323,7 +323,7 @@ def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str
 
 
 def _with_interval(value: float, lo: float, hi: float) -> tuple[str, ...]:
-    """Format a value, the interval ends and the half width to two digits of the half width."""
+    """Format a value, the interval ends and the half width, rounded to the second digit of the half width."""
     half = 0.5 * (hi - lo)
     decimals = 1 - floor(log10(half))
     if 0 <= decimals <= 9 and max(map(abs, (value, lo, hi))) < 1e6:

@@ -32,7 +32,7 @@ def summarize(c: Comparison) -> str:
 
 
 def describe_size_agreement(effect: EffectInRecordings) -> str:
-    """Return a text that states whether the sizes of an effect agree between recordings, with the p-value."""
+    """Describe whether the sizes of an effect agree between recordings, with the p-value."""
     if effect.p is None:
         return "nothing to compare"
     return f"sizes {'agree' if effect.sizes_agree else 'differ'} ({_format_p_value(effect.p)})"
@@ -48,7 +48,7 @@ def _format_p_value(p: float) -> str:
 
 
 def describe_finding_counts(result: AxisResult | None) -> str:
-    """Return a text that states how many effects and unexplained differences were found on one axis."""
+    """Describe how many effects and unexplained differences were found on one axis."""
     if result is None:
         return "not recorded"
     effects = f"{len(result.steps)} effect{'' if len(result.steps) == 1 else 's'}" if result.steps else ""

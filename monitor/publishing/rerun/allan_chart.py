@@ -81,7 +81,7 @@ def finite_sections(positions: Floats) -> list[Floats]:
 
 
 def dash_line(line: Floats, length: float = 0.22) -> list[Floats]:
-    """Divide a line into dashes that are as long as the gaps between the dashes.
+    """Divide a line into dashes and gaps of equal length, and return the dashes.
 
     >>> [stroke.tolist() for stroke in dash_line(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)]
     [[[0.0, 0.0], [1.0, 0.0]], [[2.0, 0.0], [3.0, 0.0]]]
@@ -157,7 +157,7 @@ def chart_grid(scale: ChartDecadeRange) -> ChartGrid:
 
 
 def _line_positions(span: tuple[int, int], length: float) -> tuple[list[float], list[float]]:
-    """Return the positions of the powers of ten along an axis, and the positions of their multiples by 2 to 9."""
+    """Return the positions of the powers of ten along an axis, and the positions of 2 to 9 times each power."""
     per_decade = length / (span[1] - span[0])
     at = [i * per_decade for i in range(span[1] - span[0] + 1)]
     between = [a + math.log10(k) * per_decade for a in at[:-1] for k in range(2, 10)]
@@ -173,5 +173,5 @@ def _horizontal(y: float) -> Floats:
 
 
 def _tick(power: int) -> str:
-    """Format a power of ten. Values below 0.0001 or above 10000 have exponent notation."""
+    """Format a power of ten. Values below 0.0001 or above 10000 are written in exponent notation."""
     return f"{10.0**power:g}" if -4 <= power <= 4 else f"1e{power}"

@@ -13,13 +13,13 @@ from monitor.estimation.estimate import Estimate
 COLUMNS = 300
 """Largest number of columns. The number must be even, because columns are averaged in pairs."""
 INITIAL_COLUMN_S = 2.0
-"""Duration of sample time that a column covers initially [s]."""
+"""Initial time span of a column [s]."""
 
 
 class AllanHistory:
     """Allan deviations of one device over time.
 
-    If an estimate has other averaging times or an earlier time than its predecessor, a new history starts.
+    A new history starts if an estimate is earlier than the previous estimate, or has different averaging times.
     """
 
     def __init__(self, column_s: float = INITIAL_COLUMN_S) -> None:
@@ -47,7 +47,7 @@ class AllanHistory:
         wall_s
             Unix time of the estimate [s].
         estimate
-                        Estimate with the Allan deviations to add.
+            Estimate with the Allan deviations to add.
         """
         if wall_s < self._newest_s or not np.array_equal(self.tau_s, estimate.curve.tau_s):
             self._reset(estimate.curve.tau_s, wall_s)

@@ -24,7 +24,7 @@ from monitor.publishing.zenoh.subscriber import ReceivedMessageOrLiveliness, Zen
 RECEIVE_TIMEOUT_S: Final = 0.1
 TABLE_PERIOD_S: Final = 1.0
 MAX_ROWS: Final = 40
-"""Largest number of rows of the device table, which fill about one screen."""
+"""Maximum number of rows in the device table. These rows fill about one screen."""
 
 
 def full_device_key(device: str, keyexpr: str) -> str:
@@ -36,7 +36,7 @@ def full_device_key(device: str, keyexpr: str) -> str:
     Parameters
     ----------
     device
-                Full key of the device, or the end of the key.
+        Full key of the device, or the end of the key.
     keyexpr
         Pattern of zenoh keys (key expression) of the subscription.
     """
@@ -75,7 +75,7 @@ class FleetView:
         Parameters
         ----------
         stop
-                        Event that ends the method when it is set.
+            Event that ends the method when it is set.
         report
             Function that receives the address of the web page and the problems after each change.
         duration_s
@@ -98,7 +98,7 @@ class FleetView:
                 report(text)
 
     def process_message(self, message: ReceivedMessageOrLiveliness) -> None:
-        """Update the device table from a message, and draw the results of a device shown in detail."""
+        """Update the device table from a message, and draw the results if the device is shown in detail."""
         if message.payload is None:
             self.board.set_liveliness_token(message.key, message.token_exists)
             return
@@ -123,7 +123,7 @@ class FleetView:
         Parameters
         ----------
         wall_s
-                        Unix time at which the table is shown [s].
+            Unix time at which the table is shown [s].
         now_s
             Current time [s] on the monotonic clock that gives the age of messages.
         """

@@ -1,7 +1,7 @@
 """Content of the Rerun viewer, which consists of panels that log results to one Rerun stream.
 
-Only the thread of the viewer may use this module, because a call blocks while the viewer does not read. Importing this
-module imports Rerun.
+Only the viewer thread may use this module, because calls block while the viewer is not reading. Importing this module
+imports Rerun.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Curved drift of the bias, for example by ageing."""
+"""Curved drift of the bias, for example due to ageing."""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -17,7 +17,7 @@ from monitor.noise.effect import (
 
 @dataclass(frozen=True, slots=True)
 class BiasStep(NonstationaryBias):
-    """Step of the bias by ``height`` at the first sample at or after ``time``.
+    """Bias step of size ``height`` at the first sample at or after ``time``.
 
     >>> bool(np.isnan(BiasStep(time=60.0, height=1e-3).avar(np.array([1.0]), 0.01)[0]))
     True

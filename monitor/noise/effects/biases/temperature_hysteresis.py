@@ -1,4 +1,4 @@
-"""Bias with different values while the temperature rises and while it falls."""
+"""Bias that differs between rising and falling temperature."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -32,7 +32,7 @@ class TemperatureHysteresis(NonstationaryBias):
     uses_temperature: ClassVar[bool] = True
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Hysteresis":
-        """Start a series in the middle between both branches."""
+        """Start a series midway between the two branches."""
         return _Hysteresis(self.height, self.reversal)
 
 

@@ -9,10 +9,10 @@ from monitor.noise.effect import GYROS, Effect, source_axis_field
 
 @dataclass(frozen=True, slots=True)
 class AxisPermutation(Effect):
-    """Output of the axis ``source`` in place of the own output of the axis.
+    """Replacement of the output of an axis by the output of the axis ``source``.
 
-    Two exchanged axes have this effect each, with the other axis as source. Allan variance and spectrum are those of
-    the source.
+    Each of two exchanged axes has this effect, with the other axis as its source. Allan variance and spectrum are those
+    of the source.
 
     >>> AxisPermutation(source="ax").check_axis("gx")
     Traceback (most recent call last):
@@ -24,7 +24,7 @@ class AxisPermutation(Effect):
     description: ClassVar[str] = "The axis shows the measurement of another axis."
 
     def check_axis(self, axis: str) -> None:
-        """Raise ConfigError if the source has another unit than the axis."""
+        """Raise ConfigError if the unit of the source differs from the unit of the axis."""
         if (self.source in GYROS) != (axis in GYROS):
             kind = "a gyroscope" if axis in GYROS else "an accelerometer"
             raise ConfigError(f"{self.name}: source must be {kind} as {axis} is, is {self.source!r}")

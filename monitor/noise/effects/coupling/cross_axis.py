@@ -22,7 +22,7 @@ class CrossAxis(AxisLeak):
     description: ClassVar[str] = "A misalignment adds a share of the signal of another axis."
 
     def check_axis(self, axis: str) -> None:
-        """Raise ConfigError if the source is the axis itself or has another unit."""
+        """Raise ConfigError if the source is the axis itself or has a different unit."""
         if self.source == axis:
             raise ConfigError(f"{self.name}: source must be another axis than {axis} itself")
         if (self.source in GYROS) != (axis in GYROS):

@@ -15,7 +15,7 @@ DEGREES_OF_FREEDOM: Final = NumberRange("", 2.1, 1000.0)
 
 @dataclass(frozen=True, slots=True)
 class HeavyTails(Effect):
-    """Student's t distribution with ν degrees of freedom in a share of the samples of the white noise.
+    """White noise in which a share of the samples follows Student's t distribution with ν degrees of freedom.
 
     Each of these samples is multiplied by √((ν − 2)/χ²) with a random χ² of ν degrees of freedom (Student, "The
     probable error of a mean", 1908). The variance is unchanged, so Allan variance and spectrum are those of the angle
@@ -31,7 +31,7 @@ class HeavyTails(Effect):
     description: ClassVar[str] = "Large errors of the white noise are more frequent than in Gaussian noise."
 
     def start_factors(self, rng: np.random.Generator) -> "WhiteNoiseFactors":
-        """Start the series of factors of the white noise."""
+        """Start the series of factors by which the white noise is multiplied."""
         return WhiteNoiseFactors(self.nu, 1.0 if self.share is None else self.share, rng)
 
 
@@ -43,6 +43,6 @@ class WhiteNoiseFactors(RunningEffect):
         self._choice = rng.spawn(1)[0]
 
     def multiply_in_place(self, white_noise: Floats) -> None:
-        """Multiply the next samples [n] of the white noise."""
+        """Multiply the next samples [n] of the white noise by random factors."""
         factors = np.sqrt((self._nu - 2.0) / self._rng.chisquare(self._nu, white_noise.size))
         white_noise *= np.where(self._choice.random(white_noise.size) < self._share, factors, 1.0)

@@ -27,11 +27,11 @@ class Outliers(Source):
     description: ClassVar[str] = "Single samples deviate strongly from their neighbours."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the spectrum of white noise with the mean square of the errors."""
+        """Return the spectrum of white noise with the same mean square as the errors."""
         return white_noise_spectrum(self.fraction * self.scale**2, tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_IsolatedErrors":
-        """Start a series of outliers with geometric gaps."""
+        """Start a series of outliers with geometrically distributed gaps."""
         return _IsolatedErrors(self.fraction, self.scale, rate_hz, rng)
 
 

@@ -2,7 +2,7 @@
 
 The simulated series is white noise w after the fractional integration (1 − B)^(−d) with d = α/2, where B is the delay
 of one sample (Hosking, "Fractional differencing", 1981). Whole integrations are cumulative sums. For 0 < d < 1, the
-impulse response is a mixture of exponentials by the beta function,
+beta function gives the impulse response as a mixture of exponentials,
 
     ψ_k = sin(πd)/π ∫ x^(k+d−1) (1 − x)^(−d) dx   from 0 to 1.
 
@@ -52,13 +52,16 @@ class PowerLaw(Source):
         return Spectrum(density, lambda tau_s: allan_variance_of_density(density, tau_s, tau0_s, ()), tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_FractionalNoise":
-        """Start a stationary series, or a series with stationary increments at zero for exponents of at least 1."""
+        """Start a stationary series or, for exponents of at least 1, a series that starts at zero."""
         gain = self.density * (2.0 * np.pi / rate_hz) ** (0.5 * self.exponent) * rate_hz**0.5
         return _FractionalNoise(gain, 0.5 * self.exponent, rng)
 
 
 class _FractionalNoise(NoiseSeries):
-    """Series y = direct·w + Σ weight·s, with white noise w and s ← pole·s + w, summed up for d ≥ 1."""
+    """Series y = direct·w + walk·W + Σ weight·s, where w is white noise, W ← W + w, and s ← pole·s + w.
+
+    For d ≥ 1, the output is the cumulative sum of y.
+    """
 
     def __init__(self, gain: float, d: float, rng: np.random.Generator) -> None:
         self._rng, self._starts_at_zero, self._is_summed = rng, d >= 0.5, d >= 1.0
@@ -92,7 +95,7 @@ class _FractionalNoise(NoiseSeries):
 def _integrate(
     series: Floats, states: Floats, poles: Floats, weights: Floats, direct: float, walk: float, totals: Floats
 ) -> None:
-    """Replace white noise [n] by fractional noise."""
+    """Replace white noise [n] with fractional noise."""
     for k in range(series.size):
         white = series[k]
         totals[0] += white
@@ -105,7 +108,7 @@ def _integrate(
 
 @compiled
 def _sum_up(series: Floats, totals: Floats) -> None:
-    """Replace a series [n] by the cumulative sum."""
+    """Replace a series [n] with its cumulative sum."""
     for k in range(series.size):
         totals[1] += series[k]
         series[k] = totals[1]

@@ -1,4 +1,4 @@
-"""Periodic pulses, for example a leak of the pulse per second of a satellite receiver."""
+"""Periodic pulses, for example from the pulse-per-second signal of a satellite receiver."""
 
 from dataclasses import dataclass
 from fractions import Fraction
@@ -13,7 +13,7 @@ from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parame
 from monitor.noise.spectrum import Curve, Spectrum, nan_spectrum
 
 MAX_PERIOD_SAMPLES: Final = 1 << 20
-"""Longest period, in samples, with a computed spectrum."""
+"""Longest period, in samples, for which the spectrum is computed."""
 MAX_CYCLE_SAMPLES: Final = 8192
 """Longest common cycle of pulses and samples, in samples, if the period is not a whole number of samples."""
 MAX_LINES: Final = 4096
@@ -59,7 +59,7 @@ class PulseTrain(Source):
         )
 
     def _autocovariance(self, shift: Floats) -> Floats:
-        """Return the autocovariance for shifts in periods from 0 to 1."""
+        """Return the autocovariance for shifts from 0 to 1 period."""
         duty = self.width / self.period
         overlap = np.maximum(duty - shift, 0.0) + np.maximum(duty - 1.0 + shift, 0.0)
         return np.asarray(self.height**2 * (overlap - duty**2))

@@ -23,7 +23,7 @@ class RateRamp(Source):
     description: ClassVar[str] = "The bias changes at a constant rate, for example while a sensor warms up."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return a spectrum that contains the slope of the ramp, and zero density."""
+        """Return a spectrum with zero density that contains only the slope of the ramp."""
         return Spectrum(np.zeros_like, lambda tau: 0.5 * (self.R * tau) ** 2, tau0_s, slope=self.R)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Ramp":

@@ -1,4 +1,4 @@
-"""Sinusoidal noise, for example of a motor, the mains or a fan."""
+"""Sinusoidal noise, for example from a motor, the mains or a fan."""
 
 from dataclasses import dataclass
 from math import cos, floor, pi, sin

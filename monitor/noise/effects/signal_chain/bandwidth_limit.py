@@ -1,4 +1,4 @@
-"""Low-pass filter of the sensor, with the white noise that is added behind the filter."""
+"""Low-pass filter of the sensor, and the white noise that is added after the filter."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class BandwidthLimit(Transform):
     theory of filter amplifiers", 1930), |H|² = (a²/(a² + 4(1 − a) sin²(πfτ0)))ⁿ of n exponential averages y ← y + a(x −
     y), and |H|² = |D(f)|^(2n) of n moving averages (Oppenheim & Schafer, "Discrete-Time Signal Processing"). The
     smoothing factor a and the length of the moving averages follow from the cutoff frequency. A decimator averages its
-    samples in the same way. The filter starts in the steady state of the first sample, so gravity causes no transient.
+    samples in the same way. The filter starts in the steady state for the first sample, so gravity causes no transient.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> filtered = BandwidthLimit(cutoff=10.0, order=2).transform_spectrum(white_noise_spectrum(1.0, 0.01))
@@ -48,7 +48,7 @@ class BandwidthLimit(Transform):
         return int(self.order or 1)
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum after the filter and the noise behind the filter."""
+        """Return the filtered spectrum plus the white noise that is added after the filter."""
         filtered = spectrum.filtered_by(self._squared_response(spectrum.tau0_s))
         if not self.floor:
             return filtered
@@ -72,7 +72,7 @@ class BandwidthLimit(Transform):
         return butterworth
 
     def start_transform(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
-        """Start the filter in the steady state of the first sample."""
+        """Start the filter in the steady state for the first sample."""
         noise = (self.floor or 0.0) * rate_hz**0.5
         if self.kind == "fir":
             length = moving_average_length(self.stages, self.cutoff / rate_hz)

@@ -19,8 +19,9 @@ NOISE_SIGMAS: Final = 6.0
 class Saturation(Transform):
     """Clipping of the measurement at ±``limit``.
 
-    The spectrum does not change if the range contains the signal for one hour. The signal consists of the bias, all
-    sinusoids, the slope and six standard deviations of the noise. Otherwise, the spectrum is NaN.
+    The spectrum does not change if the signal stays within the range for one hour. Otherwise, the spectrum is NaN. The
+    size of the signal is the sum of the bias, all sinusoids, the drift in one hour and six standard deviations of the
+    noise.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> clipped = [Saturation(limit=x).transform_spectrum(white_noise_spectrum(1.0, 0.01)) for x in (10.0, 1.0)]
