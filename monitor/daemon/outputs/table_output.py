@@ -25,10 +25,6 @@ PREFIX: Final = "imu"
 _log = structlog.get_logger("imu-monitor")
 
 
-class ZenohOutput(Output):
-    """Output that publishes the results as zenoh messages."""
-
-
 class TableOutput(Output):
     """Output for the table in the terminal.
 
