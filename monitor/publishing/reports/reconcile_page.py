@@ -23,7 +23,7 @@ from monitor.publishing.plots.reconcile_figures import (
 )
 from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
-from monitor.reconcile.result import AxisModelDiagnostics, AxisResult, DiagnosticGap, DiagnosticPlotData, Reconciliation
+from monitor.reconcile.result import AxisModelDiagnostics, AxisResult, DiagnosticGap, Reconciliation
 from monitor.reconcile.summary import summary_sentences
 from monitor.reconcile.summary.ranked_findings import GapRanking, rank_findings
 from monitor.reconcile.summary.summary_sentences import summarize
@@ -78,7 +78,7 @@ def render_page(r: Reconciliation, title: str = "") -> str:
         scores_by_diagnostic=_scores_by_diagnostic,
         draw_range=_draw_range,
         draw_pairs=_draw_pairs,
-        draw_single=_draw_single,
+        draw_singles=_draw_singles,
     )
 
 
@@ -114,14 +114,22 @@ def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list
     ]
 
 
-def _draw_single(view: DiagnosticPlotData, axis: str) -> str:
-    return diagnostic_comparison_svg([("", view)], axis, *SINGLE_INCHES)
+def _draw_singles(result: AxisResult) -> list[str]:
+    """Draw the Allan deviation and the diagnostics with a significant gap, before the search."""
+    drawn = _drawn_diagnostics(result.start)
+    views = [view for view in result.start.plots if view.diagnostic in drawn]
+    return [diagnostic_comparison_svg([("", view)], result.axis, *SINGLE_INCHES) for view in views]
 
 
 def _draw_pairs(before: AxisModelDiagnostics, after: AxisModelDiagnostics, axis: str) -> list[str]:
-    later = {view.diagnostic: view for view in after.plots}
-    pairs = [(view, later[view.diagnostic]) for view in before.plots if view.diagnostic in later]
+    """Draw the diagnostics with a significant gap, before and after a step."""
+    later, drawn = {view.diagnostic: view for view in after.plots}, _drawn_diagnostics(before) - {"allan"}
+    pairs = [(view, later[view.diagnostic]) for view in before.plots if view.diagnostic in drawn & set(later)]
     return before_and_after_svgs(pairs, axis, *PAIR_INCHES)
+
+
+def _drawn_diagnostics(snapshot: AxisModelDiagnostics) -> set[str]:
+    return {"allan"} | {gap.diagnostic for gap in snapshot.gaps if gap.is_significant}
 
 
 def _draw_range(snapshot: AxisModelDiagnostics, found: DiagnosticGap, axis: str) -> list[str]:
