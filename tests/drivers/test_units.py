@@ -42,7 +42,7 @@ def test_both_micro_signs_and_spaces_are_accepted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("look_up", "unit", "words"),
+    ("look_up", "unit", "expected_parts"),
     [
         (units.angular_rate_factor, "deg/sek", ("angular rate", '"deg/sek"', "possible are deg/sec, deg/s, ")),
         (units.angular_rate_factor, "furlong", ('"furlong"', "rad/s", "deg/s")),
@@ -51,10 +51,10 @@ def test_both_micro_signs_and_spaces_are_accepted() -> None:
         (units.time_factor, "fortnight", ('"fortnight"', "ms", "ns")),
     ],
 )
-def test_error_names_the_unknown_unit_and_known_units(look_up, unit: str, words: tuple[str, ...]) -> None:
+def test_error_names_the_unknown_unit_and_known_units(look_up, unit: str, expected_parts: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError) as caught:
         look_up(unit)
-    assert all(word in str(caught.value) for word in words)
+    assert all(part in str(caught.value) for part in expected_parts)
     assert "\n" not in str(caught.value)
 
 
