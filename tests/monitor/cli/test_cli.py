@@ -367,6 +367,7 @@ WRONG_ARGUMENTS = {
     ),
     "no window": (("analyze", "x.csv", "--window", "0"), '--window: "0" is not a duration'),
     "infinite rate": (("analyze", "x.csv", "--rate", "inf"), "--rate: inf Hz is outside the supported range"),
+    "unknown units": (("analyze", "x.csv", "--units", "cgs"), '--units: "cgs"; possible are imu, datasheet, si'),
     "no format": (("export", "x.toml"), "Missing option '--format'"),
     "unknown format": (("export", MODEL, "--format", "rovio"), 'unknown format "rovio"; possible are kalibr,'),
     "no source": (
