@@ -23,6 +23,8 @@ from monitor.cli import app
 from monitor.common import topics
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
+from monitor.publishing.exporters import FORMATS as EXPORT_FORMATS
+from monitor.publishing.exporters.estimator_parameters import PARAMETER_FILES
 from monitor.publishing.messages.results import CoefficientsMessage
 from monitor.publishing.rerun.sinks import server_url
 from monitor.publishing.zenoh.publisher import ZenohPublisher
@@ -38,6 +40,7 @@ ARCHITECTURE = ROOT / "docs" / "architecture.md"
 NOT_DRAWN = {"extras", "file_access", "module_lookup", "number_ranges", "settings_model"}
 """Small modules without a box of their own in the diagram."""
 SIMULATOR = ROOT / "docs" / "simulator.md"
+EXPORT = ROOT / "docs" / "export.md"
 COMMANDS_PAGE = ROOT / "docs" / "commands.md"
 MESSAGES = ROOT / "docs" / "messages.md"
 DECODERS = ROOT / "docs" / "decoders.md"
@@ -99,6 +102,19 @@ def test_every_model_is_one_that_can_be_simulated(toml: str) -> None:
     model = NoiseModel.from_toml(toml)
     assert model.sample_rate_hz is not None
     model.start_stream(model.sample_rate_hz, 1).draw_next_samples(10)
+
+
+def test_the_tables_of_exports_list_every_format_and_parameter() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \|(.*)$", section(EXPORT, "Formats"), re.M))
+    assert rows.keys() == EXPORT_FORMATS.keys()
+    assert set(re.findall(r"^\| `(\w+)` \|", section(EXPORT, "Sources and checks"), re.M)) == set(EXPORT_FORMATS)
+    for file in PARAMETER_FILES:
+        names = set(re.findall(r"`([\w.]+)`", rows[file.name]))
+        written = {parameter.name for parameter in file.parameters}
+        assert written <= names or "kalibr" in names
+        for letter in {parameter.letter for parameter in file.parameters}:
+            formula = file.quantity.formula(letter).replace("^2", "²").replace("sqrt(dt)", "√dt")
+            assert formula in rows[file.name].split("|")[3]
 
 
 def test_the_catalogue_is_that_of_the_folder() -> None:
