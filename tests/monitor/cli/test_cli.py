@@ -1171,15 +1171,15 @@ import json, sys
 import monitor.daemon.service
 from drivers.data_types import concatenate_blocks
 from monitor.cli import main
-from tests.system.rig import Caught
+from tests.system.rig import RecordingOutput
 run = monitor.daemon.service.Service.run
 def counted(self, *arguments):
-    caught = Caught()
-    self.outputs.append(caught)
+    output = RecordingOutput()
+    self.outputs.append(output)
     run(self, *arguments)
     truth = self.workers[0].simulated.fault_counts
-    if "demo" in caught.blocks:
-        numbers = (concatenate_blocks(caught.blocks["demo"]).ticks // 10_000_000).tolist()
+    if "demo" in output.blocks:
+        numbers = (concatenate_blocks(output.blocks["demo"]).ticks // 10_000_000).tolist()
         print(json.dumps([numbers, truth.total_simulated_samples, truth.dropped]), file=sys.stderr)
 monitor.daemon.service.Service.run = counted
 sys.argv[0] = "imu-monitor"
