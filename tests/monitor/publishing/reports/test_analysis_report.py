@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
+from monitor.common.unit_formatting import DEFAULT_UNITS, UNIT_SYSTEMS
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.analysis import RecordingAnalysis
-from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publishing.plots.analysis_plot import AnalysisPlotData
@@ -91,6 +91,21 @@ def vars_of(result: RecordingAnalysis) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return known.value, known.lo, known.hi
 
 
+@pytest.mark.parametrize("units", ["datasheet", "si"])
+def test_a_page_in_other_units(units: str) -> None:
+    result = analysis()
+    page = Page(analysis_report.render_page(AnalysisPlotData(result, units=UNIT_SYSTEMS[units])))
+    cells = [" ".join(cell.split()) for cell in page.cells]
+    n = result.estimate.coefficients.value[1, 2]
+    if units == "datasheet":
+        assert any(f"{n * np.degrees(1) * 60:.3f} °/√h " in cell for cell in cells)
+        assert any(f"{n * np.degrees(1) * 1000 * np.sqrt(2):.2f} m°/s/√Hz " in cell for cell in cells)
+        assert len(cells) == 2 * 6 * 4
+    else:
+        assert any(f"{n:.6f} rad/s/√Hz " in cell for cell in cells)
+        assert len(cells) == 2 * 5 * 4
+
+
 def test_what_is_not_known_is_said_in_words() -> None:
     few = made.analysis(seconds=200.0)
     few.estimate.curve.avar[:, 3:] = np.nan
@@ -99,7 +114,8 @@ def test_what_is_not_known_is_said_in_words() -> None:
     assert "— <small>(too few data)</small>" in " ".join(text.split())
     assert "<h2>Notes</h2>" not in text
     drifting = replace(made.estimate(seconds=1000.0), k_or_r=np.array([True] + [False] * 5))
-    small = {letter: analysis_report.format_value_and_interval(drifting, letter, "gx")[1] for letter in SYMBOLS}
+    columns = DEFAULT_UNITS.columns("gyro")
+    small = {one.symbol: analysis_report.format_value_and_interval(drifting, one, "gx")[1] for one in columns}
     assert small["K"] == "(upper bound; K or R)"
     assert small["R"] == "(too few data)"
     assert "…" in small["N"]
