@@ -46,9 +46,8 @@ def make_irregular_file(kind: str, path: Path) -> None:
             with socket.socket(socket.AF_UNIX) as unix_socket:
                 folder = os.open(path.parent, os.O_RDONLY)
                 try:
-                    unix_socket.bind(
-                        f"/proc/self/fd/{folder}/{path.name}"
-                    )  # the path of a socket has at most 108 characters, so use a short one
+                    # the path of a socket has at most 108 characters, so use a short one
+                    unix_socket.bind(f"/proc/self/fd/{folder}/{path.name}")
                 finally:
                     os.close(folder)
         case "device":

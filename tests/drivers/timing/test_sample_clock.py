@@ -17,13 +17,13 @@ NS_PER_S = 1e9
 START_S = 1e5  # s, host time of the first sample
 
 
-def poll_arrivals(t, every_s=0.016):
+def delay_to_next_poll(t, every_s=0.016):
     """Return the arrival times through a USB adapter, which is polled every ``every_s`` seconds."""
     return np.ceil(t / every_s) * every_s
 
 
-def jitter_arrivals(t, max_delay_s=0.010, seed=0):
-    """Return the arrival times with a uniform random delay of up to ``most_s``."""
+def delay_randomly(t, max_delay_s=0.010, seed=0):
+    """Return the arrival times with a uniform random delay of up to ``max_delay_s``."""
     return np.maximum.accumulate(t + np.random.default_rng(seed).uniform(0.0, max_delay_s, t.size))
 
 
@@ -85,71 +85,78 @@ def compute_ticks(index, kind, rate):
     return (counted + modulus - 1000 % modulus) % modulus  # starts at -1000, so that the counter wraps around
 
 
-@pytest.mark.parametrize("nominal", [True, False])
+@pytest.mark.parametrize("configured", [True, False])
 @pytest.mark.parametrize(("kind", "rate"), COUNTERS)
 class TestCounter:
     @pytest.mark.long
-    @pytest.mark.parametrize("holes", [[], [(5, 3)], [(300, 1), (400, 10), (402, 1)], [(900, 300)]])
-    @pytest.mark.parametrize("arrive", [poll_arrivals, jitter_arrivals])
-    def test_missing_samples_are_counted_exactly(self, kind, rate, nominal, holes, arrive):
+    @pytest.mark.parametrize("gaps", [[], [(5, 3)], [(300, 1), (400, 10), (402, 1)], [(900, 300)]])
+    @pytest.mark.parametrize("delay", [delay_to_next_poll, delay_randomly])
+    def test_missing_samples_are_counted_exactly(self, kind, rate, configured, gaps, delay):
         index = np.arange(int(24 * rate))
         kept = np.ones(index.size, bool)
-        for at, n in holes:
+        for at, n in gaps:
             # a short counter needs the settled regression to detect a complete wrap-around
             first = at if n < 256 else int(12 * rate)
             kept[first : first + n] = False
-        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
-        out = feed(clock, arrive(START_S + index / rate)[kept], compute_ticks(index, kind, rate)[kept])
+        clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
+        out = feed(clock, delay(START_S + index / rate)[kept], compute_ticks(index, kind, rate)[kept])
         assert count_lost(out) == (~kept).sum()
         assert clock.configured_or_measured_rate_hz == pytest.approx(rate, rel=1e-3)
         assert take_event_kinds(clock) == []
 
-    def test_duplicates_are_dropped_and_not_counted_as_lost(self, kind, rate, nominal):
+    def test_duplicates_are_dropped_and_not_counted_as_lost(self, kind, rate, configured):
         index = np.arange(int(10 * rate))
-        twice = np.sort(np.concatenate([index, index[200:203]]))
-        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
-        values = make_values(index.size)[twice]
+        with_duplicates = np.sort(np.concatenate([index, index[200:203]]))
+        clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
+        values = make_values(index.size)[with_duplicates]
         out = feed(
-            clock, poll_arrivals(START_S + index / rate)[twice], compute_ticks(index, kind, rate)[twice], values=values
+            clock,
+            delay_to_next_poll(START_S + index / rate)[with_duplicates],
+            compute_ticks(index, kind, rate)[with_duplicates],
+            values=values,
         )
         assert count_lost(out) == 0
         assert clock.dropped_repeated_rows == 3
         assert np.array_equal(np.concatenate([block.values for block in out]), make_values(index.size))
         assert set(take_event_kinds(clock)) == {"samples_repeated"}
 
-    def test_row_with_a_repeated_counter_and_other_values_is_kept(self, kind, rate, nominal):
+    def test_row_with_a_repeated_counter_and_other_values_is_kept(self, kind, rate, configured):
         index = np.arange(int(10 * rate))
-        twice = np.sort(np.concatenate([index, index[200:203]]))
-        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
+        with_duplicates = np.sort(np.concatenate([index, index[200:203]]))
+        clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
         assert (
             count_lost(
-                feed(clock, poll_arrivals(START_S + index / rate)[twice], compute_ticks(index, kind, rate)[twice])
+                feed(
+                    clock,
+                    delay_to_next_poll(START_S + index / rate)[with_duplicates],
+                    compute_ticks(index, kind, rate)[with_duplicates],
+                )
             )
             == 0
         )
         assert clock.dropped_repeated_rows == 0
         assert "other values" in clock.take_events()[0].text
 
-    def test_stuck_counter_is_reported_once(self, kind, rate, nominal):
+    def test_stuck_counter_is_reported_once(self, kind, rate, configured):
         index = np.arange(int(12 * rate))
         ticks = compute_ticks(index, kind, rate)
         ticks[300:] = ticks[300]
-        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
-        assert count_lost(feed(clock, poll_arrivals(START_S + index / rate), ticks)) == 0
+        clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
+        assert count_lost(feed(clock, delay_to_next_poll(START_S + index / rate), ticks)) == 0
         assert [kind for kind in take_event_kinds(clock) if kind != "samples_repeated"] == ["clock_jumped"]
 
-    def test_samples_during_a_stuck_counter_are_not_missing(self, kind, rate, nominal):
+    def test_samples_during_a_stuck_counter_are_not_missing(self, kind, rate, configured):
         index = np.arange(int(12 * rate))
         ticks = compute_ticks(index, kind, rate)
         ticks[300:350] = ticks[300]
-        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
-        assert count_lost(feed(clock, poll_arrivals(START_S + index / rate), ticks)) <= 1
+        clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
+        assert count_lost(feed(clock, delay_to_next_poll(START_S + index / rate), ticks)) <= 1
         assert [kind for kind in take_event_kinds(clock) if kind != "samples_repeated"] == ["clock_jumped"]
 
-    def test_samples_during_a_disconnection_of_five_seconds_are_lost(self, kind, rate, nominal):
+    def test_samples_during_a_disconnection_of_five_seconds_are_lost(self, kind, rate, configured):
         index, at, n = np.arange(int(28 * rate)), int(12 * rate), int(5 * rate)
-        ticks, arrived = compute_ticks(index, kind, rate), jitter_arrivals(START_S + index / rate)
-        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
+        ticks, arrived = compute_ticks(index, kind, rate), delay_randomly(START_S + index / rate)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
         out = feed(clock, arrived[:at], ticks[:at])
         clock.count_next_gap_by_arrival()
         later = feed(clock, arrived[at + n :], ticks[at + n :])
@@ -158,53 +165,53 @@ class TestCounter:
         assert take_event_kinds(clock) == []
 
     @pytest.mark.parametrize("at_s", [1.0, 12.0])
-    def test_restart_of_the_device_during_a_disconnection(self, kind, rate, nominal, at_s):
+    def test_loss_is_counted_if_the_device_restarts_during_a_disconnection(self, kind, rate, configured, at_s):
         index, at, n = np.arange(int(28 * rate)), int(at_s * rate), int(5 * rate)
-        ticks, arrived = compute_ticks(index + 7000, kind, rate), jitter_arrivals(START_S + index / rate)
+        ticks, arrived = compute_ticks(index + 7000, kind, rate), delay_randomly(START_S + index / rate)
         fresh = (
             compute_ticks(index, kind, rate)
             if kind[0] == 256
             else np.rint(index / rate / kind[1] if kind[1] else index)
         )
-        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
         out = feed(clock, arrived[:at], ticks[:at])
         clock.count_next_gap_by_arrival()
         out += feed(clock, arrived[at + n :], fresh[: index.size - at - n])
         turn = kind[0] / (rate and 1) * (kind[1] or 1 / rate) * rate  # samples
-        if nominal or at_s > 5.0:
+        if configured or at_s > 5.0:
             # counted by arrival times; a short counter decides by itself and may be wrong by half a turn
             assert count_lost(out) == pytest.approx(n, abs=turn / 2 + 5 if kind[0] == 256 else 5)
         else:  # the rate is unknown, so no losses are assumed
             assert count_lost(out) <= n + turn
         assert take_event_kinds(clock) == ([] if kind[0] == 256 else ["clock_jumped"])
 
-    def test_late_scheduler_loses_no_samples(self, kind, rate, nominal):
+    def test_late_scheduler_loses_no_samples(self, kind, rate, configured):
         index = np.arange(int(28 * rate))
-        arrived = poll_arrivals(START_S + index / rate)
+        arrived = delay_to_next_poll(START_S + index / rate)
         asleep = np.flatnonzero((arrived > START_S + 12) & (arrived < START_S + 13))
         arrived[asleep] = START_S + 13 + np.arange(asleep.size) // 60 * 3e-4
-        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
         out = feed(clock, np.maximum.accumulate(arrived), compute_ticks(index, kind, rate))
         assert count_lost(out) == 0
         assert take_event_kinds(clock) == []
 
 
 @pytest.mark.parametrize(("kind", "rate"), COUNTERS)
-def test_replay_at_fifty_times_the_configured_rate(kind, rate):
+def test_replay_at_fifty_times_the_configured_rate_loses_no_samples(kind, rate):
     index = np.arange(int(200 * rate))
     clock = SampleClock(CounterTimedFormat(*kind), rate)
-    out = feed(clock, poll_arrivals(START_S + index / rate / 50, 0.01), compute_ticks(index, kind, rate))
+    out = feed(clock, delay_to_next_poll(START_S + index / rate / 50, 0.01), compute_ticks(index, kind, rate))
     assert count_lost(out) == 0
     assert take_event_kinds(clock) == []
     assert join_times(out)[-1] / NS_PER_S == pytest.approx(START_S + 4.0, abs=0.1)
 
 
 @pytest.mark.parametrize(("kind", "rate"), [c for c in COUNTERS if c[0][0] > 256])
-def test_restart_of_the_device_without_disconnection(kind, rate):
+def test_unnoticed_restart_of_the_device_is_reported_as_clock_jump(kind, rate):
     index, at = np.arange(int(28 * rate)), int(12 * rate)
     ticks = compute_ticks(index + 7000, kind, rate)
     ticks[at:] = np.rint(np.arange(index.size - at) / rate / kind[1] if kind[1] else np.arange(index.size - at))
-    arrived = jitter_arrivals(START_S + index / rate + 0.7 * (index >= at))
+    arrived = delay_randomly(START_S + index / rate + 0.7 * (index >= at))
     clock = SampleClock(CounterTimedFormat(*kind), rate)
     assert count_lost(feed(clock, arrived, ticks)) == pytest.approx(0.7 * rate, abs=0.011 * rate + 1)
     assert take_event_kinds(clock) == ["clock_jumped"]
@@ -215,7 +222,7 @@ def test_samples_without_a_counter_cause_no_gap():
     ticks = index.copy()
     ticks[1000:1200] = -1
     clock = SampleClock(CounterTimedFormat(65536), 100.0)
-    assert count_lost(feed(clock, poll_arrivals(START_S + index / 100), ticks)) == 0
+    assert count_lost(feed(clock, delay_to_next_poll(START_S + index / 100), ticks)) == 0
     assert take_event_kinds(clock) == []
 
 
@@ -227,7 +234,7 @@ def test_missing_samples_are_counted_with_jittering_device_times():
     kept = np.ones(index.size, bool)
     kept[[1, 2, 700, 2000, 2001]] = False
     clock = SampleClock(CounterTimedFormat(*VECTORNAV), None)
-    assert count_lost(feed(clock, poll_arrivals(START_S + index / 400)[kept], ticks[kept])) == 5
+    assert count_lost(feed(clock, delay_to_next_poll(START_S + index / 400)[kept], ticks[kept])) == 5
 
 
 def test_clock_adapts_to_a_new_rate_of_the_device():
@@ -236,27 +243,27 @@ def test_clock_adapts_to_a_new_rate_of_the_device():
     taken = np.where(index < 4000, index / 500, 8 + (index - 4000) / 250)
     clock = SampleClock(CounterTimedFormat(*STIM300), None)
     # until half of the recent steps are new, each step counts as one missing sample
-    assert count_lost(feed(clock, poll_arrivals(START_S + taken), ticks)) < 200
+    assert count_lost(feed(clock, delay_to_next_poll(START_S + taken), ticks)) < 200
 
 
 # --- arrival times alone
 
 
 @pytest.mark.parametrize("rate", [20.0, 99.32, 100.0, 2000.0])
-@pytest.mark.parametrize("arrive", [poll_arrivals, jitter_arrivals])
-@pytest.mark.parametrize("nominal", [True, False])
-def test_sample_times_do_not_contain_the_arrival_jitter(rate, arrive, nominal):
+@pytest.mark.parametrize("delay", [delay_to_next_poll, delay_randomly])
+@pytest.mark.parametrize("configured", [True, False])
+def test_sample_times_do_not_contain_the_arrival_jitter(rate, delay, configured):
     taken = START_S + np.arange(int(45 * rate)) / rate
-    clock = SampleClock(ArrivalTimedFormat(), rate if nominal else None)
-    out = feed(clock, arrive(taken))
+    clock = SampleClock(ArrivalTimedFormat(), rate if configured else None)
+    out = feed(clock, delay(taken))
     assert count_lost(out) == 0
     assert take_event_kinds(clock) == []
     settled = join_times(out)[int(FORGET_S * rate) :] / NS_PER_S
     # the weight of one arrival in the regression is up to 4 / (arrivals in 30 s); its error is up to 8 ms or 5 ms
-    arrivals = FORGET_S * (min(rate, 1 / 0.016) if arrive is poll_arrivals else rate)
-    max_deviation_s = 4 * (0.008 if arrive is poll_arrivals else 0.005) / arrivals
+    arrivals = FORGET_S * (min(rate, 1 / 0.016) if delay is delay_to_next_poll else rate)
+    max_deviation_s = 4 * (0.008 if delay is delay_to_next_poll else 0.005) / arrivals
     assert np.abs(np.diff(settled) - 1 / rate).max() < max(1.5 * max_deviation_s, 5e-6)
-    if arrive is jitter_arrivals and rate >= 99.0:
+    if delay is delay_randomly and rate >= 99.0:
         assert np.abs(np.diff(settled) - 1 / rate).max() < 10e-6
     assert np.ptp(settled - taken[int(FORGET_S * rate) :]) < 3e-3
     assert clock.configured_or_measured_rate_hz == pytest.approx(rate, rel=2e-5 if rate > 50 else 2e-4)
@@ -264,57 +271,57 @@ def test_sample_times_do_not_contain_the_arrival_jitter(rate, arrive, nominal):
 
 
 @pytest.mark.parametrize("rate", [20.0, 99.32, 100.0])
-@pytest.mark.parametrize("arrive", [poll_arrivals, jitter_arrivals])
-@pytest.mark.parametrize("nominal", [True, False])
+@pytest.mark.parametrize("delay", [delay_to_next_poll, delay_randomly])
+@pytest.mark.parametrize("configured", [True, False])
 class TestArrival:
-    def clock(self, rate, nominal):
-        return SampleClock(ArrivalTimedFormat(), rate if nominal else None)
+    def clock(self, rate, configured):
+        return SampleClock(ArrivalTimedFormat(), rate if configured else None)
 
     @pytest.mark.parametrize("asleep_s", [0.2, 1.0, 2.5])
-    def test_late_scheduler_loses_no_samples(self, rate, arrive, nominal, asleep_s):
-        arrived = arrive(START_S + np.arange(int(28 * rate)) / rate)
+    def test_late_scheduler_loses_no_samples(self, rate, delay, configured, asleep_s):
+        arrived = delay(START_S + np.arange(int(28 * rate)) / rate)
         asleep = np.flatnonzero((arrived > START_S + 12) & (arrived < START_S + 12 + asleep_s))
         arrived[asleep] = START_S + 12 + asleep_s + np.arange(asleep.size) // 20 * 3e-4
-        clock = self.clock(rate, nominal)
+        clock = self.clock(rate, configured)
         out = feed(clock, np.maximum.accumulate(arrived))
         assert count_lost(out) == 0
         assert np.diff(join_times(out)[int(10 * rate) :]).max() < 1.1 * NS_PER_S / rate + 2e6
 
-    @pytest.mark.parametrize("hole_s", [[0.2], [0.5], [2.0], [0.5, 0.3]])
-    def test_gaps_are_counted(self, rate, arrive, nominal, hole_s):
+    @pytest.mark.parametrize("gap_s", [[0.2], [0.5], [2.0], [0.5, 0.3]])
+    def test_gaps_are_counted(self, rate, delay, configured, gap_s):
         index = np.arange(int(30 * rate))
         kept = np.ones(index.size, bool)
-        for i, length in enumerate(hole_s):
+        for i, length in enumerate(gap_s):
             at = int((12 + 1.5 * i) * rate)
             kept[at : at + round(length * rate)] = False
-        clock = self.clock(rate, nominal)
-        out = feed(clock, arrive(START_S + index / rate)[kept])
+        clock = self.clock(rate, configured)
+        out = feed(clock, delay(START_S + index / rate)[kept])
         assert count_lost(out) == pytest.approx((~kept).sum(), abs=2)
         assert take_event_kinds(clock) == []
 
-    def test_only_reported_rejected_frames_are_lost(self, rate, arrive, nominal):
+    def test_only_reported_rejected_frames_are_lost(self, rate, delay, configured):
         index = np.arange(int(28 * rate))
         bad = np.zeros(index.size, int)
         kept = np.ones(index.size, bool)
         for at in range(100, index.size, 97):
             kept[at : at + 2] = False
             bad[at + 2] = 2
-        clock = self.clock(rate, nominal)
+        clock = self.clock(rate, configured)
         # the decoder does not report these gaps, and they are too short to be detected
-        assert count_lost(feed(clock, arrive(START_S + index / rate)[kept])) == 0
-        clock = self.clock(rate, nominal)
+        assert count_lost(feed(clock, delay(START_S + index / rate)[kept])) == 0
+        clock = self.clock(rate, configured)
         arrived = START_S + index / rate  # separate arrivals, so that each block can have its lost samples
         assert count_lost(feed(clock, arrived[kept], lost=bad[kept])) == bad.sum()
 
     @pytest.mark.parametrize("at_s", [1.0, 12.0])
-    def test_samples_during_a_disconnection_of_five_seconds_are_lost(self, rate, arrive, nominal, at_s):
-        arrived = arrive(START_S + np.arange(int(30 * rate)) / rate)
+    def test_samples_during_a_disconnection_of_five_seconds_are_lost(self, rate, delay, configured, at_s):
+        arrived = delay(START_S + np.arange(int(30 * rate)) / rate)
         at, n = int(at_s * rate), int(5 * rate)
-        clock = self.clock(rate, nominal)
+        clock = self.clock(rate, configured)
         out = feed(clock, arrived[:at])
         clock.count_next_gap_by_arrival()
         out += feed(clock, arrived[at + n :])
-        if nominal or at_s > 5.0:
+        if configured or at_s > 5.0:
             assert count_lost(out) == pytest.approx(n, abs=2)
         assert clock.configured_or_measured_rate_hz == pytest.approx(rate, rel=1e-3)
 
@@ -322,7 +329,7 @@ class TestArrival:
 @pytest.mark.parametrize("rate", [20.0, 100.0, 400.0])
 def test_fast_replay_without_counter_loses_no_samples(rate):
     clock = SampleClock(ArrivalTimedFormat(), rate)
-    out = feed(clock, poll_arrivals(START_S + np.arange(int(200 * rate)) / rate / 50, 0.01))
+    out = feed(clock, delay_to_next_poll(START_S + np.arange(int(200 * rate)) / rate / 50, 0.01))
     assert count_lost(out) == 0
     assert join_times(out)[-1] / NS_PER_S == pytest.approx(START_S + 4.0, abs=0.1)
 
@@ -332,7 +339,7 @@ def test_sample_times_follow_a_drifting_oscillator():
     index = np.arange(900 * 100)
     taken = START_S + np.cumsum((1.0 + 50e-6 * np.sin(2 * np.pi * index / index.size)) / 100.0)
     clock = SampleClock(ArrivalTimedFormat(), 100.0)
-    out = feed(clock, poll_arrivals(taken))
+    out = feed(clock, delay_to_next_poll(taken))
     assert count_lost(out) == 0
     off = join_times(out)[6000:] / NS_PER_S - taken[6000:]
     # the mean delay of the polling drifts by a quarter of its interval, and the regression lags by 30 s
@@ -358,9 +365,9 @@ def test_first_samples_of_an_unknown_rate_have_increasing_times():
 
 
 @pytest.mark.parametrize("rows", [1, 20, 4096])
-@pytest.mark.parametrize("nominal", [True, False])
+@pytest.mark.parametrize("configured", [True, False])
 @pytest.mark.parametrize("scatter", ["exact", "ms", "normal", "uniform", "bursts"])
-def test_sender_times_are_kept_and_gaps_are_counted(rows, nominal, scatter):
+def test_sender_times_are_kept_and_gaps_are_counted(rows, configured, scatter):
     rng = np.random.default_rng(3)
     index = np.arange(3000)
     kept = ~((index > 1000) & (index <= 1050) | (index == 2000))
@@ -370,10 +377,10 @@ def test_sender_times_are_kept_and_gaps_are_counted(rows, nominal, scatter):
         "ms": np.round(exact, 3),
         "normal": exact + 0.0015 * rng.standard_normal(index.size),
         "uniform": np.sort(exact + rng.uniform(-0.005, 0.005, index.size)),
-        "bursts": np.sort(poll_arrivals(exact, 0.043) + rng.uniform(0.0, 0.002, index.size)),
+        "bursts": np.sort(delay_to_next_poll(exact, 0.043) + rng.uniform(0.0, 0.002, index.size)),
     }[scatter][kept]
     t_ns = np.rint(t * NS_PER_S).astype(np.int64)
-    clock = SampleClock(SenderTimedFormat(), 100.0 if nominal else None)
+    clock = SampleClock(SenderTimedFormat(), 100.0 if configured else None)
     out = []
     for at in range(0, len(t_ns), rows):
         out += clock.assign_times(
@@ -443,7 +450,7 @@ def test_rows_that_are_sent_twice_are_dropped_once(rows, repeated_rows):
     assert all(text.endswith("left out") for text in texts)
 
 
-def test_recording_with_every_row_twice():
+def test_recording_with_every_row_twice_keeps_each_row_once():
     sent = np.repeat(np.arange(3000), 2)
     clock = SampleClock(SenderTimedFormat(), None)
     out = assign_sender_times(clock, sent / 100, make_values(3000)[sent], 1000)
@@ -527,8 +534,8 @@ def test_recordings_of_real_sensors_contain_no_repeats(name):
 def test_recordings_with_host_times_have_no_false_gaps(name, max_lost):
     t = np.load(recordings() / f"{name}.npz")["t"]
     t_ns = np.rint(t * NS_PER_S).astype(np.int64)
-    for nominal in (None, (len(t) - 1) / (t[-1] - t[0])):
-        clock = SampleClock(SenderTimedFormat(), nominal)
+    for configured_hz in (None, (len(t) - 1) / (t[-1] - t[0])):
+        clock = SampleClock(SenderTimedFormat(), configured_hz)
         out = []
         for at in range(0, len(t), 500):
             out += clock.assign_times(make_block(t_ns[at : at + 500].copy(), np.zeros((len(t_ns[at : at + 500]), 6))))
@@ -556,7 +563,7 @@ def test_measured_rates_are_snapped_to_standard_rates(measured, standard):
 # --- comparison of the configured and the measured rate
 
 
-def stall_arrivals(t, seed=0):
+def delay_by_stalls(t, seed=0):
     """Return the arrival times on a host that sometimes stalls for up to a second."""
     draw = np.random.default_rng(seed)
     arrived = t + draw.uniform(0.0, 0.005, t.size)
@@ -571,7 +578,7 @@ def stall_arrivals(t, seed=0):
 @pytest.mark.parametrize("tick_s", [1e-3, 1e-6])
 def test_device_clock_contradicts_a_wrong_rate_for_any_arrival_times(tick_s):
     ticks = np.rint(np.arange(600) / 100.0 / tick_s).astype(np.int64)
-    for arrived in (START_S + np.arange(600) / 5000.0, jitter_arrivals(START_S + np.arange(600) / 100.0)):
+    for arrived in (START_S + np.arange(600) / 5000.0, delay_randomly(START_S + np.arange(600) / 100.0)):
         wrong, right = (SampleClock(CounterTimedFormat(1 << 32, tick_s), rate) for rate in (200.0, 100.0))
         states = []
         for i in range(0, 600, 5):
@@ -589,17 +596,17 @@ def test_device_clock_contradicts_a_wrong_rate_for_any_arrival_times(tick_s):
 def test_coarse_ticks_contradict_no_correct_rate():
     ticks = np.floor(np.arange(4160) / 416.0 / 1e-3).astype(np.int64)  # steps of 2 and 3
     clock = SampleClock(CounterTimedFormat(1 << 16, 1e-3), 416.0)
-    feed(clock, jitter_arrivals(START_S + np.arange(4160) / 416.0), ticks)
+    feed(clock, delay_randomly(START_S + np.arange(4160) / 416.0), ticks)
     assert not clock.rate_check_pending
     assert (clock.configured_or_measured_rate_hz, clock.contradicting_rate_hz) == (416.0, None)
 
 
-@pytest.mark.parametrize("arrive", [jitter_arrivals, poll_arrivals, stall_arrivals])
+@pytest.mark.parametrize("delay", [delay_randomly, delay_to_next_poll, delay_by_stalls])
 @pytest.mark.parametrize("seed", range(5))
-def test_arrival_jitter_contradicts_no_rate_that_is_nearly_right(arrive, seed):
+def test_arrival_jitter_contradicts_no_rate_that_is_nearly_right(delay, seed):
     taken = START_S + np.arange(3000) / 100.0
     clock = SampleClock(ArrivalTimedFormat(), 100.2)
-    arrived = arrive(taken) if arrive is poll_arrivals else arrive(taken, seed=seed)
+    arrived = delay(taken) if delay is delay_to_next_poll else delay(taken, seed=seed)
     for a in range(0, 3000, 10):
         feed(clock, arrived[a : a + 10])
         assert clock.contradicting_rate_hz is None
@@ -607,10 +614,10 @@ def test_arrival_jitter_contradicts_no_rate_that_is_nearly_right(arrive, seed):
     assert clock.configured_or_measured_rate_hz == 100.2
 
 
-@pytest.mark.parametrize("arrive", [jitter_arrivals, poll_arrivals, stall_arrivals])
-def test_arrival_times_contradict_a_rate_that_is_far_off(arrive):
+@pytest.mark.parametrize("delay", [delay_randomly, delay_to_next_poll, delay_by_stalls])
+def test_arrival_times_contradict_a_rate_that_is_far_off(delay):
     clock = SampleClock(ArrivalTimedFormat(), 200.0)
-    feed(clock, arrive(START_S + np.arange(3000) / 100.0))
+    feed(clock, delay(START_S + np.arange(3000) / 100.0))
     assert clock.contradicting_rate_hz == pytest.approx(100.0, rel=0.02)
 
 
