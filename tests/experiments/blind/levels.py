@@ -90,7 +90,7 @@ def _search(world: World, effect: Effect, aimed: Aim) -> tuple[Effect, Gains]:
         if hi > FARTHEST * guess:
             raise NotIdentifiable(f"{effect.name}: no size gains {aimed.target:.3g}")
     lo = 0.5 * hi
-    while lo > recipe.least and observer(lo).gain() > aimed.target:
+    while lo > max(recipe.least, guess / FARTHEST) and observer(lo).gain() > aimed.target:
         lo, hi = 0.5 * lo, lo
     for _ in range(6):
         middle = float(np.sqrt(lo * hi))

@@ -10,7 +10,7 @@ import pytest
 from monitor.noise.effect import Transform, gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER
 from monitor.noise.temperature import Temperature
-from tests.contracts.effect_examples import AXIS, model
+from tests.contracts.effect_examples import AXIS, make_model
 
 PAGE = Path(__file__).parents[3] / "docs" / "effects.md"
 SECTIONS = dict(
@@ -40,7 +40,7 @@ def test_section_is_that_of_the_code(name):
 
 @pytest.mark.parametrize("name", sorted(set(EFFECTS) - {"saturation", "resolution"}))  # those depend on their numbers
 def test_page_says_nan_where_the_code_does(name):
-    value = model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
+    value = make_model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
     assert ("| σ²(τ) | NaN |" in SECTIONS[name]) == bool(np.isnan(value))
 
 
