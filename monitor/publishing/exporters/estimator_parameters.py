@@ -312,7 +312,7 @@ PARAMETER_FILES: Final = (
         line="params.{name}({value} * np.eye(3))",
         notes=(
             "PreintegrationParams, for PreintegratedImuMeasurements, has no bias covariances",
-            "not set here, because they are no properties of the sensor: integrationCovariance, biasAccOmegaInt",
+            "integrationCovariance and biasAccOmegaInt do not depend on the sensor and are not set here",
         ),
         before=(
             "import gtsam",
