@@ -253,7 +253,7 @@ PARAMETER_FILES: Final = (
         KALIBR_PARAMETERS,
         line="  {name}: {value}",
         first_lines=OPENCV_FIRST_LINES,
-        notes=("T_i_b and the matrices below the noise are no results of this program: insert your calibration",),
+        notes=("T_i_b, Tw, Ta, Tg and the rotations are placeholders: replace them by your calibration",),
         before=(
             "imu0:",
             "  T_i_b:",
@@ -312,7 +312,7 @@ PARAMETER_FILES: Final = (
         line="params.{name}({value} * np.eye(3))",
         notes=(
             "PreintegrationParams, for PreintegratedImuMeasurements, has no bias covariances",
-            "not set here, because they are no properties of the sensor: integrationCovariance, biasAccOmegaInt",
+            "integrationCovariance and biasAccOmegaInt do not depend on the sensor and are not set here",
         ),
         before=(
             "import gtsam",
