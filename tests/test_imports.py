@@ -21,7 +21,7 @@ from drivers.extras import EXTRAS
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 
 ROOT = Path(__file__).parents[1]
 OPTIONAL = {
@@ -152,7 +152,7 @@ def connect_to_daemon(endpoint: str, process: subprocess.Popen[bytes]) -> Iterat
     def attempt() -> Any:
         assert process.poll() is None
         with contextlib.suppress(Exception):
-            return session(connect=[endpoint])
+            return open_session(connect=[endpoint])
         return None
 
     with wait_for(attempt, "the daemon's endpoint") as found:

@@ -29,7 +29,7 @@ from tests.monitor.daemon.operations.test_systemd import Listening
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 
 QUIET = '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
 
@@ -151,7 +151,7 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
         wait_for(lambda: service.zenoh.state == "ok" and service.viewer is not None and service.viewer.state == "ok")
         ring, estimator = stations["stays"].ring, stations["stays"].pipeline.estimator
         path.write_text(device("stays") + device("comes") + device("changes", 'publish = "5 Hz"') + rest)
-        with session(connect=[endpoint]) as listener:
+        with open_session(connect=[endpoint]) as listener:
             heard: dict[str, list[Any]] = {}
             listener.declare_subscriber(
                 "imu/*/coefficients",

@@ -21,7 +21,7 @@ from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 from monitor.settings.loading import ZenohTable
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import router, session
+from tests.support.zenoh_sessions import open_router, open_session
 
 DEVICES = ("bench-1", "bench-2")
 PUBLISHED = [topic for topic in topics.TOPICS if topic.when not in ("presence", "query")]
@@ -46,8 +46,8 @@ def started(**settings: Any) -> Iterator[ZenohPublisher]:
 def through_a_router(endpoint: str) -> Iterator[tuple[ZenohPublisher, Any]]:
     """A daemon that is open, and a client beside it."""
     with (
-        router(endpoint),
-        session(connect=[endpoint]) as client,
+        open_router(endpoint),
+        open_session(connect=[endpoint]) as client,
         started(mode="client", connect=(endpoint,)) as out,
     ):
         wait_for(lambda: out.state == "ok")
@@ -201,7 +201,7 @@ def test_a_busy_port_is_left_and_said(endpoint: str) -> None:
         assert out.state.startswith(f"ok, but {endpoint} is busy: listening on tcp/127.0.0.1:")
         found = out.state.rpartition(" ")[2]
         assert found != endpoint
-        with session(connect=[found]) as client:
+        with open_session(connect=[found]) as client:
             subscriber = client.declare_subscriber("imu/**", zenoh.handlers.FifoChannel(100))
 
             def comes() -> bool:
@@ -216,7 +216,7 @@ def test_a_client_listens_nowhere(
     endpoint: str, monkeypatch: pytest.MonkeyPatch, listen: tuple[str, ...] | None
 ) -> None:
     """It opens although the default port is busy and the given one is not to be had."""
-    with socket.create_server(("127.0.0.1", 0)) as busy, router(endpoint):
+    with socket.create_server(("127.0.0.1", 0)) as busy, open_router(endpoint):
         monkeypatch.setattr(topics, "ENDPOINT", f"tcp/127.0.0.1:{busy.getsockname()[1]}")
         with started(mode="client", listen=listen, connect=(endpoint,)) as out:
             wait_for(lambda: out.state != "not open yet")
@@ -243,7 +243,7 @@ def test_a_router_that_comes_later(endpoint: str) -> None:
         assert ".rs" not in out.state
         out.set_alive("bench-1", True)
         out.put(topics.STATUS, "bench-1", b"dropped, as nobody is there")
-        with router(endpoint), session(connect=[endpoint]) as client:
+        with open_router(endpoint), open_session(connect=[endpoint]) as client:
             wait_for(lambda: out.state == "ok")
             tokens = wait_for(lambda: list(client.liveliness().get("imu/**", timeout=PATIENCE_S)))
             assert [str(token.ok.key_expr) for token in tokens] == ["imu/bench-1/alive"]

@@ -28,7 +28,7 @@ from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, stays_true, wait_for
-from tests.support.zenoh_sessions import patient_file, router, session
+from tests.support.zenoh_sessions import open_router, open_session, patient_file
 
 
 @pytest.fixture
@@ -136,7 +136,7 @@ def test_daemons_that_come_late_go_and_come_back() -> None:
 
 
 def test_through_a_router(endpoint: str) -> None:
-    with router(endpoint), daemon(endpoint, "a", mode="client"), listening("imu/**", endpoint) as (arriving, got):
+    with open_router(endpoint), daemon(endpoint, "a", mode="client"), listening("imu/**", endpoint) as (arriving, got):
         wait_for(lambda: keys(arriving, got) >= EVERYTHING)
         assert arriving.state == "ok"
 
@@ -144,7 +144,7 @@ def test_through_a_router(endpoint: str) -> None:
 def test_a_daemon_that_is_a_peer_is_heard_through_a_router(endpoint: str) -> None:
     """A router passes nothing on from a peer to a peer."""
     out = ZenohPublisher(ZenohTable(listen=(free_endpoint(),), connect=(endpoint,)), ["a"])
-    with router(endpoint), contextlib.closing(out), listening("imu/**", endpoint) as (arriving, got):
+    with open_router(endpoint), contextlib.closing(out), listening("imu/**", endpoint) as (arriving, got):
         out.start()
         out.set_alive("a", True)
 
@@ -158,8 +158,8 @@ def test_a_daemon_that_is_a_peer_is_heard_through_a_router(endpoint: str) -> Non
 def test_two_ways_to_the_same_daemon_bring_each_message_once(tmp_path: Path) -> None:
     first, second, patient = free_endpoint(), free_endpoint(), patient_file(tmp_path)
     with (
-        session(mode="router", listen=[first]),
-        session(mode="router", listen=[second], connect=[first]),
+        open_session(mode="router", listen=[first]),
+        open_session(mode="router", listen=[second], connect=[first]),
         contextlib.closing(ZenohPublisher(ZenohTable(config=patient, mode="client", connect=(first,)), ["a"])) as out,
         listening("imu/**", first, second) as (arriving, got),
     ):
@@ -184,8 +184,8 @@ def test_who_comes_late_gets_the_last_values_and_events(endpoint: str) -> None:
     kept = {topic: topic.kept for topic in (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)}
     far = free_endpoint()
     with (
-        session(mode="router", listen=[endpoint]) as near,
-        session(mode="router", listen=[far], connect=[endpoint]) as beyond,
+        open_session(mode="router", listen=[endpoint]) as near,
+        open_session(mode="router", listen=[far], connect=[endpoint]) as beyond,
         contextlib.closing(ZenohPublisher(ZenohTable(listen=(), connect=(endpoint,)), ["a"])) as out,
     ):
         out.start()
@@ -202,7 +202,7 @@ def test_who_comes_late_gets_the_last_values_and_events(endpoint: str) -> None:
 
 
 def test_a_message_that_is_too_long_does_not_arrive_and_those_after_it_do(endpoint: str) -> None:
-    with session(mode="router", listen=[endpoint]) as sender, listening("imu/**", endpoint) as (arriving, got):
+    with open_session(mode="router", listen=[endpoint]) as sender, listening("imu/**", endpoint) as (arriving, got):
 
         def send(payload: bytes) -> None:
             sender.put("imu/a/status", payload, congestion_control=zenoh.CongestionControl.BLOCK)
