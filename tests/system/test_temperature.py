@@ -8,7 +8,7 @@ import numpy as np
 import zenoh
 
 from drivers.recordings import save_samples
-from tests.monitor.drift.made import COEFFICIENT, late, weather
+from tests.monitor.drift.thermal_biases import BIAS_SLOPE, apply_lag, simulate_temperature
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 from tests.support.zenoh_sessions import patient_file, session
@@ -39,12 +39,14 @@ connect = ["{endpoint}"]
 def day(path: Path) -> Path:
     """gz follows an hour late, and steps; gx has no temperature in it."""
     rng = np.random.default_rng(11)
-    warmth = weather(HOURS, rng)
+    warmth = simulate_temperature(HOURS, rng)
     minutes = np.arange(-48 * 60, HOURS * 60)
     t = np.arange(round(HOURS * 3600 * RATE_HZ)) / RATE_HZ
     values = np.full((t.size, 6), np.nan)
     values[:, 0] = 4e-4 * rng.standard_normal(t.size)
-    values[:, 2] = COEFFICIENT * np.interp(t / 60.0, minutes, late(warmth, 1.0)) + 4e-4 * rng.standard_normal(t.size)
+    values[:, 2] = BIAS_SLOPE * np.interp(t / 60.0, minutes, apply_lag(warmth, 1.0)) + 4e-4 * rng.standard_normal(
+        t.size
+    )
     values[t >= AT_H * 3600.0, 2] += STEP
     save_samples(path, T0 + t, values, np.interp(t / 60.0, minutes, warmth))
     return path

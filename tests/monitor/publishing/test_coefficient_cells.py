@@ -1,4 +1,4 @@
-"""Field units against closed forms."""
+"""Tests of coefficients in the units of data sheets."""
 
 import math
 
@@ -26,13 +26,13 @@ from monitor.publishing.coefficient_cells import format_coefficient
         ("ax", "R", 9.80665e-6 / 3600, 1.0, "µg/h"),
     ],
 )
-def test_a_coefficient_in_the_units_of_a_data_sheet(axis, letter, si, field, name):
+def test_coefficient_is_converted_to_data_sheet_units(axis, letter, si, field, name):
     unit = coefficient_unit(letter, axis)
     assert si * unit.factor == pytest.approx(field, rel=1e-5)
     assert unit.name == name
 
 
-def test_a_random_walk_grows_by_its_coefficient_in_one_hour():
+def test_n_is_the_angle_error_after_one_hour():
     angle_deg = math.degrees(1.5e-4 * math.sqrt(3600.0))  # rms angle after an hour is N·√t
     assert coefficient_unit("N", "gx").factor * 1.5e-4 == pytest.approx(angle_deg)
 
@@ -57,11 +57,11 @@ def test_deviation_has_the_unit_of_bias_instability():
         (math.inf, "∞"),
     ],
 )
-def test_a_number_keeps_three_digits(value, text):
+def test_number_has_three_digits(value, text):
     assert format_number(value) == text
 
 
-def test_a_reading_says_what_its_status_allows():
+def test_cell_follows_the_status():
     shape = (5, 6)
     coefficients = Coefficients(
         np.full(shape, 1.5e-4), np.full(shape, 1.4e-4), np.full(shape, 1.6e-4), np.zeros(shape, np.int8)
@@ -76,5 +76,5 @@ def test_a_reading_says_what_its_status_allows():
     assert seen == [("—", ""), ("≤ 0.550", ""), ("0.516", "0.481 … 0.550")]
 
 
-def test_kinds_share_out_the_axes():
+def test_gyro_and_accel_axes_are_all_axes():
     assert axes_of("gyro") + axes_of("accel") == AXES
