@@ -1,7 +1,7 @@
-"""A process that publishes a recording over zenoh: python -m tests.system.publisher FILE.npz KEY ENDPOINT ROWS.
+"""Publish a recording over zenoh: python -m tests.system.publisher FILE.npz KEY ENDPOINT ROWS.
 
-It publishes ROWS rows for each line on its standard input, so that a reader on a loaded machine can keep up. It ends
-with its standard input.
+The program publishes ROWS rows for each line on its standard input, so that a reader on a loaded machine can keep up.
+It ends when its standard input is closed.
 """
 
 import sys

@@ -21,13 +21,20 @@ import allantools
 import numpy as np
 import psutil
 import pytest
+import typer
 
 from drivers.data_types import AXES
 from drivers.recordings import save_samples
-from monitor.cli import main, report_failed_thread
+from monitor.cli import app, main, report_failed_thread
+from monitor.common import topics
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.noise.model_loading import read_model
-from monitor.settings.loading import load_config
+from monitor.publishing.exporters import FORMATS
+from monitor.publishing.messages.results import CoefficientsMessage
+from monitor.publishing.zenoh.publisher import ZenohPublisher
+from monitor.settings.loading import ZenohTable, load_config
+from tests.monitor.publishing.example_results import make_estimate
+from tests.support.ports import free_endpoint
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
@@ -368,25 +375,35 @@ WRONG_ARGUMENTS = {
     ),
     "zero window": (("analyze", "x.csv", "--window", "0"), '--window: "0" is not a duration'),
     "infinite rate": (("analyze", "x.csv", "--rate", "inf"), "--rate: inf Hz is outside the supported range"),
+    "unknown units": (("analyze", "x.csv", "--units", "cgs"), '--units: "cgs"; possible are imu, datasheet, si'),
     "no format": (("export", "x.toml"), "Missing option '--format'"),
-    "unknown format": (("export", MODEL, "--format", "gtsam"), 'unknown format "gtsam"; possible are kalibr,'),
-    "no source": (("export", "x.toml", "--format", "kalibr"), "x.toml: cannot be read: No such file or directory"),
-    "folder for a source": (("export", ".", "--format", "kalibr"), ".: cannot be read: is a directory"),
+    "unknown format": (("export", MODEL, "--format", "rovio"), 'unknown format "rovio"; possible are kalibr,'),
+    "no source": (
+        ("export", "x.toml", "--format", "kalibr"),
+        'no model "x.toml", neither a file nor one of those shipped',
+    ),
+    "folder for a source": (("export", ".", "--format", "kalibr"), 'no model ".", neither a file nor one of those'),
+    "nothing to export": (("export", "--format", "kalibr"), "give either a model or the JSON of analyze, or --connect"),
+    "two sources": (
+        ("export", MODEL, "--format", "kalibr", "--connect", "tcp/127.0.0.1:1"),
+        "give either a model or the JSON of analyze, or --connect",
+    ),
     "inflation below 1": (
         ("export", MODEL, "--format", "kalibr", "--inflation", "0.5"),
         "--inflation: 0.5 is outside the supported range",
     ),
     "option of another format": (
         ("export", MODEL, "--format", "kalibr", "--dt", "0.01"),
-        "--dt: belongs to --format kalman, not kalibr",
+        "--dt: belongs to --format vins_fusion, fast_lio, px4_ekf2, ardupilot_ekf3, robot_localization, imu_utils, "
+        "kalman, not kalibr",
     ),
     "correlation time of another format": (
         ("export", MODEL, "--format", "gyroparams", "--correlation-time", "9"),
-        "--correlation-time: belongs to --format kalman, not gyroparams",
+        "--correlation-time: belongs to --format gnss_ins_sim, kalman, not gyroparams",
     ),
     "topic of another format": (
         ("export", MODEL, "--format", "kalman", "--rostopic", "/imu"),
-        "--rostopic: belongs to --format kalibr, not kalman",
+        "--rostopic: belongs to --format kalibr, allan_variance_ros, openvins, not kalman",
     ),
     "zero time step": (
         ("export", MODEL, "--format", "kalman", "--dt", "0"),
@@ -862,6 +879,45 @@ def test_model_is_exported(run_program: RunProgram, arguments: tuple[str, ...], 
     assert Path("x").read_text() == run.out
 
 
+def test_shipped_model_name_is_exported_like_its_file(run_program: RunProgram) -> None:
+    for form in FORMATS:
+        named, file = (run_program("export", source, "--format", form) for source in ("consumer-mems", MODEL))
+        assert (named.status, named.err) == (0, "")
+        assert named.out == file.out
+
+
+def test_help_lists_every_export_format() -> None:
+    command = typer.main.get_command(app).commands["export"]  # type: ignore[attr-defined]
+    [option] = [parameter for parameter in command.params if "--format" in parameter.opts]
+    assert option.metavar == "|".join(FORMATS)
+
+
+def test_present_result_of_a_daemon_is_exported(run_program: RunProgram, monkeypatch: pytest.MonkeyPatch) -> None:
+    endpoint, message = free_endpoint(), CoefficientsMessage.from_result("bench-1", 1.76e9, 0, make_estimate()).encode()
+    Path("x.json").write_bytes(message)
+    file_export = run_program("export", "x.json", "--format", "robot_localization")
+    publisher = ZenohPublisher(ZenohTable(listen=(endpoint,)), ["bench-1", "bench-2"])
+    publisher.start()
+    try:
+        wait_for(lambda: publisher.state == "ok")
+        publisher.put(topics.COEFFICIENTS, "bench-1", message)
+        arguments = ("export", "--format", "robot_localization", "--connect", endpoint)
+        only, named = run_program(*arguments), run_program(*arguments, "--device", "bench-1")
+        publisher.put(topics.COEFFICIENTS, "bench-2", message)
+        several = run_program(*arguments)
+        monkeypatch.setattr("monitor.publishing.zenoh.coefficients_client.PATIENCE_S", 1.0)
+        absent = run_program(*arguments, "--device", "bench-3")
+    finally:
+        publisher.close()
+    assert (file_export.status, file_export.err) == (0, "")
+    assert "# source: device bench-1, live\n" in only.out
+    assert only.out.replace("device bench-1, live", "x.json") == file_export.out
+    assert named.out == only.out
+    assert (several.status, absent.status) == (2, 1)
+    assert "result of 2 devices; choose one with --device: bench-1, bench-2" in several.require_one_error_line()
+    assert "no coefficients of bench-3 in 1 s (ok)" in absent.require_one_error_line()
+
+
 @pytest.mark.long
 def test_result_of_analyze_is_exported(
     run_program: RunProgram, recording: Path, monkeypatch: pytest.MonkeyPatch
@@ -1184,15 +1240,15 @@ import json, sys
 import monitor.daemon.service
 from drivers.data_types import concatenate_blocks
 from monitor.cli import main
-from tests.system.rig import Caught
+from tests.system.rig import RecordingOutput
 run = monitor.daemon.service.Service.run
 def counted(self, *arguments):
-    caught = Caught()
-    self.outputs.append(caught)
+    output = RecordingOutput()
+    self.outputs.append(output)
     run(self, *arguments)
     truth = self.workers[0].simulated.fault_counts
-    if "demo" in caught.blocks:
-        numbers = (concatenate_blocks(caught.blocks["demo"]).ticks // 10_000_000).tolist()
+    if "demo" in output.blocks:
+        numbers = (concatenate_blocks(output.blocks["demo"]).ticks // 10_000_000).tolist()
         print(json.dumps([numbers, truth.total_simulated_samples, truth.dropped]), file=sys.stderr)
 monitor.daemon.service.Service.run = counted
 sys.argv[0] = "imu-monitor"
@@ -1498,7 +1554,7 @@ def test_failed_thread_is_reported_in_one_line(
     [
         (
             ("export", "m.toml"),
-            "Missing option '--format' (kalibr|gyroparams|kalman): Tool that reads the parameters. See imu-monitor exp",
+            "Missing option '--format' (kalibr|allan_variance_ros|openvins|",
         ),
         (
             ("simulate", "m.toml", "--seconds", "1"),

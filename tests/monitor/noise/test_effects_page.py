@@ -10,7 +10,7 @@ import pytest
 from monitor.noise.effect import Transform, gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER
 from monitor.noise.temperature import Temperature
-from tests.contracts.effect_examples import AXIS, model
+from tests.contracts.effect_examples import AXIS, make_model
 
 PAGE = Path(__file__).parents[3] / "docs" / "effects.md"
 SECTIONS = dict(
@@ -42,7 +42,7 @@ def test_section_agrees_with_the_code(name):
     "name", sorted(set(EFFECTS) - {"saturation", "resolution"})
 )  # whether these are NaN depends on their parameters
 def test_page_states_nan_where_the_code_returns_nan(name):
-    value = model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
+    value = make_model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
     assert ("| σ²(τ) | NaN |" in SECTIONS[name]) == bool(np.isnan(value))
 
 

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES
-from monitor.common.unit_formatting import COEFFICIENT_UNITS, DEVIATION_UNITS, axes_of, coefficient_unit, format_number
+from monitor.common.unit_formatting import (
+    COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
+    UNIT_SYSTEMS,
+    axes_of,
+    coefficient_unit,
+    format_number,
+)
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.publishing.coefficient_cells import format_coefficient
 
@@ -37,9 +44,26 @@ def test_n_is_the_angle_error_after_one_hour():
     assert coefficient_unit("N", "gx").factor * 1.5e-4 == pytest.approx(angle_deg)
 
 
+def test_one_sided_density_times_root_of_bandwidth_is_sigma_of_a_sample():
+    """White noise of N at a rate f has the variance N² f, which a one-sided density distributes over f/2."""
+    rate_hz, n = 200.0, {"gyro": 1.5e-4, "accel": 2e-3}
+    for kind, si in (("gyro", math.radians(1e-3)), ("accel", 9.80665e-6)):
+        density = n[kind] * UNIT_SYSTEMS["datasheet"].densities[kind].factor * si
+        assert density * math.sqrt(rate_hz / 2.0) == pytest.approx(n[kind] * math.sqrt(rate_hz), rel=1e-12)
+
+
+def test_si_has_factors_of_one_and_other_systems_share_their_units():
+    for kind in ("gyro", "accel"):
+        assert {unit.factor for unit in UNIT_SYSTEMS["si"].coefficients[kind].values()} == {1.0}
+        names = {column.symbol: column.unit for column in UNIT_SYSTEMS["imu"].columns(kind)}
+        columns = UNIT_SYSTEMS["datasheet"].columns(kind)
+        assert [column.symbol for column in columns] == ["Q", "N", "N", "B", "K", "R"]
+        assert all(column.unit == names[column.symbol] for column in columns if "density" not in column.name)
+
+
 def test_deviation_has_the_unit_of_bias_instability():
     for kind, unit in DEVIATION_UNITS.items():
-        assert unit == COEFFICIENT_UNITS[kind]["B"]
+        assert unit == COEFFICIENT_UNITS[kind]["B"] == UNIT_SYSTEMS["imu"].deviation(kind)
 
 
 @pytest.mark.parametrize(

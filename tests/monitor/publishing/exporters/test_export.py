@@ -278,7 +278,7 @@ def test_shipped_model_can_be_exported_to_every_format(form: str) -> None:
 @pytest.mark.parametrize(
     ("form", "inflation", "options", "message"),
     [
-        ("yaml", 1.0, {}, 'unknown format "yaml"; possible are kalibr, gyroparams, kalman'),
+        ("yaml", 1.0, {}, 'unknown format "yaml"; possible are kalibr, allan_variance_ros, openvins'),
         ("kalibr", 0.5, {}, "inflation: 0.5 is outside the supported range"),
         ("kalibr", math.nan, {}, "inflation: nan"),
         ("kalman", 1.0, {"dt_s": 0.0}, "a time step of 1 µs"),

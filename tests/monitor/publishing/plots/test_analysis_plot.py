@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
+from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.publishing.plots import allan_figure, analysis_plot, dynamic_figure, style
@@ -40,6 +41,16 @@ def draw_panel(kind: str = "gyro", **arguments: object):
     axes = figure.subplots()
     allan_figure.draw_allan_panel(axes, arguments.pop("estimate", example_results.make_estimate()), kind, **arguments)
     return axes
+
+
+@pytest.mark.parametrize(("units", "unit", "factor"), [("si", "m/s²", 1.0), ("datasheet", "µg", 1e6 / 9.80665)])
+def test_deviations_are_drawn_in_the_requested_units(units: str, unit: str, factor: float) -> None:
+    pytest.importorskip("matplotlib")
+    estimate = example_results.make_estimate()
+    axes = draw_panel("accel", estimate=estimate, units=UNIT_SYSTEMS[units])
+    assert axes.get_ylabel() == f"Allan deviation σ(τ), {unit}"
+    [measured] = [line for line in axes.lines if line.get_label() == "ax"]
+    np.testing.assert_allclose(measured.get_ydata(), np.sqrt(estimate.curve.avar[:, 3]) * factor)
 
 
 def find_letters(axes) -> dict[str, list[tuple[float, float]]]:

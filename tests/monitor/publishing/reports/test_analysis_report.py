@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
+from monitor.common.unit_formatting import DEFAULT_UNITS, UNIT_SYSTEMS
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.analysis import RecordingAnalysis
-from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publishing.plots.analysis_plot import AnalysisPlotData
@@ -93,6 +93,21 @@ def get_coefficient_arrays(result: RecordingAnalysis) -> tuple[np.ndarray, np.nd
     return known.value, known.lo, known.hi
 
 
+@pytest.mark.parametrize("units", ["datasheet", "si"])
+def test_page_can_use_other_units(units: str) -> None:
+    result = make_analysis()
+    page = ReportPage(analysis_report.render_page(AnalysisPlotData(result, units=UNIT_SYSTEMS[units])))
+    cells = [" ".join(cell.split()) for cell in page.cells]
+    n = result.estimate.coefficients.value[1, 2]
+    if units == "datasheet":
+        assert any(f"{n * np.degrees(1) * 60:.3f} °/√h " in cell for cell in cells)
+        assert any(f"{n * np.degrees(1) * 1000 * np.sqrt(2):.2f} m°/s/√Hz " in cell for cell in cells)
+        assert len(cells) == 2 * 6 * 4
+    else:
+        assert any(f"{n:.6f} rad/s/√Hz " in cell for cell in cells)
+        assert len(cells) == 2 * 5 * 4
+
+
 def test_unknown_values_are_described_in_words() -> None:
     short = example_results.make_analysis(seconds=200.0)
     short.estimate.curve.avar[:, 3:] = np.nan
@@ -101,7 +116,8 @@ def test_unknown_values_are_described_in_words() -> None:
     assert "— <small>(too few data)</small>" in " ".join(text.split())
     assert "<h2>Notes</h2>" not in text
     drifting = replace(example_results.make_estimate(seconds=1000.0), k_or_r=np.array([True] + [False] * 5))
-    small = {letter: analysis_report.format_value_and_interval(drifting, letter, "gx")[1] for letter in SYMBOLS}
+    columns = DEFAULT_UNITS.columns("gyro")
+    small = {column.symbol: analysis_report.format_value_and_interval(drifting, column, "gx")[1] for column in columns}
     assert small["K"] == "(upper bound; K or R)"
     assert small["R"] == "(too few data)"
     assert "…" in small["N"]
