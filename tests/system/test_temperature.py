@@ -7,7 +7,7 @@ import numpy as np
 import zenoh
 
 from drivers.recordings import save_samples
-from tests.monitor.drift.made import COEFFICIENT, late, weather
+from tests.monitor.drift.thermal_biases import BIAS_SLOPE, apply_lag, simulate_temperature
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 from tests.support.zenoh_sessions import open_session, patient_file
@@ -38,14 +38,14 @@ connect = ["{endpoint}"]
 def write_recording(path: Path) -> Path:
     """Write a recording in which gz follows the temperature with a lag of 1 h and has a step, and gx is white noise."""
     rng = np.random.default_rng(11)
-    temperature_c = weather(HOURS, rng)
+    temperature_c = simulate_temperature(HOURS, rng)
     minutes = np.arange(-48 * 60, HOURS * 60)
     t = np.arange(round(HOURS * 3600 * RATE_HZ)) / RATE_HZ
     values = np.full((t.size, 6), np.nan)
     values[:, 0] = 4e-4 * rng.standard_normal(t.size)
-    values[:, 2] = COEFFICIENT * np.interp(t / 60.0, minutes, late(temperature_c, 1.0)) + 4e-4 * rng.standard_normal(
-        t.size
-    )
+    values[:, 2] = BIAS_SLOPE * np.interp(
+        t / 60.0, minutes, apply_lag(temperature_c, 1.0)
+    ) + 4e-4 * rng.standard_normal(t.size)
     values[t >= AT_H * 3600.0, 2] += STEP
     save_samples(path, T0 + t, values, np.interp(t / 60.0, minutes, temperature_c))
     return path

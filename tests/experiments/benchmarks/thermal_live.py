@@ -16,7 +16,7 @@ from drivers.data_types import Floats
 from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean, OnlineThermalModel
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
 from tests.experiments.benchmarks.machine import console, table
-from tests.monitor.drift.made import COEFFICIENT, late, weather
+from tests.monitor.drift.thermal_biases import BIAS_SLOPE, apply_lag, simulate_temperature
 
 COUNT, MINUTES, FIRST, AT = 200, 10, 36, 140
 NOISE = 0.05  # of the swing of the bias
@@ -30,11 +30,12 @@ def record(kind: str, seed: int, step: float = 0.0) -> tuple[Floats, Floats, flo
     """Means of bias and temperature, and the deviation of a mean."""
     rng = np.random.default_rng(seed)
     hours = -(-COUNT * MINUTES // 60)
-    warmth = weather(hours, rng)
+    warmth = simulate_temperature(hours, rng)
     both = [
-        part[-60 * hours :].reshape(-1, MINUTES).mean(axis=1)[:COUNT] for part in (late(warmth, KINDS[kind]), warmth)
+        part[-60 * hours :].reshape(-1, MINUTES).mean(axis=1)[:COUNT]
+        for part in (apply_lag(warmth, KINDS[kind]), warmth)
     ]
-    bias = COEFFICIENT * both[0]
+    bias = BIAS_SLOPE * both[0]
     size = NOISE * float(np.ptp(bias))
     left = rng.standard_normal(COUNT)
     if kind == "wander":
