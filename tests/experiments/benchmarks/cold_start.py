@@ -26,7 +26,7 @@ from typing import Any
 
 import msgspec
 
-from tests.experiments.benchmarks.machine import Load, about, console, table
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
 from tests.support.zenoh_sessions import session
 
 ROOT = Path(__file__).parents[3]
@@ -108,22 +108,22 @@ def main() -> None:
     parser.add_argument("--load", type=int, default=0, help="busy processes beside it")
     parser.add_argument("--share", type=float, help="share of one processor, e.g. 0.25")
     parser.add_argument("--rounds", type=int, default=3)
-    chosen = parser.parse_args()
-    processors, load = os.sched_getaffinity(0), chosen.load
-    if chosen.share is not None:
-        processors, load = {min(processors)}, round(1.0 / chosen.share) - 1
-    console.print(about())
+    arguments = parser.parse_args()
+    processors, load = os.sched_getaffinity(0), arguments.load
+    if arguments.share is not None:
+        processors, load = {min(processors)}, round(1.0 / arguments.share) - 1
+    console.print(describe_machine())
     meanwhile, rows = Load(), list[tuple[str, ...]]()
-    for _ in range(chosen.rounds):
+    for _ in range(arguments.rounds):
         with tempfile.TemporaryDirectory() as folder, busy(load, processors):
             for kernels in ("cold", "warm"):
                 found = times(Path(folder))
                 rows.append((kernels, *(f"{found[name]:.1f}" for name in NAMES)))
-    shown = table("seconds after the start", "kernels", *NAMES)
+    table = create_table("seconds after the start", "kernels", *NAMES)
     for row in sorted(rows):
-        shown.add_row(*row)
-    console.print(shown)
-    console.print(meanwhile.said())
+        table.add_row(*row)
+    console.print(table)
+    console.print(meanwhile.describe())
 
 
 NAMES = ("curve", "coefficients", "everything", "lost")

@@ -132,15 +132,15 @@ def _size(folder: Path) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=30.0)
-    wanted = parser.parse_args()
+    arguments = parser.parse_args()
     print(
         "| sensors | Hz | read_timeout, ms | % of a core | memory MB | threads | MB a sensor and day, before packing |"
     )
     print("| --: | --: | --: | --: | --: | --: | --: |")
     for rate_hz in (100, 1000):
         for count in (1, 4, 16):
-            print(measured(count, rate_hz, wanted.seconds), flush=True)
-        print(measured(16, rate_hz, wanted.seconds, 0.1), flush=True)
+            print(measured(count, rate_hz, arguments.seconds), flush=True)
+        print(measured(16, rate_hz, arguments.seconds, 0.1), flush=True)
 
 
 if __name__ == "__main__":

@@ -562,11 +562,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(FAULTS))
     parser.add_argument("--times", type=int, default=1000, help="of what is done again and again")
-    wanted = parser.parse_args()
+    arguments = parser.parse_args()
     print("| fault | sent | received | lost | bad | the status said |\n| --- | --- | --- | --- | --- | --- |")
-    for name in wanted.names or FAULTS:
+    for name in arguments.names or FAULTS:
         with tempfile.TemporaryDirectory() as folder:
-            one = FAULTS[name](Path(folder), wanted.times)
+            one = FAULTS[name](Path(folder), arguments.times)
         said = one.said.replace(folder, "…")
         note = f" ({one.note})" if one.note else ""
         print(f"| {one.injected}{note} | {one.sent} | {one.received} | {one.lost} | {one.bad} | {said} |", flush=True)

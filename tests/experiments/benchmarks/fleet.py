@@ -309,15 +309,15 @@ def main() -> None:
     parser.add_argument("--publish", default="1 Hz")
     parser.add_argument("--settings", action="store_true")
     parser.add_argument("--router", nargs="+", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.router:
-        route(*asked.router)
+    arguments = parser.parse_args()
+    if arguments.router:
+        route(*arguments.router)
         return
     _alone()
-    if asked.settings:
-        settings(asked.seconds)
+    if arguments.settings:
+        settings(arguments.seconds)
     else:
-        print(json.dumps(fleet(asked.daemons, asked.rate, asked.publish, asked.seconds), indent=1))
+        print(json.dumps(fleet(arguments.daemons, arguments.rate, arguments.publish, arguments.seconds), indent=1))
 
 
 if __name__ == "__main__":

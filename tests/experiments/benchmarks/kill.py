@@ -236,14 +236,14 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--longest", type=float, default=8.0, help="s that a daemon lives at most")
-    wanted = parser.parse_args()
-    rng = np.random.default_rng(wanted.seed)
+    arguments = parser.parse_args()
+    rng = np.random.default_rng(arguments.seed)
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder))
         try:
             kills = []
-            for i in range(wanted.kills):
-                kills.append(bench.kill(float(rng.uniform(0.2, wanted.longest))))
+            for i in range(arguments.kills):
+                kills.append(bench.kill(float(rng.uniform(0.2, arguments.longest))))
                 bench.check_files()
                 one = kills[-1]
                 print(f"{i + 1:4d}  lived {one.lived_s:4.1f} s  {one.rows:6d} rows  {one.missing_s:.3f} s missing")

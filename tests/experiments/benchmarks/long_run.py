@@ -17,7 +17,7 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar
 from monitor.estimation.allan.window import AllanWindow
-from tests.experiments.benchmarks.machine import about, console
+from tests.experiments.benchmarks.machine import console, describe_machine
 
 LENGTH = 360_000
 BLOCK = 1_000_000
@@ -63,7 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--samples", type=float, default=1e8)
     blocks = max(1, round(parser.parse_args().samples / BLOCK))
-    console.print(about())
+    console.print(describe_machine())
     console.print(f"largest difference: {run(blocks, console.print):.1e}")
 
 

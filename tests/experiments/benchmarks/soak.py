@@ -139,26 +139,26 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=50.0)
     parser.add_argument("--keep", default="30d", help="of the recording")
     parser.add_argument("--plot", type=Path)
-    wanted = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "soak.toml"
-        path.write_text(CONFIG.format(rate=wanted.rate, folder=Path(folder) / "store", keep=wanted.keep))
-        wire = Wire(wanted.rate, round(wanted.days * 86400 * wanted.rate))
+        path.write_text(CONFIG.format(rate=arguments.rate, folder=Path(folder) / "store", keep=arguments.keep))
+        wire = Wire(arguments.rate, round(arguments.days * 86400 * arguments.rate))
         config = loading.load_config(path)
         (one,) = config.devices
         device = one.model_copy(update={"driver": dataclasses.replace(one.driver, link=wire)})
         service = Service(dataclasses.replace(config, devices=(device,)))
         course, begun = Course(), time.monotonic()
         done = threading.Event()
-        watcher = threading.Thread(target=_watch, args=(service, wanted.rate, Path(folder) / "store", course, done))
+        watcher = threading.Thread(target=_watch, args=(service, arguments.rate, Path(folder) / "store", course, done))
         watcher.start()
         service.run()
         done.set()
         watcher.join()
         took_s = time.monotonic() - begun
         _tell(service, wire, course, took_s, Path(folder) / "store")
-        if wanted.plot is not None:
-            _draw(course, wanted.plot)
+        if arguments.plot is not None:
+            _draw(course, arguments.plot)
 
 
 def _watch(service: Service, rate_hz: float, store: Path, course: Course, done: threading.Event) -> None:
