@@ -19,7 +19,7 @@ from typing import Any, Final
 import zenoh
 
 from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
-from tests.experiments.benchmarks.rig import PATIENCE_S, Daemon, Sensors, subscriber
+from tests.experiments.benchmarks.rig import PATIENCE_S, Daemon, Sensors, open_session
 from tests.support.waiting import wait_for
 
 RATE_HZ: Final = 1000
@@ -71,9 +71,9 @@ def run(devices: int, read_timeout_s: float, seconds: float, folder: Path) -> Ru
     daemon = Daemon(folder, devices, RATE_HZ, "10min", read_timeout=read_timeout_s)
     published = PublishedMessages()
     try:
-        with subscriber(daemon.port) as session, session.declare_subscriber("imu/**", published.take):
+        with open_session(daemon.port) as session, session.declare_subscriber("imu/**", published.take):
             wait_for(lambda: len(published.status) == devices, "the first status")
-            sensors.go()
+            sensors.start()
             time.sleep(WARM_UP_S)
             load, start_s, cpu_s, before = Load(), time.monotonic(), daemon.cpu_s(), published.messages
             sent = sensors.wait(seconds + PATIENCE_S)

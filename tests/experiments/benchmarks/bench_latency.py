@@ -20,7 +20,7 @@ import zenoh
 
 from drivers.data_types import Floats, Ints
 from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
-from tests.experiments.benchmarks.rig import PATIENCE_S, Daemon, Sensors, subscriber
+from tests.experiments.benchmarks.rig import PATIENCE_S, Daemon, Sensors, open_session
 
 RATE_HZ: Final = 1000
 WARM_UP_S: Final = 5.0
@@ -41,10 +41,10 @@ def measure_results(seconds: float, more: str, folder: Path) -> tuple[Ints, Ints
         messages.append((time.monotonic_ns(), sample.payload.to_bytes()))
 
     try:
-        with subscriber(daemon.port) as session, session.declare_subscriber("imu/imu0/coefficients", take):
+        with open_session(daemon.port) as session, session.declare_subscriber("imu/imu0/coefficients", take):
             time.sleep(SETTLE_S)
             load = Load()
-            sensors.go()
+            sensors.start()
             sent = sensors.wait(seconds + WARM_UP_S + PATIENCE_S)
             load_text = load.describe()
             time.sleep(SETTLE_S)
