@@ -52,17 +52,17 @@ def main() -> None:
     parser.add_argument("--years", type=float, default=5.0)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--keep", type=Path, help="where to leave the file of the years")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     load = Load()
     cost()
     with tempfile.TemporaryDirectory() as folder:
-        path = asked.keep or Path(folder) / "years.sqlite"
-        if asked.years:
-            years(path, asked.years)
+        path = arguments.keep or Path(folder) / "years.sqlite"
+        if arguments.years:
+            years(path, arguments.years)
             queries(path)
-        if asked.kills:
-            kills(Path(folder) / "kills.sqlite", asked.kills)
-    print(load.said())
+        if arguments.kills:
+            kills(Path(folder) / "kills.sqlite", arguments.kills)
+    print(load.describe())
 
 
 def cost() -> None:

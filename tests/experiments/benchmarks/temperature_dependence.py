@@ -12,7 +12,7 @@ import argparse
 import numpy as np
 
 from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, find_temperature_dependence
-from tests.experiments.benchmarks.machine import console, table
+from tests.experiments.benchmarks.machine import console, create_table
 from tests.monitor.drift.temperature_cycles import NOISES, SHAPES, simulate_chamber_means, simulate_noise_means
 
 COUNT = 75
@@ -62,26 +62,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=200)
     seeds = parser.parse_args().seeds
-    made = table(f"False statements in {seeds} seeds: depends / mostly temperature / hysteresis", "noise", *SHAPES)
+    table = create_table(
+        f"False statements in {seeds} seeds: depends / mostly temperature / hysteresis", "noise", *SHAPES
+    )
     for noise in NOISES:
         cells = (false_statements(noise, shape, seeds) for shape in SHAPES)
-        made.add_row(noise, *(" / ".join(map(str, cell)) for cell in cells))
-    console.print(made)
-    made = table(
+        table.add_row(noise, *(" / ".join(map(str, cell)) for cell in cells))
+    console.print(table)
+    table = create_table(
         "Named, by the share that is temperature beside a random walk", "law", "cycle", *(f"{s:.0%}" for s in SHARES)
     )
     for law in ("linear", "cubic"):
         for shape in SHAPES:
-            made.add_row(law, shape, *(f"{power(law, shape, share, seeds) / seeds:.0%}" for share in SHARES))
-    console.print(made)
-    made = table(
+            table.add_row(law, shape, *(f"{power(law, shape, share, seeds) / seeds:.0%}" for share in SHARES))
+    console.print(table)
+    table = create_table(
         "Hysteresis found, and found over true size", "law", "cycle", *(f"{size:g} deviations" for size in LOOPS)
     )
     for law in ("loop", "lag", "play"):
         for shape in SHAPES[:-1]:
             sizes = (loops(law, shape, size, seeds) for size in LOOPS)
-            made.add_row(law, shape, *(f"{count / seeds:.0%}, {ratio:.2f}" for count, ratio in sizes))
-    console.print(made)
+            table.add_row(law, shape, *(f"{count / seeds:.0%}, {ratio:.2f}" for count, ratio in sizes))
+    console.print(table)
 
 
 if __name__ == "__main__":

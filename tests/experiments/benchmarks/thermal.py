@@ -14,7 +14,7 @@ import numpy as np
 
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict_interval_means
-from tests.experiments.benchmarks.machine import console, table
+from tests.experiments.benchmarks.machine import console, create_table
 from tests.monitor.drift.thermal_biases import select_first_intervals, simulate_hourly_means
 
 DAY = 24
@@ -54,11 +54,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=200)
     seeds = parser.parse_args().seeds
     heads = ("noise", "multi-step, median", "90 %", "worst", "one-step", "inside 95 %", "difference equation")
-    made = table(f"Error over that of a cubic, {seeds} seeds a row", "late by", *heads)
+    table = create_table(f"Error over that of a cubic, {seeds} seeds a row", "late by", *heads)
     for lag_h in LAGS_H:
         for noise in NOISES:
-            made.add_row(*cell(lag_h, noise, seeds))
-    console.print(made)
+            table.add_row(*cell(lag_h, noise, seeds))
+    console.print(table)
 
 
 if __name__ == "__main__":
