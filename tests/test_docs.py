@@ -168,7 +168,7 @@ def test_the_protocols_are_those_that_are_decoded() -> None:
 
 
 def test_every_kind_of_recording_is_named() -> None:
-    named = re.findall(r"\.[a-z.]+", next(t for t in fences(README, "toml") if "recording.csv" in t))
+    named = re.findall(r"\.[a-z0-9.]+", next(t for t in fences(README, "toml") if "recording.csv" in t))
     assert set(FORMATS) <= set(named)
 
 

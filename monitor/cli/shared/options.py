@@ -107,6 +107,14 @@ Last = Annotated[
     str | None, typer.Option(metavar="S", help="Use only the last S seconds of the recording; also 1h, 1d.")
 ]
 
+Topic = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Topic to read from a ROS bag, by default the only IMU. NAME+NAME joins a gyroscope and an accelerometer.",
+    ),
+]
+
 
 def parse_averaging_times(text: str) -> "TauGrid":
     """Parse the option ``--tau``, which is the name of a grid or a list of averaging times in seconds.

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
-from drivers.recordings.formats import FORMATS
+from drivers.recordings.formats import WRITABLE
 from monitor.common.unit_formatting import coefficient_unit
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.history.history_row import STATES, HistoryRow
@@ -90,7 +90,7 @@ def test_a_span_of_events_alone_is_printed() -> None:
     assert "gz noisier" in text
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", WRITABLE)
 def test_a_file_has_every_number_with_its_unit(tmp_path: Path, suffix: str) -> None:
     past, path = made(), tmp_path / f"h{suffix}"
     history_file.save_history(past, path)
