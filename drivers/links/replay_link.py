@@ -2,7 +2,8 @@
 
 The chunks depend on the type of the file:
 
-- A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, ROS bag, or a folder) becomes messages for the decoder
+- A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, ROS bag, log of an autopilot, or a folder)
+  becomes messages for the decoder
   ``samples``.
 - A CAN log (``drivers.links.can_log_reader``) becomes CAN frames.
 - A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes.
@@ -95,7 +96,7 @@ class Settings(LinkSettings):
         None, examples=["1"], description="channel of a CAN log that is replayed; absent: all channels"
     )
     topic: str | None = Field(
-        None, examples=["/imu/data"], description="topic of a ROS bag that is replayed; absent: the only IMU"
+        None, examples=["/imu/data"], description="topic of a ROS bag or of a log of an autopilot; absent: the only IMU"
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.recordings import csv_format, npz_format, ros_bag_format
+from drivers.recordings import csv_format, npz_format, px4_ulog_format, ros_bag_format
 from drivers.recordings import parquet_and_arrow_format as arrow_format
 from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 
@@ -63,6 +63,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ".bag": _ROS_BAG,
     ".db3": _ROS_BAG,
     ".mcap": _ROS_BAG,
+    ".ulg": Format(px4_ulog_format.read_ulog, px4_ulog_format.count_ulog_rows, extra="px4"),
 }
 """Recording format for each file suffix."""
 

@@ -113,6 +113,7 @@ CONTENTS: Final = (
     (b"#ROSBAG", "a ROS 1 bag", (".bag",)),
     (b"SQLite format 3", "an SQLite database", (".db3",)),
     (b"\x89MCAP", "MCAP", (".mcap",)),
+    (b"ULog\x01\x12\x35", "a PX4 log", (".ulg",)),
     (b"\x89HDF", "HDF5", ()),
     (b"MATLAB", "a MATLAB file", ()),
     (b"\x89PNG", "a picture", ()),

@@ -9,9 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rosbags")
-
 from rosbags.rosbag2.reader import zstd
 
 from drivers.data_types import AXES, concatenate_blocks

@@ -111,7 +111,8 @@ Topic = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="Topic to read from a ROS bag, by default the only IMU. NAME+NAME joins a gyroscope and an accelerometer.",
+        help="Topic of a ROS bag or of an autopilot's log; by default its only IMU. A+B joins gyroscope and "
+        "accelerometer.",
     ),
 ]
 

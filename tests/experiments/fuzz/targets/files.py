@@ -86,7 +86,7 @@ def recording_seeds(suffix: str) -> Iterator[bytes]:
     """What the project writes."""
     rng = np.random.default_rng(7)
     if suffix not in WRITABLE:
-        yield from bag_seeds(suffix)
+        yield from robot_log_seeds(suffix)
         return
     for n, axes in ((3, ("gz",)), (12, ("gx", "gy", "gz", "ax", "ay", "az"))):
         path = folder() / f"seed{suffix}"
@@ -105,9 +105,15 @@ def recording_seeds(suffix: str) -> Iterator[bytes]:
         yield from _arrow_seeds(suffix)
 
 
-def bag_seeds(suffix: str) -> Iterator[bytes]:
+def robot_log_seeds(suffix: str) -> Iterator[bytes]:
     """Logs that the libraries of their formats write."""
     from tests.support.ros_bags import imu_topic, storage_file, write_bag
+    from tests.support.ulog import sensor_combined, ulog_bytes, vehicle_imu
+
+    if suffix == ".ulg":
+        t_us = 1_000_000 + 10_000 * np.arange(4)
+        yield ulog_bytes([sensor_combined(t_us, np.ones((4, 6))), vehicle_imu(t_us, np.ones((4, 6)), 10_000)])
+        return
 
     kinds = {".bag": ("ros1", "ros1-bz2", "ros1-lz4"), ".db3": ("sqlite",), ".mcap": ("mcap", "mcap-chunk")}
     t_ns = 1_763_700_000_000_000_000 + 10_000_000 * np.arange(4)
