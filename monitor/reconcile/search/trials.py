@@ -116,6 +116,7 @@ class Trial:
     )  # parameters that the fit does not determine
     event_count: int = 0  # number of events that were detected
     misfit_nats: float = 0.0  # difference from the data that ``effect`` hides from the diagnostics
+    gain_over_same_spectrum: float = 0.0  # gain over the Gaussian effect with the same spectrum, nats
     moved: int | None = None  # index of the model effect that ``effect`` replaces; None for an additional effect
 
     @property
