@@ -23,12 +23,14 @@ from monitor.cli import app
 from monitor.common import topics
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
+from monitor.publishing.exporters import FORMATS as EXPORT_FORMATS
+from monitor.publishing.exporters.estimator_parameters import PARAMETER_FILES
 from monitor.publishing.messages.results import CoefficientsMessage
 from monitor.publishing.rerun.sinks import server_url
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings import loading
 from monitor.settings.loading import ZenohTable
-from tests.monitor.publishing.made import estimate
+from tests.monitor.publishing.example_results import make_estimate
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 
@@ -38,6 +40,7 @@ ARCHITECTURE = ROOT / "docs" / "architecture.md"
 MODULES_NOT_IN_DIAGRAM = {"extras", "file_access", "module_lookup", "number_ranges", "settings_model"}
 """Small modules that the diagram of the layers does not show."""
 SIMULATOR = ROOT / "docs" / "simulator.md"
+EXPORT = ROOT / "docs" / "export.md"
 COMMANDS_PAGE = ROOT / "docs" / "commands.md"
 MESSAGES = ROOT / "docs" / "messages.md"
 DECODERS = ROOT / "docs" / "decoders.md"
@@ -101,6 +104,19 @@ def test_every_noise_model_can_be_simulated(toml: str) -> None:
     model = NoiseModel.from_toml(toml)
     assert model.sample_rate_hz is not None
     model.start_stream(model.sample_rate_hz, 1).draw_next_samples(10)
+
+
+def test_the_tables_of_exports_list_every_format_and_parameter() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \|(.*)$", get_section(EXPORT, "Formats"), re.M))
+    assert rows.keys() == EXPORT_FORMATS.keys()
+    assert set(re.findall(r"^\| `(\w+)` \|", get_section(EXPORT, "Sources and checks"), re.M)) == set(EXPORT_FORMATS)
+    for file in PARAMETER_FILES:
+        names = set(re.findall(r"`([\w.]+)`", rows[file.name]))
+        written = {parameter.name for parameter in file.parameters}
+        assert written <= names or "kalibr" in names
+        for letter in {parameter.letter for parameter in file.parameters}:
+            formula = file.quantity.formula(letter).replace("^2", "²").replace("sqrt(dt)", "√dt")
+            assert formula in rows[file.name].split("|")[3]
 
 
 def test_catalogue_lists_the_model_files() -> None:
@@ -169,7 +185,7 @@ def test_protocol_table_lists_every_decoder() -> None:
 
 
 def test_every_recording_format_is_named() -> None:
-    named = re.findall(r"\.[a-z.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
+    named = re.findall(r"\.[a-z0-9.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
     assert set(FORMATS) <= set(named)
 
 
@@ -263,7 +279,7 @@ def test_subscriber_example_prints_the_published_results(page: Path, word: str) 
     assert ENDPOINT_IN_PAGES in program
     rows = make_block(np.arange(2) * 10_000_000, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 9.81], (2, 1)))
     results = [
-        (topics.COEFFICIENTS, CoefficientsMessage.from_result("bench-1", 1.76e9, 0, estimate()).encode()),
+        (topics.COEFFICIENTS, CoefficientsMessage.from_result("bench-1", 1.76e9, 0, make_estimate()).encode()),
         (topics.SAMPLES, encode_samples("bench-1", 2, rows)),
     ]
     zenoh = ZenohPublisher(ZenohTable(listen=(endpoint,)), ["bench-1"])

@@ -27,7 +27,7 @@ from typing import Any
 import msgspec
 
 from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 
 ROOT = Path(__file__).parents[3]
 HOST, PORT = "127.0.0.1", 7450
@@ -60,7 +60,7 @@ def measure_start(cache: Path) -> dict[str, float]:
         program = subprocess.Popen(command, env=environment, stdout=log, stderr=log, cwd=ROOT)
         try:
             _wait_for(_is_listening, began_s)
-            with session(connect=[f"tcp/{HOST}:{PORT}"]) as opened:
+            with open_session(connect=[f"tcp/{HOST}:{PORT}"]) as opened:
 
                 def take(sample: Any) -> None:
                     topic = str(sample.key_expr).rsplit("/", 1)[-1]

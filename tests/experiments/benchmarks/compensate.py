@@ -308,7 +308,7 @@ def coast(seeds: int) -> None:
     """Print the error of the bias after a time without rest, in °/h."""
     spans = (1.0, 10.0, 60.0)
     table = create_table(
-        "Bias after so long without rest, °/h: last minute's mean | adaptive (and what it said)",
+        "Bias after so long without rest, °/h: last minute's mean | adaptive (and its stated error)",
         "sensor",
         *(f"{s:g} min" for s in spans),
     )
@@ -327,8 +327,8 @@ def coast(seeds: int) -> None:
 
 
 def _format_errors_without_rest(rows: Floats) -> list[str]:
-    minute, own, said = np.sqrt(np.mean(np.square(rows), axis=0)) * PER_H
-    return [f"{a:.3g} | {b:.3g} ({c:.3g})" for a, b, c in zip(minute, own, said, strict=True)]
+    minute, own, stated = np.sqrt(np.mean(np.square(rows), axis=0)) * PER_H
+    return [f"{a:.3g} | {b:.3g} ({c:.3g})" for a, b, c in zip(minute, own, stated, strict=True)]
 
 
 def _errors_without_rest(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats:

@@ -30,8 +30,8 @@ from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.history import HistoryMessage
 from tests.experiments.benchmarks.machine import Load
-from tests.monitor.history.kills import kill
-from tests.monitor.publishing.made import estimate
+from tests.monitor.history.kill_writers import kill_writers
+from tests.monitor.publishing.example_results import make_estimate
 
 T0 = 1_609_459_200  # 2021-01-01
 DAY_S, MINUTES, YEAR_D = 86_400, 1440, 365.25
@@ -68,7 +68,7 @@ def main() -> None:
 
 def print_cost() -> None:
     """Print the time of an estimate in the main loop and of a row in the thread of the writer."""
-    estimates = [estimate(seed=seed) for seed in range(50)]
+    estimates = [make_estimate(seed=seed) for seed in range(50)]
     minutes, rows = MinuteAggregator(), []
     begun = time.perf_counter()
     for i in range(20_000):
@@ -83,7 +83,7 @@ def print_cost() -> None:
 
 def write_years(path: Path, count: float) -> None:
     """Write the years, and print size and time."""
-    rng, simulated_days = np.random.default_rng(1), _SimulatedDays(estimate())
+    rng, simulated_days = np.random.default_rng(1), _SimulatedDays(make_estimate())
     store, begun, written = HistoryFileWriter(path), time.perf_counter(), 0
     days = round(count * YEAR_D)
     largest = 0
@@ -126,12 +126,12 @@ def print_queries(path: Path) -> None:
 
 
 def run_kills(path: Path, count: int) -> None:
-    """Kill a writer at random moments; the check is in ``tests.monitor.history.kills``."""
-    left = kill(path, count, seed=1, within_s=0.2)
-    unsaid = sum(one.found > one.acknowledged for one in left)
+    """Kill a writer at random moments; the check is in ``tests.monitor.history.kill_writers``."""
+    left = kill_writers(path, count, seed=1, within_s=0.2)
+    unacknowledged = sum(result.found > result.acknowledged for result in left)
     print(
         f"{count} kills: {left[-1].found:,} minutes, each in one row, sums and extremes exact; "
-        f"{unsaid} of the kills came after a commit and before it was said"
+        f"{unacknowledged} of the kills came after a commit and before its acknowledgement"
     )
 
 

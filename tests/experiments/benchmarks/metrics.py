@@ -9,7 +9,7 @@ import urllib.request
 
 from monitor.daemon.operations.prometheus_metrics import MetricsOutput
 from monitor.settings.loading import MetricsAddress
-from tests.monitor.publishing import made
+from tests.monitor.publishing import example_results
 
 SCRAPES = 30
 
@@ -19,8 +19,8 @@ def main() -> None:
     for devices in (1, 16, 100):
         output = MetricsOutput(MetricsAddress("127.0.0.1", 0))
         for i in range(devices):
-            output.publish_health(f"device-{i}", 0.0, made.health())
-            output.publish_result(f"device-{i}", 0.0, 0, made.estimate())
+            output.publish_health(f"device-{i}", 0.0, example_results.make_health())
+            output.publish_result(f"device-{i}", 0.0, 0, example_results.make_estimate())
         output.start()
         while not output.port:
             time.sleep(0.01)

@@ -9,8 +9,8 @@ The names are scored by ``tests.experiments.blind.score``, without confidences a
 - *GMWM ranking*: all nested models of WN, QN, RW, DR and up to three AR1 are ranked for each axis. The terms of the
   best model that the baseline does not contain are names. AR1 also replace flicker noise, which is not among the terms.
   An AR1 is therefore a name only if the same ranking has fewer AR1 for the wavelet variance of the baseline.
-- *GMWM with the given model*: the wavelet variance of the baseline is a part of every model, and the additional terms are
-  ranked. More of a term that the baseline contains is no name.
+- *GMWM with the given model*: the wavelet variance of the baseline is a part of every model, and the additional terms
+  are ranked. More of a term that the baseline contains is no name.
 - *five-term fit*: coefficients and notes of ``analyze``, see ``fit_five_terms``.
 - *reconcile*: the program in this process.
 

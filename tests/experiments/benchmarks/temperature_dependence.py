@@ -13,7 +13,7 @@ import numpy as np
 
 from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, find_temperature_dependence
 from tests.experiments.benchmarks.machine import console, create_table
-from tests.monitor.drift.cycles import NOISES, SHAPES, chamber_means, drift
+from tests.monitor.drift.temperature_cycles import NOISES, SHAPES, simulate_chamber_means, simulate_noise_means
 
 COUNT = 75
 SHARES = (0.5, 0.8, 0.95, 0.99)
@@ -24,7 +24,7 @@ def count_false_alarms(noise: str, shape: str, seeds: int) -> tuple[int, int, in
     """Return the numbers of seeds with a detected dependence, with mostly temperature, and with hysteresis."""
     found = np.zeros(3, int)
     for seed in range(seeds):
-        means = chamber_means(shape, drift(noise, COUNT, np.random.default_rng(seed)))
+        means = simulate_chamber_means(shape, simulate_noise_means(noise, COUNT, np.random.default_rng(seed)))
         dependence, loop = find_temperature_dependence(means), find_hysteresis(means)
         found += (
             dependence is not None,
@@ -38,9 +38,9 @@ def count_detections(law: str, shape: str, share: float, seeds: int) -> int:
     """Return the number of seeds that are classified as mostly temperature, for a share of the temperature."""
     found = 0
     for seed in range(seeds):
-        noise = drift("random walk", COUNT, np.random.default_rng(seed))
+        noise = simulate_noise_means("random walk", COUNT, np.random.default_rng(seed))
         size = noise.std() * (share / (1.0 - share)) ** 0.5
-        dependence = find_temperature_dependence(chamber_means(shape, noise, law, size))
+        dependence = find_temperature_dependence(simulate_chamber_means(shape, noise, law, size))
         found += dependence is not None and dependence.explains_most_variance
     return found
 
@@ -49,9 +49,9 @@ def count_loops(law: str, shape: str, size: float, seeds: int) -> tuple[int, flo
     """Return the number of detected loops, and the median of measured over true size."""
     ratios = []
     for seed in range(seeds):
-        noise = drift("white", COUNT, np.random.default_rng(seed))
-        curve = chamber_means(shape, noise, "cubic", 100.0).bias
-        loop = find_hysteresis(chamber_means(shape, curve, law, size))
+        noise = simulate_noise_means("white", COUNT, np.random.default_rng(seed))
+        curve = simulate_chamber_means(shape, noise, "cubic", 100.0).bias
+        loop = find_hysteresis(simulate_chamber_means(shape, curve, law, size))
         if loop is not None and loop.hysteresis_is_significant:
             ratios.append(loop.size / size)
     return len(ratios), float(np.median(ratios)) if ratios else float("nan")

@@ -17,7 +17,7 @@ from drivers.data_types import Floats
 from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean, OnlineThermalModel
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
 from tests.experiments.benchmarks.machine import console, create_table
-from tests.monitor.drift.made import COEFFICIENT, late, weather
+from tests.monitor.drift.thermal_biases import BIAS_SLOPE, apply_lag, simulate_temperature
 
 COUNT, MINUTES, LEARNING_MEANS, STEP_INDEX = 200, 10, 36, 140
 NOISE = 0.05  # of the swing of the bias
@@ -31,12 +31,12 @@ def simulate_means(kind: str, seed: int, step: float = 0.0) -> tuple[Floats, Flo
     """Return means of bias and temperature, and the standard deviation of a mean."""
     rng = np.random.default_rng(seed)
     hours = -(-COUNT * MINUTES // 60)
-    temperatures = weather(hours, rng)
+    temperatures = simulate_temperature(hours, rng)
     both = [
         part[-60 * hours :].reshape(-1, MINUTES).mean(axis=1)[:COUNT]
-        for part in (late(temperatures, KINDS[kind]), temperatures)
+        for part in (apply_lag(temperatures, KINDS[kind]), temperatures)
     ]
-    bias = COEFFICIENT * both[0]
+    bias = BIAS_SLOPE * both[0]
     size = NOISE * float(np.ptp(bias))
     residual = rng.standard_normal(COUNT)
     if kind == "wander":

@@ -146,9 +146,9 @@ def burst_table(records: int, seed: int) -> None:
     console.print(table)
 
 
-def _first_index_of_final_true(held: NDArray[np.bool_]) -> int:
+def _first_index_of_final_true(flags: NDArray[np.bool_]) -> int:
     """Return the first index from which on all values are True. The last value must be True."""
-    return 0 if held.all() else int(np.flatnonzero(~held)[-1]) + 1
+    return 0 if flags.all() else int(np.flatnonzero(~flags)[-1]) + 1
 
 
 def simulate_records(n: int, records: int, seed: int, source: Source, rate_hz: float) -> Iterator[Floats]:
@@ -184,11 +184,11 @@ def cost_table(rounds: int, seed: int) -> None:
     length, factors = 360_000, 2 ** np.arange(TAUS)
     values = N_TRUE * np.random.default_rng(seed).standard_normal((20_000, 6)) + 9.81
     works: dict[str, Callable[[], None]] = {}
-    held = {}
+    sizes = {}
     for name, window in make_windows(factors, length, 100.0).items():
         for _ in range(-(-(length + 1000) // len(values))):
             window.append_samples(values)
-        held[name] = memory_of(window)
+        sizes[name] = memory_of(window)
         works[f"{name} blocks"] = make_append_loop(window, values, 100)
         works[f"{name} singles"] = make_append_loop(window, values[:2000], 1)
     took = time_alternately(works, rounds)
@@ -197,9 +197,9 @@ def cost_table(rounds: int, seed: int) -> None:
         "window",
         "ns a sample, 100 a call",
         "ns a sample, 1 a call",
-        "kB held",
+        "memory in kB",
     )
-    for name, size in held.items():
+    for name, size in sizes.items():
         each = [[t * 1e9 / n for t in took[f"{name} {how}"]] for how, n in (("blocks", 20_000), ("singles", 2_000))]
         table.add_row(name, *(f"{median:.0f} ({best:.0f})" for median, best in each), f"{size / 1e3:,.0f}")
     console.print(table)

@@ -24,7 +24,7 @@ from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
-from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, EXAMPLES, NAMES, Example
+from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
 from tests.experiments.fuzz.checked_clock import CheckedClock
 from tests.experiments.fuzz.checks import feed_and_check, summarize_blocks
 from tests.experiments.fuzz.formats import FORMATS, is_subsequence
@@ -429,7 +429,7 @@ NON_STREAM_TARGETS: Final = {
     "ros2_imu": (check_ros2, _ros2_seeds),
     "samples": (check_samples, _samples_seeds),
 }
-for _name in NAMES:
+for _name in DECODER_NAMES:
     if _name in NON_STREAM_TARGETS:
         target(f"decoder-{_name}", NON_STREAM_TARGETS[_name][1], 1024)(NON_STREAM_TARGETS[_name][0])
     else:
