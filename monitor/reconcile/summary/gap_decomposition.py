@@ -5,11 +5,12 @@ distributed among the changes of the model: in each step, the change whose remov
 sizes are fitted again, and the loss is the gain of this change. The gains are never negative, and their sum is the
 explained gap.
 
-Outliers, heavy tails, changes of the variance and random jumps are not fully visible in the likelihood of the spectrum.
-The gain of the test that found them is added. The gain of a moved line is the score of its trial. The likelihood of
-quantized, clipped or repeated values is unbounded, because a continuous distribution never yields equal values. The
-gain of these effects is the gain of their influence on the noise (``value_artifact_gain``). If the model was fitted to
-the same recording, only added effects have a gain, because the sizes of the model cannot serve as a reference.
+Outliers, heavy tails, changes of the variance, random jumps and wandering lines are not fully visible in the likelihood
+of the spectrum. The gain of the test that found them is added. The gain of a moved line is the score of its trial. The
+likelihood of quantized, clipped or repeated values is unbounded, because a continuous distribution never yields equal
+values. The gain of these effects is the gain of their influence on the noise (``value_artifact_gain``). If the model
+was fitted to the same recording, only added effects have a gain, because the sizes of the model cannot serve as a
+reference.
 
 The **remaining gap** is the sum over the groups of diagnostics in ``GROUPS``. The diagnostics of a group detect the
 same difference, so the gain of a group is that of its strongest significant diagnostic. For the spectrum, the gain from
@@ -34,6 +35,7 @@ from monitor.noise.effects import (
     Resolution,
     Saturation,
     VarianceModulation,
+    WanderingLine,
 )
 from monitor.reconcile.diagnostics.whiteness_tests import fitted_variance_gain_nats
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit
@@ -50,7 +52,15 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "values": ("values",),
 }
 """Diagnostics that detect the same difference, by the name of the group."""
-EFFECTS_OUTSIDE_SPECTRUM: Final = (Outliers, HeavyTails, NoiseStep, VarianceModulation, PoissonSteps, RandomTelegraph)
+EFFECTS_OUTSIDE_SPECTRUM: Final = (
+    Outliers,
+    HeavyTails,
+    NoiseStep,
+    VarianceModulation,
+    PoissonSteps,
+    RandomTelegraph,
+    WanderingLine,
+)
 """Effects that are not fully visible in the likelihood of the spectrum."""
 SATURATED_BANDS: Final = 64
 """Number of frequency bands with a separately fitted power, equally wide on a logarithmic scale."""

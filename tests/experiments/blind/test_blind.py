@@ -34,7 +34,23 @@ def test_true_model_is_not_accused(seed: int) -> None:
     assert (found.exit_status, found.verdict, found.names) == (0, "agrees", ())
 
 
-@pytest.mark.parametrize("name", ["chirp", "sawtooth"])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(6))
+def test_a_wandering_line_is_named(seed: int) -> None:
+    found = run(job("wandering_line", seed, axes=1), in_process=True)
+    assert [(one.effect, one.right) for one in found.names] == [("wandering_line", True)]
+    assert found.closed
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", ["narrowband", "sinusoidal"])
+def test_a_resonance_and_a_line_do_not_wander(name: str, seed: int) -> None:
+    found = run(job(name, seed, axes=1), in_process=True)
+    assert "wandering_line" not in [one.effect for one in found.names]
+
+
+@pytest.mark.parametrize("name", ["chirp", "sawtooth", "amplitude_modulated_line"])
 def test_foreign_effect_gets_no_name(name: str) -> None:
     found = run(job(f"foreign:{name}", axes=1), in_process=True)
     assert found.exit_status == 0
