@@ -17,6 +17,7 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
     TemperatureRemovalComparison,
     remove_temperature_effect,
@@ -60,6 +61,7 @@ class AnalysisRequest:
     exclude_motion: bool = False  # True to exclude samples during motion
     total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
     last_s: float | None = None  # duration at the end of the recording to use; None = all
+    topic: str | None = None  # topic to read; None = the only IMU of the recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +107,7 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
 
 def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
     tell("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s)
+    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
     blocks = list(iter_blocks(found))
     pool = ThreadPoolExecutor(os.cpu_count())
     try:
@@ -133,7 +135,7 @@ def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> None:
+def save_plot_or_report(results: AnalysisResults, path: Path, title: str, units: UnitSystem = DEFAULT_UNITS) -> None:
     """Save the results as a figure, or as an HTML page if the file name ends in ``.html``.
 
     Parameters
@@ -144,6 +146,8 @@ def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> Non
         File to write.
     title : str
         Title of the figure or page.
+    units : UnitSystem
+        Units of the figure or page.
 
     Raises
     ------
@@ -154,7 +158,8 @@ def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> Non
 
     result = results.analysis
     marks = [ChangeMark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
-    drawn = AnalysisPlotData(result, additional_deviations(results.total, results.hadamard), results.dynamic, marks)
+    others = additional_deviations(results.total, results.hadamard)
+    drawn = AnalysisPlotData(result, others, results.dynamic, marks, units)
     if path.suffix == ".html":
         from monitor.publishing.reports.analysis_report import write_html_report
 

@@ -53,7 +53,7 @@ from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
 from monitor.simulator import AMBIENT_C, WARM_UP_C, WARM_UP_S
 from monitor.simulator.demo_config import build_demo_config
-from tests.monitor.publishing.made import estimate, true_coefficients
+from tests.monitor.publishing.example_results import make_estimate, make_true_coefficients
 
 SIZE = (1600, 1000)
 MODEL = shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml"
@@ -359,10 +359,10 @@ def write_history(path: Path, device: str, now_s: float) -> None:
 
 def scale_estimate(scale: Floats, rng: np.random.Generator) -> Estimate:
     """Return the estimate of one hour of the demo's sensor, with one factor on the noise of each axis."""
-    one = estimate(seed=int(rng.integers(1 << 30)))
+    one = make_estimate(seed=int(rng.integers(1 << 30)))
     c = one.coefficients
     wanted = np.outer(DEMO_LETTERS, np.repeat([1.0, 10.0], 3)) * scale
-    factor = np.divide(wanted, true_coefficients(), out=np.ones((5, 6)), where=true_coefficients() > 0.0)
+    factor = np.divide(wanted, make_true_coefficients(), out=np.ones((5, 6)), where=make_true_coefficients() > 0.0)
     return replace(one, coefficients=replace(c, value=c.value * factor, lo=c.lo * factor, hi=c.hi * factor))
 
 

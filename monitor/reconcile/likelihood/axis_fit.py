@@ -34,6 +34,7 @@ from monitor.reconcile.likelihood.effect_roles import (
     build_unit_regressors,
     effect_size,
     is_noise_effect,
+    regressor_count,
     with_effect_size,
     with_regressor_factors,
 )
@@ -284,7 +285,7 @@ class Axis:
         columns: list[Regressor] = []
         for at, effect in enumerate(effects):
             if type(effect) in DETERMINISTIC_SIZE_PARAMETERS:
-                count = len(self.regressor_cosine_transforms(effect))
+                count = regressor_count(effect)
                 slices.append((at, slice(len(columns), len(columns) + count)))
                 columns += [(effect, i) for i in range(count)]
         return tuple(slices), columns

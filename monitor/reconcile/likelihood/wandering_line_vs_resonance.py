@@ -6,7 +6,7 @@ and the modulated line are Gaussian processes, for which the Whittle likelihood 
 """
 
 from dataclasses import dataclass
-from math import log, sqrt
+from math import log, pi, sqrt
 from typing import Final
 
 import numpy as np
@@ -40,7 +40,7 @@ MIN_BAND_CYCLES: Final = 256.0
 """Smallest half width of the band, in cycles per recording."""
 MAX_COMPARED_SAMPLES: Final = 1 << 14
 """Largest number of complex samples in the comparison. The end of a longer recording is not used."""
-START_TIMES: Final = 4
+START_TIMES: Final = 6
 """Number of correlation times that are tried as starting values."""
 START_FACTORS: Final = (0.7, 1.2)
 """Starting values of the power and of the frequency deviation, relative to those of the resonance."""
@@ -154,9 +154,9 @@ def _fit_line(
 ) -> tuple[float, LineState, Floats]:
     """Return the log-likelihood, the parameters and the standard deviations of the logarithms of the first three."""
     starts = [
-        (length, LineState(power * factor, width_hz / HALF_POWER_DEVIATIONS * other, float(time_s), centre_hz))
+        (length, LineState(power * factor, _deviation(width_hz, float(time_s)) * other, float(time_s), centre_hz))
         for length in possible_block_lengths(z.size)
-        for time_s in np.geomspace(4.0 * length / rate_hz, 0.25 * z.size / rate_hz, START_TIMES)
+        for time_s in np.geomspace(1.0 / rate_hz, 0.25 * z.size / rate_hz, START_TIMES)
         for factor in START_FACTORS
         for other in START_FACTORS
     ]
@@ -167,7 +167,12 @@ def _fit_line(
 
     value, at = maximise_over_log_parameters(in_blocks, start[:3])
     state = _line_state(at, centre_hz)
-    tracked, phase = phase_log_likelihood(z, rate_hz, track_phase(z, rate_hz, length, state), state)
+    # the blocks do not resolve the deviation of a narrow line, so the phase is tracked with each start too
+    block_phase = track_phase(z, rate_hz, length, state)
+    states = [state, *(one._replace(power=state.power) for _, one in starts)]
+    tracked, phase, with_tracked = max(
+        ((*phase_log_likelihood(z, rate_hz, block_phase, one), one) for one in states), key=lambda one: one[0]
+    )
     function = in_blocks
     if tracked > value:
 
@@ -175,9 +180,14 @@ def _fit_line(
             return phase_log_likelihood(z, rate_hz, phase, LineState(power, deviation_hz, time_s, centre_hz))[0]
 
         function = with_phase
-        value, at = maximise_over_log_parameters(function, state[:3])
+        value, at = maximise_over_log_parameters(function, with_tracked[:3])
         state = _line_state(at, centre_hz)
     return value, state, compute_log_deviations(lambda x: function(*np.exp(x).tolist()), at, value)
+
+
+def _deviation(width_hz: float, time_s: float) -> float:
+    """Return the frequency deviation of a line with the given width at half power (see ``WanderingLine``)."""
+    return max(width_hz / HALF_POWER_DEVIATIONS, sqrt(width_hz / (4.0 * pi * time_s)))
 
 
 def _line_state(log_parameters: Floats, centre_hz: float) -> LineState:

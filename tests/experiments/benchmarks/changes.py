@@ -26,7 +26,7 @@ from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
 from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.model import NoiseModel
-from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine, time_alternately
 
 WHITE: Final = 1.5e-4
 STEP_OF_OUTPUT: Final = np.deg2rad(0.05)
@@ -62,7 +62,7 @@ def poisson(count: int) -> tuple[float, float]:
 
 def constant(seed: int) -> None:
     """Alarms of noise a z² at low thresholds, times e^h: the constant RATE_AT_ZERO."""
-    shown = table(
+    table = create_table(
         "white noise, six axes: alarms of noise at thresholds low enough to count",
         "h",
         "alarms",
@@ -80,15 +80,15 @@ def constant(seed: int) -> None:
             kinds.update(change.kind for change in detector.take_changes())
         count, scale = kinds["noise_changed"], np.exp(h) / (6 * n)
         low, high = poisson(count)
-        shown.add_row(
+        table.add_row(
             f"{h:g}", f"{count}", f"{6 * n:.1e}", f"{count * scale:.3f} ({low * scale:.3f}–{high * scale:.3f})"
         )
-    console.print(shown)
+    console.print(table)
 
 
 def false_alarms(years: float, seed: int) -> None:
     """Alarms on unchanging noise at the default rate and at ten times it."""
-    shown = table(
+    table = create_table(
         "unchanging noise, six axes", "noise", "simulated", "stated a day", "alarms", "a day", "kinds",
     )  # fmt: skip
     day = 86_400.0
@@ -109,8 +109,8 @@ def false_alarms(years: float, seed: int) -> None:
         for stated, seen in zip((1 / 30, 1.0, 10.0), kinds, strict=True):
             low, high = poisson(seen.total())
             rate = f"{seen.total() / days:.3f} ({low / days:.3f}–{high / days:.3f})"
-            shown.add_row(title, f"{days:.1f} d", f"{stated:.3f}", f"{seen.total()}", rate, str(dict(seen)))
-    console.print(shown)
+            table.add_row(title, f"{days:.1f} d", f"{stated:.3f}", f"{seen.total()}", rate, str(dict(seen)))
+    console.print(table)
 
 
 def onsets() -> dict[str, tuple[float, float, Callable[[Floats, np.random.Generator], Floats]]]:
@@ -177,7 +177,7 @@ def row(title: str, results: list[list[Change]], onset: int, rate_hz: float = RA
 
 def delays(repeats: int, seed: int) -> None:
     """Delay, naming and onset of changes of the mix at 100 Hz, at the default rate of false alarms."""
-    shown = table(
+    table = create_table(
         "changes of the MEMS mix at 100 Hz, one false alarm in 30 days", "change", "found",
         "delay s: median, 90 %", "onset error s: median (10–90 %)", "named",
     )  # fmt: skip
@@ -187,7 +187,7 @@ def delays(repeats: int, seed: int) -> None:
             values = mix().simulate(int((before + after) * RATE_HZ), RATE_HZ, seed + k)
             cut = int(before * RATE_HZ)
             results += looked(values[:cut], change(values[cut:], np.random.default_rng(seed + k)))
-        shown.add_row(*row(title, results, int(before * RATE_HZ)))
+        table.add_row(*row(title, results, int(before * RATE_HZ)))
     results = []
     for k in range(-(-repeats // 24)):  # K × 3 wants days: the mix at 10 Hz, where K is the same
         slow = NoiseAndBiasChangeDetector(10.0)
@@ -198,13 +198,13 @@ def delays(repeats: int, seed: int) -> None:
         found = [c for c in slow.take_changes() if c.kind != "bias_stepped"]
         results += [[c for c in found if c.axis == axis][:1] for axis in range(6) if axis not in early]
     text = row("K × 3 after 2 days, 10 Hz", results, cut, 10.0)
-    shown.add_row(*text)
-    console.print(shown)
+    table.add_row(*text)
+    console.print(table)
 
 
 def steps(repeats: int, seed: int) -> None:
     """Steps of the bias in units of the white σ, after an hour."""
-    shown = table(
+    table = create_table(
         "steps of the bias, MEMS mix at 100 Hz, after an hour, watched for ten minutes", "height / σ", "found",
         "delay s: median, 90 %", "onset error s: median (10–90 %)", "named",
     )  # fmt: skip
@@ -215,8 +215,8 @@ def steps(repeats: int, seed: int) -> None:
             cut = 360_007  # no border of blocks
             values[cut:] += height * WHITE * RATE_HZ**0.5
             results += looked(values[:cut], values[cut:])
-        shown.add_row(*row(f"{height:g}", results, 360_007))
-    console.print(shown)
+        table.add_row(*row(f"{height:g}", results, 360_007))
+    console.print(table)
 
 
 def cost() -> None:
@@ -233,12 +233,12 @@ def cost() -> None:
 
     run(detector.process_samples)(), run(window.append_samples)()
     load = Load()
-    took = alternate({"change": run(detector.process_samples), "window": run(window.append_samples)}, 7)
-    shown = table("cost, six axes, blocks of 100", "what", "ns a sample and axis: median (best)")
+    took = time_alternately({"change": run(detector.process_samples), "window": run(window.append_samples)}, 7)
+    table = create_table("cost, six axes, blocks of 100", "what", "ns a sample and axis: median (best)")
     for name, (median, best) in took.items():
-        shown.add_row(name, f"{median / 6e5 * 1e9:.1f} ({best / 6e5 * 1e9:.1f})")
-    console.print(shown)
-    console.print(load.said())
+        table.add_row(name, f"{median / 6e5 * 1e9:.1f} ({best / 6e5 * 1e9:.1f})")
+    console.print(table)
+    console.print(load.describe())
 
 
 def main() -> None:
@@ -248,16 +248,16 @@ def main() -> None:
     parser.add_argument("--years", type=float, default=0.3)
     parser.add_argument("--repeats", type=int, default=120)
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    console.print(about())
+    arguments = parser.parse_args()
+    console.print(describe_machine())
     parts: dict[str, Callable[[], None]] = {
-        "rate": lambda: constant(given.seed),
-        "false": lambda: false_alarms(given.years, given.seed),
-        "delays": lambda: delays(given.repeats, given.seed),
-        "steps": lambda: steps(given.repeats, given.seed),
+        "rate": lambda: constant(arguments.seed),
+        "false": lambda: false_alarms(arguments.years, arguments.seed),
+        "delays": lambda: delays(arguments.repeats, arguments.seed),
+        "steps": lambda: steps(arguments.repeats, arguments.seed),
         "cost": cost,
     }
-    for part in given.parts:
+    for part in arguments.parts:
         begun = time.process_time()
         parts[part]()
         console.print(f"{part}: {time.process_time() - begun:.0f} s of one core\n")

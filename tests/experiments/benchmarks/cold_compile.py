@@ -68,7 +68,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--functions", action="store_true", help="list each compilation")
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["NUMBA_CACHE_DIR"] = folder
         config.CACHE_DIR = folder
@@ -83,7 +83,7 @@ def main() -> None:
     print(f"{len(recorder.done)} compilations, {sum(one.own_s for one in recorder.done):.2f} s")
     for module, each in sorted(modules.items(), key=lambda item: -sum(one.own_s for one in item[1])):
         print(f"  {sum(one.own_s for one in each):6.2f} s  {len(each):4d}  {module}")
-        if chosen.functions:
+        if arguments.functions:
             for one in sorted(each, key=lambda one: -one.own_s):
                 print(f"          {one.own_s:6.2f} s  {one.function} {one.signature}")
 

@@ -30,8 +30,8 @@ from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.thermal.interval_means import compute_interval_means
 from monitor.noise.model_loading import load_model
-from tests.experiments.benchmarks.joint import compiled_joint, joint
-from tests.experiments.benchmarks.machine import console, table
+from tests.experiments.benchmarks.joint_filter import compiled_filter, filter_drift_and_rate
+from tests.experiments.benchmarks.machine import console, create_table
 from tests.experiments.benchmarks.motion_score import MotionScore, score_in_motion
 
 RATE_HZ = 100.0
@@ -82,7 +82,7 @@ def by(method: str, values: Floats, rest: int, axis: int) -> Floats:
 
 def rest(seeds: int) -> None:
     """Simulated sensors at rest for three hours, every method."""
-    made = table(
+    table = create_table(
         "At rest, three hours, °/h: before → after",
         "sensor, method",
         "rms",
@@ -102,8 +102,8 @@ def rest(seeds: int) -> None:
                 )
                 rows.append(_judged(place, method))
                 place.unlink()
-            made.add_row(f"{sensor} {method}", *_row(np.array(rows)))
-    console.print(made)
+            table.add_row(f"{sensor} {method}", *_row(np.array(rows)))
+    console.print(table)
 
 
 def recordings(_seeds: int) -> None:
@@ -112,7 +112,7 @@ def recordings(_seeds: int) -> None:
     if not folder:
         console.print("IMU_MONITOR_DATA is not set: no recordings")
         return
-    made = table(
+    table = create_table(
         "At rest, °/h: before → after, mean of the axes",
         "recording, method",
         "rms",
@@ -123,11 +123,11 @@ def recordings(_seeds: int) -> None:
     )
     for name in RECORDINGS:
         for method in METHODS:
-            made.add_row(
+            table.add_row(
                 f"{name.partition('/')[0]} {name[-8:-4]} {method}",
                 *_row(np.array([_judged(Path(folder) / name, method)])),
             )
-    console.print(made)
+    console.print(table)
 
 
 def allan(_seeds: int) -> None:
@@ -137,7 +137,7 @@ def allan(_seeds: int) -> None:
         console.print("IMU_MONITOR_DATA is not set: no recordings")
         return
     taus = (0.1, 1.0, 10.0, 100.0)
-    made = table("Allan deviation at rest, °/h: before → after", "recording", *(f"{tau:g} s" for tau in taus))
+    table = create_table("Allan deviation at rest, °/h: before → after", "recording", *(f"{tau:g} s" for tau in taus))
     for name in RECORDINGS:
         curves = [
             [
@@ -146,8 +146,8 @@ def allan(_seeds: int) -> None:
             ]
             for axis in _axes(Path(folder) / name, "adaptive")
         ]
-        made.add_row(name, *_row(np.array(curves)))
-    console.print(made)
+        table.add_row(name, *_row(np.array(curves)))
+    console.print(table)
 
 
 def _judged(recording: Path, method: str) -> Floats:
@@ -174,7 +174,7 @@ def motion(seeds: int) -> None:
     """A turntable after ten minutes at rest: error over that of the rate less its mean at rest."""
     t = np.arange(round(MOTION_S * RATE_HZ)) / RATE_HZ
     for sensor in SENSORS:
-        made = table(
+        table = create_table(
             f"{sensor}: rms error over that before, delay, angle (°, before → after)",
             "profile",
             *METHODS,
@@ -195,9 +195,9 @@ def motion(seeds: int) -> None:
             assert first is not None
             angle = [np.sqrt(np.mean([one[k].angle_error_rad ** 2 for one in first])) / DEGREE for k in (0, 1)]
             delay = np.mean([after.delay_s for _, after in first])
-            made.add_row(name, *cells, f"{1e3 * delay:.1f} ms", f"{angle[0]:.2g} → {angle[1]:.2g}")
-        made.add_row("worst", *(f"{worst[method]:.3f}" for method in METHODS))
-        console.print(made)
+            table.add_row(name, *cells, f"{1e3 * delay:.1f} ms", f"{angle[0]:.2g} → {angle[1]:.2g}")
+        table.add_row("worst", *(f"{worst[method]:.3f}" for method in METHODS))
+        console.print(table)
 
 
 def one_filter(_seeds: int) -> None:
@@ -205,7 +205,7 @@ def one_filter(_seeds: int) -> None:
     t = np.arange(round(MOTION_S * RATE_HZ)) / RATE_HZ
     shown = ("sine 1 °/s, 0.1 Hz", "sine 10 °/s, 1 Hz", "steps 10 °/s")
     truths = {"rest": np.zeros(t.size), **{name: truth for name, truth in profiles(t) if name in shown}}
-    made = table("One filter of both: rms error over that before", "sensor, (°/s³)²/Hz", *truths)
+    table = create_table("One filter of both: rms error over that before", "sensor, (°/s³)²/Hz", *truths)
     for sensor in SENSORS:
         still = round(REST_S * RATE_HZ)
         measured = noise(sensor, 0, REST_S + MOTION_S)[:, 2]
@@ -218,11 +218,11 @@ def one_filter(_seeds: int) -> None:
             for truth in truths.values():
                 z = measured - measured[:still].mean()
                 z[still:] += truth
-                out = compiled_joint(z, 1.0 / RATE_HZ, phi, 0.0, 0.0, variance, white, intensity)
+                out = compiled_filter(z, 1.0 / RATE_HZ, phi, 0.0, 0.0, variance, white, intensity)
                 before, after = score_in_motion(z[still:], truth, RATE_HZ), score_in_motion(out[still:], truth, RATE_HZ)
                 cells.append(f"{after.rms_error / before.rms_error:.3g}")
-            made.add_row(f"{sensor}, {intensity / DEGREE**2:.1e}", *cells)
-    console.print(made)
+            table.add_row(f"{sensor}, {intensity / DEGREE**2:.1e}", *cells)
+    console.print(table)
 
 
 def _in_motion(sensor: str, seed: int, truth: Floats, method: str) -> tuple[MotionScore, MotionScore]:
@@ -236,7 +236,7 @@ def _in_motion(sensor: str, seed: int, truth: Floats, method: str) -> tuple[Moti
 
 def slow(seeds: int) -> None:
     """How slow a rotation may be before it is taken for drift: half an hour at rest, then a constant rate."""
-    made = table("Constant rotation for ten minutes: what is left of it", "°/s", *SENSORS)
+    table = create_table("Constant rotation for ten minutes: what is left of it", "°/s", *SENSORS)
     for rate in (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 5.0):
         cells = []
         for sensor in SENSORS:
@@ -247,14 +247,14 @@ def slow(seeds: int) -> None:
                 out = live(values, RATE_HZ)[0][180_000:, 2]
                 left.append([out[:6000].mean(), out[24_000:30_000].mean(), out[-6000:].mean()])
             cells.append(" ".join(f"{100.0 * x / DEGREE / rate:.0f}" for x in np.mean(left, axis=0)))
-        made.add_row(f"{rate:g}", *cells)
-    console.print(made)
+        table.add_row(f"{rate:g}", *cells)
+    console.print(table)
     console.print("percent of it in the first, the fifth and the tenth minute")
 
 
 def doubling(seeds: int) -> None:
     """White noise of the means that doubles, or grows fourfold, half way: noise estimated, or as identified."""
-    made = table(
+    table = create_table(
         "rms error of the drift, in units of its own deviation",
         "white noise",
         "before",
@@ -275,7 +275,7 @@ def doubling(seeds: int) -> None:
             model = fit_arma(z[:2048], float(scatter[:2048].mean()))
             rows.append([_followed(model, z, scatter, drift, adapts) for adapts in (True, False)])
         (before, adaptive, first), (_, fixed, second) = np.sqrt(np.mean(np.square(rows), axis=0))
-        made.add_row(
+        table.add_row(
             f"× {factor:g}",
             f"{before:.3f}",
             f"{adaptive:.3f}",
@@ -283,7 +283,7 @@ def doubling(seeds: int) -> None:
             f"{1 / first**2:.2f}",
             f"{1 / second**2:.2f}",
         )
-    console.print(made)
+    console.print(table)
 
 
 def _followed(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) -> list[float]:  # type: ignore[no-untyped-def]
@@ -305,21 +305,21 @@ def _followed(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) ->
 def coast(seeds: int) -> None:
     """As if the carrier moved: how far off the bias is when nothing was learned for so long, °/h."""
     spans = (1.0, 10.0, 60.0)
-    made = table(
+    table = create_table(
         "Bias after so long without rest, °/h: last minute's mean | adaptive (and what it said)",
         "sensor",
         *(f"{s:g} min" for s in spans),
     )
     for sensor in SENSORS:
         rows = [_coasted(noise(sensor, seed, 10_800.0), RATE_HZ, spans) for seed in range(seeds)]
-        made.add_row(sensor, *_coast_cells(np.array(rows)))
+        table.add_row(sensor, *_coast_cells(np.array(rows)))
     folder = os.environ.get("IMU_MONITOR_DATA")
     for name in RECORDINGS if folder else ():
         found = load_samples(Path(str(folder)) / name)
         rate_hz = float(found.rate_hz or RATE_HZ)
         within = tuple(s for s in spans if 120.0 * s < len(found) / rate_hz)
-        made.add_row(name, *_coast_cells(np.array([_coasted(found.values, rate_hz, within)])))
-    console.print(made)
+        table.add_row(name, *_coast_cells(np.array([_coasted(found.values, rate_hz, within)])))
+    console.print(table)
 
 
 def _coast_cells(rows: Floats) -> list[str]:
@@ -360,7 +360,7 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
 
 def alarms(seeds: int) -> None:
     """How often ``drift_unexplained`` is told of a sensor whose noise stays what it is."""
-    made = table("Events at rest", "sensor", "hours", "events", "of them steps")
+    table = create_table("Events at rest", "sensor", "hours", "events", "of them steps")
     sources: list[tuple[str, list[Floats], float]] = [
         (sensor, [noise(sensor, 1000 + seed, 10_800.0) for seed in range(seeds)], RATE_HZ) for sensor in SENSORS
     ]
@@ -378,8 +378,8 @@ def alarms(seeds: int) -> None:
                 by_hand.adopt_and_start_models(one)
             told += [event.text for event in one.take_events()]
         hours = sum(len(values) for values in records) / rate_hz / 3600.0
-        made.add_row(name, f"{hours:.1f}", str(len(told)), str(sum("step of the bias" in text for text in told)))
-    console.print(made)
+        table.add_row(name, f"{hours:.1f}", str(len(told)), str(sum("step of the bias" in text for text in told)))
+    console.print(table)
 
 
 def consistency(_seeds: int) -> None:
@@ -388,13 +388,13 @@ def consistency(_seeds: int) -> None:
     if not folder:
         console.print("IMU_MONITOR_DATA is not set: no recordings")
         return
-    made = table("rms difference to the witness: before → after", "recording", "learned at rest", "°/s, or °")
+    table = create_table("rms difference to the witness: before → after", "recording", "learned at rest", "°/s, or °")
     for name in ("mpu9150", "mpu6500", "mpu6050"):
         with np.load(Path(folder) / f"robot-arm/{name}.npz") as found:
             values, rate_hz, t = _six(found), float(found["fs"]), found["t"]
             attitude = Rotation.from_quat(found["ref_quat"][:, [1, 2, 3, 0]])
         out, one = live(values, rate_hz)
-        made.add_row(
+        table.add_row(
             f"robot-arm {name}, ° turned in 100 samples",
             _known(one),
             " → ".join(f"{_turned_apart(x[:, :3], t, attitude):.3g}" for x in (values, out)),
@@ -404,7 +404,7 @@ def consistency(_seeds: int) -> None:
         t = np.arange(len(values)) / rate_hz if "t" not in found else found["t"] - found["t"][0]
         yaw = np.interp(t, found["t_yaw"] - found["t_yaw"][0], found["yaw_counts"] * 0.24 * DEGREE)
     out, one = live(values, rate_hz)
-    made.add_row(
+    table.add_row(
         "car-phone-can, yaw",
         _known(one),
         _differences([x[:, 2] - x[:, 2].mean() for x in (values, out)], yaw.mean() - yaw),
@@ -423,8 +423,8 @@ def consistency(_seeds: int) -> None:
             means = apart[: len(apart) // 500 * 500].reshape(-1, 500, 3).mean(axis=1)
             cells.append((np.sqrt(np.mean(apart**2)), np.sqrt(np.mean(means**2))))
         text = ", ".join(f"{x / DEGREE:.3g} → {y / DEGREE:.3g}" for x, y in zip(*cells, strict=True))
-        made.add_row(f"autopilot-3imu {a + 1} and {b + 1} in flight; means of 10 s", each[a][2], text)
-    console.print(made)
+        table.add_row(f"autopilot-3imu {a + 1} and {b + 1} in flight; means of 10 s", each[a][2], text)
+    console.print(table)
 
 
 def _six(found) -> Floats:  # type: ignore[no-untyped-def]
@@ -454,7 +454,7 @@ def _differences(both: list[Floats], truth: Floats) -> str:
 def arma(seeds: int) -> None:
     """Intervals of the coefficients, 95 %: how many of 20 times ``seeds`` simulated drifts they hold."""
     count = 20 * seeds
-    made = table(f"{count} drifts each, per cent inside 95 %", "φ1, φ2, θ1", "values", "φ1", "φ2", "θ1")
+    table = create_table(f"{count} drifts each, per cent inside 95 %", "φ1, φ2, θ1", "values", "φ1", "φ2", "θ1")
     for phi, theta in (
         ((1.2, -0.5), -0.4),
         ((0.9, 0.05), -0.5),
@@ -469,8 +469,8 @@ def arma(seeds: int) -> None:
                 z = lfilter([1.0, theta], [1.0, -phi[0], -phi[1]], a)[500:]
                 found = fit_arma(z, orders=[(2, 1)], with_confidence_intervals=True)
                 inside += (np.array(found.lo) <= [*phi, theta]) & (np.array(found.hi) >= [*phi, theta])
-            made.add_row(f"{phi[0]:g}, {phi[1]:g}, {theta:g}", str(n), *(f"{100 * x / count:.0f}" for x in inside))
-    console.print(made)
+            table.add_row(f"{phi[0]:g}, {phi[1]:g}, {theta:g}", str(n), *(f"{100 * x / count:.0f}" for x in inside))
+    console.print(table)
 
 
 def robust(_seeds: int) -> None:
@@ -525,13 +525,13 @@ def speed(_seeds: int) -> None:
         return 1e9 * best
 
     began = time.process_time()
-    joint(values[:10_000, 0], 1.0 / RATE_HZ, 1.6, -0.61, -0.8, 1e-10, 1e-6, 1e-2)
+    filter_drift_and_rate(values[:10_000, 0], 1.0 / RATE_HZ, 1.6, -0.61, -0.8, 1e-10, 1e-6, 1e-2)
     plain = 1e9 * (time.process_time() - began) / 10_000.0
-    made = table("ns a sample and axis", "fed by", "ns", "plain NumPy filter over it")
+    table = create_table("ns a sample and axis", "fed by", "ns", "plain NumPy filter over it")
     for rows, count in ((4096, 400_000), (100, 400_000), (1, 40_000)):
         ns = cost(rows, count)
-        made.add_row(str(rows), f"{ns:.0f}", f"{plain / ns:.0f}")
-    console.print(made)
+        table.add_row(str(rows), f"{ns:.0f}", f"{plain / ns:.0f}")
+    console.print(table)
 
 
 EACH = (rest, recordings, allan, motion, one_filter, slow, doubling, coast, alarms, consistency, arma, robust, speed)
@@ -543,9 +543,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=[])
     parser.add_argument("--seeds", type=int, default=5)
-    asked = parser.parse_args()
-    for part in asked.parts or PARTS:
-        PARTS[part](asked.seeds)
+    arguments = parser.parse_args()
+    for part in arguments.parts or PARTS:
+        PARTS[part](arguments.seeds)
 
 
 if __name__ == "__main__":

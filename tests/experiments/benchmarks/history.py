@@ -29,8 +29,8 @@ from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.history import HistoryMessage
 from tests.experiments.benchmarks.machine import Load
-from tests.monitor.history.kills import kill
-from tests.monitor.publishing.made import estimate
+from tests.monitor.history.kill_writers import kill_writers
+from tests.monitor.publishing.example_results import make_estimate
 
 T0 = 1_609_459_200  # 2021-01-01
 DAY_S, MINUTES, YEAR_D = 86_400, 1440, 365.25
@@ -52,22 +52,22 @@ def main() -> None:
     parser.add_argument("--years", type=float, default=5.0)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--keep", type=Path, help="where to leave the file of the years")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     load = Load()
     cost()
     with tempfile.TemporaryDirectory() as folder:
-        path = asked.keep or Path(folder) / "years.sqlite"
-        if asked.years:
-            years(path, asked.years)
+        path = arguments.keep or Path(folder) / "years.sqlite"
+        if arguments.years:
+            years(path, arguments.years)
             queries(path)
-        if asked.kills:
-            kills(Path(folder) / "kills.sqlite", asked.kills)
-    print(load.said())
+        if arguments.kills:
+            kills(Path(folder) / "kills.sqlite", arguments.kills)
+    print(load.describe())
 
 
 def cost() -> None:
     """Of an estimate in the loop, and of a row in the writer's thread."""
-    looks = [estimate(seed=seed) for seed in range(50)]
+    looks = [make_estimate(seed=seed) for seed in range(50)]
     minutes, rows = MinuteAggregator(), []
     begun = time.perf_counter()
     for i in range(20_000):
@@ -82,7 +82,7 @@ def cost() -> None:
 
 def years(path: Path, count: float) -> None:
     """Write so many years, and say what they take."""
-    rng, course = np.random.default_rng(1), _Course(estimate())
+    rng, course = np.random.default_rng(1), _Course(make_estimate())
     store, begun, written = HistoryFileWriter(path), time.perf_counter(), 0
     days = round(count * YEAR_D)
     largest = 0
@@ -124,8 +124,8 @@ def queries(path: Path) -> None:
 
 
 def kills(path: Path, count: int) -> None:
-    """Kill a writer at random moments; the check is in ``tests.monitor.history.kills``."""
-    left = kill(path, count, seed=1, within_s=0.2)
+    """Kill a writer at random moments; the check is in ``tests.monitor.history.kill_writers``."""
+    left = kill_writers(path, count, seed=1, within_s=0.2)
     unsaid = sum(one.found > one.acknowledged for one in left)
     print(
         f"{count} kills: {left[-1].found:,} minutes, each in one row, sums and extremes exact; "

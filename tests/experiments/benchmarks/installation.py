@@ -20,7 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from tests.experiments.benchmarks.machine import console, table
+from tests.experiments.benchmarks.machine import console, create_table
 
 ROOT: Final = Path(__file__).parents[3]
 DEVELOPMENT: Final = ("test", "fuzz")
@@ -78,19 +78,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--source", type=Path, default=ROOT, help="checkout to install")
     parser.add_argument("--extra", action="append", help="only these; else every extra of the project")
-    given = parser.parse_args()
-    project = tomllib.loads((given.source / "pyproject.toml").read_text("utf-8"))["project"]
-    extras = given.extra or [one for one in project["optional-dependencies"] if one not in DEVELOPMENT]
-    shown = table("installed size, MB", "extra", "whole", "it adds", "largest packages of what it adds")
+    arguments = parser.parse_args()
+    project = tomllib.loads((arguments.source / "pyproject.toml").read_text("utf-8"))["project"]
+    extras = arguments.extra or [one for one in project["optional-dependencies"] if one not in DEVELOPMENT]
+    table = create_table("installed size, MB", "extra", "whole", "it adds", "largest packages of what it adds")
     base = Counter[str]()
-    for extra, found in installed(given.source.resolve(), extras):
+    for extra, found in installed(arguments.source.resolve(), extras):
         added = found - base
         largest = ", ".join(f"{name} {size / MB:.0f}" for name, size in added.most_common(LARGEST) if size > 0.5 * MB)
         more = f"{added.total() / MB:.1f}" if extra else ""
-        shown.add_row(extra or "(none)", f"{found.total() / MB:.1f}", more, largest)
+        table.add_row(extra or "(none)", f"{found.total() / MB:.1f}", more, largest)
         base = base or found
-    console.print(f"Python {sys.version.split()[0]}, {given.source.resolve().name}")
-    console.print(shown)
+    console.print(f"Python {sys.version.split()[0]}, {arguments.source.resolve().name}")
+    console.print(table)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ from tests.experiments.benchmarks import five_terms, gmwm
 from tests.experiments.blind import run
 from tests.experiments.blind.cases import SINGLES, Case
 from tests.experiments.blind.score import Outcome, score
-from tests.experiments.blind.tables import markdown, share
+from tests.experiments.blind.tables import format_share, format_table
 
 NAMES: Final = {
     "WN": "angle_random_walk",
@@ -160,7 +160,7 @@ def as_report(names: Sequence[Named]) -> dict[str, Any]:
 
 def run_all(todo: Sequence[run.Job], peers: Sequence[str], file: Path) -> None:
     """Append what ``file`` lacks, a line for each case and peer."""
-    done = {(line["key"], line["peer"]) for line in run.lines(file)}
+    done = {(line["key"], line["peer"]) for line in run.read_lines(file)}
     with file.open("a") as results:
         for job in todo:
             left = [peer for peer in peers if (job.key, peer) not in done]
@@ -186,7 +186,7 @@ def warm(peers: Sequence[str]) -> None:
 def outcomes(file: Path) -> dict[str, list[Outcome]]:
     """Peer -> its scored cases."""
     found: dict[str, list[Outcome]] = defaultdict(list)
-    for line in run.lines(file):
+    for line in run.read_lines(file):
         found[line["peer"]].append(Outcome.from_json({k: v for k, v in line.items() if k not in ("key", "peer")}))
     return {peer: found[peer] for peer in PEERS if peer in found}
 
@@ -210,10 +210,10 @@ def summary(found: Mapping[str, Sequence[Outcome]]) -> str:
         rows.append(
             (
                 peer,
-                share(sum(_named(one) for one in singles), len(singles)),
-                share(sum(_named(one) for one in sayable), len(sayable)),
-                share(sum(bool(one.false) for one in singles), len(singles)),
-                share(sum(bool(one.false) for one in nulls), len(nulls)),
+                format_share(sum(_named(one) for one in singles), len(singles)),
+                format_share(sum(_named(one) for one in sayable), len(sayable)),
+                format_share(sum(bool(one.false) for one in singles), len(singles)),
+                format_share(sum(bool(one.false) for one in nulls), len(nulls)),
                 f"{np.mean([len(one.false) for one in of_peer]):.2f}",
                 f"{np.median(seconds):.2f} / {seconds.max():.2f}",
             )
@@ -227,7 +227,7 @@ def summary(found: Mapping[str, Sequence[Outcome]]) -> str:
         "false names a recording",
         "processor seconds an axis, median / most",
     )
-    return markdown(head, rows)
+    return format_table(head, rows)
 
 
 def by_effect(found: Mapping[str, Sequence[Outcome]]) -> str:
@@ -242,7 +242,7 @@ def by_effect(found: Mapping[str, Sequence[Outcome]]) -> str:
             right = "" if name == "null" else f"{sum(_named(one) for one in those)} of {len(those)}"
             cells.append(", ".join(part for part in (right, f"{false} false" if false else "") if part) or "none false")
         rows.append((f"`{name}`" if name != "null" else "null", *cells))
-    return markdown(("hidden", *found), rows)
+    return format_table(("hidden", *found), rows)
 
 
 def _named(one: Outcome) -> bool:

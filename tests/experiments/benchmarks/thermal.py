@@ -14,8 +14,8 @@ import numpy as np
 
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict_interval_means
-from tests.experiments.benchmarks.machine import console, table
-from tests.monitor.drift.made import first_intervals, hourly
+from tests.experiments.benchmarks.machine import console, create_table
+from tests.monitor.drift.thermal_biases import select_first_intervals, simulate_hourly_means
 
 DAY = 24
 LAGS_H = (0.0, 1.0, 2.0, 4.0)
@@ -26,8 +26,8 @@ def cell(lag_h: float, noise: float, seeds: int) -> tuple[str, ...]:
     """One row of the table."""
     ratios, inside, names = [], [], Counter[str]()
     for seed in range(seeds):
-        means = hourly(seed, lag_h, noise)
-        model = fit_thermal_model(first_intervals(means, DAY)).model
+        means = simulate_hourly_means(seed, lag_h, noise)
+        model = fit_thermal_model(select_first_intervals(means, DAY)).model
         multi = predict_interval_means(model, means.temperature_c, starts_with_fit=True)
         one = predict_interval_means(model, means.temperature_c, means.bias, starts_with_fit=True)
         cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)
@@ -54,11 +54,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=200)
     seeds = parser.parse_args().seeds
     heads = ("noise", "multi-step, median", "90 %", "worst", "one-step", "inside 95 %", "difference equation")
-    made = table(f"Error over that of a cubic, {seeds} seeds a row", "late by", *heads)
+    table = create_table(f"Error over that of a cubic, {seeds} seeds a row", "late by", *heads)
     for lag_h in LAGS_H:
         for noise in NOISES:
-            made.add_row(*cell(lag_h, noise, seeds))
-    console.print(made)
+            table.add_row(*cell(lag_h, noise, seeds))
+    console.print(table)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean, OnlineThermalModel
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
-from tests.experiments.benchmarks.machine import console, table
-from tests.monitor.drift.made import COEFFICIENT, late, weather
+from tests.experiments.benchmarks.machine import console, create_table
+from tests.monitor.drift.thermal_biases import BIAS_SLOPE, apply_lag, simulate_temperature
 
 COUNT, MINUTES, FIRST, AT = 200, 10, 36, 140
 NOISE = 0.05  # of the swing of the bias
@@ -30,11 +30,12 @@ def record(kind: str, seed: int, step: float = 0.0) -> tuple[Floats, Floats, flo
     """Means of bias and temperature, and the deviation of a mean."""
     rng = np.random.default_rng(seed)
     hours = -(-COUNT * MINUTES // 60)
-    warmth = weather(hours, rng)
+    warmth = simulate_temperature(hours, rng)
     both = [
-        part[-60 * hours :].reshape(-1, MINUTES).mean(axis=1)[:COUNT] for part in (late(warmth, KINDS[kind]), warmth)
+        part[-60 * hours :].reshape(-1, MINUTES).mean(axis=1)[:COUNT]
+        for part in (apply_lag(warmth, KINDS[kind]), warmth)
     ]
-    bias = COEFFICIENT * both[0]
+    bias = BIAS_SLOPE * both[0]
     size = NOISE * float(np.ptp(bias))
     left = rng.standard_normal(COUNT)
     if kind == "wander":
@@ -101,19 +102,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--only", nargs="*", choices=[*KINDS, "steps"], default=[*KINDS, "steps"])
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     heads = ("predicted", f"inside, to mean {FIRST}", "after", "told", "records")
-    made = table(f"A true model, {asked.seeds} records of {COUNT} means", "left", *heads)
+    table = create_table(f"A true model, {arguments.seeds} records of {COUNT} means", "left", *heads)
     for kind in KINDS:
-        if kind in asked.only:
-            made.add_row(*held(kind, asked.seeds))
-    if made.row_count:
-        console.print(made)
-    if "steps" in asked.only:
-        made = table("A step", "size", "told", "means until told", "size told over true")
+        if kind in arguments.only:
+            table.add_row(*held(kind, arguments.seeds))
+    if table.row_count:
+        console.print(table)
+    if "steps" in arguments.only:
+        table = create_table("A step", "size", "told", "means until told", "size told over true")
         for step in STEPS:
-            made.add_row(*found_steps(step, asked.seeds))
-        console.print(made)
+            table.add_row(*found_steps(step, arguments.seeds))
+        console.print(table)
 
 
 if __name__ == "__main__":

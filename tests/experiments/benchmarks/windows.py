@@ -26,7 +26,7 @@ from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.model import NoiseModel
-from tests.experiments.benchmarks.machine import about, alternate, console, table
+from tests.experiments.benchmarks.machine import console, create_table, describe_machine, time_alternately
 
 RATE_HZ: Final = 20.0
 WINDOW_S: Final = 3600.0
@@ -105,13 +105,16 @@ def step_table(records: int, seed: int) -> None:
     ends = [before + int(s) for s in since]
     gain = np.where(np.arange(ends[-1]) < before, 1.0, N_STEP)
     calm, step = pairs(gain, factors, ends, records, seed)
-    shown = table(f"a step of N × {N_STEP}: seconds until so much of it shows in σ² (mean of {records} records)",
-                  "share, τ", *KINDS)  # fmt: skip
+    table = create_table(
+        f"a step of N × {N_STEP}: seconds until so much of it shows in σ² (mean of {records} records)",
+        "share, τ",
+        *KINDS,
+    )
     for i, m in enumerate(factors):
         for wanted in (0.5, 0.9, 0.99):
             reached = [crossing(since / RATE_HZ, step[name][:, i] / calm[name][:, i], wanted) for name in KINDS]
-            shown.add_row(f"{wanted:.0%} at {m / RATE_HZ:g} s", *(f"{t:.0f}" for t in reached))
-    console.print(shown)
+            table.add_row(f"{wanted:.0%} at {m / RATE_HZ:g} s", *(f"{t:.0f}" for t in reached))
+    console.print(table)
 
 
 def crossing(t: Floats, ratio: Floats, wanted: float) -> float:
@@ -126,16 +129,17 @@ def burst_table(records: int, seed: int) -> None:
     factors, since = np.array([1, 64]), np.arange(0.02, 10.0, 0.02)
     before = 4 * LENGTH
     ends = [before + round(RATE_HZ) + round(s * LENGTH) for s in since]
-    shown = table(f"a burst of 1 s: windows until it is within 1 % of σ² for good (mean of {records} records)",
-                  "burst, τ", *KINDS)  # fmt: skip
+    table = create_table(
+        f"a burst of 1 s: windows until it is within 1 % of σ² for good (mean of {records} records)", "burst, τ", *KINDS
+    )
     for height in (10.0, 100.0, 10_000.0):
         gain = np.ones(ends[-1])
         gain[before : before + round(RATE_HZ)] = height
         calm, burst = pairs(gain, factors, ends, records, seed)
         for i, m in enumerate(factors):
             left = [since[_looks_until(burst[name][:, i] <= 1.01 * calm[name][:, i])] for name in KINDS]
-            shown.add_row(f"{height:,g} × the noise, {m / RATE_HZ:g} s", *(f"{t:.2f}" for t in left))
-    console.print(shown)
+            table.add_row(f"{height:,g} × the noise, {m / RATE_HZ:g} s", *(f"{t:.2f}" for t in left))
+    console.print(table)
 
 
 def _looks_until(held: NDArray[np.bool_]) -> int:
@@ -154,8 +158,12 @@ def scatter_table(records: int, seed: int) -> None:
     length, factors = 4096, np.array([1, 16, 128, 512])
     rate_hz = length / WINDOW_S
     kinds = {"white": AngleRandomWalk(N=1e-4), "flicker": BiasInstability(B=1e-4), "walk": RateRandomWalk(K=1e-4)}
-    shown = table(f"standard deviation of the deviation at rest, % ({records} records; "
-                  f"itself known to {70.0 / np.sqrt(records):.1f} % of it)", "noise, τ", *KINDS)  # fmt: skip
+    table = create_table(
+        f"standard deviation of the deviation at rest, % ({records} records; "
+        f"itself known to {70.0 / np.sqrt(records):.1f} % of it)",
+        "noise, τ",
+        *KINDS,
+    )
     for kind, source in kinds.items():
         every: dict[str, list[Floats]] = {name: [] for name in KINDS}
         for values in noises(6 * length, records, seed, source, rate_hz):
@@ -163,8 +171,8 @@ def scatter_table(records: int, seed: int) -> None:
                 every[name].append(np.sqrt(found[0]))
         deviations = [np.concatenate(every[name], axis=1) for name in KINDS]
         for i, m in enumerate(factors):
-            shown.add_row(f"{kind}, T/{length // m}", *(f"{100 * d[i].std() / d[i].mean():.1f}" for d in deviations))
-    console.print(shown)
+            table.add_row(f"{kind}, T/{length // m}", *(f"{100 * d[i].std() / d[i].mean():.1f}" for d in deviations))
+    console.print(table)
 
 
 def cost_table(rounds: int, seed: int) -> None:
@@ -179,13 +187,18 @@ def cost_table(rounds: int, seed: int) -> None:
         held[name] = bytes_of(window)
         works[f"{name} blocks"] = advancing(window, values, 100)
         works[f"{name} singles"] = advancing(window, values[:2000], 1)
-    took = alternate(works, rounds)
-    shown = table(f"cost: {TAUS} τ, six axes, window of {length:,} samples; median (best) of {rounds} rounds",
-                  "window", "ns a sample, 100 a call", "ns a sample, 1 a call", "kB held")  # fmt: skip
+    took = time_alternately(works, rounds)
+    table = create_table(
+        f"cost: {TAUS} τ, six axes, window of {length:,} samples; median (best) of {rounds} rounds",
+        "window",
+        "ns a sample, 100 a call",
+        "ns a sample, 1 a call",
+        "kB held",
+    )
     for name, size in held.items():
         each = [[t * 1e9 / n for t in took[f"{name} {how}"]] for how, n in (("blocks", 20_000), ("singles", 2_000))]
-        shown.add_row(name, *(f"{median:.0f} ({best:.0f})" for median, best in each), f"{size / 1e3:,.0f}")
-    console.print(shown)
+        table.add_row(name, *(f"{median:.0f} ({best:.0f})" for median, best in each), f"{size / 1e3:,.0f}")
+    console.print(table)
 
 
 def bytes_of(window: AllanWindow) -> int:
@@ -221,14 +234,18 @@ def fit_table(records: int, seed: int) -> None:
         for look, one in enumerate(restarted(values, factors, before, ends)):
             fits.setdefault((RESTARTED, look), []).append(one)
     names = (*KINDS, RESTARTED)
-    shown = table(f"the fit while N changes: N over its value now / % of axes with Q or K in / % whose B the interval "
-                  f"misses ({records} records)", f"since N × {N_STEP}", *names)  # fmt: skip
+    table = create_table(
+        f"the fit while N changes: N over its value now / % of axes with Q or K in / % whose B the interval "
+        f"misses ({records} records)",
+        f"since N × {N_STEP}",
+        *names,
+    )
     for look, since_s in enumerate(LOOKS_S):
         truth = N_TRUE * (N_STEP if since_s > 0.0 else 1.0)
-        shown.add_row(
+        table.add_row(
             "at rest" if since_s < 0.0 else f"{since_s:g} s", *(said(fits[name, look], truth) for name in names)
         )
-    console.print(shown)
+    console.print(table)
 
 
 def fitted(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
@@ -272,13 +289,13 @@ def main() -> None:
     )
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    console.print(about())
-    step_table(max(given.records // 8, 3), given.seed)
-    burst_table(max(given.records // 40, 3), given.seed)
-    scatter_table(10 * given.records, given.seed)
-    cost_table(given.rounds, given.seed)
-    fit_table(given.records, given.seed)
+    arguments = parser.parse_args()
+    console.print(describe_machine())
+    step_table(max(arguments.records // 8, 3), arguments.seed)
+    burst_table(max(arguments.records // 40, 3), arguments.seed)
+    scatter_table(10 * arguments.records, arguments.seed)
+    cost_table(arguments.rounds, arguments.seed)
+    fit_table(arguments.records, arguments.seed)
 
 
 if __name__ == "__main__":

@@ -108,7 +108,8 @@ def _pulses(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]
 
 
 def _curve(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
-    return {"slope": sign(rng) * world.noise(axis) / world.seconds}
+    # the slope alone must stay below the target, or no curvature is the smallest one that reaches the target
+    return {"slope": 0.02 * uniform(rng, -1.0, 1.0) * world.noise(axis) / world.seconds}
 
 
 def _breath(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
