@@ -22,6 +22,7 @@ from monitor.noise.effects import (
     Saturation,
     Sinusoidal,
     VarianceModulation,
+    WanderingLine,
 )
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
@@ -39,7 +40,15 @@ from monitor.reconcile.search.sample_repair import repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest log-likelihood gain of an effect in one half of the recording, in nats."""
-SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers, HeavyTails, VarianceModulation)
+SAMPLE_EFFECTS: Final = (
+    Resolution,
+    Saturation,
+    RandomSampleHold,
+    Outliers,
+    HeavyTails,
+    VarianceModulation,
+    WanderingLine,
+)
 """Effects that do not change the Whittle likelihood. They are validated by the gap of the diagnostic."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
 

@@ -29,6 +29,7 @@ from monitor.noise.effects import (
     PowerLaw,
     PulseTrain,
     Sinusoidal,
+    WanderingLine,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
 from monitor.reconcile.likelihood.axis_fit import Effects
@@ -47,6 +48,8 @@ HARMONIC_TOLERANCE: Final = 2e-4
 """Largest distance of a line from a harmonic, relative to the highest line frequency."""
 RESONANCE_REACH_HALF_WIDTHS: Final = 2.0
 """Distance from a resonance, in half widths, within which other lines and resonances overlap."""
+WANDERING_REACH_DEVIATIONS: Final = 3.0
+"""Distance from the mean frequency of a wandering line, in standard deviations, within which other effects overlap."""
 LINE_REACH_HZ: Final = 0.1
 MAX_REMAINING_SHARE: Final = 0.1
 """Largest remaining gain, relative to the gain that an effect should explain."""
@@ -108,9 +111,34 @@ def keep_uncontradicted_effects(
     return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)
 
 
+def leaves_difference(line: WanderingLine, before: Findings, after: Findings, null: AxisNull) -> bool:
+    """Return True if a significant difference remains in the frequency range of a wandering line.
+
+    Parameters
+    ----------
+    line : WanderingLine
+        Line that was subtracted from the axis.
+    before, after : Findings
+        Findings before and after the subtraction.
+    null : AxisNull
+        Null distribution of each diagnostic.
+    """
+    largest = max(before[diagnostic].gain for diagnostic in FREQUENCY_DIAGNOSTICS)
+    for diagnostic in FREQUENCY_DIAGNOSTICS:
+        one = after[diagnostic]
+        if one.gain > max(null[diagnostic].threshold, MAX_REMAINING_SHARE * largest) and one.where.frequency:
+            lo, hi = _frequency_range(line)
+            if lo < one.where.frequency[1] and one.where.frequency[0] < hi:
+                return True
+    return False
+
+
 def _frequency_range(effect: Effect) -> tuple[float, float]:
     if isinstance(effect, Narrowband):
         half = max(RESONANCE_REACH_HALF_WIDTHS * 0.5 * effect.bandwidth, LINE_REACH_HZ)
+        return effect.frequency - half, effect.frequency + half
+    if isinstance(effect, WanderingLine):
+        half = max(WANDERING_REACH_DEVIATIONS * effect.frequency_deviation, LINE_REACH_HZ)
         return effect.frequency - half, effect.frequency + half
     assert isinstance(effect, Sinusoidal)
     return effect.frequency - LINE_REACH_HZ, effect.frequency + LINE_REACH_HZ

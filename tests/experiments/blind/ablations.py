@@ -27,7 +27,7 @@ HIDDEN = (
     *("sinusoidal", "narrowband", "exponentially_correlated", "rate_ramp", "bias_step", "temperature_bias"),
     *("outliers", "cross_axis"),
 )
-FOREIGN = ("foreign:chirp", "foreign:amplitude_modulated_line", "foreign:wandering_line", "foreign:pulse_train")
+FOREIGN = ("foreign:chirp", "foreign:amplitude_modulated_line", "foreign:sawtooth")
 
 
 @contextmanager
