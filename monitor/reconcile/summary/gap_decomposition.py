@@ -121,8 +121,9 @@ def _gains_outside_spectrum(search: AxisSearchResult) -> dict[int, float]:
             found[at] = value_artifact_gain(hypothesis.fit, type(effect))
         elif isinstance(effect, EFFECTS_OUTSIDE_SPECTRUM):
             trials = [one.trials[0] for one in search.rounds if one.trials[0].name == effect.name]
-            jumps = isinstance(effect, NON_GAUSSIAN_EFFECTS)  # the likelihood of the spectrum already contains their power
-            found[at] = max((one.gain_over_same_spectrum if jumps else one.score for one in trials), default=0.0)
+            # the likelihood of the spectrum already contains the power of non-Gaussian effects
+            has_spectrum = isinstance(effect, NON_GAUSSIAN_EFFECTS)
+            found[at] = max((one.gain_over_same_spectrum if has_spectrum else one.score for one in trials), default=0.0)
         elif isinstance(effect, CommonVibration):
             trials = [one.trials[0] for one in search.rounds]
             found[at] = next((one.score for one in trials if one.effect == effect), 0.0)
