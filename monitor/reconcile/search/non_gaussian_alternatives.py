@@ -84,6 +84,7 @@ class NonGaussianAlternative:
             slow_noise_score=replaced.slow_noise_score,
             intervals=self.intervals,
             event_count=self.event_count,
+            gain_over_same_spectrum=max(self.gain, 0.0),
         )
         return (trial, *(self.runner_up.as_trials(replaced) if self.runner_up else ()))
 

@@ -5,7 +5,8 @@ resonances, low-pass filters and power laws are withdrawn in these cases:
 
 - Several lines or resonances overlap.
 - ``MIN_COMB_LINES`` or more lines are harmonics of one frequency.
-- A significant difference remains at the frequency of the effect.
+- A significant difference remains at the frequency of the effect. If a line or resonance at this frequency is kept, the
+  difference comes from the line or resonance and does not contradict a filter or a power law.
 
 A leak is withdrawn if more than half of the dependence on other axes remains. Pulses are withdrawn if more than a tenth
 of the harmonics remains, or if several lines are harmonics of the pulses. A step or a curve is withdrawn if the mean
@@ -56,6 +57,7 @@ MAX_REMAINING_LEAK_SHARE: Final = 0.5
 """Largest remaining gain, relative to the gain that a leak should explain."""
 MAX_FOREIGN_RATIO: Final = 100.0
 """Largest gain of the non-spectral diagnostics, relative to the gain that a smooth spectrum should explain."""
+PEAKS: Final = (Narrowband, Sinusoidal)
 SMOOTH_SPECTRA: Final = (BandwidthLimit, ExponentiallyCorrelated, PowerLaw)
 NON_SPECTRAL_DIAGNOSTICS: Final = ("tails", "variance", "other_axes")
 """Diagnostics of non-Gaussian, non-stationary or common noise."""
@@ -96,7 +98,10 @@ def keep_uncontradicted_effects(
         place = findings[diagnostic].where.frequency
         if place is not None:
             candidates = contradicted_effects(Effect, significant_gain(diagnostic), MAX_REMAINING_SHARE)
-            withdrawn |= {at for at in candidates if _overlaps(added[at], place)}
+            overlapping = {at for at, effect in enumerate(added) if _overlaps(effect, place)}
+            peaks = {at for at in overlapping if isinstance(added[at], PEAKS)}
+            # a small difference at a peak that is kept comes from this peak and not from the smooth spectrum below
+            withdrawn |= candidates & (peaks if peaks - candidates else overlapping)
     withdrawn |= contradicted_effects(AxisLeak, significant_gain("other_axes"), MAX_REMAINING_LEAK_SHARE)
     withdrawn |= contradicted_effects(PulseTrain, significant_gain("lines"), MAX_REMAINING_SHARE)
     withdrawn |= contradicted_effects((BiasStep, BiasCurve), significant_gain("level"), MAX_REMAINING_SHARE)
@@ -145,14 +150,14 @@ def _overlaps(effect: Effect, place: tuple[float, float]) -> bool:
         return True
     if isinstance(effect, BandwidthLimit):
         return place[1] > 0.5 * effect.cutoff
-    if not isinstance(effect, (Narrowband, Sinusoidal)):
+    if not isinstance(effect, PEAKS):
         return False
     lo, hi = _frequency_range(effect)
     return lo < place[1] and place[0] < hi
 
 
 def _overlapping_features(added: Effects) -> set[int]:
-    features = {at: effect for at, effect in enumerate(added) if isinstance(effect, (Sinusoidal, Narrowband))}
+    features = {at: effect for at, effect in enumerate(added) if isinstance(effect, PEAKS)}
     overlapping: set[int] = set()
     for at, one in features.items():
         lo, hi = _frequency_range(one)
