@@ -8,14 +8,13 @@ of each diagnostic. An interval chart shows one parameter in several recordings.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.unit_formatting import DEVIATION_UNITS, sensor_kind
 from monitor.publishing.plots import style
-from monitor.publishing.plots.svg_panel import TICK_TEXT_SIZE, SvgPanel, render_svg, text_width
 from monitor.publishing.reports.reconcile_sentences import (
     diagnostic_name,
     displayed_unit,
@@ -25,10 +24,11 @@ from monitor.publishing.reports.reconcile_sentences import (
 )
 from monitor.reconcile.result import DiagnosticGap, DiagnosticPlotData, Location, ParameterInterval
 
-POINTS_PER_INCH: Final = 72.0
-MARGINS: Final = (41.76, 10.8, 21.6, 31.68)  # left, right, top and bottom margins for the labels of a panel, points
-DASHED: Final = "3.7 1.6"  # lengths of dashes and gaps, points
-DOTTED: Final = "1.6 2.6"
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MARGINS_INCHES: Final = (0.58, 0.15, 0.30, 0.44)  # left, right, top and bottom margins for the labels of a panel
 BAND_COLOUR: Final = "#cfd5dd"
 RANGE_TEXT_COLOUR: Final = "#8a5a00"
 ABOVE_THRESHOLD_COLOUR: Final = "#b3261e"
@@ -89,17 +89,54 @@ def diagnostic_comparison_svg(
     plots = [
         to_displayed_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
     ]
-    left, right, top, bottom = MARGINS
-    share, limits = POINTS_PER_INCH * width / len(plots), common_y_limits(plots)
-    size = share - left - right, POINTS_PER_INCH * height - top - bottom
-    panels = [
-        _draw_panel(
-            (i * share + left, top, *size), plot, "" if i else plots[0].y_label, style.axis_colour(axis), limits
-        )
-        for i, plot in enumerate(plots)
-    ]
-    description = f"{axis}: {plots[0].y_label} over {plots[0].x_label}"
-    return render_svg(POINTS_PER_INCH * width, POINTS_PER_INCH * height, panels, description)
+    with style.figure_style():
+        return _draw_comparison(*_create_panels(len(plots), width, height), plots, axis)
+
+
+def before_and_after_svgs(
+    views: Sequence[tuple[DiagnosticPlotData, DiagnosticPlotData]], axis: str, width: float, height: float
+) -> list[str]:
+    """Draw each diagnostic with a panel before and a panel after a step, and return the figures as SVG elements.
+
+    All figures use the same panels, because matplotlib takes a long time to create panels and ticks.
+
+    Parameters
+    ----------
+    views
+        Data of each diagnostic before and after the step.
+    axis
+        Name of the axis.
+    width, height
+        Size of each figure [inches].
+    """
+    drawn = []
+    with style.figure_style():
+        figure, panels = _create_panels(2, width, height)
+        for pair in views:
+            plots = [
+                to_displayed_units(title, view, axis, None)
+                for title, view in zip(("before", "after"), pair, strict=True)
+            ]
+            drawn.append(_draw_comparison(figure, panels, plots, axis))
+            for artist in [artist for panel in panels for artist in (*panel.lines, *panel.collections)]:
+                artist.remove()
+    return drawn
+
+
+def _create_panels(count: int, width: float, height: float) -> "tuple[Figure, list[Axes]]":
+    """Create a figure with panels side by side."""
+    left, right, top, bottom = MARGINS_INCHES
+    share = width / count
+    size = ((share - left - right) / width, (height - top - bottom) / height)
+    figure = style.create_figure(width, height, layout=None)
+    return figure, [figure.add_axes(((i * share + left) / width, bottom / height, *size)) for i in range(count)]
+
+
+def _draw_comparison(figure: "Figure", panels: "Sequence[Axes]", plots: Sequence[DiagnosticPlot], axis: str) -> str:
+    limits = common_y_limits(plots)
+    for i, (panel, plot) in enumerate(zip(panels, plots, strict=True)):
+        _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), style.axis_colour(axis), limits)
+    return style.to_svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
 
 
 def select_diagnostic_view(
@@ -235,28 +272,32 @@ def _finite(lines: Sequence[Floats], log: bool) -> Floats:
     return np.log10(values) if log else values
 
 
-def _draw_panel(
-    box: tuple[float, float, float, float],
-    plot: DiagnosticPlot,
-    y_label: str,
-    colour: str,
-    limits: tuple[float, float],
-) -> SvgPanel:
+def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[float, float]) -> None:
     x = plot.x[np.isfinite(plot.x) & ((plot.x > 0) | (not plot.log))]
-    ends = (float(x.min()), float(x.max())) if np.ptp(x) > 0 else (0.5, 1.5)
-    panel = SvgPanel(box, ends, limits, (plot.log, plot.log))
-    panel.draw_axes(plot.x_label)
-    if plot.mark is not None:
-        panel.mark_range(*plot.mark, style.ORANGE)
-        panel.write_titles(y_label, style.GREY, plot.mark_label, RANGE_TEXT_COLOUR, bold=True)
-    else:
-        panel.write_titles(y_label, style.GREY, plot.title, style.DARK)
+    left, right = (float(x.min()), float(x.max())) if np.ptp(x) > 0 else (0.5, 1.5)
+    scale = "log" if plot.log else "linear"
+    panel.set(xscale=scale, yscale=scale, xlim=(left, right), ylim=limits, xlabel=plot.x_label)
+    panel.autoscale(False)
     # A lower end of zero is drawn below the panel, because zero has no logarithm.
     lo, hi = (np.fmax(line, 0.1 * limits[0]) if plot.log else line for line in (plot.lo, plot.hi))
-    panel.fill_band(plot.x, lo, np.where(np.isfinite(plot.hi), hi, np.nan), BAND_COLOUR)
-    panel.draw_line(plot.x, plot.measured, colour, 1.1, markers=plot.x.size <= MAX_MARKERS)
-    panel.draw_line(plot.x, plot.expected, style.DARK, 1.0, dashes=DASHED)
-    return panel
+    panel.fill_between(plot.x, lo, hi, where=np.isfinite(plot.hi).tolist(), color=BAND_COLOUR, linewidth=0)
+    few = plot.x.size <= MAX_MARKERS
+    panel.plot(plot.x, plot.measured, color=colour, linewidth=1.1, marker="o" if few else "", markersize=4.5)
+    panel.plot(plot.x, plot.expected, "--", color=style.DARK, linewidth=1.0)
+    if plot.mark is not None:
+        ends = np.clip(plot.mark, left, right).tolist()
+        # The outline keeps a very narrow range visible.
+        panel.axvspan(*ends, facecolor=style.ORANGE, edgecolor=style.ORANGE, alpha=0.35, linewidth=3)
+        panel.set_title(plot.mark_label, loc="right", y=1.0, fontsize=9, color=RANGE_TEXT_COLOUR, fontweight="bold")
+    else:
+        panel.set_title(plot.title, loc="right", y=1.0, fontsize=9)
+    for which in "xy" if plot.log else ():
+        style.style_log_axis(panel, which, minor_grid=False)
+    if not plot.log:
+        panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
+        panel.yaxis.set_major_formatter(lambda value, _: style.format_tick(value))
+    panel.tick_params(labelsize=8.5)
+    panel.set_title(plot.y_label, loc="left", y=1.0, fontsize=9, color=style.GREY)
 
 
 def allan_before_and_after_svg(
@@ -281,26 +322,28 @@ def allan_before_and_after_svg(
     replaced = np.fmax(before.measured**2 - after.measured**2, 0.0)
     curves = {name: np.sqrt(getattr(after, name) ** 2 + replaced) for name in ("measured", "expected", "lo", "hi")}
     first, last = (to_displayed_units("", view, axis, None) for view in (before, replace(after, **curves)))
-    low, high = common_y_limits([first, last])
-    x_limits = float(first.x.min()) / 1.15, float(first.x.max()) * 1.15
-    width, height = (POINTS_PER_INCH * side for side in ALLAN_INCHES)
-    left, right, top, bottom = MARGINS
-    box = left, top, width - left - right, height - top - bottom
-    panel = SvgPanel(box, x_limits, (low, high * (high / low) ** MARK_SHARE), (True, True))
-    panel.draw_axes(first.x_label)
-    panel.fill_band(last.x, np.fmax(last.lo, 0.1 * low), last.hi, BAND_COLOUR)
-    for tau_s, label in marks.items():
-        panel.mark_position(tau_s, label, style.ORANGE, RANGE_TEXT_COLOUR)
-    panel.draw_line(first.x, first.measured, style.axis_colour(axis), 1.4, markers=True)
-    panel.draw_line(first.x, first.expected, style.GREY, 1.6, dashes=DOTTED)
-    panel.draw_line(last.x, last.expected, style.DARK, 1.2, dashes=DASHED)
-    panel.write_titles(f"{axis}: {first.y_label}", style.GREY, "", style.DARK)
-    panel.draw_legend([
-        ("measured", style.axis_colour(axis), ""),
-        ("model before", style.GREY, DOTTED),
-        ("model after", style.DARK, DASHED),
-    ])  # fmt: skip
-    return render_svg(width, height, [panel], f"{axis}: Allan deviation before and after the search")
+    with style.figure_style():
+        figure = style.create_figure(*ALLAN_INCHES)
+        panel = figure.subplots()
+        low, high = common_y_limits([first, last])
+        x_limits = float(first.x.min()) / 1.15, float(first.x.max()) * 1.15
+        panel.set(xscale="log", yscale="log", xlim=x_limits, ylim=(low, high * (high / low) ** MARK_SHARE))
+        panel.fill_between(last.x, np.fmax(last.lo, 0.1 * low), last.hi, color=BAND_COLOUR, linewidth=0)
+        panel.plot(first.x, first.measured, "o-", color=style.axis_colour(axis), markersize=4.5, label="measured")
+        panel.plot(first.x, first.expected, ":", color=style.GREY, linewidth=1.6, label="model before")
+        panel.plot(last.x, last.expected, "--", color=style.DARK, linewidth=1.2, label="model after")
+        for tau_s, label in marks.items():
+            panel.axvline(tau_s, color=style.ORANGE, linewidth=1.2, alpha=0.7, zorder=0)
+            panel.annotate(
+                label, (tau_s, 0.97), xycoords=panel.get_xaxis_transform(), ha="center", va="top",
+                color=RANGE_TEXT_COLOUR, fontsize=9, fontweight="bold", bbox=style.LABEL_BOX,
+            )  # fmt: skip
+        for which in "xy":
+            style.style_log_axis(panel, which, minor_grid=False)
+        panel.set_xlabel(first.x_label)
+        panel.set_title(f"{axis}: {first.y_label}", fontsize=9.5, color=style.GREY)
+        style.draw_legend_above(panel, 3)
+        return style.to_svg_element(figure, f"{axis}: Allan deviation before and after the search")
 
 
 def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap] = ()) -> str:
@@ -314,23 +357,25 @@ def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap
         Gaps with the next model. Empty if there is only one model.
     """
     later = {score.diagnostic: score for score in after}
-    rows = []
-    for score in before:
-        scores = [score] + ([later[score.diagnostic]] if score.diagnostic in later else [])
-        rows.append([(max(gap_to_threshold_ratio(one), MIN_GAP_RATIO), one.is_significant) for one in scores])
-    largest = max((ratio for row in rows for ratio, _ in row), default=1.0)
-    names = [diagnostic_name(score.diagnostic) for score in before]
-    limits = 0.8 * MIN_GAP_RATIO, max(20.0, 1.3 * largest)
-    panel = _create_row_panel(names, "gap over threshold", limits, log=True)
-    panel.draw_line(np.array([1.0, 1.0]), np.array([-1.0, len(names)]), style.DARK, 1.2)
-    for y, row in enumerate(rows):
-        panel.draw_line(np.array([ratio for ratio, _ in row]), np.full(len(row), float(y)), style.GREY, 1.4)
-        for at, (ratio, significant) in enumerate(row):
-            colour = ABOVE_THRESHOLD_COLOUR if significant else BELOW_THRESHOLD_COLOUR
-            panel.draw_disc(ratio, y, colour, hollow=at < len(row) - 1)
-    if after:
-        panel.write_titles("", style.GREY, "○ before   ● after", style.GREY)
-    return _render_rows(panel, "gap over threshold of each diagnostic")
+    with style.figure_style():
+        figure, panel = _create_row_panel([diagnostic_name(score.diagnostic) for score in before], "gap over threshold")
+        panel.set_xscale("log")
+        ratios = [1.0]
+        for y, score in enumerate(before):
+            scores = [score] + ([later[score.diagnostic]] if score.diagnostic in later else [])
+            x = [max(gap_to_threshold_ratio(one), MIN_GAP_RATIO) for one in scores]
+            colours = [ABOVE_THRESHOLD_COLOUR if one.is_significant else BELOW_THRESHOLD_COLOUR for one in scores]
+            panel.plot(x, [y] * len(x), color=style.GREY, linewidth=1.4, zorder=2)
+            if len(x) > 1:
+                panel.plot(x[0], y, "o", mfc="white", mec=colours[0], mew=1.4, markersize=6)
+            panel.plot(x[-1], y, "o", color=colours[-1], markersize=6)
+            ratios += x
+        panel.axvline(1.0, color=style.DARK, linewidth=1.2, zorder=1)
+        panel.set_xlim(0.8 * MIN_GAP_RATIO, max(20.0, 1.3 * max(ratios)))
+        style.style_log_axis(panel, "x", minor_grid=False)
+        if after:
+            panel.set_title("○ before   ● after", loc="right", fontsize=9, color=style.GREY)
+        return style.to_svg_element(figure, "gap over threshold of each diagnostic")
 
 
 def interval_chart_svg(
@@ -349,32 +394,27 @@ def interval_chart_svg(
     colour
         Colour of the recordings.
     """
-    drawn = [
-        (y, *(factor * part for part in (one.value, one.lo, one.hi)))
-        for y, (_, one) in enumerate(intervals)
-        if not (isinstance(one.value, str) or one.lo is None or one.hi is None or not isfinite(one.hi - one.lo))
-    ]
-    ends = [end for row in drawn for end in row[1:]] or [0.0, 1.0]
-    margin = MARGIN_SHARE * (max(ends) - min(ends)) or abs(ends[0]) or 1.0
-    limits = min(ends) - margin, max(ends) + margin
-    panel = _create_row_panel([name for name, _ in intervals], x_label, limits, log=False)
-    for y, value, lo, hi in drawn:
-        row_colour = style.DARK if y == len(intervals) - 1 else colour
-        panel.draw_line(np.array([min(lo, value), max(hi, value)]), np.array([y, y]), row_colour, 1.8)
-        panel.draw_disc(value, y, row_colour)
-    return _render_rows(panel, f"{x_label}, of each recording")
+    with style.figure_style():
+        figure, panel = _create_row_panel([name for name, _ in intervals], x_label)
+        for y, (_, one) in enumerate(intervals):
+            if isinstance(one.value, str) or one.lo is None or one.hi is None or not isfinite(one.hi - one.lo):
+                continue
+            pooled = y == len(intervals) - 1
+            value, lo, hi = (factor * part for part in (one.value, one.lo, one.hi))
+            panel.errorbar(
+                value, y, xerr=[[max(value - lo, 0.0)], [max(hi - value, 0.0)]],
+                fmt="D" if pooled else "o", color=style.DARK if pooled else colour, elinewidth=1.8, markersize=6,
+            )  # fmt: skip
+        panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
+        return style.to_svg_element(figure, f"{x_label}, of each recording")
 
 
-def _create_row_panel(names: Sequence[str], x_label: str, limits: tuple[float, float], log: bool) -> SvgPanel:
-    """Create a panel with a named row for each integer along y, beginning at the top."""
+def _create_row_panel(names: Sequence[str], x_label: str) -> "tuple[Figure, Axes]":
+    figure = style.create_figure(ROWS_WIDTH_INCHES, 0.75 + ROW_INCHES * len(names))
+    panel = figure.subplots()
     short = [name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…" for name in names]
-    _, right, top, _ = MARGINS
-    left = max(text_width(name, TICK_TEXT_SIZE) for name in short) + right
-    box = left, top, POINTS_PER_INCH * ROWS_WIDTH_INCHES - left - right, POINTS_PER_INCH * ROW_INCHES * len(names)
-    panel = SvgPanel(box, limits, (len(names) - 0.4, -0.6), (log, False))
-    panel.draw_axes(x_label, list(enumerate(short)))
-    return panel
-
-
-def _render_rows(panel: SvgPanel, description: str) -> str:
-    return render_svg(POINTS_PER_INCH * ROWS_WIDTH_INCHES, panel.bottom + MARGINS[3], [panel], description)
+    panel.set_yticks(range(len(names)), short)
+    panel.set_ylim(len(names) - 0.4, -0.6)
+    panel.set_xlabel(x_label)
+    panel.grid(axis="y", color=style.MINOR_GRID_COLOUR)
+    return figure, panel

@@ -1,4 +1,4 @@
-"""Style of the figures of matplotlib, and output of figures as image files and SVG elements.
+"""Style of all figures, and output of figures as image files and SVG elements.
 
 Figures do not use pyplot and need no display. Drawing the same data twice gives identical files, because the files
 contain no date and no random identifiers. matplotlib is imported when the first figure is drawn.
@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -104,17 +104,20 @@ def figure_style() -> Iterator[None]:
         yield
 
 
-def create_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure. Matplotlib arranges the panels so that labels do not overlap.
+def create_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> "Figure":
+    """Return an empty figure.
 
     Parameters
     ----------
     width, height
                 Width and height of the figure [inches].
+    layout
+        By default, matplotlib arranges the panels so that labels do not overlap. With None, panels keep their
+        positions.
     """
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    return Figure(figsize=(width, height), layout=layout)
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

@@ -16,6 +16,7 @@ from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots import reconcile_figures, style
 from monitor.publishing.plots.reconcile_figures import (
     allan_before_and_after_svg,
+    before_and_after_svgs,
     diagnostic_comparison_svg,
     select_diagnostic_view,
     zoomed_view,
@@ -49,7 +50,7 @@ def render_page(r: Reconciliation, title: str = "") -> str:
     Raises
     ------
     ConfigError
-        If Jinja2 is not installed.
+        If matplotlib or Jinja2 is not installed.
     """
     ranking = rank_findings(r)
     return render_template(
@@ -124,10 +125,7 @@ def _draw_pairs(before: AxisModelDiagnostics, after: AxisModelDiagnostics, axis:
     """Draw the diagnostics with a significant gap, before and after a step."""
     later, drawn = {view.diagnostic: view for view in after.plots}, _drawn_diagnostics(before) - {"allan"}
     pairs = [(view, later[view.diagnostic]) for view in before.plots if view.diagnostic in drawn & set(later)]
-    return [
-        diagnostic_comparison_svg([("before", view), ("after", next_view)], axis, *PAIR_INCHES)
-        for view, next_view in pairs
-    ]
+    return before_and_after_svgs(pairs, axis, *PAIR_INCHES)
 
 
 def _drawn_diagnostics(snapshot: AxisModelDiagnostics) -> set[str]:

@@ -55,6 +55,7 @@ PENALTY_NATS: Final[dict[str, float]] = {
     "exponentially_correlated": 10.0,
     "sinusoidal": 23.0,
     "narrowband": 14.5 + 2.0,
+    "wandering_line": 14.5 + 2.0 + 2.0,
     "common_vibration": 9.5 + 3.5,
     "temperature_bias": 9.0,
     "temperature_lag": 10.0,

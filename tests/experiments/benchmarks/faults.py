@@ -319,14 +319,14 @@ def two_daemons(folder: Path, times: int) -> Outcome:
         thread = threading.Thread(target=second.run)
         thread.start()
         try:
-            held = output.wait_for_text("held by another program")
+            in_use = output.wait_for_text("held by another program")
             busy = output.wait_for_text("is busy")
             rig.wait_for_samples()
         finally:
             second.request_stop()
             thread.join(PATIENCE_S)
         assert second.workers[0].driver.counts.received == 0
-        return rig.finish("two daemons on one port", f"the second: {held}; {busy}")
+        return rig.finish("two daemons on one port", f"the second: {in_use}; {busy}")
 
 
 def no_descriptors(folder: Path, times: int) -> Outcome:

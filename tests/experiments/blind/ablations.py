@@ -27,7 +27,7 @@ HIDDEN = (
     *("sinusoidal", "narrowband", "exponentially_correlated", "rate_ramp", "bias_step", "temperature_bias"),
     *("outliers", "cross_axis"),
 )
-FOREIGN = ("foreign:chirp", "foreign:amplitude_modulated_line", "foreign:wandering_line", "foreign:pulse_train")
+FOREIGN = ("foreign:chirp", "foreign:amplitude_modulated_line", "foreign:sawtooth")
 
 
 @contextmanager
@@ -62,14 +62,14 @@ def without_cross_validation() -> Iterator[None]:
 @contextmanager
 def without_joint_fit() -> Iterator[None]:
     """Keep all sizes of the model fixed when an effect is added."""
-    from monitor.reconcile.likelihood import hypothesis
+    from monitor.reconcile.likelihood import hypothesis_fit
     from monitor.reconcile.search import search
 
     def fit_with_fixed_sizes(axis: Any, added: Sequence[Any], model: tuple[Any, ...]) -> Any:
-        return hypothesis.Hypothesis(model, axis.fit((*model, *added), hypothesis.noise_effect_indices(model)))
+        return hypothesis_fit.Hypothesis(model, axis.fit((*model, *added), hypothesis_fit.noise_effect_indices(model)))
 
     name = "fit_with_fewest_changes"
-    with patch.object(search, name, fit_with_fixed_sizes), patch.object(hypothesis, name, fit_with_fixed_sizes):
+    with patch.object(search, name, fit_with_fixed_sizes), patch.object(hypothesis_fit, name, fit_with_fixed_sizes):
         yield
 
 

@@ -5,7 +5,10 @@ is compared with this model, first without a hidden effect and then with each ef
 hidden effect on its axis. Other names count as false if they do not occur without the hidden effect.
 
 An effect acts before the converter of the sensor, and recorded values are already rounded. The recorded values are
-therefore spread evenly over their step, the effect is added, and the sum is rounded to the step. The effects are large
+therefore spread evenly over their step, the effect is applied, and the result is rounded to the step. Effects that
+need a temperature are left out, because these recordings have none. Terms that the model of the sensor contains anyway
+are left out too, as well as effects that real noise cannot be given afterwards (``heavy_tails``, ``resolution``,
+``sample_rate_error``). A noise step and a modulation act on the deviations from a running mean. The effects are large
 compared with the white noise: the gain in ln L is above 100, and less over the best wrong name. The table contains the
 sizes in units of the standard deviation s of a sample.
 """
@@ -28,7 +31,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 
-from tests.experiments.blind.processes import SOURCES, Clock, Floats, generator  # noqa: E402
+from tests.experiments.blind.processes import SOURCES, TRANSFORMS, Clock, Floats, generator, modulated  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,41 @@ def _transient(s: float, n: int, rate_hz: float) -> Parameters:
     return {"amplitude": 1.0 * s, "time_constant": 0.07 * n / rate_hz}
 
 
+def _wandering_line(s: float, n: int, rate_hz: float) -> Parameters:
+    return {
+        "amplitude": 0.5 * s,
+        "frequency": 0.0931 * rate_hz,
+        "frequency_deviation": 2e-3 * rate_hz,
+        "correlation_time": 2000.0 / rate_hz,
+        "phase": 1.0,
+    }
+
+
+def _power_law(s: float, n: int, rate_hz: float) -> Parameters:
+    """Return noise with the density of the white noise at one hundredth of the sample rate."""
+    return {"density": s / rate_hz**0.5 * (0.01 * rate_hz) ** 0.75, "exponent": 1.5}
+
+
+def _poisson_steps(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"rate": 20.0 * rate_hz / n, "height": 0.6 * s}
+
+
+def _pulses(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"height": 0.6 * s, "period": 100.0 / rate_hz, "width": 10.0 / rate_hz, "delay": 33.0 / rate_hz}
+
+
+def _curve(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"slope": 0.0, "curvature": 1.5 * s * (rate_hz / n) ** 2}
+
+
+def _noise_step(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"time": 0.6 * n / rate_hz, "ratio": 1.3}
+
+
+def _modulation(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"depth": 0.5, "period": 0.07 * n / rate_hz, "phase": 1.0}
+
+
 HIDDEN: Final[dict[str, Sizes]] = {
     "sinusoidal": _line,
     "narrowband": _resonance,
@@ -115,7 +153,22 @@ HIDDEN: Final[dict[str, Sizes]] = {
     "bias_step": _step,
     "rate_ramp": _slope,
     "turn_on_transient": _transient,
+    "wandering_line": _wandering_line,
+    "power_law": _power_law,
+    "poisson_steps": _poisson_steps,
+    "pulse_train": _pulses,
+    "bias_curve": _curve,
+    "noise_step": _noise_step,
+    "variance_modulation": _modulation,
+    "bandwidth_limit": lambda s, n, rate_hz: {"cutoff": 0.15 * rate_hz, "order": 2},
+    "sample_hold": lambda s, n, rate_hz: {"fraction": 0.03},
+    "scale_factor": lambda s, n, rate_hz: {"factor": 1.3},
+    "leak": lambda s, n, rate_hz: {"coefficient": 0.25},
 }
+LEAK_NAMES: Final = ("cross_axis", "g_sensitivity")
+"""Names of a leak from an axis of the same kind, and from an axis of the other kind."""
+MEAN_SAMPLES: Final = 65
+"""Number of samples of the running mean whose deviations a noise step or a modulation changes."""
 
 
 @dataclass(frozen=True)
@@ -145,18 +198,43 @@ def load_columns(data: Path, place: tuple[str, int, int], axes: Sequence[str]) -
         return {axis: columns[axis][begin:end].astype(np.float64) for axis in axes}, float(columns["fs"])
 
 
-def add_effect(values: Floats, rate_hz: float, name: str, seed: int) -> tuple[Floats, Parameters]:
+def add_effect(values: Floats, other_axis: Floats, rate_hz: float, name: str, seed: int) -> tuple[Floats, Parameters]:
     """Return values [n] with an effect, rounded to their original step, and the parameters of the effect."""
     rng = generator(seed, "hidden in real noise", name)
     step = float(np.median(np.diff(np.unique(values))))
-    s = float(np.std(np.diff(values))) / 2.0**0.5
+    s = white_deviation(values)
     parameters = HIDDEN[name](s, values.size, rate_hz)
-    effect = SOURCES[name](Clock(values.size, rate_hz), rng, **parameters)
+    if name == "leak":  # the coefficient is relative to the noise of both axes
+        parameters["coefficient"] *= s / white_deviation(other_axis)
     if step < MIN_STEP_SHARE * s:
-        return values + effect, {**parameters, "s": s}
+        return apply_effect(values, other_axis, rate_hz, name, rng, parameters), {**parameters, "s": s}
     spread = values + step * (rng.random(values.size) - 0.5)
-    origin = values[0]
-    return origin + step * np.rint((spread + effect - origin) / step), {**parameters, "s": s}
+    changed, origin = apply_effect(spread, other_axis, rate_hz, name, rng, parameters), values[0]
+    return origin + step * np.rint((changed - origin) / step), {**parameters, "s": s}
+
+
+def white_deviation(values: Floats) -> float:
+    """Return the standard deviation of a sample of the white noise."""
+    return float(np.std(np.diff(values))) / 2.0**0.5
+
+
+def apply_effect(
+    values: Floats, other_axis: Floats, rate_hz: float, name: str, rng: np.random.Generator, parameters: Parameters
+) -> Floats:
+    """Return values [n] with an effect."""
+    clock = Clock(values.size, rate_hz)
+    if name in SOURCES:
+        return values + SOURCES[name](clock, rng, **parameters)
+    if name in TRANSFORMS:
+        return TRANSFORMS[name](values, rate_hz, rng, **parameters)
+    if name == "leak":
+        return values + parameters["coefficient"] * (other_axis - other_axis.mean())
+    mean = np.convolve(np.pad(values, MEAN_SAMPLES // 2, "reflect"), np.full(MEAN_SAMPLES, 1.0 / MEAN_SAMPLES), "valid")
+    if name == "noise_step":
+        level = np.where(clock.t_s >= parameters["time"], parameters["ratio"], 1.0)
+    else:
+        level = np.sqrt(modulated(clock, **parameters))
+    return mean + level * (values - mean)
 
 
 def run_reconcile(folder: Path, columns: dict[str, Floats], rate_hz: float, model: Path | None) -> ReconcileAnswer:
@@ -203,10 +281,12 @@ def run_sensor(data: Path, sensor: Sensor, seed: int, only: Sequence[str]) -> li
             flush=True,
         )
         for name in only or HIDDEN:
-            changed, parameters = add_effect(second[sensor.hidden_axis], rate_hz, name, seed)
+            (other_axis,) = (axis for axis in sensor.axes if axis != sensor.hidden_axis)
+            changed, parameters = add_effect(second[sensor.hidden_axis], second[other_axis], rate_hz, name, seed)
             answer = run_reconcile(folder / name, {**second, sensor.hidden_axis: changed}, rate_hz, model)
             added = answer.names_not_in(without_effect)
-            right = any((axis, effect) == (sensor.hidden_axis, name) for axis, effect, _ in added)
+            expected = LEAK_NAMES[other_axis[0] != sensor.hidden_axis[0]] if name == "leak" else name
+            right = any((axis, effect) == (sensor.hidden_axis, expected) for axis, effect, _ in added)
             text = _format_row(sensor.name, name, _format_sizes(parameters), answer.verdict, added, answer.seconds)
             print(text, flush=True)
             found.append((text, right, len(added) - right))

@@ -20,6 +20,13 @@ SPECTRA = {
     "rate_random_walk": {"K": 1e-5},
     "exponentially_correlated": {"sigma": 1e-3, "correlation_time": 3.0},
     "narrowband": {"sigma": 1e-3, "frequency": 17.0, "bandwidth": 2.0},
+    "wandering_line": {
+        "amplitude": 1e-3,
+        "frequency": 17.0,
+        "frequency_deviation": 2.0,
+        "correlation_time": 0.2,
+        "phase": 0.3,
+    },
     "random_telegraph": {"amplitude": 1e-3, "dwell_time": 9.0},
     "poisson_steps": {"rate": 1.0, "height": 1e-3},
     "outliers": {"fraction": 1e-2, "scale": 1e-2},

@@ -21,6 +21,8 @@ from monitor.publishing.plots.style import COLOURS, ORANGE
 from monitor.reconcile.result import DiagnosticPlotData, Location, ParameterInterval
 from tests.monitor.reconcile import samples
 
+pytest.importorskip("matplotlib")
+
 SVG = "{http://www.w3.org/2000/svg}"
 START = samples.look("gz", n_true=samples.MORE_N, line=True)
 PSD, ALLAN, LEVEL, DISTRIBUTION = START.plots
