@@ -31,6 +31,7 @@ from drivers.recordings.writing import open_recording_writer, save_samples
 __all__ = [
     "FORMATS",
     "Recording",
+    "create_recording",
     "is_recording",
     "iter_blocks",
     "load_samples",
@@ -94,6 +95,30 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
             f"{path}: does not fit into the memory that is free; read a part of the recording with --last"
         ) from error
     return found if last_s is None else _take_last(found, last_s)
+
+
+def create_recording(columns: Mapping[str, Floats], rate_hz: float | None = None, source: str = "values") -> Recording:
+    """Create a recording from columns in memory, in the same way as from the columns of a file.
+
+    Parameters
+    ----------
+    columns
+        float64 arrays [n] by name: ``t`` in s, the axes in rad/s and m/s², and ``temperature`` in °C. NaN means
+        missing. The recording contains copies.
+    rate_hz
+        Sample rate in Hz, which takes precedence over the times.
+    source
+        Name of the source in error messages.
+
+    Raises
+    ------
+    RecordingError
+        If the columns are empty or have different lengths, or if no time is usable.
+    ConfigError
+        If there are neither times nor a sample rate.
+    """
+    copies = {name: np.array(column, np.float64) for name, column in columns.items()}
+    return _assemble(Path(source), Table(copies, None, []), rate_hz)
 
 
 def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]:
