@@ -18,6 +18,8 @@ ARGUMENTS: Final = {
     "--out": "folder",
     "--rate HZ": "rate_hz",
     "--rate": "rate_hz",
+    "--topic (in a configuration file: topic)": "topic",
+    "--topic": "topic",
     "--window S": "window_s",
 }
 """Options in messages, the longest spelling first, and the arguments of the Python functions."""

@@ -140,19 +140,25 @@ class Recording(recordings.Recording):
 
 @errors_name_arguments()
 def read_recording(
-    path: str | PathLike[str], rate_hz: float | None = None, *, last_s: float | None = None
+    path: str | PathLike[str],
+    rate_hz: float | None = None,
+    *,
+    last_s: float | None = None,
+    topic: str | None = None,
 ) -> Recording:
     """Read a recording from a file, or from all segments in a folder.
 
     Parameters
     ----------
     path : str or path-like
-        File (.csv, .csv.gz, .npz, .parquet, .arrow, .feather, .arrows) or folder. The columns are ``t`` in s, ``gx gy
-        gz`` in rad/s, ``ax ay az`` in m/s² and ``temperature`` in °C.
+        File or folder (docs/recording-formats.md). The columns of tables are ``t`` in s, ``gx gy gz`` in rad/s, ``ax ay
+        az`` in m/s² and ``temperature`` in °C.
     rate_hz : float, optional
         Sample rate in Hz, for a file without the column ``t``.
     last_s : float, optional
         Duration in s of the part to read at the end of the recording. By default, the whole recording is read.
+    topic : str, optional
+        Topic to read from a ROS bag or a log of PX4. By default, its only IMU is read.
 
     Returns
     -------
@@ -176,7 +182,7 @@ def read_recording(
     >>> imu_monitor.read_recording(path, last_s=30.0)
     <Recording of gx gy gz ax ay az: 3000 samples, 30 s>
     """
-    return to_public(recordings.load_samples(Path(path), rate_hz, last_s))
+    return to_public(recordings.load_samples(Path(path), rate_hz, last_s, topic))
 
 
 def to_public(recording: recordings.Recording) -> Recording:

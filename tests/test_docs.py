@@ -30,7 +30,7 @@ from monitor.publishing.rerun.sinks import server_url
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings import loading
 from monitor.settings.loading import ZenohTable
-from tests.monitor.publishing.made import estimate
+from tests.monitor.publishing.example_results import make_estimate
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 
@@ -185,7 +185,7 @@ def test_protocol_table_lists_every_decoder() -> None:
 
 
 def test_every_recording_format_is_named() -> None:
-    named = re.findall(r"\.[a-z.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
+    named = re.findall(r"\.[a-z0-9.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
     assert set(FORMATS) <= set(named)
 
 
@@ -279,7 +279,7 @@ def test_subscriber_example_prints_the_published_results(page: Path, word: str) 
     assert ENDPOINT_IN_PAGES in program
     rows = make_block(np.arange(2) * 10_000_000, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 9.81], (2, 1)))
     results = [
-        (topics.COEFFICIENTS, CoefficientsMessage.from_result("bench-1", 1.76e9, 0, estimate()).encode()),
+        (topics.COEFFICIENTS, CoefficientsMessage.from_result("bench-1", 1.76e9, 0, make_estimate()).encode()),
         (topics.SAMPLES, encode_samples("bench-1", 2, rows)),
     ]
     zenoh = ZenohPublisher(ZenohTable(listen=(endpoint,)), ["bench-1"])

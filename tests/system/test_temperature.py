@@ -7,10 +7,10 @@ import numpy as np
 import zenoh
 
 from drivers.recordings import save_samples
-from tests.monitor.drift.made import COEFFICIENT, late, weather
+from tests.monitor.drift.thermal_biases import BIAS_SLOPE, apply_lag, simulate_temperature
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
-from tests.support.zenoh_sessions import patient_file, session
+from tests.support.zenoh_sessions import open_session, patient_file
 from tests.system.rig import RecordingOutput, run_service
 
 RATE_HZ = 5.0
@@ -38,14 +38,14 @@ connect = ["{endpoint}"]
 def write_recording(path: Path) -> Path:
     """Write a recording in which gz follows the temperature with a lag of 1 h and has a step, and gx is white noise."""
     rng = np.random.default_rng(11)
-    temperature_c = weather(HOURS, rng)
+    temperature_c = simulate_temperature(HOURS, rng)
     minutes = np.arange(-48 * 60, HOURS * 60)
     t = np.arange(round(HOURS * 3600 * RATE_HZ)) / RATE_HZ
     values = np.full((t.size, 6), np.nan)
     values[:, 0] = 4e-4 * rng.standard_normal(t.size)
-    values[:, 2] = COEFFICIENT * np.interp(t / 60.0, minutes, late(temperature_c, 1.0)) + 4e-4 * rng.standard_normal(
-        t.size
-    )
+    values[:, 2] = BIAS_SLOPE * np.interp(
+        t / 60.0, minutes, apply_lag(temperature_c, 1.0)
+    ) + 4e-4 * rng.standard_normal(t.size)
     values[t >= AT_H * 3600.0, 2] += STEP
     save_samples(path, T0 + t, values, np.interp(t / 60.0, minutes, temperature_c))
     return path
@@ -56,7 +56,7 @@ def test_bias_step_that_temperature_does_not_explain_is_reported(tmp_path: Path)
     complete, recording = write_recording(tmp_path / "complete.npz"), tmp_path / "day.npz"
     recording.touch()  # the replay retries until the file is a recording
     config = CONFIG.format(path=recording, endpoint=endpoint, patient=patient_file(tmp_path))
-    with session(mode="router", listen=[endpoint]) as listener:
+    with open_session(mode="router", listen=[endpoint]) as listener:
         subscriber = listener.declare_subscriber("imu/oven/thermal", zenoh.handlers.FifoChannel(1000))
         with run_service(tmp_path, config, output) as run:
             wait_for(lambda: run.service.zenoh.state == "ok", "zenoh")
