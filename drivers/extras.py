@@ -9,6 +9,8 @@ from drivers.errors import ConfigError
 EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
     "can": {"can": "python-can", "cantools": "cantools"},
     "reconcile": {"scipy": "SciPy"},
+    "ros": {"rosbags": "rosbags"},
+    "px4": {"pyulog": "pyulog"},
 }
 """Modules that each extra provides, with the name of the package that contains each module."""
 

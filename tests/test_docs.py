@@ -185,7 +185,7 @@ def test_protocol_table_lists_every_decoder() -> None:
 
 
 def test_every_recording_format_is_named() -> None:
-    named = re.findall(r"\.[a-z.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
+    named = re.findall(r"\.[a-z0-9.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
     assert set(FORMATS) <= set(named)
 
 

@@ -21,12 +21,12 @@ from drivers.extras import EXTRAS
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 
 ROOT = Path(__file__).parents[1]
 OPTIONAL = {
     "scipy", "can", "cantools", "rerun", "matplotlib", "jinja2", "pyarrow", "PyEMD", "pywt", "prometheus_client",
-    "msgpack",
+    "msgpack", "rosbags", "pyulog",
 }  # fmt: skip
 """Modules that only extras install."""
 SERVICES = {"http.server", "socketserver"}
@@ -152,7 +152,7 @@ def connect_to_daemon(endpoint: str, process: subprocess.Popen[bytes]) -> Iterat
     def attempt() -> Any:
         assert process.poll() is None
         with contextlib.suppress(Exception):
-            return session(connect=[endpoint])
+            return open_session(connect=[endpoint])
         return None
 
     with wait_for(attempt, "the daemon's endpoint") as found:
@@ -203,6 +203,16 @@ def test_reconcile_without_scipy_names_the_missing_extra(tmp_path: Path) -> None
     line = 'imu-monitor: reconcile needs SciPy: pip install "imu-monitor[reconcile]"\n'
     assert run_program(tmp_path, "reconcile", "x.npz", "--out", "found", absent=("scipy",)) == (2, line)
     assert not (tmp_path / "found").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [("x.bag", 'rosbags: pip install "imu-monitor[ros]"'), ("x.ulg", 'pyulog: pip install "imu-monitor[px4]"')],
+)
+def test_a_recording_without_its_extra_is_refused_in_one_line(tmp_path: Path, name: str, line: str) -> None:
+    (tmp_path / name).write_bytes(b"x")
+    refused = (2, f"imu-monitor: {name}: this recording needs {line}\n")
+    assert run_program(tmp_path, "analyze", name, absent=tuple(sorted(OPTIONAL))) == refused
 
 
 CAN_DEVICE = """

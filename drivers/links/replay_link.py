@@ -2,7 +2,8 @@
 
 The chunks depend on the type of the file:
 
-- A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, or a folder) becomes messages for the decoder
+- A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, ROS bag, log of an autopilot, or a folder)
+  becomes messages for the decoder
   ``samples``.
 - A CAN log (``drivers.links.can_log_reader``) becomes CAN frames.
 - A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes.
@@ -38,7 +39,7 @@ from drivers.extras import require_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
-from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, segment_file
+from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, require_packages_of_format, segment_file
 from drivers.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
@@ -93,6 +94,9 @@ class Settings(LinkSettings):
     )
     channel: str | None = Field(
         None, examples=["1"], description="channel of a CAN log that is replayed; absent: all channels"
+    )
+    topic: str | None = Field(
+        None, examples=["/imu/data"], description="topic of a ROS bag or of a log of an autopilot; absent: the only IMU"
     )
 
 
@@ -163,7 +167,7 @@ class ReplayLink(PolledLink):
 
     def _read_items(self) -> Generator[TimedChunk]:
         if self._kind == "recording":
-            recording = load_samples(self._path, self._settings.rate)
+            recording = load_samples(self._path, self._settings.rate, topic=self._settings.topic)
             self.notes = recording.notes
             return _read_messages(recording, self._message_rows(recording))
         if self._kind == "raw":
@@ -321,6 +325,8 @@ def build(settings: Settings) -> Link:
     kind = _detect_kind(path)
     if kind == "log":
         require_extra("can", "a CAN log")
+    if kind == "recording":
+        require_packages_of_format(path)
     return ReplayLink(settings, kind)
 
 

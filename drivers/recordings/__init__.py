@@ -1,5 +1,7 @@
 """Reading and writing of recordings in CSV, .npz, Parquet and Arrow files, or in a folder of segments.
 
+Logs of robots and of autopilots (ROS bags, MCAP, PX4 logs) are only read.
+
 ``load_samples`` reads a file or a folder and returns a ``Recording``, which includes notes about irregularities of the
 file, such as missing values.
 
@@ -10,6 +12,7 @@ The reader never resamples, sorts or interpolates samples, so the sample times k
 steps. The reader never unpickles Python objects.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,20 +24,24 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, SampleBlock, make_block
 from drivers.errors import ConfigError, RecordingError, describe_error, make_printable_and_shorten
+from drivers.extras import require_extra
 from drivers.file_access import check_regular_file
 from drivers.number_ranges import DURATION_S, RATE_HZ
 from drivers.recordings import memory_check
-from drivers.recordings.formats import FORMATS, find_format, is_recording
+from drivers.recordings.formats import FORMATS, WRITABLE, Format, find_format, is_recording
+from drivers.recordings.ros_bag_format import is_bag_folder
 from drivers.recordings.table import EXAMPLE_HEADER, T_LIMIT_S, Table
 from drivers.recordings.writing import open_recording_writer, save_samples
 
 __all__ = [
     "FORMATS",
+    "WRITABLE",
     "Recording",
     "is_recording",
     "iter_blocks",
     "load_samples",
     "open_recording_writer",
+    "require_packages_of_format",
     "save_samples",
 ]
 
@@ -59,7 +66,9 @@ class Recording:
         return int(self.values.shape[0])
 
 
-def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None = None) -> Recording:
+def load_samples(
+    path: Path, rate_hz: float | None = None, last_s: float | None = None, topic: str | None = None
+) -> Recording:
     """Read a recording from a file, or from all segments in a folder.
 
     Parameters
@@ -71,6 +80,8 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
         file.
     last_s
         Duration in s of the part to read at the end of the recording. None reads the whole recording.
+    topic
+        Topic to read from a log that contains several. None selects the only IMU of the log.
 
     Raises
     ------
@@ -86,7 +97,10 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
         except ConfigError as error:
             raise ConfigError(f"{option}: {error}") from None
     try:
-        found = _load_folder(path, rate_hz, last_s) if path.is_dir() else _load_file(path, rate_hz)
+        if path.is_dir() and not is_bag_folder(path):
+            found = _load_folder(path, rate_hz, last_s, topic)
+        else:
+            found = _load_file(path, rate_hz, topic)
     except OSError as error:
         raise RecordingError(_error_text(path, error)) from error
     except MemoryError as error:
@@ -117,6 +131,13 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
         yield make_block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
 
 
+def require_packages_of_format(path: Path) -> None:
+    """Raise ConfigError if the packages that read a file are not installed. A folder of segments is not checked."""
+    extra = find_format(path).extra if is_recording(path) else ""
+    if extra:
+        require_extra(extra, f"{path}: this recording")
+
+
 def _error_text(path: Path, error: RecordingError | OSError) -> str:
     if isinstance(error, RecordingError):
         return str(error)
@@ -126,10 +147,9 @@ def _error_text(path: Path, error: RecordingError | OSError) -> str:
 # --- from columns to a recording -----------------------------------------------------------------
 
 
-def _load_file(path: Path, rate_hz: float | None) -> Recording:
-    check_regular_file(path)
-    if path.stat().st_size:
-        return _assemble(path, find_format(path).read(path), rate_hz)
+def _load_file(path: Path, rate_hz: float | None, topic: str | None) -> Recording:
+    if not _is_empty(path):
+        return _assemble(path, _format_with_packages(path).read(path, topic), rate_hz)
     if not is_recording(path):
         raise ConfigError(
             f"{path}: the file is empty, and its name does not end like that of a recording; known are "
@@ -138,6 +158,19 @@ def _load_file(path: Path, rate_hz: float | None) -> Recording:
     raise RecordingError(
         f"{path}: the file is empty, expected columns such as {EXAMPLE_HEADER}; record it again, or name another file"
     )
+
+
+def _is_empty(path: Path) -> bool:
+    """Return True if a file is empty. Raise OSError if the path is neither a regular file nor the folder of a bag."""
+    if is_bag_folder(path):
+        return False
+    check_regular_file(path)
+    return path.stat().st_size == 0
+
+
+def _format_with_packages(path: Path) -> Format:
+    require_packages_of_format(path)
+    return find_format(path)
 
 
 def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
@@ -248,9 +281,9 @@ def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
 # --- folders -------------------------------------------------------------------------------------
 
 
-def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Recording:
+def _load_folder(path: Path, rate_hz: float | None, last_s: float | None, topic: str | None) -> Recording:
     """Read all segments in a folder. Skip unreadable segments, and append a note for each skipped segment."""
-    segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != ".")
+    segments = sorted((p for p in path.iterdir() if is_recording(p) and p.name[0] != "."), key=_number_order)
     if not segments:
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
     parts: list[Recording] = []  # newest first
@@ -258,10 +291,10 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
     free = memory_check.available_bytes()
     rows = size_bytes = 0
     if last_s is None:
-        _check_folder(path, segments, free)
+        _check_folder(path, segments, free, topic)
     for segment in reversed(segments):
         try:
-            part = _load_file(segment, rate_hz)
+            part = _load_file(segment, rate_hz, topic)
         except (RecordingError, OSError) as error:
             notes.append(f"A segment was left out: {_error_text(segment, error)}.")
             continue
@@ -276,13 +309,17 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
     return _concatenate(path, parts[::-1], notes[::-1])
 
 
-def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> None:
+def _number_order(path: Path) -> list[str | int]:
+    """Return a key that sorts ``run_10.bag`` after ``run_2.bag``."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", path.name))]
+
+
+def _check_folder(path: Path, segments: Sequence[Path], free: int | None, topic: str | None) -> None:
     """Raise an error if the readable segments together contain too many rows."""
     rows = size_bytes = 0
     for segment in segments:
         try:
-            check_regular_file(segment)
-            rows += find_format(segment).count_rows(segment) if segment.stat().st_size else 0
+            rows += 0 if _is_empty(segment) else _format_with_packages(segment).count_rows(segment, topic)
         except (RecordingError, OSError):
             continue  # the note about the segment is added when the segment is read
         size_bytes += segment.stat().st_size

@@ -61,7 +61,10 @@ class RecordingSizeLimits:
                 f"{self.path}: at least {rows} rows in a file of {self.size_bytes} bytes are not measured samples; "
                 f"the limit is {MIN_ROW_LIMIT} rows, or {MAX_ROWS_PER_BYTE} rows per byte in a larger file"
             )
-        needed_bytes = COPIES * rows * ROW_BYTES
+        self.check_needed_memory(COPIES * rows * ROW_BYTES)
+
+    def check_needed_memory(self, needed_bytes: float) -> None:
+        """Raise ConfigError if a recording needs more memory in bytes than is available."""
         if self.free is not None and needed_bytes > self.free:
             raise ConfigError(
                 f"{self.path}: more than {needed_bytes / 1e9:.1f} GB of memory would be needed, "

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
-from drivers.recordings.formats import find_format
+from drivers.recordings.formats import find_writer
 from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_name_list
 
 
@@ -59,7 +59,7 @@ def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) ->
     if unknown or not axes:
         what = f"unknown axis {format_name_list(unknown)}" if unknown else "no axis has a value"
         raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
-    open_writer = find_format(path).open_writer
+    open_writer = find_writer(path)
     names = ["t", *axes, *(["temperature"] if temperature else [])]
     with atomic_write_path(path) as part, open_writer(part, names) as append_columns:
 

@@ -25,6 +25,7 @@ def compensate(
     ] = None,
     rate: options.Rate = None,
     last: options.Last = None,
+    topic: options.Topic = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
@@ -44,7 +45,8 @@ def compensate(
             raise ConfigError(f"{option}: {place} is also the output file of --out; choose another name")
     service_in_terminal.exit_on_sigterm()
     last_s = options.parse_duration("--last", last)
-    wanted = compensating.CompensationRequest(recording, out, method, rate, options.parse_arma_order(order), last_s)
+    arma_order = options.parse_arma_order(order)
+    wanted = compensating.CompensationRequest(recording, out, method, rate, arma_order, last_s, topic)
     with output.show_progress_bar() as tell:
         output.compile_analysis_kernels(tell)
         result = compensating.run_compensation(wanted, tell)

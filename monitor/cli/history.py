@@ -53,7 +53,7 @@ def history(
     from rich.console import Console
 
     from drivers.data_types import AXES
-    from drivers.recordings.formats import find_format
+    from drivers.recordings.formats import find_writer
     from monitor.estimation.fit.coefficient_values import SYMBOLS
     from monitor.history.history_table import choose_bucket_width_s as width_of
     from monitor.history.query_parameters import PARTS, HistoryQuery
@@ -66,7 +66,7 @@ def history(
     output.check_output_file("--json", json)
     output.check_output_file("--out", out)
     if out is not None:
-        find_format(out)
+        find_writer(out)
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: give either a file or --connect, not both")

@@ -29,6 +29,7 @@ def reconcile(
     seed: options.ReportSeed = 1,
     rate: options.Rate = None,
     last: options.Last = None,
+    topic: options.Topic = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
 ) -> None:
@@ -51,12 +52,17 @@ def reconcile(
         with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
             if several:
-                every = reconciling.RecordingsComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
+                every = reconciling.RecordingsComparisonRequest(
+                    tuple(recordings), tested, out, seed, rate, last_s, topic
+                )
                 runs = reconciling.compare_recordings(every, tell)
                 data, show = comparison_json.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
                 one = reconciling.reconcile_and_write_report(
-                    reconciling.ReconciliationRequest(recordings[0], tested, out, seed, rate, last_s=last_s), tell
+                    reconciling.ReconciliationRequest(
+                        recordings[0], tested, out, seed, rate, last_s=last_s, topic=topic
+                    ),
+                    tell,
                 )
                 data, show = json_report.encode_report(one), partial(text.print_reconciliation, one, details=details)
     except NotReady:

@@ -21,6 +21,7 @@ def simulate(
     temperature_from: Annotated[
         Path | None, typer.Option(metavar="RECORDING", help="Use the temperature of this recording.")
     ] = None,
+    topic: options.Topic = None,
     truth: Annotated[
         bool,
         typer.Option(
@@ -39,7 +40,7 @@ def simulate(
         if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{option}: {path} is also the output file of --out; choose another name")
     noise = load_model(model, Path.cwd())
-    request = simulation.SimulationRequest(noise, out, length_s, seed, rate, temperature_from, truth, model)
+    request = simulation.SimulationRequest(noise, out, length_s, seed, rate, temperature_from, truth, model, topic)
     service_in_terminal.exit_on_sigterm()
     with output.show_progress_bar() as tell:
         result = simulation.run_simulation(request, tell)

@@ -24,6 +24,7 @@ def thermal_fit(
     ] = None,
     rate: options.Rate = None,
     last: options.Last = None,
+    topic: options.Topic = None,
     json: JsonPath = None,
     plot: PlotPath = None,
 ) -> None:
@@ -37,7 +38,7 @@ def thermal_fit(
     output.check_output_file("--json", json)
     output.check_output_file("--out", out)
     interval_s, last_s = options.parse_duration("--interval", interval), options.parse_duration("--last", last)
-    study = thermal.fit_thermal_models(recording, interval_s, rate, last_s)
+    study = thermal.fit_thermal_models(recording, interval_s, rate, last_s, topic)
     if json is not None:
         output.write_file_or_stdout("--json", json, text.encode_thermal_fit(study) + b"\n")
     if not study.fits:
@@ -57,6 +58,7 @@ def thermal_predict(
     model: Annotated[Path, typer.Option(metavar="MODEL.json", help="Model file that thermal fit has written.")],
     rate: options.Rate = None,
     last: options.Last = None,
+    topic: options.Topic = None,
     json: JsonPath = None,
     plot: PlotPath = None,
 ) -> None:
@@ -69,7 +71,7 @@ def thermal_predict(
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--json", json)
     outlook = thermal.predict_bias_of_recording(
-        recording, thermal.read_model_file(model), rate, options.parse_duration("--last", last)
+        recording, thermal.read_model_file(model), rate, options.parse_duration("--last", last), topic
     )
     if json is not None:
         output.write_file_or_stdout("--json", json, text.encode_thermal_prediction(outlook) + b"\n")

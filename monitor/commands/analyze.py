@@ -61,6 +61,7 @@ class AnalysisRequest:
     exclude_motion: bool = False  # True to exclude samples during motion
     total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
     last_s: float | None = None  # duration at the end of the recording to use; None = all
+    topic: str | None = None  # topic to read; None = the only IMU of the recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +107,7 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
 
 def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
     tell("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s)
+    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
     blocks = list(iter_blocks(found))
     pool = ThreadPoolExecutor(os.cpu_count())
     try:

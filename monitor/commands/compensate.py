@@ -43,6 +43,7 @@ class CompensationRequest:
     rate_hz: float | None = None
     order: Order | None = None  # order of the ARMA drift model; None = selected by a criterion
     last_s: float | None = None  # duration at the end of the recording to use; None = all
+    topic: str | None = None  # topic to read; None = the only IMU of the recording
 
 
 def run_compensation(
@@ -72,7 +73,7 @@ def run_compensation(
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
     report_progress("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s)
+    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
         raise ConfigError(f"{request.recording}: there is no gyro axis; columns gx, gy, gz in rad/s are needed")

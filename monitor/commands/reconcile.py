@@ -45,6 +45,7 @@ class ReconciliationRequest:
     rate_hz: float | None = None
     notes: tuple[str, ...] = ()  # additional notes for the report
     last_s: float | None = None  # length of the end of the recording that is used; None for all
+    topic: str | None = None  # topic to read; None for the only IMU of the recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,7 @@ class RecordingsComparisonRequest:
     seed: int = 1
     rate_hz: float | None = None
     last_s: float | None = None  # length of the end of each recording that is used; None for all
+    topic: str | None = None  # topic to read from each recording; None for the only IMU
 
 
 def reconcile_and_write_report(
@@ -79,7 +81,7 @@ def reconcile_and_write_report(
         If the data do not support an answer.
     """
     report_progress("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s)
+    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
     create_report_folder(request.out)
     try:
         recording, notes = _to_regular_grid(found)
@@ -123,7 +125,7 @@ def compare_recordings(
             (f"The model under test consists of the five noise terms of {fitted_to}.",) if fitted_to and at > 1 else ()
         )
         one = ReconciliationRequest(
-            path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s
+            path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s, request.topic
         )
         try:
             result = reconcile_and_write_report(one, _tell_for(report_progress, f"{name}, {at} of {len(named)}"))

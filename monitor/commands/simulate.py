@@ -40,6 +40,7 @@ class SimulationRequest:
     temperature_from: Path | None = None  # recording from which the temperature is taken
     truth: bool = False  # True to write a file with the drawn random values
     name: str = "the model"  # name of the model in messages
+    topic: str | None = None  # topic to read from the recording of the temperature; None for its only IMU
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +163,7 @@ def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats |
     """
     if request.temperature_from is None:
         return None
-    found = _load_recording(request.temperature_from, request.rate_hz)
+    found = _load_recording(request.temperature_from, request.rate_hz, request.topic)
     known = np.isfinite(found.temperature_c)
     if not known.any():
         raise ConfigError(f"{request.temperature_from}: has no temperature; a column temperature in °C is needed")
@@ -173,14 +174,14 @@ def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats |
     return np.interp(np.arange(length) / rate_hz, t_s[order], temperature_c[order])
 
 
-def _load_recording(path: Path, rate_hz: float | None) -> Recording:
+def _load_recording(path: Path, rate_hz: float | None, topic: str | None) -> Recording:
     """Load the recording of the temperature. The requested sample rate is used if the recording has none."""
     try:
-        return load_samples(path)
+        return load_samples(path, topic=topic)
     except ConfigError:
         if rate_hz is None:
             raise
-        return load_samples(path, rate_hz)
+        return load_samples(path, rate_hz, topic=topic)
 
 
 def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> bytes:

@@ -56,7 +56,11 @@ class _ModelFile(msgspec.Struct):
 
 
 def fit_thermal_models(
-    recording: Path, interval_s: float | None = None, rate_hz: float | None = None, last_s: float | None = None
+    recording: Path,
+    interval_s: float | None = None,
+    rate_hz: float | None = None,
+    last_s: float | None = None,
+    topic: str | None = None,
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
 
@@ -70,13 +74,15 @@ def fit_thermal_models(
         Sample rate, if the recording has none.
     last_s : float, optional
         Length in seconds of the end of the recording that is used. By default the whole recording is used.
+    topic : str, optional
+        Topic to read. By default the only IMU of the recording is read.
 
     Raises
     ------
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s)
+    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, topic)
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -88,7 +94,11 @@ def fit_thermal_models(
 
 
 def predict_bias_of_recording(
-    recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None, last_s: float | None = None
+    recording: Path,
+    models: Mapping[str, ThermalModel],
+    rate_hz: float | None = None,
+    last_s: float | None = None,
+    topic: str | None = None,
 ) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models that were fitted to an earlier recording.
 
@@ -102,6 +112,8 @@ def predict_bias_of_recording(
         Sample rate, if the recording has none.
     last_s : float, optional
         Length in seconds of the end of the recording that is used. By default the whole recording is used.
+    topic : str, optional
+        Topic to read. By default the only IMU of the recording is read.
 
     Raises
     ------
@@ -109,7 +121,7 @@ def predict_bias_of_recording(
         If the recording cannot be read, or if it has no temperature.
     """
     interval = next(iter(models.values())).interval_s
-    means, notes = _read_interval_means(recording, interval, rate_hz, last_s)
+    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, topic)
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
@@ -211,10 +223,10 @@ def _model(path: Path, axis: str, row: _AxisModelRecord, interval_s: float) -> T
 
 
 def _read_interval_means(
-    recording: Path, interval_s: float | None, rate_hz: float | None, last_s: float | None
+    recording: Path, interval_s: float | None, rate_hz: float | None, last_s: float | None, topic: str | None
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
     """Return the interval means of each recorded axis, and notes about the recording."""
-    found = load_samples(recording, rate_hz, last_s)
+    found = load_samples(recording, rate_hz, last_s, topic)
     values, temperature_c, rate, notes = place_samples_and_temperature_on_grid(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")

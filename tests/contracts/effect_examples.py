@@ -56,6 +56,9 @@ EXAMPLES = {
     "exponentially_correlated": Example({"sigma": 0.7, "correlation_time": 0.8}),
     "sinusoidal": Example({"amplitude": 0.7, "frequency": 7.3}),
     "narrowband": Example({"sigma": 0.7, "frequency": 7.3, "bandwidth": 0.9}),
+    "wandering_line": Example(
+        {"amplitude": 0.7, "frequency": 7.3, "frequency_deviation": 0.9, "correlation_time": 0.1}
+    ),
     "common_vibration": Example({"source_number": 2, "gain": -0.7, "bandwidth": 0.9, "frequency": 7.3}),
     "random_telegraph": Example({"amplitude": 0.7, "dwell_time": 0.4}),
     "poisson_steps": Example({"rate": 3.0, "height": 0.7}),

@@ -158,9 +158,9 @@ def test_series_does_not_depend_on_the_division_into_blocks(name, cuts):
     n = 4500  # longer than the block that a stream draws at once
     stream = make_model(name).start_stream(RATE_HZ, 5)
     pieces = [stream.draw_samples_with_temperature(size) for size in [*cuts, max(0, n - sum(cuts))]]
-    whole = make_model(name).start_stream(RATE_HZ, 5).draw_samples_with_temperature(max(n, sum(cuts)))
-    np.testing.assert_array_equal(np.concatenate([piece.values for piece in pieces]), whole.values)
-    np.testing.assert_array_equal(np.concatenate([piece.temperature_c for piece in pieces]), whole.temperature_c)
+    expected = make_model(name).start_stream(RATE_HZ, 5).draw_samples_with_temperature(max(n, sum(cuts)))
+    np.testing.assert_array_equal(np.concatenate([piece.values for piece in pieces]), expected.values)
+    np.testing.assert_array_equal(np.concatenate([piece.temperature_c for piece in pieces]), expected.temperature_c)
 
 
 @pytest.mark.parametrize(
@@ -169,8 +169,8 @@ def test_series_does_not_depend_on_the_division_into_blocks(name, cuts):
 def test_source_gives_the_same_series_for_any_division(name):
     started = make_effect(name).start_series(RATE_HZ, np.random.default_rng(5))
     pieces = [started.draw_next_samples(size, first) for size, first in ((1, 0), (0, 1), (900, 1), (99, 901))]
-    whole = make_effect(name).start_series(RATE_HZ, np.random.default_rng(5)).draw_next_samples(1000)
-    np.testing.assert_array_equal(np.concatenate(pieces), whole)
+    expected = make_effect(name).start_series(RATE_HZ, np.random.default_rng(5)).draw_next_samples(1000)
+    np.testing.assert_array_equal(np.concatenate(pieces), expected)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -26,7 +26,7 @@ from tests.support.loopback_link import LoopbackLink
 from tests.support.ports import free_endpoint
 from tests.support.settings import read_settings
 from tests.support.waiting import FOREVER_S, PATIENCE_S
-from tests.support.zenoh_sessions import router as open_router
+from tests.support.zenoh_sessions import open_router
 
 UNIQUE = itertools.count()
 DATA = b"12345678"

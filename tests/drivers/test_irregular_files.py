@@ -16,7 +16,7 @@ import pytest
 from drivers import file_access
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
-from drivers.recordings import load_samples, segment_file
+from drivers.recordings import FORMATS, load_samples, segment_file
 from drivers.recordings.writing import atomic_write_path
 from drivers.zenoh.session_config import build_session_config
 from monitor.commands import thermal
@@ -46,9 +46,8 @@ def make_irregular_file(kind: str, path: Path) -> None:
             with socket.socket(socket.AF_UNIX) as unix_socket:
                 folder = os.open(path.parent, os.O_RDONLY)
                 try:
-                    unix_socket.bind(
-                        f"/proc/self/fd/{folder}/{path.name}"
-                    )  # the path of a socket has at most 108 characters, so use a short one
+                    # the path of a socket has at most 108 characters, so use a short one
+                    unix_socket.bind(f"/proc/self/fd/{folder}/{path.name}")
                 finally:
                     os.close(folder)
         case "device":
@@ -92,7 +91,7 @@ def test_name_with_a_nul_character_raises_os_error() -> None:
         file_access.open_regular_file(Path("a\0b"))
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".npz", ".parquet", ".arrow", ".arrows"])
+@pytest.mark.parametrize("suffix", tuple(FORMATS))
 def test_irregular_recording_is_refused(kind: str, suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
     make_irregular_file(kind, path)

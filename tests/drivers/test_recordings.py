@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 from drivers.data_types import AXES, concatenate_blocks
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recordings import (
-    FORMATS,
     MAX_VALUE,
+    WRITABLE,
     Recording,
     is_recording,
     iter_blocks,
@@ -37,7 +37,7 @@ from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recordings.writing import atomic_write_path
 from tests.support.recordings import recordings
 
-SUFFIXES = tuple(FORMATS)
+SUFFIXES = WRITABLE
 TEXTS = (".csv", ".csv.gz")
 ROWS = "t,gx,az\n0.0,1.5,9.8\n0.1,2.5,9.7\n0.2,3.5,9.6\n"
 

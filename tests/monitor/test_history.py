@@ -27,7 +27,7 @@ from monitor.publishing.messages.history import decode_history
 from monitor.settings import loading
 from tests.support.ports import free_endpoint
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 
 T0 = 1_600_000_020.0
 SECONDS = 400
@@ -133,7 +133,7 @@ def service_and_client(tmp_path: Path, recording: Path) -> Iterator[tuple[Servic
     thread.start()
     try:
         wait_for(lambda: service.zenoh.state == "ok")
-        with session(connect=[endpoint]) as client:
+        with open_session(connect=[endpoint]) as client:
             wait_for(lambda: list(client.get("imu/bench-1/history", timeout=PATIENCE_S)))
             yield service, client
     finally:

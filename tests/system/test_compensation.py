@@ -11,7 +11,7 @@ from drivers.zenoh.sample_message import DecodedSampleMessage, decode_samples
 from monitor.commands.compensate import CompensationRequest, run_compensation
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
-from tests.support.zenoh_sessions import patient_file, session
+from tests.support.zenoh_sessions import open_session, patient_file
 from tests.system.rig import RecordingOutput, run_service
 
 RATE_HZ, SECONDS, T0 = 100.0, 200.0, 1_763_705_400.0
@@ -44,7 +44,7 @@ def test_live_compensation_equals_offline_compensation(tmp_path: Path) -> None:
     save_samples(complete, T0 + np.arange(n) / RATE_HZ, values)
     endpoint, output = free_endpoint(), RecordingOutput()
     config = CONFIG.format(path=recording, endpoint=endpoint, patient=patient_file(tmp_path))
-    with session(mode="router", listen=[endpoint]) as listener:
+    with open_session(mode="router", listen=[endpoint]) as listener:
         subscriber = listener.declare_subscriber("imu/bench-1/compensated", zenoh.handlers.FifoChannel(10_000))
         with run_service(tmp_path, config, output) as run:
             wait_for(lambda: run.service.zenoh.state == "ok", "zenoh")

@@ -23,7 +23,7 @@ import zenoh
 from drivers.data_types import concatenate_blocks
 from tests.support.ports import free_endpoint, free_port
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import router, session
+from tests.support.zenoh_sessions import open_router, open_session
 from tests.system.rig import PluggableTerminal, RunningService, run_service
 
 PERIOD_NS = 10_000_000
@@ -291,7 +291,7 @@ def test_service_connects_as_soon_as_the_router_starts(tmp_path: Path, mode: str
         assert endpoint in wait_for_output_state(run, "zenoh", lambda text: text not in ("ok", "not open yet"))
         check_healthy_device_continues(run)
         for _ in range(2):  # a second time for a restarted router
-            with router(endpoint) as opened:
+            with open_router(endpoint) as opened:
                 subscriber = opened.declare_subscriber("imu/healthy/status", zenoh.handlers.RingChannel(4))
                 wait_for_output_state(run, "zenoh", lambda text: text == "ok")
                 wait_for(lambda subscriber=subscriber: subscriber.try_recv() is not None, "a status at the router")
@@ -311,7 +311,7 @@ def test_busy_zenoh_port_is_replaced_by_another_port(tmp_path: Path, host: str) 
             state = wait_for_output_state(run, "zenoh", lambda text: text.startswith("ok"))
             assert f"{busy} is busy: listening on tcp/{host}:" in state
             free = state.rsplit(" ", 1)[1]
-            with session(connect=[free]) as client:
+            with open_session(connect=[free]) as client:
                 subscriber = client.declare_subscriber("imu/healthy/status", zenoh.handlers.RingChannel(4))
                 wait_for(lambda: subscriber.try_recv() is not None, "a status on the other port")
 

@@ -20,7 +20,7 @@ import pytest
 from drivers.recordings import save_samples
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import router, session
+from tests.support.zenoh_sessions import open_router, open_session
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
 CONFIG = """
@@ -117,7 +117,7 @@ def start_daemon(folder: Path, stdout: int, stderr: int, source: str | None = No
     path = folder / "config.toml"
     path.write_text(CONFIG.format(endpoint=endpoint))
     command = PROGRAM if source is None else [sys.executable, "-c", source]
-    with router(endpoint), session(connect=[endpoint]) as client:
+    with open_router(endpoint), open_session(connect=[endpoint]) as client:
         subscriber = client.declare_subscriber("imu/**")
         with start_program([*command, "run", str(path)], stdout, stderr) as process:
             yield Daemon(process, subscriber)
@@ -413,7 +413,7 @@ def test_watch_ends_although_nobody_reads_its_output(place: str) -> None:
     endpoint = free_endpoint()
     more = ["--seconds", "1"] if place == "pipe, once" else []
     with contextlib.ExitStack() as stack:
-        stack.enter_context(router(endpoint))
+        stack.enter_context(open_router(endpoint))
         out = stack.enter_context(frozen_terminal("unread") if place == "terminal" else unread_pipe())
         command = [*PROGRAM, "watch", "--connect", endpoint, *more]
         process = stack.enter_context(start_program(command, out.writing, subprocess.DEVNULL))
@@ -424,7 +424,7 @@ def test_watch_ends_although_nobody_reads_its_output(place: str) -> None:
 def test_watch_is_updated_again_once_its_output_is_read(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with contextlib.ExitStack() as stack:
-        stack.enter_context(router(endpoint))
+        stack.enter_context(open_router(endpoint))
         screen = stack.enter_context(frozen_terminal("unread"))
         process = stack.enter_context(
             start_program([*PROGRAM, "watch", "--connect", endpoint], screen.writing, subprocess.DEVNULL)

@@ -35,7 +35,7 @@ def test_kills_lose_no_sample_that_was_written(tmp_path: Path) -> None:
         bench.kill_when(bench.after(bench.has_port, float(rng.uniform(0.0, 1.0))))  # before or in its first batch
         bench.check_files()
         before, rebuilds = bench.ticks(), len(rebuilt_durations_s(tmp_path))
-        status = bench.live(
+        status = bench.run_until(
             lambda: len(bench.ticks()) > len(before) + RATE and len(rebuilt_durations_s(tmp_path)) > rebuilds
         )
         ticks = bench.ticks()

@@ -14,7 +14,7 @@ from monitor.daemon.service import Service
 from tests.support.paced_sensor import follow_reader
 from tests.support.ports import free_endpoint, free_port
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 from tests.system.rig import RecordingOutput, run_service
 
 RATE_HZ = 100.0
@@ -65,7 +65,7 @@ def test_crossed_limit_is_passed_to_hook_command_and_zenoh_key(tmp_path: Path) -
     config = CONFIG.format(at_s=AT_S, out=out, endpoint=endpoint, port=(port := free_port()))
     with run_service(tmp_path, config, output := RecordingOutput(), pace) as run:
         wait_for(lambda: run.service.zenoh.state == "ok", "zenoh")
-        with session(connect=[endpoint]) as listener:
+        with open_session(connect=[endpoint]) as listener:
             messages = []
             listener.declare_subscriber("site/**", lambda sample: messages.append(bytes(sample.payload)))
             wait_for(out.exists, "the hook")

@@ -22,7 +22,7 @@ from monitor.simulator.demo_config import build_demo_config
 from tests.support.paced_sensor import follow_reader
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 from tests.system.rig import RecordingOutput
 
 MODEL = CONFIG_FOLDER / "models" / "consumer-mems.toml"
@@ -119,7 +119,7 @@ def test_reconcile_on_request_over_zenoh_delays_neither_samples_nor_other_comman
     try:
         wait_for(lambda: "demo" in output.comparisons and output.comparisons["demo"].samples > 3000, "samples")
         wait_for(lambda: service.zenoh.state == "ok", "zenoh")
-        with session(connect=[endpoint]) as client:
+        with open_session(connect=[endpoint]) as client:
             subscriber = client.declare_subscriber("imu/demo/gap", zenoh.handlers.FifoChannel(1000))
             first_request = client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)
             wait_for(copy.exists, "the program")

@@ -10,7 +10,7 @@ from drivers.recordings import save_samples
 from tests.monitor.drift.thermal_biases import BIAS_SLOPE, apply_lag, simulate_temperature
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
-from tests.support.zenoh_sessions import patient_file, session
+from tests.support.zenoh_sessions import open_session, patient_file
 from tests.system.rig import RecordingOutput, run_service
 
 RATE_HZ = 5.0
@@ -56,7 +56,7 @@ def test_bias_step_that_temperature_does_not_explain_is_reported(tmp_path: Path)
     complete, recording = write_recording(tmp_path / "complete.npz"), tmp_path / "day.npz"
     recording.touch()  # the replay retries until the file is a recording
     config = CONFIG.format(path=recording, endpoint=endpoint, patient=patient_file(tmp_path))
-    with session(mode="router", listen=[endpoint]) as listener:
+    with open_session(mode="router", listen=[endpoint]) as listener:
         subscriber = listener.declare_subscriber("imu/oven/thermal", zenoh.handlers.FifoChannel(1000))
         with run_service(tmp_path, config, output) as run:
             wait_for(lambda: run.service.zenoh.state == "ok", "zenoh")

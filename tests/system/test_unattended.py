@@ -31,7 +31,7 @@ needs_root = pytest.mark.skipif(
 def test_every_sample_is_accounted_for(tmp_path: Path, name: str) -> None:
     outcome = faults.FAULTS[name](tmp_path, 20)
     assert outcome.received >= 100  # the injection waits for 50 samples before and 50 after the fault
-    assert EXPECTED_STATUS[name] in outcome.said
+    assert EXPECTED_STATUS[name] in outcome.reported
     assert outcome.accounted, outcome
     if name in ("two_daemons", "full_disk", "slow_disk", "clock_back", "router"):
         # the board drops samples that a loaded machine does not read in time; no other sample may be missing

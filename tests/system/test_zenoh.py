@@ -16,15 +16,14 @@ from monitor.common import topics
 from tests.support.ports import free_endpoint
 from tests.support.recordings import recordings
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import patient_file
-from tests.support.zenoh_sessions import router as zenoh_router
+from tests.support.zenoh_sessions import open_router, patient_file
 from tests.system.rig import PluggableTerminal, run_service
 
 
 @pytest.fixture
 def router() -> Iterator[str]:
     endpoint = free_endpoint()
-    with zenoh_router(endpoint):
+    with open_router(endpoint):
         yield endpoint
 
 

@@ -111,6 +111,15 @@ Last = Annotated[
     str | None, typer.Option(metavar="S", help="Use only the last S seconds of the recording; also 1h, 1d.")
 ]
 
+Topic = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Topic of a ROS bag or of an autopilot's log; by default its only IMU. A+B joins gyroscope and "
+        "accelerometer.",
+    ),
+]
+
 
 def parse_averaging_times(text: str) -> "TauGrid":
     """Parse the option ``--tau``, which is the name of a grid or a list of averaging times in seconds.

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
-from drivers.recordings.formats import find_format
+from drivers.recordings.formats import find_writer
 from drivers.recordings.writing import atomic_write_path
 from monitor.common.unit_formatting import sensor_kind
 from monitor.history.history_row import COUNTS, STATES
@@ -38,7 +38,7 @@ def save_history(past: HistoryTable, path: Path) -> None:
         If the suffix is unknown or the file cannot be written.
     """
     columns = history_columns(past)
-    begin = find_format(path).open_writer
+    begin = find_writer(path)
     with atomic_write_path(path) as part, begin(part, list(columns)) as append:
         append(columns)
 

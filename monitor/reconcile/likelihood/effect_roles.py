@@ -99,6 +99,7 @@ _EFFECTS_BY_DIAGNOSTIC: Final = {
     "psd": (
         *("quantization_noise", "angle_random_walk", "bias_instability", "rate_random_walk"),
         *("exponentially_correlated", "scale_factor", "narrowband", "bandwidth_limit", "power_law"),
+        "wandering_line",
     ),
     "lines": ("sinusoidal", "pulse_train"),
     "temperature": ("temperature_bias", "temperature_lag", "temperature_hysteresis"),

@@ -164,14 +164,15 @@ class _JumpFilterUpdate(NamedTuple):
 def _jump_log_likelihood(
     means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: _JumpProbabilities
 ) -> float:
-    d = noise.table.shape[0]
+    d, last = noise.table.shape[0], JUMP_AGES - 1
     state = _JumpFilterState(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
-    state.probability[JUMP_AGES - 1] = 1.0
-    state.covariance[JUMP_AGES - 1] = initial_state_covariance(noise, level_variance)
+    state.probability[last] = 1.0
+    state.covariance[last] = initial_state_covariance(noise, level_variance)
     update = _JumpFilterUpdate(
         np.zeros((2, JUMP_AGES)), np.zeros((2, JUMP_AGES)), np.zeros((2, JUMP_AGES, d)), np.zeros((2, JUMP_AGES, d))
     )
     jumped_mean, jumped_covariance = np.zeros(d), np.zeros((d, d))
+    merged_mean, merged_covariance = np.zeros(d), np.zeros((d, d))
     total: float = -0.5 * means.size * np.log(2.0 * np.pi)
     for block_mean in means:
         density, log_scale = _weigh_branches(block_mean, noise, jumps, state, update)
@@ -179,12 +180,13 @@ def _jump_log_likelihood(
         update.weight[:] /= density
         # all hypotheses with a jump in this block become the hypothesis with age 0
         jumped = _merge(1, 0, JUMP_AGES, noise.table, state.covariance, update, jumped_mean, jumped_covariance)
-        # without a jump, the age increases by one block; the last age includes all older jumps
-        for age in range(JUMP_AGES - 1, 0, -1):
-            end = age + age // (JUMP_AGES - 1)
-            state.probability[age] = _merge(
-                0, age - 1, end, noise.table, state.covariance, update, state.mean[age], state.covariance[age]
-            )
+        # the last age includes all older jumps
+        state.probability[last] = _merge(
+            0, last - 1, JUMP_AGES, noise.table, state.covariance, update, merged_mean, merged_covariance
+        )
+        state.mean[last] = merged_mean
+        state.covariance[last] = merged_covariance
+        _increase_ages(noise.table, state, update)
         state.probability[0] = jumped
         state.mean[0] = jumped_mean
         state.covariance[0] = jumped_covariance
@@ -227,8 +229,10 @@ def _weigh_branches(
         variance, innovation = noise.white, block_mean
         for i in range(d):
             total = 0.0
-            for j in range(d):
-                total += covariance[age, max(i, j), min(i, j)] * table[j, 1]
+            for j in range(i + 1):
+                total += covariance[age, i, j] * table[j, 1]
+            for j in range(i + 1, d):
+                total += covariance[age, j, i] * table[j, 1]
             variance += table[i, 1] * total
             innovation -= table[i, 1] * mean[age, i]
             state_covariance[0, age, i] = state_covariance[1, age, i] = table[i, 0] * total + table[i, 3]
@@ -287,14 +291,37 @@ def _merge(
         for age in range(first, end):
             total += weight[jump, age] * mean[jump, age, i]
         merged_mean[i] = total / share
+    merged_covariance[:] = 0.0
+    for age in range(first, end):
+        if weight[jump, age] == 0.0:
+            continue
+        part, known = weight[jump, age] / share, inverse_variance[jump, age]
+        for i in range(d):
+            decay, pull, apart = (
+                table[i, 0],
+                state_covariance[jump, age, i] * known,
+                mean[jump, age, i] - merged_mean[i],
+            )
+            for j in range(i + 1):
+                own = decay * table[j, 0] * covariance[age, i, j] - pull * state_covariance[jump, age, j]
+                merged_covariance[i, j] += part * (own + apart * (mean[jump, age, j] - merged_mean[j]))
     for i in range(d):
-        for j in range(i + 1):
-            decay, total = table[i, 0] * table[j, 0], 0.0
-            for age in range(first, end):
-                own = decay * covariance[age, i, j]
-                own -= state_covariance[jump, age, i] * state_covariance[jump, age, j] * inverse_variance[jump, age]
-                apart = (mean[jump, age, i] - merged_mean[i]) * (mean[jump, age, j] - merged_mean[j])
-                total += weight[jump, age] * (own + apart)
-            merged_covariance[i, j] = total / share
         merged_covariance[i, i] += table[i, 2]
     return share
+
+
+@compiled
+def _increase_ages(table: Floats, state: _JumpFilterState, update: _JumpFilterUpdate) -> None:
+    """Update the hypotheses with ages from 1 to ``JUMP_AGES`` − 2, which have no jump in the block."""
+    probability, mean, covariance = state.probability, state.mean, state.covariance
+    weight, next_mean = update.weight, update.mean
+    inverse_variance, state_covariance = update.inverse_variance, update.state_covariance
+    for age in range(JUMP_AGES - 2, 0, -1):
+        old = age - 1
+        probability[age] = weight[0, old]
+        for i in range(table.shape[0]):
+            mean[age, i] = next_mean[0, old, i]
+            decay, pull = table[i, 0], state_covariance[0, old, i] * inverse_variance[0, old]
+            for j in range(i + 1):
+                covariance[age, i, j] = decay * table[j, 0] * covariance[old, i, j] - pull * state_covariance[0, old, j]
+            covariance[age, i, i] += table[i, 2]

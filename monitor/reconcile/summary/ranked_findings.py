@@ -34,7 +34,7 @@ from monitor.reconcile.several_recordings.effect_matching import (
     identifying_parameter_name,
 )
 
-PEAK_NAMES: Final = ("sinusoidal", "narrowband")
+PEAK_NAMES: Final = ("sinusoidal", "narrowband", "wandering_line")
 """Effects that one oscillation produces on different axes."""
 MAX_LOG_RATIO_DIFFERENCE: Final = log(1.1)
 """Largest difference between the logarithms of two size ratios in the same finding."""

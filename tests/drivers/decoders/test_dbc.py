@@ -176,12 +176,12 @@ def test_signal_is_decoded_as_by_cantools(
     expected = [message.decode(f)["S"] for f in frames]
     np.testing.assert_allclose(bits.extract_values(stacked), expected, rtol=1e-15)
     # writing the raw numbers into other frames touches these bits and no other
-    there = np.full_like(stacked, 0xA5)
-    bits.insert_raw(there, bits.extract_raw(stacked))
-    np.testing.assert_array_equal(bits.extract_raw(there), bits.extract_raw(stacked))
+    other_frames = np.full_like(stacked, 0xA5)
+    bits.insert_raw(other_frames, bits.extract_raw(stacked))
+    np.testing.assert_array_equal(bits.extract_raw(other_frames), bits.extract_raw(stacked))
     mask = np.zeros_like(stacked)
     bits.insert_raw(mask, np.full(len(mask), (1 << length) - 1, np.uint64))
-    np.testing.assert_array_equal(there & ~mask, np.full_like(there, 0xA5) & ~mask)
+    np.testing.assert_array_equal(other_frames & ~mask, np.full_like(other_frames, 0xA5) & ~mask)
 
 
 @pytest.mark.parametrize(("length", "kind", "code"), [(32, 1, "f"), (64, 2, "d")])
@@ -347,9 +347,8 @@ def test_sample_with_a_late_frame_counts_as_late_and_not_as_bad(period_ms: int, 
     blocks = decoder.feed(frames)
     assert read_sample_numbers(blocks) == list_sample_numbers(10, late)
     assert (decoder.dropped_late_samples, decoder.bad) == (len(late), 0)
-    assert sum(b.lost for b in blocks) == len(
-        [i for i in late if i < read_sample_numbers(blocks)[-1][0]]
-    )  # late samples before the last good one
+    # a late sample counts as lost when a good one follows
+    assert sum(b.lost for b in blocks) == len([i for i in late if i < read_sample_numbers(blocks)[-1][0]])
     assert decoder.recent_problem == LATE_FRAME_HINT
     single = build("j1939_imu", SAE_SIGNALS, window=0.005)
     assert read_sample_numbers([b for frame in frames for b in single.feed([frame])]) == list_sample_numbers(10, late)
@@ -529,7 +528,7 @@ def test_only_one_sender_is_decoded() -> None:
     assert chosen.recent_problem == ""
 
 
-def test_addresses_of_the_messages() -> None:
+def test_decoder_lists_the_addresses_of_its_messages() -> None:
     assert build("canmod_gps", CANMOD_SIGNALS).addresses == (9,)
     wanted = (0x0CF02AFE | EXTENDED_ID | ANY_SOURCE, 0x0CF02DFE | EXTENDED_ID | ANY_SOURCE)
     assert build("j1939_imu", SAE_SIGNALS).addresses == wanted

@@ -33,7 +33,7 @@ def test_two_packets_form_a_sample() -> None:
     assert build(Settings()).timing == ArrivalTimedFormat()
 
 
-def test_temperature_of_the_jy61_family() -> None:
+def test_temperature_of_the_jy61_family_is_decoded() -> None:
     assert decode_bytes(ACCEL + RATE, temperature="jy61").temperature_c[0] == pytest.approx(2512 / 340 + 36.53)
 
 

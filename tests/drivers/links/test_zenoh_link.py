@@ -19,8 +19,7 @@ from drivers.links.base import Link
 from tests.support.ports import free_endpoint
 from tests.support.settings import read_settings
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import router as open_router
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_router, open_session
 
 
 def build(**keys: Any) -> Link:
@@ -96,7 +95,7 @@ def test_used_listening_port_raises_link_unavailable(router: Any, endpoint: str)
 def test_message_of_a_peer_behind_the_same_router_is_received(router: Any, endpoint: str) -> None:
     link = build(key="k", connect=[endpoint])
     link.open()
-    with session(mode="peer", connect=[endpoint]) as publisher:
+    with open_session(mode="peer", connect=[endpoint]) as publisher:
         assert put_until_received(link, lambda: publisher.put("k", b"x"))[0].data == b"x"
     link.close()
 

@@ -18,7 +18,7 @@ from drivers.errors import DecodeError
 from drivers.zenoh import sample_message
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 from tests.support.ports import free_endpoint
-from tests.support.zenoh_sessions import router
+from tests.support.zenoh_sessions import open_router
 
 START_NS = 1_763_700_000_123_456_789
 PAGE = Path(__file__).parents[3] / "docs" / "samples-format.md"
@@ -172,7 +172,7 @@ def test_documented_example_receives_published_samples() -> None:
 
     sent = make_samples(20)
     stop = threading.Event()
-    with router(endpoint) as opened:
+    with open_router(endpoint) as opened:
 
         def publish() -> None:
             while not stop.wait(0.05):

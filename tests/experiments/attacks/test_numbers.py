@@ -91,9 +91,8 @@ def arguments(tmp_path: Path) -> dict[tuple[str, ...], list[str]]:
     rng = np.random.default_rng(1)
     recording, model = tmp_path / "r.npz", str(shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
     temperature_c = 25.0 + 5.0 * np.sin(np.arange(2000) / 200.0)
-    np.savez(
-        recording, t=np.arange(2000) / 100.0, temperature=temperature_c, **{a: rng.normal(size=2000) for a in AXES}
-    )  # type: ignore[arg-type]
+    samples: dict[str, Any] = {axis: rng.normal(size=2000) for axis in AXES}
+    np.savez(recording, t=np.arange(2000) / 100.0, temperature=temperature_c, **samples)
     config = tmp_path / "c.toml"
     config.write_text('[[device]]\nname = "a"\ndriver = { link = "virtual" }\n[storage]\nfolder = "kept"\n')
     out = ["--out", str(tmp_path / "out.npz")]

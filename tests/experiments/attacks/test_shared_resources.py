@@ -289,8 +289,8 @@ def test_two_daemons_on_one_serial_port(tmp_path: Path) -> None:
 @pytest.mark.timeout(900)
 def test_two_daemons_on_one_serial_port_and_one_zenoh_endpoint(tmp_path: Path) -> None:
     outcome = faults.two_daemons(tmp_path, 1)
-    assert "held by another program" in outcome.said
-    assert "is busy" in outcome.said
+    assert "held by another program" in outcome.reported
+    assert "is busy" in outcome.reported
     assert (outcome.received, outcome.lost, outcome.bad) == (outcome.sent, 0, 0)
 
 

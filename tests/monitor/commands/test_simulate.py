@@ -10,7 +10,7 @@ import pytest
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.recordings import FORMATS, load_samples, save_samples
+from drivers.recordings import WRITABLE, load_samples, save_samples
 from monitor.commands import analyze
 from monitor.commands.simulate import CHUNK_ROWS, SimulationRequest, run_simulation
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
@@ -49,7 +49,7 @@ height = 1.0
 )
 
 
-@pytest.fixture(params=tuple(FORMATS))
+@pytest.fixture(params=WRITABLE)
 def output_path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / f"simulated{request.param}"
 

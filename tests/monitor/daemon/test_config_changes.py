@@ -29,7 +29,7 @@ from tests.monitor.daemon.operations.test_systemd import NotificationReceiver
 from tests.monitor.publishing import example_results
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 
 QUIET = '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
 
@@ -163,7 +163,7 @@ def test_added_removed_and_changed_devices_do_not_disturb_the_others(tmp_path: P
         path.write_text(
             format_device("stays") + format_device("comes") + format_device("changes", 'publish = "5 Hz"') + rest
         )
-        with session(connect=[endpoint]) as listener:
+        with open_session(connect=[endpoint]) as listener:
             received: dict[str, list[Any]] = {}
             listener.declare_subscriber(
                 "imu/*/coefficients",

@@ -5,6 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from scipy.signal import hilbert
 from scipy.stats import kstest
 
 from drivers.data_types import AXES
@@ -37,6 +38,7 @@ from monitor.noise.effects import (
     TemperatureBias,
     TemperatureLag,
     TurnOnTransient,
+    WanderingLine,
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
@@ -204,6 +206,7 @@ def test_dwell_times_are_exponential_and_both_levels_can_be_first():
     [
         ExponentiallyCorrelated(sigma=2.0, correlation_time=50.0),
         Narrowband(sigma=2.0, frequency=3.0, bandwidth=0.01),
+        WanderingLine(amplitude=8.0**0.5, frequency=3.0, frequency_deviation=0.01, correlation_time=50.0),
         RandomTelegraph(amplitude=4.0, dwell_time=100.0),
     ],
     ids=lambda source: source.name,
@@ -212,6 +215,18 @@ def test_first_sample_is_stationary(source):
     # The variance of 3000 first samples is known to 2.6 %; the bound is four times that.
     first = [NoiseModel({"gx": (source,)}).simulate(1, RATE_HZ, seed)[0, 0] for seed in range(3000)]
     assert np.mean(np.square(first)) == pytest.approx(4.0, rel=0.1)
+
+
+def test_a_wandering_line_has_one_amplitude_and_many_frequencies():
+    line = WanderingLine(amplitude=2.0, frequency=20.0, frequency_deviation=3.0, correlation_time=5.0, phase=0.5)
+    y = NoiseModel({"gx": (line,)}).simulate(400_000, 1000.0, 1)[:, 0]
+    assert y[0] == pytest.approx(2.0 * np.sin(0.5))
+    turns = np.unwrap(np.angle(hilbert(y)))[2000:-2000]
+    assert np.abs(hilbert(y))[2000:-2000] == pytest.approx(2.0, rel=0.02)
+    hz = np.diff(turns[::100]) / (2.0 * np.pi * 0.1)
+    # 80 correlation times: the mean is known to 0.47 Hz, the deviation to 8 %
+    assert hz.mean() == pytest.approx(20.0, abs=1.5)
+    assert hz.std() == pytest.approx(3.0, rel=0.25)
 
 
 def test_generated_temperature_agrees_with_its_parameters():

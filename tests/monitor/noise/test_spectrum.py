@@ -25,6 +25,7 @@ from monitor.noise.effects import (
     Saturation,
     ScaleFactor,
     Sinusoidal,
+    WanderingLine,
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.spectrum import allan_variance_of_density
@@ -51,6 +52,21 @@ def test_integral_over_the_spectrum_equals_the_closed_form(source):
     tau = FACTORS * TAU0_S
     found = allan_variance_of_density(spectrum.density, tau, TAU0_S, spectrum.peaks)
     np.testing.assert_allclose(found, source.avar(tau, TAU0_S), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("deviation", "time_s"), [(0.05, 0.3), (0.9, 0.1), (0.9, 2.0), (0.3, 50.0)])
+def test_wandering_line_has_the_autocovariance_of_kubo(deviation, time_s):
+    lag = np.arange(400_000) * TAU0_S
+    index = (2.0 * np.pi * deviation * time_s) ** 2
+    r = 2.0 * np.cos(2.0 * np.pi * 17.3 * lag) * np.exp(-index * (np.expm1(-lag / time_s) + lag / time_s))
+    line = WanderingLine(amplitude=2.0, frequency=17.3, frequency_deviation=deviation, correlation_time=time_s)
+    factors = np.array([1, 2, 3, 7, 30, 500, 8000])
+    np.testing.assert_allclose(
+        line.avar(factors * TAU0_S, TAU0_S), compute_avar_from_autocovariance(r, factors), rtol=1e-3
+    )
+    f = 17.3 + np.array([-10.0, -2.0, -0.5, 0.0, 0.1, 1.5, 30.0])
+    expected = [TAU0_S * (2.0 * r @ np.cos(2.0 * np.pi * one * lag) - r[0]) for one in f]
+    np.testing.assert_allclose(line.two_sided_psd(f, TAU0_S), expected, rtol=5e-3, atol=1e-7)
 
 
 def compute_avar_from_autocovariance(autocovariance: np.ndarray, factors: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from drivers.zenoh.session_config import build_session_config
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 
 DEVICES = ("nose", "tail")
 
@@ -37,8 +37,8 @@ def test_leaf_router_limits_status_messages_per_device_and_passes_all_events(tmp
     with (
         zenoh.open(root),
         zenoh.open(leaf),
-        session(mode="peer", connect=[site]) as daemon,
-        session(connect=[up]) as remote_client,
+        open_session(mode="peer", connect=[site]) as daemon,
+        open_session(connect=[up]) as remote_client,
     ):
         watcher = remote_client.declare_subscriber("imu/**", zenoh.handlers.RingChannel(10_000))
         wait_for(lambda: daemon.put("imu/ready/event", b"") or count_messages(watcher))

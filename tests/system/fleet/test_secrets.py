@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S
-from tests.support.zenoh_sessions import router
+from tests.support.zenoh_sessions import open_router
 
 PASSWORD = "tr0ub4dor-and-3"
 ZENOH = """{{
@@ -52,7 +52,7 @@ def test_password_is_never_written(tmp_path: Path, broken: str) -> None:
     (tmp_path / "z.json5").write_text(ZENOH.format(endpoint=endpoint, password=PASSWORD, broken=broken))
     path = tmp_path / "a.toml"
     path.write_text(CONFIG.format(password=PASSWORD))
-    with router(endpoint):
+    with open_router(endpoint):
         outputs = {
             "check": run_program("check", str(path)),
             "run": run_program("run", str(path), "--seconds", "4"),

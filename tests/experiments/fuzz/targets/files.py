@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links.replay_link import Settings, build
-from drivers.recordings import FORMATS, iter_blocks, load_samples, memory_check, save_samples
+from drivers.recordings import FORMATS, WRITABLE, iter_blocks, load_samples, memory_check, save_samples
 from tests.experiments.fuzz.checks import check_error_message
 from tests.experiments.fuzz.input_reader import InputReader
 from tests.experiments.fuzz.target import Check, target
@@ -85,6 +85,9 @@ def make_recording_check(suffix: str) -> Check:
 def recording_seeds(suffix: str) -> Iterator[bytes]:
     """Return recordings that the project writes, and truncated ones."""
     rng = np.random.default_rng(7)
+    if suffix not in WRITABLE:
+        yield from robot_log_seeds(suffix)
+        return
     for n, axes in ((3, ("gz",)), (12, ("gx", "gy", "gz", "ax", "ay", "az"))):
         path = get_folder() / f"seed{suffix}"
         values = np.round(rng.normal(size=(n, 6)), 2)
@@ -100,6 +103,24 @@ def recording_seeds(suffix: str) -> Iterator[bytes]:
         yield packed.getvalue()
     if suffix in (".arrow", ".parquet", ".arrows"):
         yield from _arrow_seeds(suffix)
+
+
+def robot_log_seeds(suffix: str) -> Iterator[bytes]:
+    """Logs that the libraries of their formats write."""
+    from tests.support.ros_bags import imu_topic, storage_file, write_bag
+    from tests.support.ulog import sensor_combined, ulog_bytes, vehicle_imu
+
+    if suffix == ".ulg":
+        t_us = 1_000_000 + 10_000 * np.arange(4)
+        yield ulog_bytes([sensor_combined(t_us, np.ones((4, 6))), vehicle_imu(t_us, np.ones((4, 6)), 10_000)])
+        return
+
+    kinds = {".bag": ("ros1", "ros1-bz2", "ros1-lz4"), ".db3": ("sqlite",), ".mcap": ("mcap", "mcap-chunk")}
+    t_ns = 1_763_700_000_000_000_000 + 10_000_000 * np.arange(4)
+    for kind in kinds[suffix]:
+        with tempfile.TemporaryDirectory() as place:
+            path = write_bag(Path(place), kind, {"/imu": imu_topic(t_ns, np.ones((4, 6)))})
+            yield storage_file(path).read_bytes()
 
 
 def _arrow_seeds(suffix: str) -> Iterator[bytes]:

@@ -21,7 +21,7 @@ from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import example_results
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import router
+from tests.support.zenoh_sessions import open_router
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
@@ -44,7 +44,7 @@ def test_detailed_devices_are_drawn_and_others_are_in_the_table(
     viewer = RerunView(ViewerSettings(mode=str(path)), [ViewerDeviceDescription("imu/nose", "over zenoh")], fleet=True)
     out = ZenohPublisher(ZenohTable(listen=(), connect=(endpoint,)), ["nose", "tail"])
     with (
-        router(endpoint),
+        open_router(endpoint),
         contextlib.closing(out),
         contextlib.closing(ZenohSubscriber("imu/**", [endpoint], None, ["imu/nose"])) as subscriber,
         contextlib.closing(viewer),

@@ -21,7 +21,7 @@ from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 from monitor.settings.loading import ZenohTable
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import router, session
+from tests.support.zenoh_sessions import open_router, open_session
 
 DEVICES = ("bench-1", "bench-2")
 PUBLISHED = [topic for topic in topics.TOPICS if topic.when not in ("presence", "query")]
@@ -46,8 +46,8 @@ def start_publisher(**settings: Any) -> Iterator[ZenohPublisher]:
 def connect_through_router(endpoint: str) -> Iterator[tuple[ZenohPublisher, Any]]:
     """Yield a connected publisher and a client."""
     with (
-        router(endpoint),
-        session(connect=[endpoint]) as client,
+        open_router(endpoint),
+        open_session(connect=[endpoint]) as client,
         start_publisher(mode="client", connect=(endpoint,)) as publisher,
     ):
         wait_for(lambda: publisher.state == "ok")
@@ -201,7 +201,7 @@ def test_busy_port_is_replaced_and_reported(endpoint: str) -> None:
         assert publisher.state.startswith(f"ok, but {endpoint} is busy: listening on tcp/127.0.0.1:")
         found = publisher.state.rpartition(" ")[2]
         assert found != endpoint
-        with session(connect=[found]) as client:
+        with open_session(connect=[found]) as client:
             subscriber = client.declare_subscriber("imu/**", zenoh.handlers.FifoChannel(100))
 
             def publish_and_receive() -> bool:
@@ -214,7 +214,7 @@ def test_busy_port_is_replaced_and_reported(endpoint: str) -> None:
 @pytest.mark.parametrize("listen", [None, ("tcp/127.0.0.1:1",)])
 def test_client_does_not_listen(endpoint: str, monkeypatch: pytest.MonkeyPatch, listen: tuple[str, ...] | None) -> None:
     """The client opens although the default port is busy and the given port is not available."""
-    with socket.create_server(("127.0.0.1", 0)) as busy, router(endpoint):
+    with socket.create_server(("127.0.0.1", 0)) as busy, open_router(endpoint):
         monkeypatch.setattr(topics, "ENDPOINT", f"tcp/127.0.0.1:{busy.getsockname()[1]}")
         with start_publisher(mode="client", listen=listen, connect=(endpoint,)) as publisher:
             wait_for(lambda: publisher.state != "not open yet")
@@ -241,7 +241,7 @@ def test_publisher_connects_to_a_router_that_starts_later(endpoint: str) -> None
         assert ".rs" not in publisher.state
         publisher.set_alive("bench-1", True)
         publisher.put(topics.STATUS, "bench-1", b"dropped, as nobody is there")
-        with router(endpoint), session(connect=[endpoint]) as client:
+        with open_router(endpoint), open_session(connect=[endpoint]) as client:
             wait_for(lambda: publisher.state == "ok")
             tokens = wait_for(lambda: list(client.liveliness().get("imu/**", timeout=PATIENCE_S)))
             assert [str(token.ok.key_expr) for token in tokens] == ["imu/bench-1/alive"]

@@ -28,7 +28,7 @@ from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import example_results
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, stays_true, wait_for
-from tests.support.zenoh_sessions import patient_file, router, session
+from tests.support.zenoh_sessions import open_router, open_session, patient_file
 
 
 @pytest.fixture
@@ -153,7 +153,7 @@ def test_daemons_that_start_late_end_and_return_are_followed() -> None:
 
 def test_messages_arrive_through_a_router(endpoint: str) -> None:
     with (
-        router(endpoint),
+        open_router(endpoint),
         run_daemon(endpoint, "a", mode="client"),
         start_subscriber("imu/**", endpoint) as (subscriber, messages),
     ):
@@ -165,7 +165,7 @@ def test_messages_of_a_peer_arrive_through_a_router(endpoint: str) -> None:
     """A router forwards nothing from a peer to a peer."""
     publisher = ZenohPublisher(ZenohTable(listen=(free_endpoint(),), connect=(endpoint,)), ["a"])
     with (
-        router(endpoint),
+        open_router(endpoint),
         contextlib.closing(publisher),
         start_subscriber("imu/**", endpoint) as (subscriber, messages),
     ):
@@ -186,8 +186,8 @@ def test_messages_of_a_peer_arrive_through_a_router(endpoint: str) -> None:
 def test_two_routes_to_a_daemon_deliver_each_message_once(tmp_path: Path) -> None:
     first, second, patient = free_endpoint(), free_endpoint(), patient_file(tmp_path)
     with (
-        session(mode="router", listen=[first]),
-        session(mode="router", listen=[second], connect=[first]),
+        open_session(mode="router", listen=[first]),
+        open_session(mode="router", listen=[second], connect=[first]),
         contextlib.closing(
             ZenohPublisher(ZenohTable(config=patient, mode="client", connect=(first,)), ["a"])
         ) as publisher,
@@ -214,8 +214,8 @@ def test_late_subscriber_gets_the_last_values_and_events(endpoint: str) -> None:
     kept = {topic: topic.kept for topic in (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)}
     far = free_endpoint()
     with (
-        session(mode="router", listen=[endpoint]) as near,
-        session(mode="router", listen=[far], connect=[endpoint]) as beyond,
+        open_session(mode="router", listen=[endpoint]) as near,
+        open_session(mode="router", listen=[far], connect=[endpoint]) as beyond,
         contextlib.closing(ZenohPublisher(ZenohTable(listen=(), connect=(endpoint,)), ["a"])) as publisher,
     ):
         publisher.start()
@@ -233,7 +233,7 @@ def test_late_subscriber_gets_the_last_values_and_events(endpoint: str) -> None:
 
 def test_too_long_message_is_dropped_and_later_ones_arrive(endpoint: str) -> None:
     with (
-        session(mode="router", listen=[endpoint]) as sender,
+        open_session(mode="router", listen=[endpoint]) as sender,
         start_subscriber("imu/**", endpoint) as (subscriber, messages),
     ):
 

@@ -1,6 +1,6 @@
 """Measure how long the service takes to end, and how long samples wait for publication, during a fault.
 
-    python -m tests.experiments.benchmarks.closing
+    python -m tests.experiments.benchmarks.shutdown
 
 The cases are a service without a fault, a frozen viewer, and a zenoh subscriber that reads nothing. The tests in
 ``tests/system/test_faults.py`` cover the same faults. They check no times, because times depend on the machine.

@@ -1,0 +1,209 @@
+"""Reading of ROS 1 bags, ROS 2 bags (SQLite and MCAP) and MCAP files with ROS 2 messages, by the library rosbags.
+
+Topics of type ``sensor_msgs/Imu`` contain rad/s and m/s². If the first covariance of a quantity is -1, the message does
+not provide the quantity (sensor_msgs/Imu.msg). Topics of type ``sensor_msgs/Temperature`` contain °C and can be joined
+to an IMU.
+
+Messages are decoded block by block. The times are the header stamps. If most messages have no header stamp, the times
+of the log are used instead.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.data_types import AXES, Floats
+from drivers.errors import ImuError, RecordingError, describe_error
+from drivers.file_access import check_regular_file, open_regular_file
+from drivers.recordings import memory_check, table
+from drivers.recordings.topics import Topic, collect_columns, join_topics, select_topics
+
+METADATA: Final = "metadata.yaml"
+"""File that a folder with a ROS 2 bag contains."""
+STORAGE_SUFFIXES: Final = (".db3", ".mcap", ".zstd")
+IMU_TYPE: Final = "sensor_msgs/msg/Imu"
+COLUMNS_OF_TYPES: Final[Mapping[str, tuple[str, ...]]] = {
+    IMU_TYPE: AXES,
+    "sensor_msgs/msg/Temperature": ("temperature",),
+}
+NOT_PROVIDED: Final = -1.0
+MISSING: Final = (float("nan"),) * 3
+MAX_METADATA_BYTES: Final = 4_000_000
+EXPECTED: Final = "messages of type sensor_msgs/Imu"
+REPAIRS: Final[Mapping[str, str]] = {
+    ".bag": "`rosbag reindex` repairs a bag that was not closed",
+    ".mcap": "`mcap recover` copies the intact messages",
+}
+REINDEX: Final = "`ros2 bag reindex` writes the metadata again"
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Return True if a folder contains the metadata of a ROS 2 bag."""
+    return (path / METADATA).is_file()
+
+
+def read_ros_bag(path: Path, topic: str | None) -> table.Table:
+    """Read the samples of an IMU from a bag.
+
+    Parameters
+    ----------
+    path
+        Folder with a ROS 2 bag, or a file of type .bag, .db3 or .mcap.
+    topic
+        Topic to read, or several topics joined by ``+``. None selects the only topic of type ``sensor_msgs/Imu``.
+
+    Raises
+    ------
+    RecordingError
+        If the bag is damaged or contains no IMU.
+    ConfigError
+        If the topic is unknown, or the samples do not fit into memory.
+    """
+    notes: list[str] = []
+    with _bag_errors(path), _open_bag(path) as (bag, limit):
+        names = bag.select(path, topic, notes)
+        limit.check_row_count(sum(one.rows for one in bag.topics if one.name in names))
+        tables = {name: _read_topic(bag, name, limit, notes) for name in names}
+    return table.Table(join_topics(path, tables), None, notes)
+
+
+def count_ros_bag_rows(path: Path, topic: str | None) -> int:
+    """Return the number of messages of the topic according to the index of a bag."""
+    with _bag_errors(path), _open_bag(path) as (bag, _):
+        first = bag.select(path, topic, [])[0]
+        return next(one.rows for one in bag.topics if one.name == first)
+
+
+@dataclass(frozen=True, slots=True)
+class _Bag:
+    """An open bag."""
+
+    connections: Sequence[Any]
+    topics: Sequence[Topic]
+    messages: Callable[[Sequence[Any]], Iterable[tuple[Any, int, bytes]]]
+    deserialize: Callable[[bytes, str], Any]
+
+    def select(self, path: Path, topic: str | None, notes: list[str]) -> list[str]:
+        """Return the names of the topics to read."""
+        imus = [one.name for one in self.topics if one.message_type == IMU_TYPE and one.rows]
+        return select_topics(path, self.topics, [imus], topic, EXPECTED, notes)
+
+
+@contextmanager
+def _open_bag(path: Path) -> Iterator[tuple[_Bag, memory_check.RecordingSizeLimits]]:
+    """Check the files of a bag and open the bag."""
+    from rosbags.typesys import Stores, get_typestore
+
+    from drivers.recordings import ros_bag_readers as readers
+
+    limit = _check_files(path)
+    # The definitions in the bag are not used, since both types are the same in all versions of ROS 1 and of ROS 2.
+    if path.suffix.lower() == ".bag":
+        with readers.Ros1Reader(path) as bag1:
+            topics = _list_topics(bag1.connections, bag1.count_messages())
+            store = get_typestore(Stores.ROS1_NOETIC)
+            yield _Bag(bag1.connections, topics, bag1.messages, store.deserialize_ros1), limit
+    else:
+        with readers.Ros2Reader(path) as bag2:
+            topics = _list_topics(bag2.connections, {one.id: one.msgcount for one in bag2.connections})
+            store = get_typestore(Stores.ROS2_HUMBLE)
+            yield _Bag(bag2.connections, topics, bag2.messages, store.deserialize_cdr), limit
+
+
+@contextmanager
+def _bag_errors(path: Path) -> Iterator[None]:
+    """Convert the exceptions of rosbags, and of the libraries that it uses, to RecordingError."""
+    try:
+        yield
+    except (ImuError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        what = (describe_error(error) or type(error).__name__).rstrip(".")
+        raise RecordingError(f"{path}: is no complete bag ({what}){_describe_remedy(path)}") from error
+
+
+def _describe_remedy(path: Path) -> str:
+    if path.is_file() and is_bag_folder(path.parent):
+        return f"; read the folder {path.parent}, whose {METADATA} states how the messages are compressed"
+    mismatch = table.describe_suffix_mismatch(path) if path.is_file() else ""
+    return mismatch or f"; {REPAIRS.get(path.suffix.lower(), REINDEX)}"
+
+
+def _list_topics(connections: Iterable[Any], counts: Mapping[int, int]) -> list[Topic]:
+    """Return the topics of a bag. Several connections may publish on the same topic."""
+    rows: dict[tuple[str, str], int] = defaultdict(int)
+    for connection in connections:
+        rows[connection.topic, connection.msgtype] += counts.get(connection.id, 0)
+    return [Topic(name, kind, COLUMNS_OF_TYPES.get(kind, ()), count) for (name, kind), count in sorted(rows.items())]
+
+
+def _check_files(path: Path) -> memory_check.RecordingSizeLimits:
+    """Return the size limits of a bag. Raise an error if a file is not a regular file or too large."""
+    from drivers.recordings.ros_bag_readers import iter_unpacked
+
+    files = [path]
+    if path.is_dir():
+        files = [path / METADATA, *sorted(one for one in path.iterdir() if one.suffix in STORAGE_SUFFIXES)]
+    for file in files:
+        check_regular_file(file)
+    if path.is_dir() and files[0].stat().st_size > MAX_METADATA_BYTES:
+        raise RecordingError(f"{files[0]}: has more than {MAX_METADATA_BYTES} bytes; {REINDEX}")
+    size_bytes = sum(file.stat().st_size for file in files)
+    limit = memory_check.RecordingSizeLimits(path, size_bytes, memory_check.available_bytes())
+    unpacked = 0
+    for file in files:
+        if file.suffix == ".zstd":  # rosbags unpacks the file to the folder for temporary files
+            with open_regular_file(file) as packed:
+                for piece in iter_unpacked(packed, "zstd"):
+                    unpacked += len(piece)
+                    limit.check_unpacked_size(unpacked)
+    return limit
+
+
+# --- messages ------------------------------------------------------------------------------------
+
+
+def _read_topic(bag: _Bag, name: str, limit: memory_check.RecordingSizeLimits, notes: list[str]) -> dict[str, Floats]:
+    """Return the columns of a topic. Quantities that no message provides are absent."""
+    connections = [one for one in bag.connections if one.topic == name and one.msgtype in COLUMNS_OF_TYPES]
+    kind = connections[0].msgtype
+    rows = (
+        (log_ns * 1e-9, *_message_numbers(bag.deserialize(data, kind))) for _, log_ns, data in bag.messages(connections)
+    )
+    columns = collect_columns(rows, ("log", "t", *COLUMNS_OF_TYPES[kind]), limit)
+    log_s, stamps = columns.pop("log"), columns["t"]
+    unstamped = int(np.count_nonzero(stamps == 0.0))
+    if 2 * unstamped > stamps.size:
+        what = f"{unstamped} of {stamps.size} messages of {name} have no header stamp"
+        notes.append(f"{what}; the times of the log are used.")
+        columns["t"] = log_s
+    elif unstamped:
+        columns["t"] = np.where(stamps == 0.0, np.nan, stamps)
+    if kind == IMU_TYPE:
+        for axes in (AXES[:3], AXES[3:]):
+            if all(np.isnan(columns[axis]).all() for axis in axes):
+                notes.append(f"The messages of {name} do not provide {' '.join(axes)}.")
+                for axis in axes:
+                    del columns[axis]
+    return columns
+
+
+def _message_numbers(message: Any) -> tuple[float, ...]:
+    """Return the header stamp in s and the values of a message. Values that are not provided are NaN."""
+    stamp = message.header.stamp
+    t_s = stamp.sec + stamp.nanosec * 1e-9
+    if hasattr(message, "temperature"):
+        return t_s, message.temperature
+    gyro, accel = message.angular_velocity, message.linear_acceleration
+    has_gyro = message.angular_velocity_covariance[0] != NOT_PROVIDED
+    has_accel = message.linear_acceleration_covariance[0] != NOT_PROVIDED
+    return (
+        t_s,
+        *((gyro.x, gyro.y, gyro.z) if has_gyro else MISSING),
+        *((accel.x, accel.y, accel.z) if has_accel else MISSING),
+    )

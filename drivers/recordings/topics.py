@@ -1,0 +1,208 @@
+"""Topics of a recording: the choice of the topic to read, and the join of a gyroscope with an accelerometer.
+
+A log of a robot or of an autopilot contains messages of many kinds. A topic is a stream of messages of one kind, such
+as the ROS topic ``/imu/data`` or the second instance of the PX4 topic ``sensor_gyro``.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.data_types import AXES, Floats
+from drivers.errors import ConfigError, RecordingError
+from drivers.module_lookup import format_choices_by_similarity
+from drivers.recordings.memory_check import RecordingSizeLimits
+from drivers.recordings.table import Columns, format_name_list
+
+JOIN: Final = "+"
+"""Separator of two topics that are read as one IMU."""
+GYROS: Final = AXES[:3]
+BLOCK_ROWS: Final = 4096
+"""Number of rows that are converted to arrays at once. As Python objects, a row needs about 400 bytes."""
+MAX_RATE_DIFFERENCE: Final = 0.1
+"""Largest relative difference of the mean rates of two topics that are joined. Lost messages reduce a mean rate."""
+HOW_TO_CHOOSE: Final = "choose with --topic (in a configuration file: topic)"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a file."""
+
+    name: str
+    message_type: str
+    columns: tuple[str, ...]  # columns of a recording that the messages contain; empty for other messages
+    rows: int  # number of messages according to the file
+
+
+def select_topics(
+    path: Path,
+    topics: Sequence[Topic],
+    imus: Sequence[Sequence[str]],
+    wanted: str | None,
+    expected: str,
+    notes: list[str],
+) -> list[str]:
+    """Return the names of the topics to read.
+
+    Parameters
+    ----------
+    path
+        Path of the file, used in error messages.
+    topics
+        All topics of the file.
+    imus
+        Names of the IMUs of the file, grouped by the kind of message. The preferred kind is first. A name may join two
+        topics.
+    wanted
+        Name of a topic, or of several topics separated by JOIN. None selects the only IMU of the file.
+    expected
+        Description of the expected messages, used in error messages.
+    notes
+        List to which a note is appended if the file contains the samples of the IMU in several kinds of messages.
+
+    Raises
+    ------
+    ConfigError
+        If the topic does not exist, has other messages, or has to be chosen.
+    RecordingError
+        If the file contains no samples of an IMU.
+    """
+    readable = [topic.name for topic in topics if topic.columns and topic.rows]
+    every = [name for group in imus for name in group]
+    if wanted is None:
+        if not any(set(topic.columns) & {*AXES} for topic in topics if topic.rows):
+            found = [f"{topic.name} ({topic.message_type})" for topic in topics]
+            has = f"found {format_name_list(found)}" if found else "found no messages"
+            raise RecordingError(f"{path}: contains no samples of an IMU; expected {expected}, {has}")
+        if not every or max(map(len, imus)) > 1:
+            among = every or readable
+            listed = f"contains {len(among)} IMU topics: {format_name_list(among)}"
+            raise ConfigError(f"{path}: {listed}; {HOW_TO_CHOOSE}, such as {among[0]}")
+        if len(every) > 1:
+            notes.append(f"Topic {every[0]} is read; the file also contains {format_name_list(every[1:])}.")
+        wanted = every[0]
+    known = {topic.name: topic for topic in topics}
+    chosen = [known.get(name) or known.get(name.removesuffix(":0")) for name in wanted.split(JOIN)]
+    for name, topic in zip(wanted.split(JOIN), chosen, strict=True):
+        if topic is None:
+            choices = format_choices_by_similarity(name, readable) if readable else f"; it contains no {expected}"
+            raise ConfigError(f'{path}: contains no topic "{name}"{choices}')
+        if not topic.columns:
+            raise ConfigError(
+                f'{path}: topic "{name}" contains {topic.message_type}, expected {expected}'
+                f"{format_choices_by_similarity(name, readable) if readable else ''}"
+            )
+        if not topic.rows:
+            raise RecordingError(f'{path}: topic "{name}" contains no messages')
+    names = list(dict.fromkeys(topic.name for topic in chosen if topic is not None))
+    if not any(axis in known[name].columns for name in names for axis in AXES):
+        raise ConfigError(
+            f'{path}: topic "{wanted}" contains no gyroscope and no accelerometer; '
+            f"add one, as in --topic {readable[0]}{JOIN}{wanted}"
+        )
+    return names
+
+
+def collect_columns(
+    rows: Iterable[Sequence[float]], names: Sequence[str], limit: RecordingSizeLimits
+) -> dict[str, Floats]:
+    """Collect rows as arrays, block by block.
+
+    Parameters
+    ----------
+    rows
+        Rows with one number per column.
+    names
+        Names of the columns.
+    limit
+        Limits on the number of rows.
+    """
+    blocks: list[Floats] = []
+    count = 0
+    for block in iter_row_blocks(rows):
+        count += len(block)
+        limit.check_row_count(count)
+        blocks.append(block)
+    return {name: np.concatenate([np.empty(0), *(block[:, i] for block in blocks)]) for i, name in enumerate(names)}
+
+
+def iter_row_blocks(rows: Iterable[Sequence[float]]) -> Iterator[Floats]:
+    """Yield arrays [n, columns] of up to BLOCK_ROWS rows."""
+    iterator = iter(rows)
+    while block := list(islice(iterator, BLOCK_ROWS)):
+        yield np.array(block, np.float64)
+
+
+def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Floats]:
+    """Join the columns of several topics.
+
+    The first topic determines the rows. The gyroscope comes from the first topic that contains one, and the
+    accelerometer from the last topic that contains one. Values of another topic belong to the row with the nearest time
+    within half a sampling interval. A temperature without axes applies until the next temperature.
+
+    Parameters
+    ----------
+    path
+        Path of the file, used in error messages.
+    tables
+        Columns of each topic, which include ``t``. The first topic contains at least one axis.
+
+    Raises
+    ------
+    ConfigError
+        If two topics with axes have different rates.
+    """
+    first, *others = tables
+    joined = dict(tables[first])
+    for name in others:
+        columns = tables[name]
+        if any(axis in columns for axis in AXES):
+            _check_equal_rates(path, {one: tables[one]["t"] for one in (first, name)})
+            rows = _nearest_rows(joined["t"], columns["t"])
+        else:
+            rows = _preceding_rows(joined["t"], columns["t"])
+        for key, column in columns.items():
+            if key == "t" or (key in GYROS and key in joined):
+                continue
+            joined[key] = np.where(rows < 0, np.nan, column[rows])
+    return joined
+
+
+def _check_equal_rates(path: Path, times: Mapping[str, Floats]) -> None:
+    rates = {name: (t.size - 1) / max(float(t[-1] - t[0]), 1e-9) for name, t in times.items()}
+    if max(rates.values()) > (1.0 + MAX_RATE_DIFFERENCE) * min(rates.values()):
+        what = " and ".join(f"{name} {rate:.4g} Hz" for name, rate in rates.items())
+        raise ConfigError(
+            f"{path}: mixed rates: {what}; only topics with equal rates can be joined; {HOW_TO_CHOOSE} one of them"
+        )
+
+
+def _nearest_rows(t: Floats, other: Floats) -> NDArray[np.intp]:
+    """Return the row of ``other`` that is nearest to each time. -1 marks a time without such a row.
+
+    No row is returned twice, and the distance is at most half the mean sampling interval.
+    """
+    order = np.argsort(other, kind="stable")
+    after = np.clip(np.searchsorted(other[order], t), 1, max(other.size - 1, 1))
+    near = np.minimum(after, other.size - 1)
+    before = near - (other.size > 1)
+    rows = order[np.where(np.abs(t - other[order][before]) <= np.abs(t - other[order][near]), before, near)]
+    distance = np.abs(t - other[rows])
+    by_distance = np.argsort(distance, kind="stable")
+    _, first_use = np.unique(rows[by_distance], return_index=True)
+    used = np.zeros(t.size, np.bool_)
+    used[by_distance[first_use]] = True
+    half_interval_s = 0.5 * (t[-1] - t[0]) / max(t.size - 1, 1)
+    return np.where(used & (distance <= half_interval_s), rows, -1)
+
+
+def _preceding_rows(t: Floats, other: Floats) -> NDArray[np.intp]:
+    """Return the last row of ``other`` that is not later than each time, or -1."""
+    order = np.argsort(other, kind="stable")
+    at = np.searchsorted(other[order], t, side="right") - 1
+    return np.where(at < 0, -1, order[at])

@@ -1,0 +1,365 @@
+"""Recordings in ROS bags and MCAP files, which rosbags has written: samples, topics, damage and memory."""
+
+import bz2
+import contextlib
+import os
+import struct
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2.reader import zstd
+
+from drivers.data_types import AXES, concatenate_blocks
+from drivers.decoders import samples
+from drivers.errors import ConfigError, ImuError, LinkEnded, LinkUnavailable, RecordingError
+from drivers.links import replay_link
+from drivers.recordings import load_samples, memory_check, ros_bag_format, ros_bag_readers, save_samples
+from drivers.recordings.topics import iter_row_blocks
+from monitor.commands.analyze import AnalysisRequest, run_analysis
+from tests.support.ros_bags import KINDS, imu_topic, storage_file, temperature_topic, text_topic, write_bag
+
+START_NS = 1_763_700_000_123_456_789
+GYROS, ACCELS = AXES[:3], AXES[3:]
+
+
+def times_ns(n: int, rate_hz: float = 100.0) -> np.ndarray:
+    return START_NS + np.rint(np.arange(n) / rate_hz * 1e9).astype(np.int64)
+
+
+def seconds(t_ns: np.ndarray) -> np.ndarray:
+    """The stamps in s, as a driver of ROS computes them."""
+    return t_ns // 1_000_000_000 + (t_ns % 1_000_000_000) * 1e-9
+
+
+def noise(n: int, seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(n, 6)) * 1e-2 + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
+
+
+def refusal(path: Path, topic: str | None = None) -> str:
+    """The one line that refuses a bag."""
+    with pytest.raises(ImuError) as error:
+        load_samples(path, topic=topic)
+    line = str(error.value)
+    assert "\n" not in line
+    assert line.startswith(f"{path}")
+    return line
+
+
+def attempt(path: Path) -> None:
+    """Read a bag that is damaged: a recording, or an error of one line."""
+    try:
+        assert len(load_samples(path)) > 0
+    except ImuError as error:
+        line = str(error)
+    else:
+        return
+    assert line.startswith(f"{path}")
+    assert "\n" not in line
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+class TestSamples:
+    def test_a_bag_gives_the_result_of_the_npz_of_its_samples(self, kind: str, tmp_path: Path) -> None:
+        t_ns, values = times_ns(6000), noise(6000)
+        bag = write_bag(tmp_path, kind, {"/imu/data": imu_topic(t_ns, values), "/text": text_topic(t_ns[::50], "x")})
+        save_samples(tmp_path / "same.npz", seconds(t_ns), values)
+        found, same = load_samples(bag), load_samples(tmp_path / "same.npz")
+        assert found.t_s is not None
+        assert found.t_s.tobytes() == same.t_s.tobytes()
+        assert found.values.tobytes() == same.values.tobytes()
+        assert (found.axes, found.notes) == (AXES, ())
+        of_bag, of_npz = (run_analysis(AnalysisRequest(one)).analysis for one in (bag, tmp_path / "same.npz"))
+        assert of_bag.estimate.rate_hz == of_npz.estimate.rate_hz
+        for field in ("value", "lo", "hi"):
+            ours, theirs = (getattr(one.estimate.coefficients, field) for one in (of_bag, of_npz))
+            np.testing.assert_array_equal(ours, theirs)
+
+    @pytest.mark.parametrize("kind", ["sqlite", "mcap", "mcap-chunk"])
+    def test_the_file_alone_is_the_bag(self, kind: str, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(50), noise(50))})
+        assert load_samples(storage_file(bag)).values.tobytes() == load_samples(bag).values.tobytes()
+
+    def test_several_chunks(self, kind: str, tmp_path: Path) -> None:
+        n = 8000  # 2.5 MB; a chunk has 1 MB
+        bag = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(n), noise(n))})
+        assert load_samples(bag).values.tobytes() == noise(n).tobytes()
+
+    @pytest.mark.parametrize(("missing", "axes"), [(GYROS, ACCELS), (ACCELS, GYROS)])
+    def test_what_the_messages_do_not_provide_is_absent(
+        self, missing: tuple[str, ...], axes: tuple[str, ...], tmp_path: Path
+    ) -> None:
+        values = noise(20)
+        values[:, [AXES.index(axis) for axis in missing]] = np.nan
+        for kind in ("ros1", "sqlite"):
+            found = load_samples(write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(20), values)}))
+            assert found.axes == axes
+            assert found.notes == (f"The messages of /imu do not provide {' '.join(missing)}.",)
+
+    def test_without_header_stamps_the_times_of_the_log_are_used(self, kind: str, tmp_path: Path) -> None:
+        t_ns = times_ns(20)
+        bag = write_bag(tmp_path, kind, {"/imu": imu_topic(0 * t_ns, noise(20), log_ns=t_ns)})
+        found = load_samples(bag)
+        assert found.t_s is not None
+        np.testing.assert_allclose(found.t_s, t_ns * 1e-9, rtol=0.0, atol=1e-6)
+        assert found.notes == ("20 of 20 messages of /imu have no header stamp; the times of the log are used.",)
+
+    def test_a_message_without_a_stamp_is_left_out(self, tmp_path: Path) -> None:
+        t_ns = times_ns(20)
+        stamps = np.where(np.arange(20) == 7, 0, t_ns)
+        found = load_samples(write_bag(tmp_path, "mcap", {"/imu": imu_topic(stamps, noise(20), log_ns=t_ns)}))
+        assert len(found) == 19
+        assert "1 of 20 rows have no usable time" in found.notes[0]
+
+    def test_the_end_alone(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "mcap", {"/imu": imu_topic(times_ns(300), noise(300))})
+        assert len(load_samples(bag, last_s=1.0)) == 100
+
+    def test_a_folder_of_ros_1_bags_in_the_order_of_their_numbers(self, tmp_path: Path) -> None:
+        t_ns = times_ns(30)
+        for number, rows in ((0, slice(0, 10)), (2, slice(10, 20)), (10, slice(20, 30))):
+            write_bag(tmp_path, "ros1", {"/imu": imu_topic(t_ns[rows], noise(30)[rows])}, f"run_{number}")
+        found = load_samples(tmp_path)
+        assert found.t_s is not None
+        assert found.t_s.tolist() == seconds(t_ns).tolist()
+        assert found.notes == ()
+
+
+class TestTopics:
+    def test_two_imus_are_listed(self, kind: str, tmp_path: Path) -> None:
+        t_ns = times_ns(20)
+        topics = {name: imu_topic(t_ns, noise(20, seed)) for seed, name in enumerate(("/left/imu", "/right/imu"))}
+        bag = write_bag(tmp_path, kind, topics)
+        assert refusal(bag) == (
+            f"{bag}: contains 2 IMU topics: /left/imu, /right/imu; "
+            "choose with --topic (in a configuration file: topic), such as /left/imu"
+        )
+        assert load_samples(bag, topic="/right/imu").values.tobytes() == noise(20, 1).tobytes()
+
+    def test_an_absent_topic_names_the_nearest_first(self, tmp_path: Path) -> None:
+        topics = {"/a": imu_topic(times_ns(5), noise(5)), "/imu/data": imu_topic(times_ns(5), noise(5))}
+        bag = write_bag(tmp_path, "mcap", topics)
+        assert refusal(bag, "/imu/dat").endswith('contains no topic "/imu/dat"; possible are /imu/data, /a')
+
+    def test_another_type_of_message(self, tmp_path: Path) -> None:
+        topics = {"/imu": imu_topic(times_ns(5), noise(5)), "/odom": text_topic(times_ns(5))}
+        bag = write_bag(tmp_path, "sqlite", topics)
+        assert refusal(bag, "/odom").endswith(
+            'topic "/odom" contains std_msgs/msg/String, expected messages of type sensor_msgs/Imu; possible are /imu'
+        )
+
+    def test_no_imu_at_all(self, kind: str, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, kind, {"/odom": text_topic(times_ns(5))})
+        said = "contains no samples of an IMU; expected messages of type sensor_msgs/Imu, found /odom"
+        assert refusal(bag).endswith(f"{said} (std_msgs/msg/String)")
+        assert refusal(bag, "/odom").endswith("expected messages of type sensor_msgs/Imu")
+
+    def test_a_bag_without_messages(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "mcap", {"/imu": imu_topic(times_ns(0), noise(0)), "/a": text_topic(times_ns(3))})
+        assert "contains no samples of an IMU" in refusal(bag)
+        assert refusal(bag, "/imu").endswith('topic "/imu" contains no messages')
+
+    def test_a_table_has_no_topic(self, tmp_path: Path) -> None:
+        save_samples(tmp_path / "x.csv", np.arange(3.0), noise(3))
+        assert refusal(tmp_path / "x.csv", "/imu").endswith("leave out the topic /imu")
+
+
+class TestJoin:
+    def test_gyroscope_of_one_topic_and_accelerometer_of_another(self, tmp_path: Path) -> None:
+        t_ns, gyro, accel = times_ns(50), noise(50, 1), noise(50, 2)
+        topics = {"/gyro": imu_topic(t_ns, gyro), "/accel": imu_topic(t_ns + 2_000_000, accel)}
+        bag = write_bag(tmp_path, "mcap", topics)
+        found = load_samples(bag, topic="/gyro+/accel")
+        assert found.values.tobytes() == np.hstack([gyro[:, :3], accel[:, 3:]]).tobytes()
+        assert found.t_s is not None
+        assert found.t_s.tolist() == seconds(t_ns).tolist()
+
+    def test_a_lost_message_leaves_a_gap_and_moves_no_other(self, tmp_path: Path) -> None:
+        t_ns, values = times_ns(50), noise(50)
+        kept = np.arange(50) != 20
+        topics = {"/gyro": imu_topic(t_ns, values), "/accel": imu_topic(t_ns[kept] + 1_000_000, values[kept])}
+        found = load_samples(write_bag(tmp_path, "mcap", topics), topic="/gyro+/accel")
+        values[20, 3:] = np.nan
+        np.testing.assert_array_equal(found.values, values)
+
+    def test_mixed_rates(self, tmp_path: Path) -> None:
+        topics = {
+            "/gyro": imu_topic(times_ns(200, 200.0), noise(200)),
+            "/accel": imu_topic(times_ns(63, 63.0), noise(63)),
+        }
+        bag = write_bag(tmp_path, "sqlite", topics)
+        assert "mixed rates: /gyro 200 Hz and /accel 63 Hz" in refusal(bag, "/gyro+/accel")
+
+    def test_a_temperature_applies_until_the_next(self, tmp_path: Path) -> None:
+        t_ns = times_ns(50)
+        warm = temperature_topic(t_ns[5::20], np.array([20.0, 21.0, 22.0]))
+        bag = write_bag(tmp_path, "ros1", {"/imu": imu_topic(t_ns, noise(50)), "/imu/temperature": warm})
+        assert np.isnan(load_samples(bag).temperature_c).all()
+        found = load_samples(bag, topic="/imu+/imu/temperature")
+        assert found.values.tobytes() == noise(50).tobytes()
+        expected = np.repeat([np.nan, 20.0, 21.0, 22.0], [5, 20, 20, 5])
+        np.testing.assert_array_equal(found.temperature_c, expected)
+
+    def test_a_temperature_alone_is_no_recording(self, tmp_path: Path) -> None:
+        topics = {"/imu": imu_topic(times_ns(9), noise(9)), "/warm": temperature_topic(times_ns(9), np.ones(9))}
+        bag = write_bag(tmp_path, "ros1", topics)
+        assert refusal(bag, "/warm").endswith("add one, as in --topic /imu+/warm")
+
+
+class TestDamage:
+    @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.999])
+    def test_a_file_that_is_cut_off(self, kind: str, share: float, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(2000), noise(2000))})
+        file = storage_file(bag)
+        data = file.read_bytes()
+        file.write_bytes(data[: int(share * len(data))])
+        said = refusal(bag)
+        assert "cut off" in said or "is no complete bag" in said
+
+    @pytest.mark.parametrize(
+        ("kind", "remedy"),
+        [("ros1", "`rosbag reindex`"), ("mcap", "`mcap recover run.mcap -o indexed.mcap`"), ("sqlite", "folder")],
+    )
+    def test_the_line_names_the_remedy(self, kind: str, remedy: str, tmp_path: Path) -> None:
+        file = storage_file(write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(2000), noise(2000))}))
+        file.write_bytes(file.read_bytes()[:50_000])
+        assert remedy in refusal(file)
+
+    def test_a_ros_1_bag_without_an_index(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "ros1", {"/imu": imu_topic(times_ns(20), noise(20))})
+        data = bag.read_bytes()
+        at = data.index(b"index_pos=") + len(b"index_pos=")
+        bag.write_bytes(data[:at] + bytes(8) + data[at + 8 :])  # as a recorder leaves it after a crash
+        assert "Bag is not indexed" in refusal(bag)
+
+    def test_an_mcap_file_without_an_index(self, tmp_path: Path) -> None:
+        file = storage_file(write_bag(tmp_path, "mcap", {"/imu": imu_topic(times_ns(20), noise(20))}))
+        data = file.read_bytes()
+        (summary,) = struct.unpack_from("<Q", data, len(data) - 28)
+        footer = struct.pack("<BQQQI", 2, 20, 0, 0, 0) + data[-8:]
+        file.write_bytes(data[:summary] + footer)
+        assert refusal(file).endswith(
+            "is not indexed; expected an MCAP file with a summary section that lists schemas and chunks; "
+            "`mcap recover run.mcap -o indexed.mcap` writes an indexed copy"
+        )
+
+    def test_a_missing_file(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "sqlite", {"/imu": imu_topic(times_ns(20), noise(20))})
+        storage_file(bag).unlink()
+        assert "files are missing" in refusal(bag)
+
+    def test_a_fifo_in_a_bag_is_not_waited_for(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "sqlite", {"/imu": imu_topic(times_ns(20), noise(20))})
+        file = storage_file(bag)
+        file.unlink()
+        os.mkfifo(file)
+        with pytest.raises(RecordingError, match="is a FIFO, not a regular file"):
+            load_samples(bag)
+
+    def test_other_content_is_named(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "ros1", {"/imu": imu_topic(times_ns(20), noise(20))})
+        other = bag.rename(tmp_path / "run.mcap")
+        assert refusal(other).endswith("its content is a ROS 1 bag: rename it to end in .bag")
+
+    def test_flipped_bytes_end_in_one_line_or_a_recording(self, kind: str, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(60), noise(60))})
+        file, rng = storage_file(bag), np.random.default_rng(5)
+        data = file.read_bytes()
+        for _ in range(60):
+            damaged = bytearray(data)
+            for at in rng.integers(0, len(data), 3):
+                damaged[at] = rng.integers(256)
+            file.write_bytes(damaged)
+            attempt(bag)
+
+
+class TestMemory:
+    @pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap-chunk"])
+    def test_a_longer_bag_needs_no_more_memory(self, kind: str, tmp_path: Path) -> None:
+        peaks = []
+        for n in (8_000, 32_000):
+            path = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(n), noise(n))}, f"run{n}")
+            tracemalloc.start()
+            with ros_bag_format._open_bag(path) as (bag, _):
+                assert sum(1 for _ in bag.messages(bag.connections)) == n
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+        assert peaks[1] < 1.1 * peaks[0]
+
+    @pytest.mark.parametrize("kind", ["ros1-bz2", "ros1-lz4", "mcap-chunk", "sqlite-message", "mcap-message"])
+    def test_messages_that_unpack_to_more_than_the_limit(
+        self, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        bag = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(500), noise(500))})
+        load_samples(bag)
+        for name in ("MAX_CHUNK_BYTES", "MAX_MESSAGE_BYTES"):
+            monkeypatch.setattr(ros_bag_readers, name, 300)
+        assert "messages unpack to more than 0.0003 MB at a time" in refusal(bag)
+
+    def test_a_file_that_unpacks_to_more_than_the_limit(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        bag = write_bag(tmp_path, "sqlite-file", {"/imu": imu_topic(times_ns(500), np.zeros((500, 6)))})
+        monkeypatch.setattr(memory_check, "MIN_UNPACKED_LIMIT_BYTES", 1000)
+        monkeypatch.setattr(memory_check, "MAX_UNPACKING_RATIO", 1)
+        assert "unpacks to more than" in refusal(bag)
+
+    @pytest.mark.parametrize("pack", [bz2.compress, zstd.compress])
+    def test_unpacking_stops_at_the_limit(self, pack: object, tmp_path: Path) -> None:
+        packed = pack(bytes(50_000_000))  # type: ignore[operator]
+        name = "bz2" if pack is bz2.compress else "zstd"
+        tracemalloc.start()
+        with pytest.raises(RecordingError, match="more than 2 MB"):
+            ros_bag_readers.unpack(tmp_path, packed, name, 2_000_000)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 5_000_000
+        assert ros_bag_readers.unpack(tmp_path, pack(b"a") + pack(b"b"), name, 2) == b"ab"  # type: ignore[operator]
+
+    def test_chunks_whose_times_overlap_count_together(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        n = 20_000
+        bag = write_bag(tmp_path, "mcap", {"/imu": imu_topic(times_ns(n), noise(n))})
+        monkeypatch.setattr(ros_bag_readers, "MAX_CHUNK_BYTES", 1_500_000)
+        load_samples(bag)
+        file = storage_file(bag)
+        data = bytearray(file.read_bytes())
+        (summary,) = struct.unpack_from("<Q", data, len(data) - 28)
+        at = summary
+        while data[at] != 0x02:
+            if data[at] == 0x08:
+                struct.pack_into("<QQ", data, at + 9, START_NS, START_NS + 1_000_000_000_000)
+            at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+        file.write_bytes(data)
+        assert "messages unpack to more than 1.5 MB at a time" in refusal(bag)
+
+    def test_rows_that_do_not_fit_are_refused(self, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        bag = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(500), noise(500))})
+        monkeypatch.setattr(memory_check, "available_bytes", lambda: 50_000)
+        with pytest.raises(ConfigError, match=r"more than 0\.0 GB of memory would be needed"):
+            load_samples(bag)
+
+    def test_blocks_of_rows(self) -> None:
+        blocks = list(iter_row_blocks((float(i), 1.0) for i in range(10_000)))
+        assert max(map(len, blocks)) <= 4096
+        assert np.concatenate(blocks)[:, 0].tolist() == list(range(10_000))
+
+
+def test_the_replay_of_a_bag(tmp_path: Path) -> None:
+    t_ns = times_ns(500)
+    topics = {"/left/imu": imu_topic(t_ns, noise(500, 1)), "/right/imu": imu_topic(t_ns, noise(500, 2))}
+    bag = write_bag(tmp_path, "mcap", topics)
+    keys = {"path": str(bag), "speed": "max"}
+    link = replay_link.build(replay_link.Settings.model_validate({**keys, "topic": "/right/imu"}))
+    chunks = []
+    with contextlib.closing(link), contextlib.suppress(LinkEnded):
+        link.open()
+        while True:
+            chunks += link.wait_for_chunks_or_timeout(0.1) or []
+    got = concatenate_blocks(samples.build(samples.Settings()).feed(chunks))
+    assert got.values.tobytes() == noise(500, 2).tobytes()
+    np.testing.assert_allclose(got.t_ns, t_ns, rtol=0.0, atol=500)
+    with pytest.raises(LinkUnavailable, match=r"contains 2 IMU topics: /left/imu, /right/imu"):
+        replay_link.build(replay_link.Settings.model_validate(keys)).open()
