@@ -106,6 +106,7 @@ def _open_log(path: Path, limit: memory_check.RecordingSizeLimits) -> Iterator[A
 
         def init_arrays_fast(self, progress_callback: Any = None) -> None:
             """Find the messages in Python, because the compiled function prints a line for each damaged byte."""
+            self.formats = _Formats(vars(self)["formats"])
             self.init_arrays(progress_callback)
 
     if not is_ardupilot_log(path):
@@ -124,6 +125,14 @@ def _open_log(path: Path, limit: memory_check.RecordingSizeLimits) -> Iterator[A
             if name in vars(log):
                 with suppress(BufferError):  # arrays that refer to the file are still in use
                     getattr(log, name).close()
+
+
+class _Formats(dict[int, Any]):
+    """Layouts of messages by their number. pymavlink would not end if a message had no bytes."""
+
+    def __setitem__(self, number: int, form: Any) -> None:
+        if form.len > HEAD_BYTES:
+            super().__setitem__(number, form)
 
 
 def _discard(*_: object, **__: object) -> None:

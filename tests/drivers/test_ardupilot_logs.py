@@ -181,6 +181,12 @@ class TestDamage:
         assert found.notes == (f"The log is damaged at byte {at} of {len(data) + 3} and was read up to there.",)
         assert capfd.readouterr() == ("", "")
 
+    def test_messages_without_bytes(self, tmp_path: Path) -> None:
+        data = bytearray(dataflash_bytes([imu(times_us(300), noise(300))]))
+        data[89 + 4] = 0  # the length in the second message, which describes IMU
+        (tmp_path / "x.bin").write_bytes(data)
+        assert "contains no samples of an IMU" in refusal(tmp_path / "x.bin")
+
     def test_a_layout_of_another_length(self, tmp_path: Path) -> None:
         rows = table_of(TimeUS=times_us(3).astype("<u8"), GyrX=np.ones(3, "<f4"))
         path = write_dataflash(tmp_path / "x.bin", Messages("IMU", rows, "Qd"))
