@@ -19,7 +19,7 @@ MAX_WORKERS: Final = 12
 LONG_FOLDERS: Final = {"benchmarks", "blind", "fuzz", "system"}
 """End-to-end, fault, network and fuzzing tests, blind trials of the reconciliation, and tests of the benchmarks."""
 
-# Hypothesis limits each example to 200 ms, and the generation of its input, by the clock on the wall.
+# By default, Hypothesis limits the elapsed time of each example to 200 ms. A loaded machine exceeds this limit.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
@@ -44,10 +44,10 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if session.config.option.collectonly:
         return
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-    compile_kernels(_say_nothing if reporter is None else reporter.write_line)
+    compile_kernels(_ignore_line if reporter is None else reporter.write_line)
 
 
-def _say_nothing(_line: str) -> None: ...
+def _ignore_line(_line: str) -> None: ...
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -64,7 +64,7 @@ def pytest_unconfigure() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _no_identifier_left() -> Iterator[None]:
+def _wait_for_drift_threads() -> Iterator[None]:
     """Wait for the threads that identify a drift.
 
     pytest and SciPy both set warning filters, which apply to the whole process. A thread that outlives its test would

@@ -1,4 +1,4 @@
-"""The pages say what is so: commands, keys, settings, links, names of functions, and the programs printed in them."""
+"""Tests that the documentation agrees with the program: commands, keys, settings, links, names and example programs."""
 
 import ast
 import re
@@ -23,115 +23,133 @@ from monitor.cli import app
 from monitor.common import topics
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
+from monitor.publishing.exporters import FORMATS as EXPORT_FORMATS
+from monitor.publishing.exporters.estimator_parameters import PARAMETER_FILES
 from monitor.publishing.messages.results import CoefficientsMessage
 from monitor.publishing.rerun.sinks import server_url
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings import loading
 from monitor.settings.loading import ZenohTable
-from tests.monitor.publishing.made import estimate
+from tests.monitor.publishing.example_results import make_estimate
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 ARCHITECTURE = ROOT / "docs" / "architecture.md"
-NOT_DRAWN = {"extras", "file_access", "module_lookup", "number_ranges", "settings_model"}
-"""Small modules without a box of their own in the diagram."""
+MODULES_NOT_IN_DIAGRAM = {"extras", "file_access", "module_lookup", "number_ranges", "settings_model"}
+"""Small modules that the diagram of the layers does not show."""
 SIMULATOR = ROOT / "docs" / "simulator.md"
+EXPORT = ROOT / "docs" / "export.md"
 COMMANDS_PAGE = ROOT / "docs" / "commands.md"
 MESSAGES = ROOT / "docs" / "messages.md"
 DECODERS = ROOT / "docs" / "decoders.md"
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 PAGES = sorted([README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-PRINTED_BY = "tcp/127.0.0.1:7450"
+ENDPOINT_IN_PAGES = "tcp/127.0.0.1:7450"
 
 
-def options(command: str) -> set[str]:
-    """All that a command takes, or its own commands do."""
-    each = [COMMANDS[command], *getattr(COMMANDS[command], "commands", {}).values()]
+def list_options(command: str) -> set[str]:
+    """Return the visible options of a command and of its subcommands."""
+    commands = [COMMANDS[command], *getattr(COMMANDS[command], "commands", {}).values()]
     return {
         option
-        for one in each
-        for parameter in one.params
+        for item in commands
+        for parameter in item.params
         for option in parameter.opts
         if option.startswith("--") and not getattr(parameter, "hidden", False)
     }
 
 
-def title(page: Path) -> str:
+def get_title(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-def fences(page: Path, language: str) -> list[str]:
+def find_code_blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
 
 
-def code(page: Path) -> list[str]:
-    """All that is set as code: fenced blocks, and spans between backticks in the rest."""
+def find_code(page: Path) -> list[str]:
+    """Return all code of a page: the fenced blocks, and the spans between backticks in the other text."""
     text = page.read_text("utf-8")
     fenced = re.findall(r"^```\w*\n(.*?)^```", text, re.M | re.S)
     return fenced + re.findall(r"`([^`]+)`", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
 
 
-def section(page: Path, heading: str) -> str:
+def get_section(page: Path, heading: str) -> str:
     parts = re.split(r"^## ", page.read_text("utf-8"), flags=re.M)
     return next(part for part in parts if part.startswith(heading + "\n"))
 
 
-def first_cells(text: str) -> list[str]:
-    """The code in the first column of the section's tables."""
+def find_first_cells(text: str) -> list[str]:
+    """Return the code in the first column of the tables in a text."""
     return re.findall(r"^\| `([^`]+)` \|", text, re.M)
 
 
 # --- settings and commands
 
 
-@pytest.mark.parametrize("toml", [t for page in PAGES for t in fences(page, "toml") if "[[device]]" in t])
-def test_every_configuration_is_one(toml: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("toml", [t for page in PAGES for t in find_code_blocks(page, "toml") if "[[device]]" in t])
+def test_every_configuration_is_valid(toml: str, tmp_path: Path) -> None:
     (tmp_path / "recording.csv").write_text("t,gz\n0.00,0.1\n0.01,0.2\n")
     (tmp_path / "page.toml").write_text(toml)
     assert loading.examine_config_file(tmp_path / "page.toml").wrong == []
 
 
-@pytest.mark.parametrize("toml", [t for page in PAGES for t in fences(page, "toml") if "angle_random_walk]" in t])
-def test_every_model_is_one_that_can_be_simulated(toml: str) -> None:
+@pytest.mark.parametrize(
+    "toml", [t for page in PAGES for t in find_code_blocks(page, "toml") if "angle_random_walk]" in t]
+)
+def test_every_noise_model_can_be_simulated(toml: str) -> None:
     model = NoiseModel.from_toml(toml)
     assert model.sample_rate_hz is not None
     model.start_stream(model.sample_rate_hz, 1).draw_next_samples(10)
 
 
-def test_the_catalogue_is_that_of_the_folder() -> None:
-    rows = re.findall(r"^\| `([^`]+)` \|.*\| ([\d.]+) \|$", section(SIMULATOR, "The catalogue"), re.M)
+def test_the_tables_of_exports_list_every_format_and_parameter() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \|(.*)$", get_section(EXPORT, "Formats"), re.M))
+    assert rows.keys() == EXPORT_FORMATS.keys()
+    assert set(re.findall(r"^\| `(\w+)` \|", get_section(EXPORT, "Sources and checks"), re.M)) == set(EXPORT_FORMATS)
+    for file in PARAMETER_FILES:
+        names = set(re.findall(r"`([\w.]+)`", rows[file.name]))
+        written = {parameter.name for parameter in file.parameters}
+        assert written <= names or "kalibr" in names
+        for letter in {parameter.letter for parameter in file.parameters}:
+            formula = file.quantity.formula(letter).replace("^2", "²").replace("sqrt(dt)", "√dt")
+            assert formula in rows[file.name].split("|")[3]
+
+
+def test_catalogue_lists_the_model_files() -> None:
+    rows = re.findall(r"^\| `([^`]+)` \|.*\| ([\d.]+) \|$", get_section(SIMULATOR, "The catalogue"), re.M)
     models = [(path.stem, read_model(path)) for path in sorted((ROOT / "config" / "models").glob("*.toml"))]
     assert rows == [(name, f"{model.sample_rate_hz:g}") for name, model in models]
 
 
-def test_the_configurations_show_every_link() -> None:
-    shown = {found for toml in fences(README, "toml") for found in re.findall(r'link = "(\w+)"', toml)}
+def test_configurations_show_every_link() -> None:
+    shown = {found for toml in find_code_blocks(README, "toml") for found in re.findall(r'link = "(\w+)"', toml)}
     assert shown == {"serial", "can", "zenoh", "replay"}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=title)
-def test_every_command_is_one(page: Path) -> None:
-    for text in code(page):
+@pytest.mark.parametrize("page", PAGES, ids=get_title)
+def test_every_command_and_option_exists(page: Path) -> None:
+    for text in find_code(page):
         for line in text.splitlines():
             for word, rest in re.findall(r"\bimu-monitor ([a-z][\w-]*)(.*)", line):
                 assert word in COMMANDS, line
-                assert set(re.findall(r"--[a-z-]+", rest)) <= options(word), line
+                assert set(re.findall(r"--[a-z-]+", rest)) <= list_options(word), line
 
 
-def test_the_table_has_every_command_and_its_options() -> None:
+def test_command_tables_are_complete() -> None:
     row = r"^\| `imu-monitor ([\w-]+)[^`]*` \|(.*)"
     rows = re.findall(row, COMMANDS_PAGE.read_text("utf-8"), re.M)
     assert [name for name, _ in rows] == list(COMMANDS)
-    assert [name for name, _ in re.findall(row, section(README, "Commands"), re.M)] == list(COMMANDS)
+    assert [name for name, _ in re.findall(row, get_section(README, "Commands"), re.M)] == list(COMMANDS)
     everywhere = {"--help", "--seconds", "--viewer"}
     for name, row in rows:
-        assert options(name) - everywhere == set(re.findall(r"--[a-z-]+", row)), name
+        assert list_options(name) - everywhere == set(re.findall(r"--[a-z-]+", row)), name
 
 
-def test_the_viewers_address_is_the_one_it_listens_on() -> None:
+def test_viewer_address_has_the_default_ports() -> None:
     own = loading.ViewerTable()
     page = f"http://127.0.0.1:{own.web_port}/?url={quote(server_url(own.port), safe='')}"
     assert f"`{page}`" in README.read_text("utf-8")
@@ -141,72 +159,71 @@ def test_the_viewers_address_is_the_one_it_listens_on() -> None:
 # --- tables
 
 
-def test_the_keys_are_those_that_are_published() -> None:
+def test_zenoh_keys_are_those_that_are_published() -> None:
     rows = re.findall(r"^\| `(imu/[^`]+)` \| (\S*) ?\|", MESSAGES.read_text("utf-8"), re.M)
     encodings = {topics.JSON: "JSON", topics.MSGPACK: "msgpack", "": ""}
     published = [(topic.key("imu", "<device>"), encodings[topic.encoding]) for topic in topics.TOPICS]
     assert sorted(rows) == sorted(published)
 
 
-def test_the_kinds_of_events_are_those_that_a_hook_may_wait_for() -> None:
+def test_event_kinds_in_pages_and_sources_are_those_that_hooks_accept() -> None:
     (row,) = re.findall(r"^\| `imu/<device>/event` \|.*$", MESSAGES.read_text("utf-8"), re.M)
     assert sorted(re.findall(r"`(\w+)`", row)) == sorted(EVENT_KINDS)
-    made = re.compile(
+    event_pattern = re.compile(
         r'(?:Event\(|Told\([\w.]+, |_event\(|announce\([\w.]+, |^(?:KIND|CROSSED|BACK): Final = )"([a-z]+_[a-z_]+)"',
         re.M,
     )
     sources = [*ROOT.glob("drivers/**/*.py"), *ROOT.glob("monitor/**/*.py")]
-    said = {
-        kind for path in sources if "Event" in path.read_text("utf-8") for kind in made.findall(path.read_text("utf-8"))
-    }
-    assert len(said) > 5
-    assert said <= set(EVENT_KINDS)
+    texts = [text for path in sources if "Event" in (text := path.read_text("utf-8"))]
+    kinds = {kind for text in texts for kind in event_pattern.findall(text)}
+    assert len(kinds) > 5
+    assert kinds <= set(EVENT_KINDS)
 
 
-def test_the_protocols_are_those_that_are_decoded() -> None:
-    assert sorted(first_cells(DECODERS.read_text("utf-8"))) == sorted(module_lookup.list_modules(drivers.decoders))
+def test_protocol_table_lists_every_decoder() -> None:
+    assert sorted(find_first_cells(DECODERS.read_text("utf-8"))) == sorted(module_lookup.list_modules(drivers.decoders))
 
 
-def test_every_kind_of_recording_is_named() -> None:
-    named = re.findall(r"\.[a-z0-9.]+", next(t for t in fences(README, "toml") if "recording.csv" in t))
+def test_every_recording_format_is_named() -> None:
+    named = re.findall(r"\.[a-z0-9.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
     assert set(FORMATS) <= set(named)
 
 
 # --- links, pictures, files, names
 
 
-@pytest.mark.parametrize("page", PAGES, ids=title)
-def test_every_link_leads_somewhere(page: Path) -> None:
+@pytest.mark.parametrize("page", PAGES, ids=get_title)
+def test_every_hyperlink_target_exists(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.M | re.S)
     for alt, target in re.findall(r"!?\[([^\]]+)\]\(([^)]+)\)", text):
         assert alt
         if not re.match(r"https?://", target):
             assert (page.parent / target.partition("#")[0]).exists(), target
-    assert "![](" not in text, "a picture without words for those who cannot see it"
+    assert "![](" not in text, "an image without alternative text"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=title)
-def test_every_file_named_is_there(page: Path) -> None:
-    for text in code(page):
+@pytest.mark.parametrize("page", PAGES, ids=get_title)
+def test_every_named_file_exists(page: Path) -> None:
+    for text in find_code(page):
         for path in re.findall(r"(?<![\w/-])((?:monitor|drivers|config|tests|docs)/[\w./-]*\w)", text):
             assert (ROOT / path).exists(), path
 
 
-def test_the_layers_drawn_are_those_of_the_contracts_in_their_order() -> None:
+def test_diagram_shows_the_layers_of_the_import_contracts_in_order() -> None:
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
-    drawn = section(ARCHITECTURE, "Layers")
-    for contract in (one for one in contracts if one["type"] == "layers"):
-        places = []
+    drawn = get_section(ARCHITECTURE, "Layers")
+    for contract in (item for item in contracts if item["type"] == "layers"):
+        positions = []
         for layer in contract["layers"]:
             names = [name.rpartition(".")[2] for name in layer.split(" | ")]
             found = [match.start() for name in names for match in re.finditer(rf"\b{name}\[", drawn)]
-            assert found or set(names) <= NOT_DRAWN, layer
-            places += found[:1]
-        assert places == sorted(places)
+            assert found or set(names) <= MODULES_NOT_IN_DIAGRAM, layer
+            positions += found[:1]
+        assert positions == sorted(positions)
 
 
-def defined() -> set[str]:
-    """What the sources define: ``module``, ``name``, ``Class.method``, ``module.function``."""
+def list_defined_names() -> set[str]:
+    """Return all names that the sources define: ``module``, ``name``, ``Class.method``, ``module.function``."""
     names: set[str] = set()
     for path in [*ROOT.glob("drivers/**/*.py"), *ROOT.glob("monitor/**/*.py")]:
         names.add(path.stem)
@@ -230,25 +247,25 @@ def defined() -> set[str]:
     ids=["contributing", "data flow", "threads"],
 )
 def test_every_name_in_the_text_is_defined(page: Path, heading: str) -> None:
-    said = re.findall(r"`([A-Z]\w+\.\w+|[a-z]\w+\.[a-z]\w+|[A-Z][a-z]\w+|[a-z_]+)`", section(page, heading))
-    assert len(said) >= 3
-    assert set(said) <= defined()
+    mentioned = re.findall(r"`([A-Z]\w+\.\w+|[a-z]\w+\.[a-z]\w+|[A-Z][a-z]\w+|[a-z_]+)`", get_section(page, heading))
+    assert len(mentioned) >= 3
+    assert set(mentioned) <= list_defined_names()
 
 
 # --- programs
 
 
-def first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]", zenoh: ZenohPublisher) -> str:
-    """What a program prints first, while results are published ten times a second."""
+def read_first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]", zenoh: ZenohPublisher) -> str:
+    """Return the first line that a program prints, while results are published ten times a second."""
     with selectors.DefaultSelector() as selector:
         selector.register(stdout, selectors.EVENT_READ)
 
-        def printed() -> str:
+        def publish_and_read() -> str:
             for topic, payload in publish:
                 zenoh.put(topic, "bench-1", payload)
             return stdout.readline() if selector.select(0.1) else ""
 
-        return wait_for(printed, "a line of the program")
+        return wait_for(publish_and_read, "a line of the program")
 
 
 @pytest.mark.parametrize(
@@ -256,24 +273,24 @@ def first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]", zen
     [(README, "estimated"), (ROOT / "docs" / "samples-format.md", "9.81")],
     ids=["coefficients", "samples"],
 )
-def test_a_subscriber_as_printed_prints_what_is_published(page: Path, word: str) -> None:
+def test_subscriber_example_prints_the_published_results(page: Path, word: str) -> None:
     endpoint = free_endpoint()
-    [program] = [text for text in fences(page, "python") if "declare_subscriber" in text]
-    assert PRINTED_BY in program
+    [program] = [text for text in find_code_blocks(page, "python") if "declare_subscriber" in text]
+    assert ENDPOINT_IN_PAGES in program
     rows = make_block(np.arange(2) * 10_000_000, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 9.81], (2, 1)))
     results = [
-        (topics.COEFFICIENTS, CoefficientsMessage.from_result("bench-1", 1.76e9, 0, estimate()).encode()),
+        (topics.COEFFICIENTS, CoefficientsMessage.from_result("bench-1", 1.76e9, 0, make_estimate()).encode()),
         (topics.SAMPLES, encode_samples("bench-1", 2, rows)),
     ]
     zenoh = ZenohPublisher(ZenohTable(listen=(endpoint,)), ["bench-1"])
     zenoh.start()
     try:
         wait_for(lambda: zenoh.state == "ok")
-        command = [sys.executable, "-u", "-c", program.replace(PRINTED_BY, endpoint)]
+        command = [sys.executable, "-u", "-c", program.replace(ENDPOINT_IN_PAGES, endpoint)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             try:
                 assert process.stdout is not None
-                line = first_line(process.stdout, results, zenoh)
+                line = read_first_line(process.stdout, results, zenoh)
             finally:
                 process.kill()
     finally:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from drivers.errors import NotReady
+from drivers.errors import ConfigError, NotReady, make_printable_and_shorten
 from monitor.cli.shared import options, output
 
 
@@ -24,6 +24,13 @@ def analyze(
         ),
     ] = None,
     rest: Annotated[bool, typer.Option("--rest", help="Leave out periods in which the sensor moved.")] = False,
+    units: Annotated[
+        str,
+        typer.Option(
+            metavar="imu|datasheet|si",
+            help="Units of table and plot: °/√h, with noise density in m°/s/√Hz, or rad/s/√Hz.",
+        ),
+    ] = "imu",
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     plot: Annotated[
         Path | None,
@@ -32,8 +39,11 @@ def analyze(
 ) -> None:
     """Print the Allan deviations, noise coefficients Q, N, B, K, R, motion and noise changes of a recording."""
     from monitor.commands import analyze as offline
+    from monitor.common.unit_formatting import UNIT_SYSTEMS
     from monitor.publishing.messages.analysis_json import AnalysisMessage, FailedAnalysisMessage
 
+    if units not in UNIT_SYSTEMS:
+        raise ConfigError(f'--units: "{make_printable_and_shorten(units)}"; possible are {", ".join(UNIT_SYSTEMS)}')
     output.check_output_file("--plot", plot, ".png", ".html")
     window_s = options.parse_duration("--window", window)
     last_s = options.parse_duration("--last", last)
@@ -56,8 +66,8 @@ def analyze(
         )
         output.write_file_or_stdout("--json", json, message.encode() + b"\n")
     if plot is not None:
-        offline.save_plot_or_report(results, plot, recording.name)
+        offline.save_plot_or_report(results, plot, recording.name, UNIT_SYSTEMS[units])
     if json != Path("-"):
-        output.print_analysis(results.analysis)
+        output.print_analysis(results.analysis, UNIT_SYSTEMS[units])
     if results.lacking:
         raise NotReady(results.lacking)

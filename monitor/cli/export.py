@@ -1,39 +1,73 @@
 """Command ``export``: writes noise parameters for other tools."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from monitor.cli.shared import options, output
 
+if TYPE_CHECKING:
+    from monitor.publishing.exporters import NoiseCoefficients
+
+OPTION_NAMES: Final = {"dt_s": "--dt", "correlation_time_s": "--correlation-time", "rostopic": "--rostopic"}
+
 
 def export(
-    source: Annotated[
-        Path,
-        typer.Argument(metavar="MODEL.toml|RESULT.json", help="Model, or JSON of analyze; - = standard input."),
-    ],
     target_format: Annotated[
-        str, typer.Option("--format", metavar="kalibr|gyroparams|kalman", help="Tool that reads the parameters.")
+        str,
+        typer.Option(
+            "--format",
+            metavar="kalibr|allan_variance_ros|openvins|vins_fusion|orb_slam3|lio_sam|fast_lio|gtsam|px4_ekf2|"
+            "ardupilot_ekf3|robot_localization|imu_utils|gnss_ins_sim|gyroparams|kalman",
+            help="Program that reads the parameters.",
+        ),
     ],
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[MODEL.toml|NAME|RESULT.json]",
+            help="Model, name of a shipped model, or JSON of analyze; - = standard input.",
+        ),
+    ] = None,
     inflation: options.Inflation = 1.0,
     dt: options.TimeStep = None,
     correlation_time: options.CorrelationTime = None,
-    rostopic: Annotated[
-        str | None, typer.Option(metavar="T", help="kalibr: topic of the IMU; /imu0 by default.")
+    rostopic: Annotated[str | None, typer.Option(metavar="T", help="Topic of the IMU; /imu0 by default.")] = None,
+    connect: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help="Use the results of a running daemon, tcp/127.0.0.1:7450.")
     ] = None,
+    zenoh: options.ZenohFile = None,
+    prefix: options.Prefix = "imu",
+    device: options.DeviceName = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="File to write; by default standard output.")] = None,
 ) -> None:
-    """Write noise parameters for other tools: Kalibr's imu.yaml, MATLAB's gyroparams, F and Q of a Kalman filter."""
-    from monitor.publishing import exporters as exports
+    """Write noise parameters in the file formats of other programs: estimators, calibration programs, simulators."""
+    from monitor.publishing import exporters
 
     keys = {"dt_s": dt, "correlation_time_s": correlation_time, "rostopic": rostopic}
-    belong = {"dt_s": "kalman", "correlation_time_s": "kalman", "rostopic": "kalibr"}
     given = {name: value for name, value in keys.items() if value is not None}
     for name in given:
-        if target_format in exports.FORMATS and target_format != belong[name]:
-            option = name.removesuffix("_s").replace("_", "-")
-            raise ConfigError(f"--{option}: belongs to --format {belong[name]}, not {target_format}")
-    text = exports.export(options.read_noise_coefficients(source), target_format, inflation, **given)
+        belong = [one for one, exporter in exporters.FORMATS.items() if name in exporter.options]
+        if target_format in exporters.FORMATS and target_format not in belong:
+            raise ConfigError(f"{OPTION_NAMES[name]}: belongs to --format {', '.join(belong)}, not {target_format}")
+    live = connect is not None or zenoh is not None
+    if live == (source is not None):
+        raise ConfigError("give either a model or the JSON of analyze, or --connect ENDPOINT for a running daemon")
+    noise = (
+        options.read_noise_coefficients(source) if source is not None else _from_daemon(connect, zenoh, prefix, device)
+    )
+    text = exporters.export(noise, target_format, inflation, **given)
     output.write_file_or_stdout("--out", out or Path("-"), text.encode())
+
+
+def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> "NoiseCoefficients":
+    """Return the coefficients that a running daemon publishes at present."""
+    from monitor.publishing import exporters
+    from monitor.publishing.zenoh.coefficients_client import receive_coefficients
+
+    found = receive_coefficients(endpoint, name, prefix, file)
+    device = options.select_device(name, list(found), mask_secrets(endpoint or str(file)), "result")
+    return exporters.from_analysis_json(found[device], f"device {device}, live")

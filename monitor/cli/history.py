@@ -30,8 +30,8 @@ def history(
         str | None, typer.Option(metavar="ENDPOINT", help="Query a running daemon instead, e.g. tcp/127.0.0.1:7450.")
     ] = None,
     zenoh: options.ZenohFile = None,
-    prefix: Annotated[str, typer.Option(metavar="KEY", help="Prefix of the keys of the daemon.")] = "imu",
-    device: Annotated[str | None, typer.Option(metavar="NAME", help="Device; needed if there are several.")] = None,
+    prefix: options.Prefix = "imu",
+    device: options.DeviceName = None,
     since: Annotated[
         str | None,
         typer.Option("--from", metavar="T", help="Start: -1d, 2026-11-20, 2026-11-20T14:30; by default -1d."),
@@ -112,7 +112,7 @@ def _from_file(source: Path | None, name: str | None) -> Get:
         raise ConfigError("CONFIG.toml or a folder is needed, or --connect ENDPOINT for a running daemon")
     path = _history_path(source)
     with open_history(path) as reader:
-        device = _select_device(name, list(reader.list_devices()), str(path))
+        device = options.select_device(name, list(reader.list_devices()), str(path), "history")
 
     def query_file(query: "HistoryQuery") -> "HistoryTable":
         with open_history(path) as reader:
@@ -128,7 +128,7 @@ def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str
         found = {
             one.device: one for one in query_histories(endpoint, name or "*", query.format_parameters(), prefix, file)
         }
-        return found[_select_device(name, list(found), mask_secrets(endpoint or str(file)))]
+        return found[options.select_device(name, list(found), mask_secrets(endpoint or str(file)), "history")]
 
     return query_daemon
 
@@ -146,30 +146,6 @@ def _history_path(source: Path) -> Path:
     if config.storage is None:
         raise ConfigError(f"{source}: stores no history, because [storage] has no folder")
     return config.storage.folder / FILE_NAME
-
-
-def _select_device(name: str | None, there: list[str], where: str) -> str:
-    """Return the name of the requested device, or of the only device if no name is given.
-
-    Raises
-    ------
-    NotReady
-        If the history is still empty.
-    ConfigError
-        If no device has this name, or if there are several devices and no name is given.
-    """
-    from drivers.errors import NotReady
-    from drivers.module_lookup import format_suggestion
-
-    if not there:
-        raise NotReady(f"{where}: there is no history yet")
-    if name is None and len(there) == 1:
-        return there[0]
-    if name is None:
-        raise ConfigError(f"{where}: history of {len(there)} devices; choose one with --device: {', '.join(there)}")
-    if name not in there:
-        raise ConfigError(f'--device: "{name}"{format_suggestion(name, there)}')
-    return name
 
 
 def _span(since: str | None, until: str | None) -> "TimeRange | None":

@@ -17,6 +17,7 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
     TemperatureRemovalComparison,
     remove_temperature_effect,
@@ -134,7 +135,7 @@ def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> None:
+def save_plot_or_report(results: AnalysisResults, path: Path, title: str, units: UnitSystem = DEFAULT_UNITS) -> None:
     """Save the results as a figure, or as an HTML page if the file name ends in ``.html``.
 
     Parameters
@@ -145,6 +146,8 @@ def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> Non
         File to write.
     title : str
         Title of the figure or page.
+    units : UnitSystem
+        Units of the figure or page.
 
     Raises
     ------
@@ -155,7 +158,8 @@ def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> Non
 
     result = results.analysis
     marks = [ChangeMark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
-    drawn = AnalysisPlotData(result, additional_deviations(results.total, results.hadamard), results.dynamic, marks)
+    others = additional_deviations(results.total, results.hadamard)
+    drawn = AnalysisPlotData(result, others, results.dynamic, marks, units)
     if path.suffix == ".html":
         from monitor.publishing.reports.analysis_report import write_html_report
 

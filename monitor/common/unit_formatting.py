@@ -1,13 +1,15 @@
-"""Customary units of inertial navigation, and formatting of quantities, durations and numbers as text.
+"""Units of inertial navigation, data sheets and SI, and formatting of quantities, durations and numbers as text.
 
-The program computes in SI units. Terminal output and figures use customary units. The conversion factors follow from 1
+The program computes in SI units. Terminal output and figures use the units of inertial navigation, unless ``analyze``
+is called with ``--units``. The conversion factors follow from 1
 rad = 180/π ° and standard gravity, 1 g = 9.80665 m/s² (CGPM 1901).
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -95,6 +97,78 @@ COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
     },
 }
 """Name of each noise coefficient, for gyroscopes and accelerometers."""
+
+
+class CoefficientColumn(NamedTuple):
+    """Column of a table in which a noise coefficient is shown."""
+
+    symbol: str
+    name: str
+    unit: Unit
+
+
+@dataclass(frozen=True, slots=True)
+class UnitSystem:
+    """Units in which tables, figures and reports show noise coefficients and Allan deviations."""
+
+    coefficients: Mapping[Kind, Mapping[str, Unit]]
+    densities: Mapping[Kind, Unit] = field(default_factory=dict)
+    """Units of the one-sided noise density, which is shown in addition to the random walk N. Empty without density."""
+
+    def deviation(self, kind: Kind) -> Unit:
+        """Return the unit of Allan deviations, which is the unit of the bias instability B."""
+        return self.coefficients[kind]["B"]
+
+    def columns(self, kind: Kind) -> list[CoefficientColumn]:
+        """Return the columns of a table of all coefficients.
+
+        >>> [f"{one.symbol} {one.unit.name}" for one in UNIT_SYSTEMS["datasheet"].columns("gyro")][:3]
+        ['Q µrad', 'N °/√h', 'N m°/s/√Hz']
+
+        Parameters
+        ----------
+        kind : {"gyro", "accel"}
+            Kind of sensor.
+        """
+        found = []
+        for symbol, name in COEFFICIENT_NAMES[kind].items():
+            found.append(CoefficientColumn(symbol, name, self.coefficients[kind][symbol]))
+            if symbol == "N" and kind in self.densities:
+                found.append(CoefficientColumn(symbol, "noise density, one-sided", self.densities[kind]))
+        return found
+
+
+UNIT_SYSTEMS: Final = {
+    "imu": UnitSystem(COEFFICIENT_UNITS),
+    "datasheet": UnitSystem(
+        COEFFICIENT_UNITS,
+        # White noise with the two-sided density N² has the one-sided density 2 N², which data sheets state.
+        {
+            "gyro": Unit(math.sqrt(2.0) * DEGREE * 1e3, "m°/s/√Hz"),
+            "accel": Unit(math.sqrt(2.0) * MICRO_G, "µg/√Hz"),
+        },
+    ),
+    "si": UnitSystem(
+        {
+            "gyro": {
+                "Q": Unit(1.0, "rad"),
+                "N": Unit(1.0, "rad/s/√Hz"),
+                "B": Unit(1.0, "rad/s"),
+                "K": Unit(1.0, "rad/s²/√Hz"),
+                "R": Unit(1.0, "rad/s²"),
+            },
+            "accel": {
+                "Q": Unit(1.0, "m/s"),
+                "N": Unit(1.0, "m/s²/√Hz"),
+                "B": Unit(1.0, "m/s²"),
+                "K": Unit(1.0, "m/s³/√Hz"),
+                "R": Unit(1.0, "m/s³"),
+            },
+        }
+    ),
+}
+"""Unit systems of ``analyze --units``. In SI, N and K are two-sided densities: rad/s/√Hz is the same as rad/√s."""
+DEFAULT_UNITS: Final = UNIT_SYSTEMS["imu"]
 
 
 def sensor_kind(axis: str) -> Kind:

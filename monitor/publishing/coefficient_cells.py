@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.data_types import AXES
-from monitor.common.unit_formatting import NO_VALUE, coefficient_unit, format_number
+from monitor.common.unit_formatting import NO_VALUE, Unit, coefficient_unit, format_number
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 
 TEMPERATURE_MARK: Final = "†"
@@ -21,8 +21,10 @@ class CoefficientText:
     unit: str
 
 
-def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digits: int = 3) -> CoefficientText:
-    """Format one noise coefficient in the unit that data sheets use.
+def format_coefficient(
+    coefficients: Coefficients, symbol: str, axis: str, digits: int = 3, unit: Unit | None = None
+) -> CoefficientText:
+    """Format one noise coefficient.
 
     Parameters
     ----------
@@ -34,9 +36,11 @@ def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digit
         Name of the axis.
     digits
         Number of significant digits.
+    unit
+        Unit of the text. By default, the unit of inertial navigation, such as °/√h.
     """
     at = SYMBOLS.index(symbol), AXES.index(axis)
-    unit = coefficient_unit(symbol, axis)
+    unit = unit or coefficient_unit(symbol, axis)
     value, lo, hi = (float(a[at]) * unit.factor for a in (coefficients.value, coefficients.lo, coefficients.hi))
     match Status(int(coefficients.status[at])):
         case Status.ESTIMATED:

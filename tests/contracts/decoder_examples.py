@@ -1,6 +1,6 @@
-"""How each decoder is tried: settings, and how finely its format can tell numbers apart.
+"""Examples of settings for the tests of all decoders, with the resolution of each format.
 
-A decoder that is not listed is tried with its default settings and a coarse resolution.
+A decoder that is not listed is tested with its default settings and a coarse resolution.
 """
 
 import importlib
@@ -40,15 +40,15 @@ CAN_SIGNALS = {
 
 @dataclass(frozen=True)
 class Example:
-    """One way to set a decoder, and what its format can hold."""
+    """Settings of a decoder and the properties of its format."""
 
     name: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    gyro_step: float = 1e-3  # rad/s; what one bit or digit means
+    gyro_step: float = 1e-3  # rad/s; value of the last bit or digit
     accel_step: float = 1e-2  # m/s²
-    temperature_step: float | None = 0.5  # °C; None = not carried
-    checksum: bool = False  # whether every damaged byte is noticed
-    unchecked_tail: int = 0  # bytes at the end of a frame that its check does not cover
+    temperature_step: float | None = 0.5  # °C; None if the format has no temperature
+    checksum: bool = False  # True if every damaged byte is detected
+    unchecked_tail: int = 0  # number of bytes at the end of a frame that its checksum does not cover
 
     def __str__(self) -> str:
         keys = [str(v) for k, v in self.settings.items() if k not in ("columns", "file", "signals")]
@@ -56,13 +56,13 @@ class Example:
 
     @property
     def carrier(self) -> str:
-        """What the decoder is fed: bytes, frames or messages."""
+        """Kind of the decoder's input: bytes, frames or messages."""
         module = importlib.import_module(f"{decoders.__name__}.{self.name}")
-        carriers = [getattr(found, "carrier", None) for found in vars(module).values()]
-        return str(next(c for c in carriers if isinstance(c, str)))
+        carriers = [getattr(attribute, "carrier", None) for attribute in vars(module).values()]
+        return str(next(carrier for carrier in carriers if isinstance(carrier, str)))
 
     def build(self, folder: Path) -> Decoder:
-        """The decoder; a file that its settings name is written to the folder."""
+        """Return the decoder. Write the file that its settings name to ``folder``."""
         settings = dict(self.settings)
         if self.name == "dbc":
             (folder / "imu.dbc").write_text(CAN_DATABASE)
@@ -72,29 +72,31 @@ class Example:
         return decoder
 
 
-FLOAT = 2.0**-22  # relative step of a float32, for numbers up to 4 with a bit to spare
+FLOAT32_STEP = 2.0**-22  # step of a float32 for numbers from 2 to 4
 COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az", "temperature")
 TEXT = Example("text", {"columns": COLUMNS}, 1e-14, 1e-13, 1e-13)
-UNITS = {"gyro_unit": "deg/s", "accel_unit": "mg", "temperature_unit": "K", "delimiter": ";"}
+OTHER_UNITS = {"gyro_unit": "deg/s", "accel_unit": "mg", "temperature_unit": "K", "delimiter": ";"}
 STIM300 = Example("stim300", {}, DEGREE / 2**14, G / 2**19, 2.0**-8, checksum=True)
-VECTORNAV = Example("vectornav_binary", {}, FLOAT, 8 * FLOAT, 32 * FLOAT, checksum=True)
-XSENS = Example("xsens_mtdata2", {}, FLOAT, 8 * FLOAT, 32 * FLOAT, checksum=True)
+VECTORNAV = Example("vectornav_binary", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
+XSENS = Example("xsens_mtdata2", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
 WITMOTION = Example("witmotion", {}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 0.01, checksum=True)
 
-LISTED = (
+LISTED_EXAMPLES = (
     TEXT,
     Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),
     Example("text", {"columns": ("t", "-", *COLUMNS), "time_unit": "ms"}, 1e-14, 1e-13, 1e-13),
-    Example("text", {"columns": COLUMNS, **UNITS}, 1e-13, 1e-13, 1e-12),
+    Example("text", {"columns": COLUMNS, **OTHER_UNITS}, 1e-13, 1e-13, 1e-12),
     Example("vectornav_ascii", {}, 1e-6, 1e-3, 0.1, checksum=True),
     Example("vectornav_ascii", {"sentence": "VNYMR"}, 1e-6, 1e-3, None, checksum=True),
     VECTORNAV,
-    Example("vectornav_binary", {"clock": "arrival"}, FLOAT, 8 * FLOAT, 32 * FLOAT, checksum=True),
+    Example("vectornav_binary", {"clock": "arrival"}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
     XSENS,
-    Example("xsens_mtdata2", {"clock": "packet_counter"}, FLOAT, 8 * FLOAT, 32 * FLOAT, checksum=True),
-    Example("xsens_mtdata2", {"format": "fp12.20", "high_rate": True}, 2.0**-20, 2.0**-20, 32 * FLOAT, True),
-    Example("xsens_mtdata2", {"format": "fp16.32"}, 2.0**-32, 2.0**-32, 32 * FLOAT, True),
-    Example("xsens_mtdata2", {"format": "float64"}, 1e-15, 1e-14, 32 * FLOAT, True),
+    Example(
+        "xsens_mtdata2", {"clock": "packet_counter"}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True
+    ),
+    Example("xsens_mtdata2", {"format": "fp12.20", "high_rate": True}, 2.0**-20, 2.0**-20, 32 * FLOAT32_STEP, True),
+    Example("xsens_mtdata2", {"format": "fp16.32"}, 2.0**-32, 2.0**-32, 32 * FLOAT32_STEP, True),
+    Example("xsens_mtdata2", {"format": "float64"}, 1e-15, 1e-14, 32 * FLOAT32_STEP, True),
     STIM300,
     Example("stim300", {"identifier": 0xAF, "crlf": True}, DEGREE / 2**14, G / 2**19, 2.0**-8, True, 2),
     Example(
@@ -112,8 +114,8 @@ LISTED = (
     Example("samples", {}, 1e-15, 1e-14, 1e-14),
 )
 
-NAMES = module_lookup.list_modules(decoders)
-EXAMPLES = tuple(e for e in LISTED if e.name in NAMES) + tuple(
-    Example(name) for name in NAMES if name not in {e.name for e in LISTED}
+DECODER_NAMES = module_lookup.list_modules(decoders)
+EXAMPLES = tuple(e for e in LISTED_EXAMPLES if e.name in DECODER_NAMES) + tuple(
+    Example(name) for name in DECODER_NAMES if name not in {e.name for e in LISTED_EXAMPLES}
 )
-"""At least one for every decoder in the folder."""
+"""At least one example for every decoder in the folder."""

@@ -1,4 +1,4 @@
-"""What every decoder must do, whatever it decodes: found by listing the folder."""
+"""Tests that every decoder in the folder ``drivers/decoders`` has to pass."""
 
 import itertools
 import tracemalloc
@@ -21,20 +21,21 @@ from drivers.data_types import (
     make_block,
 )
 from drivers.decoders.base import Decoder
-from tests.contracts.decoder_examples import EXAMPLES, NAMES, Example
+from tests.contracts.decoder_examples import DECODER_NAMES, EXAMPLES, Example
 
-N = 16
+SAMPLE_COUNT = 16
 STEP_NS = 10_000_000
-QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-STREAMS = [e for e in EXAMPLES if e.carrier == "bytes"]
-CHECKED = [e for e in STREAMS if e.checksum]
-PACKETS = [e for e in EXAMPLES if e.carrier in ("frames", "messages")]
+FEW_EXAMPLES = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+STREAM_EXAMPLES = [example for example in EXAMPLES if example.carrier == "bytes"]
+CHECKED_EXAMPLES = [example for example in STREAM_EXAMPLES if example.checksum]
+PACKET_EXAMPLES = [example for example in EXAMPLES if example.carrier in ("frames", "messages")]
+FRAME_EXAMPLES = [example for example in PACKET_EXAMPLES if example.carrier == "frames"]
 
 every_decoder = pytest.mark.parametrize("example", EXAMPLES, ids=str)
-every_stream = pytest.mark.parametrize("example", STREAMS, ids=str)
-every_checked_stream = pytest.mark.parametrize("example", CHECKED, ids=str)
-every_packet = pytest.mark.parametrize("example", PACKETS, ids=str)
-every_frame = pytest.mark.parametrize("example", [e for e in PACKETS if e.carrier == "frames"], ids=str)
+every_stream = pytest.mark.parametrize("example", STREAM_EXAMPLES, ids=str)
+every_checked_stream = pytest.mark.parametrize("example", CHECKED_EXAMPLES, ids=str)
+every_packet = pytest.mark.parametrize("example", PACKET_EXAMPLES, ids=str)
+every_frame = pytest.mark.parametrize("example", FRAME_EXAMPLES, ids=str)
 
 
 @pytest.fixture
@@ -42,8 +43,8 @@ def decoder(example: Example, tmp_path: Path) -> Decoder:
     return example.build(tmp_path)
 
 
-def made(decoder: Decoder, n: int = N, seed: int = 7) -> SampleBlock:
-    """Samples of a resting sensor; a counter of the device wraps in the middle of them."""
+def make_samples(decoder: Decoder, n: int = SAMPLE_COUNT, seed: int = 7) -> SampleBlock:
+    """Return samples of a sensor at rest. The counter of the device wraps around in the middle."""
     rng = np.random.default_rng(seed)
     values = rng.normal(0.0, 0.5, (n, 6)) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.8])
     ticks = np.full(n, NO_TICK, np.int64)
@@ -53,73 +54,84 @@ def made(decoder: Decoder, n: int = N, seed: int = 7) -> SampleBlock:
     return make_block(np.arange(1, n + 1) * STEP_NS, values, rng.normal(25.0, 1.0, n), ticks)
 
 
-def one_by_one(samples: SampleBlock) -> list[SampleBlock]:
+def split_into_single_samples(samples: SampleBlock) -> list[SampleBlock]:
     return [samples[i : i + 1] for i in range(len(samples))]
 
 
-def chunks_of(decoder: Decoder, samples: SampleBlock) -> list[list[Chunk]]:
-    """What the device sends for each sample."""
-    return [list(decoder.encode(one)) for one in one_by_one(samples)]
+def encode_each_sample(decoder: Decoder, samples: SampleBlock) -> list[list[Chunk]]:
+    """Return the chunks that the device sends, one list for each sample."""
+    return [list(decoder.encode(sample)) for sample in split_into_single_samples(samples)]
 
 
-def flat(parts: list[list[Chunk]]) -> list[Chunk]:
+def join_chunks(parts: list[list[Chunk]]) -> list[Chunk]:
+    """Return the chunks of all samples in one list."""
     return [chunk for part in parts for chunk in part]
 
 
-def bytes_of(parts: list[list[Chunk]]) -> list[bytes]:
+def join_bytes_of_each_sample(parts: list[list[Chunk]]) -> list[bytes]:
+    """Return the bytes of each sample."""
     return [b"".join(chunk.data for chunk in part) for part in parts]
 
 
-def feed(decoder: Decoder, calls: list[list[Chunk]]) -> list[SampleBlock]:
-    """All blocks, each of them checked to be one."""
-    out = []
+def feed_chunks(decoder: Decoder, calls: list[list[Chunk]]) -> list[SampleBlock]:
+    """Return all decoded blocks, after checks of their shapes, types and values."""
+    blocks = []
     for chunks in calls:
-        for each in decoder.feed(chunks):
-            assert len(each) >= 1
-            assert each.values.shape == (len(each), 6)
-            assert each.values.dtype == np.float64
-            assert each.temperature_c.shape == each.t_ns.shape == each.ticks.shape == (len(each),)
-            assert each.t_ns.dtype == each.ticks.dtype == np.int64
-            assert not any(a.flags.writeable for a in (each.values, each.t_ns, each.ticks, each.temperature_c))
-            assert each.lost >= 0
-            assert not np.isinf(each.values).any()
-            out.append(each)
-    return out
+        for block in decoder.feed(chunks):
+            assert len(block) >= 1
+            assert block.values.shape == (len(block), 6)
+            assert block.values.dtype == np.float64
+            assert block.temperature_c.shape == block.t_ns.shape == block.ticks.shape == (len(block),)
+            assert block.t_ns.dtype == block.ticks.dtype == np.int64
+            assert not any(a.flags.writeable for a in (block.values, block.t_ns, block.ticks, block.temperature_c))
+            assert block.lost >= 0
+            assert not np.isinf(block.values).any()
+            blocks.append(block)
+    return blocks
 
 
 def feed_bytes(decoder: Decoder, data: bytes, cuts: list[int] | None = None) -> list[SampleBlock]:
-    edges = [0, *sorted(c for c in cuts or [] if c < len(data)), len(data)]
-    return feed(decoder, [[Chunk(data[a:b], 1000 + b)] for a, b in itertools.pairwise(edges)])
+    """Feed bytes that are divided at the positions ``cuts``."""
+    edges = [0, *sorted(cut for cut in cuts or [] if cut < len(data)), len(data)]
+    return feed_chunks(decoder, [[Chunk(data[a:b], 1000 + b)] for a, b in itertools.pairwise(edges)])
 
 
-def seen(blocks: list[SampleBlock]) -> tuple[list[list[float]], list[str], list[int], int]:
-    """Values, temperatures, ticks and all that was lost: what no cut of the bytes may change."""
+def summarize(blocks: list[SampleBlock]) -> tuple[list[list[float]], list[str], list[int], int]:
+    """Return the values, temperatures, ticks and number of lost samples of all blocks.
+
+    None of them may depend on how the bytes are divided.
+    """
     if not blocks:
         return [], [], [], 0
-    all_of = concatenate_blocks(blocks)
-    return all_of.values.tolist(), [repr(t) for t in all_of.temperature_c], all_of.ticks.tolist(), all_of.lost
+    joined = concatenate_blocks(blocks)
+    return (
+        joined.values.tolist(),
+        [repr(temperature) for temperature in joined.temperature_c],
+        joined.ticks.tolist(),
+        joined.lost,
+    )
 
 
-def clean(example: Example, folder: Path, samples: SampleBlock) -> list[list[float]]:
-    """The values that come back when nothing happens on the way, sample by sample."""
+def decode_undamaged(example: Example, folder: Path, samples: SampleBlock) -> list[list[float]]:
+    """Return the decoded values of undamaged data, one row for each sample."""
     decoder = example.build(folder)
-    got = concatenate_blocks(feed(decoder, [flat(chunks_of(decoder, samples))]))
+    got = concatenate_blocks(feed_chunks(decoder, [join_chunks(encode_each_sample(decoder, samples))]))
     assert len(got) == len(samples)
     return got.values.tolist()
 
 
-def test_every_decoder_is_tried() -> None:
-    assert {e.name for e in EXAMPLES} == set(NAMES)
-    assert len(NAMES) >= 6
+def test_every_decoder_has_an_example() -> None:
+    assert {example.name for example in EXAMPLES} == set(DECODER_NAMES)
+    assert len(DECODER_NAMES) >= 6
 
 
 # --- all carriers ------------------------------------------------------------------------------
 
 
 @every_decoder
-def test_encode_then_feed_gives_back_the_samples_to_half_a_bit(example: Example, decoder: Decoder) -> None:
-    samples = made(decoder)
-    got = concatenate_blocks(feed(decoder, [list(decoder.encode(samples))]))
+def test_feeding_encoded_samples_returns_them_to_half_a_bit(example: Example, decoder: Decoder) -> None:
+    samples = make_samples(decoder)
+    got = concatenate_blocks(feed_chunks(decoder, [list(decoder.encode(samples))]))
     steps = np.repeat([example.gyro_step, example.accel_step], 3)
     error = np.abs(got.values - samples.values).max(axis=0)
     assert (error <= 0.5 * steps * (1 + 1e-6)).all(), error / steps
@@ -140,23 +152,23 @@ def test_encode_then_feed_gives_back_the_samples_to_half_a_bit(example: Example,
 
 
 @every_decoder
-def test_samples_arrive_with_the_chunk_that_completes_them(decoder: Decoder) -> None:
-    samples = made(decoder)
-    got = concatenate_blocks(feed(decoder, [flat(chunks_of(decoder, samples))]))
+def test_sample_time_is_that_of_the_chunk_that_completes_the_sample(decoder: Decoder) -> None:
+    samples = make_samples(decoder)
+    got = concatenate_blocks(feed_chunks(decoder, [join_chunks(encode_each_sample(decoder, samples))]))
     assert got.t_ns.tolist() == samples.t_ns.tolist()
 
 
 @every_decoder
-def test_one_call_or_many_make_no_difference(example: Example, decoder: Decoder, tmp_path: Path) -> None:
-    parts = chunks_of(decoder, made(decoder))
-    at_once = seen(feed(decoder, [flat(parts)]))
-    again = example.build(tmp_path)
-    assert seen(feed(again, [[chunk] for chunk in flat(parts)])) == at_once
-    assert again.bad == decoder.bad == 0
+def test_feeding_chunk_by_chunk_returns_the_same_samples(example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    parts = encode_each_sample(decoder, make_samples(decoder))
+    expected = summarize(feed_chunks(decoder, [join_chunks(parts)]))
+    other_decoder = example.build(tmp_path)
+    assert summarize(feed_chunks(other_decoder, [[chunk] for chunk in join_chunks(parts)])) == expected
+    assert other_decoder.bad == decoder.bad == 0
 
 
 @every_decoder
-def test_nothing_fed_gives_nothing(decoder: Decoder) -> None:
+def test_empty_input_returns_no_blocks(decoder: Decoder) -> None:
     assert decoder.feed([]) == []
     assert decoder.feed([Chunk(b"", 5)]) == []
     assert decoder.recent_problem == "" or decoder.carrier != "bytes"
@@ -166,42 +178,44 @@ def test_nothing_fed_gives_nothing(decoder: Decoder) -> None:
 
 
 @every_stream
-@QUICK
+@FEW_EXAMPLES
 @given(data=st.data())
-def test_any_cut_gives_the_same(data: st.DataObject, example: Example, decoder: Decoder, tmp_path: Path) -> None:
-    parts = chunks_of(decoder, made(decoder))
-    wire = b"".join(bytes_of(parts))
-    tail = bytes_of(parts)[-1][: data.draw(st.integers(0, 5), label="tail")]
-    cuts = data.draw(st.lists(st.integers(1, len(wire)), max_size=12), label="cuts")
-    whole = seen(feed_bytes(example.build(tmp_path), wire))
-    assert len(whole[0]) == N
-    assert seen(feed_bytes(example.build(tmp_path), wire + tail, cuts)) == whole
-
-
-@every_stream
-def test_byte_by_byte_gives_the_same(example: Example, decoder: Decoder, tmp_path: Path) -> None:
-    wire = b"".join(bytes_of(chunks_of(decoder, made(decoder))))
-    whole = seen(feed_bytes(decoder, wire))
-    assert seen(feed_bytes(example.build(tmp_path), wire, list(range(1, len(wire))))) == whole
-
-
-@every_stream
-@QUICK
-@given(data=st.data())
-def test_cuts_do_not_matter_in_a_damaged_stream(
+def test_result_does_not_depend_on_the_division_into_chunks(
     data: st.DataObject, example: Example, decoder: Decoder, tmp_path: Path
 ) -> None:
-    frames = bytes_of(chunks_of(decoder, made(decoder, 40)))
+    parts = encode_each_sample(decoder, make_samples(decoder))
+    wire = b"".join(join_bytes_of_each_sample(parts))
+    tail = join_bytes_of_each_sample(parts)[-1][: data.draw(st.integers(0, 5), label="tail")]
+    cuts = data.draw(st.lists(st.integers(1, len(wire)), max_size=12), label="cuts")
+    expected = summarize(feed_bytes(example.build(tmp_path), wire))
+    assert len(expected[0]) == SAMPLE_COUNT
+    assert summarize(feed_bytes(example.build(tmp_path), wire + tail, cuts)) == expected
+
+
+@every_stream
+def test_feeding_byte_by_byte_returns_the_same_samples(example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    wire = b"".join(join_bytes_of_each_sample(encode_each_sample(decoder, make_samples(decoder))))
+    expected = summarize(feed_bytes(decoder, wire))
+    assert summarize(feed_bytes(example.build(tmp_path), wire, list(range(1, len(wire))))) == expected
+
+
+@every_stream
+@FEW_EXAMPLES
+@given(data=st.data())
+def test_result_for_a_damaged_stream_does_not_depend_on_the_division_into_chunks(
+    data: st.DataObject, example: Example, decoder: Decoder, tmp_path: Path
+) -> None:
+    frames = join_bytes_of_each_sample(encode_each_sample(decoder, make_samples(decoder, 40)))
     for at in data.draw(st.lists(st.integers(1, 20), max_size=4), label="noise at"):
         frames[at] = data.draw(st.binary(max_size=60), label="noise") + frames[at]
     wire = b"".join(frames)
     cuts = data.draw(st.lists(st.integers(1, len(wire)), max_size=12), label="cuts")
-    one, other = example.build(tmp_path), example.build(tmp_path)
-    assert seen(feed_bytes(one, wire)) == seen(feed_bytes(other, wire, cuts))
-    assert one.bad == other.bad
+    first, second = example.build(tmp_path), example.build(tmp_path)
+    assert summarize(feed_bytes(first, wire)) == summarize(feed_bytes(second, wire, cuts))
+    assert first.bad == second.bad
 
 
-def noises(frame: bytes) -> dict[str, bytes]:
+def make_noise(frame: bytes) -> dict[str, bytes]:
     rng = np.random.default_rng(11)
     return {
         "random": rng.integers(0, 256, 29, np.uint8).tobytes(),
@@ -215,124 +229,135 @@ def noises(frame: bytes) -> dict[str, bytes]:
 @every_stream
 @pytest.mark.parametrize("kind", ["random", "long", "half a frame", "starts of frames", "zeros"])
 @pytest.mark.parametrize("place", ["before", "inside", "between", "after"])
-def test_noise_costs_only_the_frame_it_touches(
+def test_noise_damages_only_the_frame_that_it_touches(
     example: Example, decoder: Decoder, kind: str, place: str, tmp_path: Path
 ) -> None:
-    samples = made(decoder, 80)
-    frames = bytes_of(chunks_of(decoder, samples))
-    expected = clean(example, tmp_path, samples)
-    noise, at = noises(frames[7])[kind], 7
+    samples = make_samples(decoder, 80)
+    frames = join_bytes_of_each_sample(encode_each_sample(decoder, samples))
+    expected = decode_undamaged(example, tmp_path, samples)
+    noise, at = make_noise(frames[7])[kind], 7
     if place == "before":
         frames[0] = noise + frames[0]
-        may_miss = {0}
+        may_be_missing = {0}
     elif place == "inside":
         half = len(frames[at]) // 2
         frames[at] = frames[at][:half] + noise + frames[at][half:]
-        may_miss = {at}
+        may_be_missing = {at}
     elif place == "between":
         frames[at] = noise + frames[at]
-        may_miss = {at}
+        may_be_missing = {at}
     else:
         frames[-1] += noise
-        may_miss = set()
-    got = seen(feed_bytes(decoder, b"".join(frames)))[0]
-    whole = [row for i, row in enumerate(expected) if i not in may_miss]
+        may_be_missing = set()
+    got = summarize(feed_bytes(decoder, b"".join(frames)))[0]
+    undamaged = [row for i, row in enumerate(expected) if i not in may_be_missing]
     if example.checksum:
         kept = [row for row in got if row in expected]
-        assert kept == got, "a row that was never sent"
+        assert kept == got, "the decoder returned a row that was never sent"
     else:
-        # without a checksum noise that reads as a number is a number
+        # without a checksum, noise that looks like a number is decoded as one
         kept = [row for row in got if row in expected]
         assert len(got) - len(kept) <= 1
-    assert kept in (whole, expected)
+    assert kept in (undamaged, expected)
 
 
 MASKS = (0x01, 0x04, 0x80)
 
 
 @every_checked_stream
-def test_one_damaged_byte_costs_exactly_its_sample(example: Example, decoder: Decoder, tmp_path: Path) -> None:
-    samples = made(decoder)
-    frames = bytes_of(chunks_of(decoder, samples))
-    expected = clean(example, tmp_path, samples)
-    k = N // 2
-    start = len(frames[k]) - len(frames[k].lstrip(b"\r\n"))  # text begins with a line end
-    for at in range(start, len(frames[k]) - example.unchecked_tail):
+def test_one_damaged_byte_loses_exactly_its_sample(example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    samples = make_samples(decoder)
+    frames = join_bytes_of_each_sample(encode_each_sample(decoder, samples))
+    expected = decode_undamaged(example, tmp_path, samples)
+    damaged_sample = SAMPLE_COUNT // 2
+    start = len(frames[damaged_sample]) - len(
+        frames[damaged_sample].lstrip(b"\r\n")
+    )  # a text frame begins with a line end
+    for at in range(start, len(frames[damaged_sample]) - example.unchecked_tail):
         mask = MASKS[at % len(MASKS)]
-        hurt = bytearray(frames[k])
-        hurt[at] ^= mask
-        fresh = example.build(tmp_path)
-        blocks = feed_bytes(fresh, b"".join([*frames[:k], bytes(hurt), *frames[k + 1 :]]))
-        assert seen(blocks)[0] == expected[:k] + expected[k + 1 :], f"byte {at} ^ {mask:#x}"
-        assert [(len(b), b.lost) for b in blocks] == [(k, 0), (N - k - 1, 1)]
-        assert fresh.bad == 1
-        assert fresh.recent_problem != ""
+        damaged = bytearray(frames[damaged_sample])
+        damaged[at] ^= mask
+        other_decoder = example.build(tmp_path)
+        blocks = feed_bytes(
+            other_decoder, b"".join([*frames[:damaged_sample], bytes(damaged), *frames[damaged_sample + 1 :]])
+        )
+        assert summarize(blocks)[0] == expected[:damaged_sample] + expected[damaged_sample + 1 :], (
+            f"byte {at} ^ {mask:#x}"
+        )
+        assert [(len(b), b.lost) for b in blocks] == [(damaged_sample, 0), (SAMPLE_COUNT - damaged_sample - 1, 1)]
+        assert other_decoder.bad == 1
+        assert other_decoder.recent_problem != ""
 
 
 @every_checked_stream
-def test_a_missing_byte_costs_one_sample(example: Example, decoder: Decoder, tmp_path: Path) -> None:
-    samples = made(decoder)
-    frames = bytes_of(chunks_of(decoder, samples))
-    expected = clean(example, tmp_path, samples)
-    k = N // 2
-    frames[k] = frames[k][:5] + frames[k][6:]
-    assert seen(feed_bytes(decoder, b"".join(frames)))[0] == expected[:k] + expected[k + 1 :]
+def test_missing_byte_loses_one_sample(example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    samples = make_samples(decoder)
+    frames = join_bytes_of_each_sample(encode_each_sample(decoder, samples))
+    expected = decode_undamaged(example, tmp_path, samples)
+    damaged_sample = SAMPLE_COUNT // 2
+    frames[damaged_sample] = frames[damaged_sample][:5] + frames[damaged_sample][6:]
+    assert (
+        summarize(feed_bytes(decoder, b"".join(frames)))[0]
+        == expected[:damaged_sample] + expected[damaged_sample + 1 :]
+    )
     assert decoder.bad == 1
 
 
 @every_checked_stream
-def test_missing_frames_are_counted(example: Example, decoder: Decoder) -> None:
-    frames = bytes_of(chunks_of(decoder, made(decoder)))
-    for k in (4, 5, 6):  # line ends stay: a line is as long as it is
+def test_missing_frames_are_counted_as_lost(example: Example, decoder: Decoder) -> None:
+    frames = join_bytes_of_each_sample(encode_each_sample(decoder, make_samples(decoder)))
+    for k in (4, 5, 6):  # keep the line ends, so that each line keeps its length
         end = frames[k][-2:] if frames[k].endswith(b"\r\n") else b""
         frames[k] = bytes(len(frames[k]) - len(end)) + end
-    got = seen(feed_bytes(decoder, b"".join(frames)))
-    assert len(got[0]) == N - 3
+    got = summarize(feed_bytes(decoder, b"".join(frames)))
+    assert len(got[0]) == SAMPLE_COUNT - 3
     assert got[3] == 3
-    assert decoder.bad >= 3  # a sample may be more than one frame
+    assert decoder.bad >= 3  # a sample may consist of several frames
 
 
 @every_stream
-def test_reset_forgets_half_a_frame(decoder: Decoder) -> None:
-    samples = made(decoder)
-    parts = chunks_of(decoder, samples)
-    first, rest = flat(parts[:4]), bytes_of(parts[4:])
-    feed(decoder, [first])
+def test_reset_discards_an_incomplete_frame(decoder: Decoder) -> None:
+    samples = make_samples(decoder)
+    parts = encode_each_sample(decoder, samples)
+    first, rest = join_chunks(parts[:4]), join_bytes_of_each_sample(parts[4:])
+    feed_chunks(decoder, [first])
     assert feed_bytes(decoder, rest[0][: len(rest[0]) // 2]) == []
     decoder.forget_stream_state()
-    got = seen(feed_bytes(decoder, b"".join(rest[1:])))
-    assert len(got[0]) == N - 5
+    got = summarize(feed_bytes(decoder, b"".join(rest[1:])))
+    assert len(got[0]) == SAMPLE_COUNT - 5
     assert got[3] == 0
     assert decoder.bad == 0
 
 
 @every_stream
-def test_joined_in_the_middle_of_a_frame(example: Example, decoder: Decoder, tmp_path: Path) -> None:
-    samples = made(decoder)
-    frames = bytes_of(chunks_of(decoder, samples))
-    expected = clean(example, tmp_path, samples)
-    got = seen(feed_bytes(decoder, b"".join(frames)[len(frames[0]) // 3 :]))
+def test_stream_that_starts_inside_a_frame_loses_only_that_frame(
+    example: Example, decoder: Decoder, tmp_path: Path
+) -> None:
+    samples = make_samples(decoder)
+    frames = join_bytes_of_each_sample(encode_each_sample(decoder, samples))
+    expected = decode_undamaged(example, tmp_path, samples)
+    got = summarize(feed_bytes(decoder, b"".join(frames)[len(frames[0]) // 3 :]))
     assert got[0] == expected[1:]
     assert got[3] == decoder.bad == 0
 
 
 @every_stream
-def test_garbage_raises_nothing_and_fills_no_memory(decoder: Decoder) -> None:
+def test_garbage_raises_no_error_and_uses_bounded_memory(decoder: Decoder) -> None:
     rng = np.random.default_rng(3)
-    starts = bytes_of(chunks_of(decoder, made(decoder)))[0][:4]
+    starts = join_bytes_of_each_sample(encode_each_sample(decoder, make_samples(decoder)))[0][:4]
     garbage = rng.integers(0, 256, 50_000, np.uint8).tobytes() + starts * 5000 + b"x" * 30_000
     parts = [garbage[i : i + 1000] for i in range(0, len(garbage), 1000)]
-    feed(decoder, [[Chunk(p, 1)] for p in parts])
+    feed_chunks(decoder, [[Chunk(part, 1)] for part in parts])
     tracemalloc.start()
     before, _ = tracemalloc.get_traced_memory()
-    feed(decoder, [[Chunk(p, 1)] for p in parts])
+    feed_chunks(decoder, [[Chunk(part, 1)] for part in parts])
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert after - before < 30_000
     assert decoder.recent_problem != ""
-    lines = b"\r\n" if decoder.encode(made(decoder, 1))[0].data.endswith(b"\r\n") else b""
-    frames = bytes_of(chunks_of(decoder, made(decoder, 200)))
-    got = seen(feed_bytes(decoder, lines + b"".join(frames)))
+    line_end = b"\r\n" if decoder.encode(make_samples(decoder, 1))[0].data.endswith(b"\r\n") else b""
+    frames = join_bytes_of_each_sample(encode_each_sample(decoder, make_samples(decoder, 200)))
+    got = summarize(feed_bytes(decoder, line_end + b"".join(frames)))
     assert len(got[0]) >= 130
 
 
@@ -341,41 +366,46 @@ def test_garbage_raises_nothing_and_fills_no_memory(decoder: Decoder) -> None:
 
 @every_packet
 @pytest.mark.parametrize("damage", ["cut", "empty", "garbage"])
-def test_a_damaged_chunk_costs_only_its_sample(example: Example, decoder: Decoder, damage: str, tmp_path: Path) -> None:
-    samples = made(decoder)
-    parts = chunks_of(decoder, samples)
-    expected = clean(example, tmp_path, samples)
-    k = N // 2
-    for at, chunk in enumerate(parts[k]):
-        harm = {"cut": chunk.data[: len(chunk.data) // 2], "empty": b"", "garbage": b"\xc1"}[damage]
-        hurt = list(parts[k])
-        hurt[at] = replace(chunk, data=harm)
-        fresh = example.build(tmp_path)
-        blocks = feed(fresh, [flat([*parts[:k], hurt, *parts[k + 1 :]])])
-        got = seen(blocks)
+def test_damaged_chunk_loses_only_its_sample(example: Example, decoder: Decoder, damage: str, tmp_path: Path) -> None:
+    samples = make_samples(decoder)
+    parts = encode_each_sample(decoder, samples)
+    expected = decode_undamaged(example, tmp_path, samples)
+    damaged_sample = SAMPLE_COUNT // 2
+    for at, chunk in enumerate(parts[damaged_sample]):
+        data = {"cut": chunk.data[: len(chunk.data) // 2], "empty": b"", "garbage": b"\xc1"}[damage]
+        chunks = list(parts[damaged_sample])
+        chunks[at] = replace(chunk, data=data)
+        other_decoder = example.build(tmp_path)
+        blocks = feed_chunks(
+            other_decoder, [join_chunks([*parts[:damaged_sample], chunks, *parts[damaged_sample + 1 :]])]
+        )
+        got = summarize(blocks)
         if got[0] == expected:
-            continue  # it held nothing but the temperature
-        assert got[0] == expected[:k] + expected[k + 1 :]
+            continue  # the damaged chunk contained only the temperature
+        assert got[0] == expected[:damaged_sample] + expected[damaged_sample + 1 :]
         assert got[3] == 1
-        assert fresh.bad == 1
-        assert fresh.recent_problem != ""
+        assert other_decoder.bad == 1
+        assert other_decoder.recent_problem != ""
 
 
 @every_frame
-def test_chunks_of_others_are_passed_over(decoder: Decoder, tmp_path: Path) -> None:
-    parts = chunks_of(decoder, made(decoder))
+def test_chunks_with_another_address_are_ignored(decoder: Decoder, tmp_path: Path) -> None:
+    parts = encode_each_sample(decoder, make_samples(decoder))
     other = Chunk(b"12345678", 1, address=0x7AB)
-    got = seen(feed(decoder, [[c for chunk in flat(parts) for c in (other, chunk, other)]]))
-    assert len(got[0]) == N
+    got = summarize(feed_chunks(decoder, [[c for chunk in join_chunks(parts) for c in (other, chunk, other)]]))
+    assert len(got[0]) == SAMPLE_COUNT
     assert decoder.bad == 0
 
 
 @every_packet
-def test_garbage_chunks_raise_nothing(decoder: Decoder) -> None:
+def test_garbage_chunks_raise_no_error(decoder: Decoder) -> None:
     rng = np.random.default_rng(5)
-    addresses = [c.address for c in decoder.encode(made(decoder, 1))]
+    addresses = [c.address for c in decoder.encode(make_samples(decoder, 1))]
     for n in rng.integers(0, 400, 2000).tolist():
         data = rng.integers(0, 256, n, np.uint8).tobytes()
-        feed(decoder, [[Chunk(data, 1, address=addresses[n % len(addresses)])]])
+        feed_chunks(decoder, [[Chunk(data, 1, address=addresses[n % len(addresses)])]])
     decoder.forget_stream_state()
-    assert len(seen(feed(decoder, [flat(chunks_of(decoder, made(decoder)))]))[0]) >= N - 1
+    assert (
+        len(summarize(feed_chunks(decoder, [join_chunks(encode_each_sample(decoder, make_samples(decoder)))]))[0])
+        >= SAMPLE_COUNT - 1
+    )

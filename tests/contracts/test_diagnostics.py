@@ -1,8 +1,8 @@
-"""Contract of the diagnostics, which are found by listing ``DIAGNOSTICS``.
+"""Tests that every diagnostic in ``DIAGNOSTICS`` has to pass.
 
-A diagnostic finds no difference in data that are equal to the expectation. Its null distribution holds for simulated
-recordings. It depends on nothing but its input. The data are one minute of white noise and random walk, drawn by SciPy,
-with a temperature and another axis.
+A diagnostic finds no difference in data that are equal to the expectation. Its null distribution is valid for
+simulated recordings. Its result depends only on its input. The data are one minute of white noise and random walk,
+with a temperature and another axis. They are drawn without the simulator.
 """
 
 from collections.abc import Callable
@@ -25,27 +25,27 @@ RUNS = 240
 OTHER = correlated(n, np.random.default_rng(99_999), 1e-2, 1.0)
 
 
-def whitened_by_white_noise(y: np.ndarray) -> WhitenedAxis:
+def whiten_by_white_noise(y: np.ndarray) -> WhitenedAxis:
     """Whiten a series by white noise of the same size."""
     return seen(axes({"gx": OTHER, "gz": y}, (WHITE,), warmth(n))["gz"], (WHITE,))
 
 
 @cache
-def findings(first: int, runs: int) -> list[dict[str, Finding]]:
+def simulate_findings(first: int, runs: int) -> list[dict[str, Finding]]:
     """Return the findings on simulated recordings of one model."""
     found = []
     for seed in range(first, first + runs):
         rng = np.random.default_rng(seed)
         y = white(n, rng) + walk(n, rng)
-        one = axes({"gx": OTHER, "gz": y}, {"gx": (WHITE,), "gz": (WHITE, WALK)}, warmth(n))["gz"]
-        found.append(dict(run_diagnostics(seen(one, (WHITE, WALK)))))
+        axis = axes({"gx": OTHER, "gz": y}, {"gx": (WHITE,), "gz": (WHITE, WALK)}, warmth(n))["gz"]
+        found.append(dict(run_diagnostics(seen(axis, (WHITE, WALK)))))
     return found
 
 
 @cache
-def all_nulls(name: str) -> np.ndarray:
+def estimate_all_null95(name: str) -> np.ndarray:
     """Return null95 of a diagnostic in nats, from six recordings with three axes at a time."""
-    found = findings(0, 108)
+    found = simulate_findings(0, 108)
     parts = [found[at : at + 18] for at in range(0, 108, 18)]
     each = [
         estimate_null_distributions({axis: part[k::3] for k, axis in enumerate(("gx", "gy", "gz"))}) for part in parts
@@ -53,57 +53,59 @@ def all_nulls(name: str) -> np.ndarray:
     return np.array([null[axis][name].null95 for null in each for axis in null])
 
 
-def null95(name: str) -> float:
-    return float(np.median(all_nulls(name)))
+def median_null95(name: str) -> float:
+    """Return the median of null95 over all estimates, in nats."""
+    return float(np.median(estimate_all_null95(name)))
 
 
-def signs(size: int) -> np.ndarray:
+def draw_signs(size: int) -> np.ndarray:
+    """Return ±SIGMA with random signs, shape [size]."""
     return SIGMA * np.random.default_rng(1).choice([-1.0, 1.0], size)
 
 
-def impulse() -> np.ndarray:
+def make_impulse() -> np.ndarray:
     """Return an impulse, whose periodogram is flat, with a little noise in each bin of the cosine transform."""
     y = white(n, np.random.default_rng(0), 0.1 * N)
     y[1] = SIGMA * n**0.5
     return y
 
 
-def impulses(apart: int) -> np.ndarray:
+def make_impulses(apart: int) -> np.ndarray:
     """Return impulses that have the same power at each time and frequency."""
     y = np.zeros(n)
-    y[apart // 2 :: apart] = signs(y[apart // 2 :: apart].size) * apart**0.5
+    y[apart // 2 :: apart] = draw_signs(y[apart // 2 :: apart].size) * apart**0.5
     return y
 
 
-def flat() -> np.ndarray:
+def make_noise_without_low_frequencies() -> np.ndarray:
     """Return white noise with reduced power at low frequencies, so that the level hardly changes."""
     coefficients = cosine_transform(white(n, np.random.default_rng(2)))
     coefficients[: n // 2] *= 0.2
     return inverse_cosine_transform(coefficients)
 
 
-def without(column: np.ndarray) -> np.ndarray:
+def make_noise_without_column(column: np.ndarray) -> np.ndarray:
     """Return white noise without the contributions of a column and of its square."""
     stacked = np.stack([np.ones(n), column, column**2], axis=1)
     y = white(n, np.random.default_rng(3))
     return y - stacked @ np.linalg.lstsq(stacked, y, rcond=None)[0]
 
 
-EQUAL: dict[str, Callable[[], np.ndarray]] = {
+DATA_EQUAL_TO_EXPECTATION: dict[str, Callable[[], np.ndarray]] = {
     "values": lambda: white(n, np.random.default_rng(4)),
-    "psd": lambda: inverse_cosine_transform(signs(n - 1)),
-    "lines": impulse,
-    "autocorrelation": lambda: inverse_cosine_transform(signs(n - 1)),
-    "level": flat,
-    "temperature": lambda: without(warmth(n) - 25.0),
-    "other_axes": lambda: without(OTHER),
+    "psd": lambda: inverse_cosine_transform(draw_signs(n - 1)),
+    "lines": make_impulse,
+    "autocorrelation": lambda: inverse_cosine_transform(draw_signs(n - 1)),
+    "level": make_noise_without_low_frequencies,
+    "temperature": lambda: make_noise_without_column(warmth(n) - 25.0),
+    "other_axes": lambda: make_noise_without_column(OTHER),
     "tails": lambda: np.random.default_rng(5).permutation(SIGMA * norm.ppf((np.arange(n) + 0.5) / n)),
-    "variance": lambda: signs(n),
-    "spectrogram": lambda: impulses(128),
+    "variance": lambda: draw_signs(n),
+    "spectrogram": lambda: make_impulses(128),
 }
 """For each diagnostic, data that are equal to the expectation."""
 
-HIDDEN: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+ADD_DIFFERENCE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "values": lambda y: 5e-4 * np.rint(y / 5e-4),
     "psd": lambda y: y + correlated(n, np.random.default_rng(6), 5e-4, 0.02),
     "lines": lambda y: y + 4e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n)),
@@ -119,65 +121,65 @@ HIDDEN: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def test_every_diagnostic_is_tested():
-    assert set(EQUAL) == set(HIDDEN) == set(DIAGNOSTICS)
+    assert set(DATA_EQUAL_TO_EXPECTATION) == set(ADD_DIFFERENCE) == set(DIAGNOSTICS)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_data_that_equal_the_expectation_have_no_gap(name):
-    found = DIAGNOSTICS[name](whitened_by_white_noise(EQUAL[name]()))
-    assert 0.0 <= found.gain < 0.2 * null95(name)
+    finding = DIAGNOSTICS[name](whiten_by_white_noise(DATA_EQUAL_TO_EXPECTATION[name]()))
+    assert 0.0 <= finding.gain < 0.2 * median_null95(name)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_hidden_difference_is_found(name):
+def test_added_difference_is_found(name):
     y = white(n, np.random.default_rng(8))
-    found, before = (
-        DIAGNOSTICS[name](whitened_by_white_noise(HIDDEN[name](y))),
-        DIAGNOSTICS[name](whitened_by_white_noise(y)),
+    finding, before = (
+        DIAGNOSTICS[name](whiten_by_white_noise(ADD_DIFFERENCE[name](y))),
+        DIAGNOSTICS[name](whiten_by_white_noise(y)),
     )
-    assert found.gain > 3.0 * null95(name)
-    assert found.gain > before.gain + 10.0
+    assert finding.gain > 3.0 * median_null95(name)
+    assert finding.gain > before.gain + 10.0
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_recordings_of_a_true_model_stay_below_the_null_distribution(name):
-    gains = np.array([one[name].gain for one in findings(1000, RUNS)])
+    gains = np.array([findings[name].gain for findings in simulate_findings(1000, RUNS)])
     assert np.all(np.isfinite(gains))
     assert np.all(gains >= 0.0)
 
-    def beyond(factor: float) -> float:
+    def count_above(factor: float) -> float:
         """Return the number of recordings above a multiple of null95, averaged over the null distributions."""
-        return float(np.mean(gains > factor * all_nulls(name)[:, None]) * RUNS)
+        return float(np.mean(gains > factor * estimate_all_null95(name)[:, None]) * RUNS)
 
-    # of 240 runs 12 are expected: 28 or more once in 10 000
-    assert beyond(1.0) < 28
-    if np.median(gains) > 0.0:  # where most runs show nothing at all, 95 of 100 is no more than a bound
-        assert beyond(1.0) > 1.5  # 1 or less once in 10 000
-        assert beyond(0.5) >= 28
-        assert beyond(2.0) <= 1.5
+    # 12 of 240 runs are expected; 28 or more occur once in 10 000 tests
+    assert count_above(1.0) < 28
+    if np.median(gains) > 0.0:  # if the gain of most runs is zero, 5 % is only an upper bound
+        assert count_above(1.0) > 1.5  # 1 or fewer occur once in 10 000 tests
+        assert count_above(0.5) >= 28
+        assert count_above(2.0) <= 1.5
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_finding_depends_only_on_the_input_and_the_input_is_not_changed(name):
     rng = np.random.default_rng(9)
-    y = HIDDEN[name](white(n, rng))
-    kept = y.copy()
-    one, other = whitened_by_white_noise(y), whitened_by_white_noise(kept)
-    arrays = {field: getattr(one, field).copy() for field in ("coefficients", "weights", "series", "flat_series")}
-    coefficients, samples = one.axis.coefficients.copy(), one.axis.repaired.copy()
-    found = DIAGNOSTICS[name](one)
-    assert DIAGNOSTICS[name](one) == found == DIAGNOSTICS[name](other)
+    y = ADD_DIFFERENCE[name](white(n, rng))
+    copy = y.copy()
+    first, second = whiten_by_white_noise(y), whiten_by_white_noise(copy)
+    arrays = {field: getattr(first, field).copy() for field in ("coefficients", "weights", "series", "flat_series")}
+    coefficients, samples = first.axis.coefficients.copy(), first.axis.repaired.copy()
+    finding = DIAGNOSTICS[name](first)
+    assert DIAGNOSTICS[name](first) == finding == DIAGNOSTICS[name](second)
     for field, before in arrays.items():
-        np.testing.assert_array_equal(getattr(one, field), before)
-    np.testing.assert_array_equal(one.axis.coefficients, coefficients)
-    np.testing.assert_array_equal(one.axis.repaired, samples)
-    np.testing.assert_array_equal(y, kept)
+        np.testing.assert_array_equal(getattr(first, field), before)
+    np.testing.assert_array_equal(first.axis.coefficients, coefficients)
+    np.testing.assert_array_equal(first.axis.repaired, samples)
+    np.testing.assert_array_equal(y, copy)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_location_is_inside_the_recording(name):
-    where = DIAGNOSTICS[name](whitened_by_white_noise(HIDDEN[name](white(n, np.random.default_rng(10))))).where
+    where = DIAGNOSTICS[name](whiten_by_white_noise(ADD_DIFFERENCE[name](white(n, np.random.default_rng(10))))).where
     limits = {
         "frequency": (-0.05, 0.5 * RATE_HZ + 0.05),
         "tau": (0.0, n / RATE_HZ),
@@ -191,9 +193,9 @@ def test_location_is_inside_the_recording(name):
         assert where.source == "gx"
 
 
-def test_location_is_that_of_the_hidden_difference():
+def test_location_is_that_of_the_added_difference():
     def where(name):
-        return DIAGNOSTICS[name](whitened_by_white_noise(HIDDEN[name](white(n, np.random.default_rng(11))))).where
+        return DIAGNOSTICS[name](whiten_by_white_noise(ADD_DIFFERENCE[name](white(n, np.random.default_rng(11))))).where
 
     lo, hi = where("lines").frequency
     assert lo < 17.3 < hi

@@ -1,4 +1,7 @@
-"""What every link keeps to, found by listing the folder: a link without a rig here fails the suite."""
+"""Tests that every link in the folder ``drivers/links`` has to pass.
+
+A test fails if a link has no rig in ``RIGS``.
+"""
 
 import contextlib
 import itertools
@@ -23,22 +26,22 @@ from tests.support.loopback_link import LoopbackLink
 from tests.support.ports import free_endpoint
 from tests.support.settings import read_settings
 from tests.support.waiting import FOREVER_S, PATIENCE_S
-from tests.support.zenoh_sessions import router as zenoh_router
+from tests.support.zenoh_sessions import open_router
 
 UNIQUE = itertools.count()
 DATA = b"12345678"
 
 
 @dataclass
-class Rig:
-    """A link and the world at its other end."""
+class LinkRig:
+    """A link, and functions that act at its other end."""
 
     link: Link
-    send: Callable[[], None]  # makes DATA arrive
-    lose: Callable[[], None] | None  # the peer goes away; None: see why
-    absent: Link  # a link to a target that is not there
+    send: Callable[[], None]  # sends DATA to the link
+    lose: Callable[[], None] | None  # disconnects the peer; None if that is impossible, see ``why_not_lost``
+    absent: Link  # a link whose target does not exist
     why_not_lost: str = ""
-    quiet_s: float = 0.3  # nothing arrives by itself within this time
+    quiet_s: float = 0.3  # no data arrive within this time unless the test sends them
 
 
 def build(name: str, **keys: Any) -> Link:
@@ -47,8 +50,8 @@ def build(name: str, **keys: Any) -> Link:
     return link
 
 
-class Pty:
-    """A pseudo terminal: a serial port with a test behind it."""
+class PseudoTerminal:
+    """A pseudo-terminal, whose other end the test reads and writes."""
 
     def __init__(self) -> None:
         self.master, slave = os.openpty()
@@ -67,17 +70,17 @@ class Pty:
 
 
 @contextlib.contextmanager
-def serial_rig(tmp_path: Path) -> Iterator[Rig]:
-    pty = Pty()
+def serial_rig(tmp_path: Path) -> Iterator[LinkRig]:
+    pty = PseudoTerminal()
     link = build("serial", port=pty.port)
     absent = build("serial", port=str(tmp_path / "ttyNONE"))
-    yield Rig(link, lambda: pty.write(DATA), pty.close, absent)
+    yield LinkRig(link, lambda: pty.write(DATA), pty.close, absent)
     link.close()
     pty.close()
 
 
 @contextlib.contextmanager
-def can_virtual_rig(tmp_path: Path) -> Iterator[Rig]:
+def can_virtual_rig(tmp_path: Path) -> Iterator[LinkRig]:
     import can
 
     channel = f"contract-{next(UNIQUE)}"
@@ -85,59 +88,59 @@ def can_virtual_rig(tmp_path: Path) -> Iterator[Rig]:
         message = can.Message(arbitration_id=9, is_extended_id=False, data=DATA)
         link = build("can", interface="virtual", channel=channel)
         absent = build("can", interface="socketcan", channel="nonesuch0")
-        why = "a virtual bus, as a real one, is there whether or not anybody sends"
-        yield Rig(link, lambda: peer.send(message), None, absent, why)
+        why_not_lost = "a virtual bus exists whether or not anybody sends"
+        yield LinkRig(link, lambda: peer.send(message), None, absent, why_not_lost)
         link.close()
 
 
 @contextlib.contextmanager
-def can_slcan_rig(tmp_path: Path) -> Iterator[Rig]:
-    pty = Pty()
+def can_slcan_rig(tmp_path: Path) -> Iterator[LinkRig]:
+    pty = PseudoTerminal()
     options = {"sleep_after_open": 0.0}
     link = build("can", interface="slcan", channel=pty.port, options=options)
     absent = build("can", interface="slcan", channel=str(tmp_path / "ttyNONE"), options=options)
     line = b"t0098" + DATA.hex().encode() + b"\r"
-    yield Rig(link, lambda: pty.write(line), pty.close, absent)
+    yield LinkRig(link, lambda: pty.write(line), pty.close, absent)
     link.close()
     pty.close()
 
 
 @contextlib.contextmanager
-def router() -> Iterator[tuple[str, Callable[[str, bytes], None]]]:
-    """A zenoh router in this process: its endpoint, and a put."""
+def start_router() -> Iterator[tuple[str, Callable[[str, bytes], None]]]:
+    """Open a zenoh router in this process. Yield its endpoint and its function ``put``."""
     endpoint = free_endpoint()
-    with zenoh_router(endpoint) as session:
+    with open_router(endpoint) as session:
         yield endpoint, session.put
 
 
 @contextlib.contextmanager
-def zenoh_rig(tmp_path: Path) -> Iterator[Rig]:
-    with router() as (endpoint, put):
+def zenoh_rig(tmp_path: Path) -> Iterator[LinkRig]:
+    with start_router() as (endpoint, put):
         link = build("zenoh", key="contract/**", connect=[endpoint])
         absent = build("zenoh", key="a/b", mode="client", connect=[free_endpoint()])
-        why = "zenoh reconnects by itself: a lost publisher is silence, see LinkSettings.silence"
-        yield Rig(link, lambda: put("contract/a", DATA), None, absent, why)
+        why_not_lost = "zenoh reconnects by itself, so a lost publisher only causes silence, see LinkSettings.silence"
+        yield LinkRig(link, lambda: put("contract/a", DATA), None, absent, why_not_lost)
         link.close()
 
 
 @contextlib.contextmanager
-def replay_rig(tmp_path: Path) -> Iterator[Rig]:
+def replay_rig(tmp_path: Path) -> Iterator[LinkRig]:
     path = tmp_path / "frames.csv"
     path.write_text(f"t,id_hex,data_hex\n0.0,9,{DATA.hex()}\n1000.0,9,{DATA.hex()}\n")
     link = build("replay", path=str(path))
     absent = build("replay", path=str(tmp_path / "none.npz"))
-    yield Rig(link, lambda: None, None, absent, "an open file cannot be lost; its end is LinkEnded")
+    yield LinkRig(link, lambda: None, None, absent, "an open file cannot be lost, and its end raises LinkEnded")
     link.close()
 
 
 @contextlib.contextmanager
-def loopback_rig(tmp_path: Path) -> Iterator[Rig]:
+def loopback_rig(tmp_path: Path) -> Iterator[LinkRig]:
     link, absent = LoopbackLink(), LoopbackLink()
     absent.absent = True
-    yield Rig(link, lambda: link.write(DATA), link.drop, absent)
+    yield LinkRig(link, lambda: link.write(DATA), link.drop, absent)
 
 
-RIGS: dict[str, Callable[[Path], AbstractContextManager[Rig]]] = {
+RIGS: dict[str, Callable[[Path], AbstractContextManager[LinkRig]]] = {
     "serial": serial_rig,
     "can": can_virtual_rig,
     "can-slcan": can_slcan_rig,
@@ -148,9 +151,9 @@ RIGS: dict[str, Callable[[Path], AbstractContextManager[Rig]]] = {
 
 
 @pytest.fixture(params=RIGS)
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
-    with RIGS[request.param](tmp_path) as made:
-        yield made
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[LinkRig]:
+    with RIGS[request.param](tmp_path) as opened:
+        yield opened
 
 
 @pytest.fixture(params=module_lookup.list_modules(links, "_link"))
@@ -158,17 +161,17 @@ def module(request: pytest.FixtureRequest) -> ModuleType:
     return module_lookup.import_module(links, request.param, "_link")
 
 
-def receive(rig: Rig) -> list[Chunk]:
-    """Send until something comes: a zenoh session needs a moment to see its router."""
+def receive_chunks(rig: LinkRig) -> list[Chunk]:
+    """Send until chunks arrive, because a zenoh session needs some time to find its router."""
     for _ in range(100):
         rig.send()
         chunks = rig.link.wait_for_chunks_or_timeout(0.05)
         if chunks:
             return chunks
-    raise AssertionError("nothing came")
+    raise AssertionError("no chunks arrived")
 
 
-def read_on(link: Link) -> None:
+def read_repeatedly(link: Link) -> None:
     for _ in range(100):
         link.wait_for_chunks_or_timeout(0.05)
 
@@ -188,34 +191,34 @@ def test_unknown_keys_are_refused(module: ModuleType) -> None:
         read_settings(module.Settings, {"nonesuch": 1, "port": "x", "key": "x", "path": "x"})
 
 
-def test_what_is_sent_is_read(rig: Rig) -> None:
+def test_sent_data_are_received(rig: LinkRig) -> None:
     begun_ns = time.monotonic_ns()
     rig.link.open()
-    chunks = receive(rig)
+    chunks = receive_chunks(rig)
     assert DATA in b"".join(c.data for c in chunks)
     if rig.link.epoch == "monotonic":
-        # a link that converts a stamp of Unix time may be off by what the scheduler takes between two clocks
+        # a link that converts Unix time reads two clocks, and the scheduler may interrupt it in between
         assert all(begun_ns - 20e6 <= c.t_ns <= time.monotonic_ns() for c in chunks)
 
 
-def test_opens_and_closes_twice_without_harm(rig: Rig) -> None:
+def test_link_can_be_opened_and_closed_twice(rig: LinkRig) -> None:
     for _ in range(2):
         rig.link.open()
         rig.link.open()
-        assert receive(rig)
+        assert receive_chunks(rig)
         rig.link.close()
         rig.link.close()
 
 
-def test_closing_before_opening_is_harmless(rig: Rig) -> None:
+def test_link_can_be_closed_before_it_is_opened(rig: LinkRig) -> None:
     rig.link.close()
     rig.link.open()
-    assert receive(rig)
+    assert receive_chunks(rig)
 
 
-def test_read_returns_none_on_timeout(rig: Rig) -> None:
+def test_read_returns_none_on_timeout(rig: LinkRig) -> None:
     rig.link.open()
-    receive(rig)
+    receive_chunks(rig)
     while rig.link.wait_for_chunks_or_timeout(0.05):
         pass
     start = time.monotonic()
@@ -223,28 +226,28 @@ def test_read_returns_none_on_timeout(rig: Rig) -> None:
     assert time.monotonic() - start >= rig.quiet_s * 0.9  # a lower bound holds on any machine
 
 
-def test_lost_peer_raises_link_lost(rig: Rig) -> None:
+def test_lost_peer_raises_link_lost(rig: LinkRig) -> None:
     if rig.lose is None:
         pytest.skip(rig.why_not_lost)
     rig.link.open()
-    receive(rig)
+    receive_chunks(rig)
     rig.lose()
     with pytest.raises(LinkLost) as raised:
-        read_on(rig.link)
+        read_repeatedly(rig.link)
     assert "\n" not in str(raised.value)
     rig.link.close()
 
 
-def test_read_after_close_raises_link_lost(rig: Rig) -> None:
+def test_read_after_close_raises_link_lost(rig: LinkRig) -> None:
     rig.link.open()
     rig.link.close()
     with pytest.raises(LinkLost):
         rig.link.wait_for_chunks_or_timeout(0.1)
 
 
-def test_closing_ends_a_waiting_read(rig: Rig) -> None:
+def test_closing_ends_a_waiting_read(rig: LinkRig) -> None:
     rig.link.open()
-    receive(rig)
+    receive_chunks(rig)
     while rig.link.wait_for_chunks_or_timeout(0.05):
         pass
     began, ended = threading.Event(), threading.Event()
@@ -264,7 +267,7 @@ def test_closing_ends_a_waiting_read(rig: Rig) -> None:
     reader.join(PATIENCE_S)
 
 
-def test_absent_target_is_link_unavailable(rig: Rig) -> None:
+def test_absent_target_raises_link_unavailable(rig: LinkRig) -> None:
     for _ in range(2):
         with pytest.raises(LinkUnavailable) as raised:
             rig.absent.open()

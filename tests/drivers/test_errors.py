@@ -1,4 +1,4 @@
-"""The text of an error is one line that a terminal can be given."""
+"""Tests of error texts: one printable line of limited length."""
 
 import pytest
 
@@ -7,11 +7,11 @@ from drivers.errors import ConfigError, DecodeError, LinkLost, RecordingError, m
 
 
 @pytest.mark.parametrize("kind", [ConfigError, DecodeError, LinkLost, RecordingError])
-def test_one_line_whatever_it_quotes(kind: type[Exception]) -> None:
+def test_error_text_is_one_line_without_control_characters(kind: type[Exception]) -> None:
     assert str(kind("a\r\nb \x1b[2J ü")) == "a  b  [2J ü"
 
 
-def test_not_endless() -> None:
+def test_long_error_text_is_shortened() -> None:
     text = make_printable_and_shorten("x" * 10**6)
     assert len(text) == errors.MAX_TEXT_CHARACTERS + 2
     assert text.endswith(" …")

@@ -1,4 +1,4 @@
-"""Files that people write are read whole, and no more than a bounded part of anything else."""
+"""Tests of reading small files completely and refusing large ones."""
 
 from pathlib import Path
 
@@ -11,12 +11,12 @@ from monitor.noise.model_loading import read_model
 from monitor.settings import loading
 
 
-def test_all_of_a_file(tmp_path: Path) -> None:
+def test_small_file_is_read_completely(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1\r\n2")
     assert file_access.read_small_file(tmp_path / "a") == b"1\r\n2"
 
 
-def test_what_is_too_large_is_one_line_for_every_reader(tmp_path: Path) -> None:
+def test_every_reader_refuses_a_file_that_is_too_large(tmp_path: Path) -> None:
     path = tmp_path / "big"
     with path.open("wb") as file:
         file.truncate(file_access.MAX_BYTES + 1)

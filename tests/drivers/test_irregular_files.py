@@ -1,4 +1,7 @@
-"""A FIFO, socket, device, directory or looping link in place of a file is one line, and nothing waits for it."""
+"""Tests of a FIFO, socket, device, directory or broken symbolic link in place of a file.
+
+Every reader refuses it with an error of one line and does not wait for data.
+"""
 
 import os
 import socket
@@ -25,7 +28,7 @@ from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S
 
 IMU_MONITOR = [sys.executable, "-m", "monitor.cli"]
-KINDS = {
+ERROR_TEXTS = {
     "fifo": "is a FIFO",
     "socket": "is a socket",
     "device": "is a character device",
@@ -35,17 +38,18 @@ KINDS = {
 }
 
 
-def make(kind: str, path: Path) -> None:
+def make_irregular_file(kind: str, path: Path) -> None:
     match kind:
         case "fifo":
             os.mkfifo(path)
         case "socket":
-            with socket.socket(socket.AF_UNIX) as one:
-                here = os.open(path.parent, os.O_RDONLY)
+            with socket.socket(socket.AF_UNIX) as unix_socket:
+                folder = os.open(path.parent, os.O_RDONLY)
                 try:
-                    one.bind(f"/proc/self/fd/{here}/{path.name}")  # a short name: sockets allow 108 characters
+                    # the path of a socket has at most 108 characters, so use a short one
+                    unix_socket.bind(f"/proc/self/fd/{folder}/{path.name}")
                 finally:
-                    os.close(here)
+                    os.close(folder)
         case "device":
             path.symlink_to("/dev/zero")
         case "directory":
@@ -56,69 +60,69 @@ def make(kind: str, path: Path) -> None:
             path.symlink_to("nothing-here")
 
 
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=ERROR_TEXTS)
 def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def one_line(error: BaseException) -> str:
+def get_one_line_text(error: BaseException) -> str:
     text = str(error)
     assert "\n" not in text
     return text
 
 
-def test_open_regular_says_what_it_is(kind: str, tmp_path: Path) -> None:
+def test_error_names_the_kind_of_file(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
-    make(kind, path)
+    make_irregular_file(kind, path)
     for read in (file_access.read_small_file, file_access.open_regular_file, file_access.check_regular_file):
-        with pytest.raises(OSError, match=KINDS[kind]):
+        with pytest.raises(OSError, match=ERROR_TEXTS[kind]):
             read(path)
 
 
-def test_a_descriptor_is_not_inherited(tmp_path: Path) -> None:
+def test_file_descriptor_is_not_inherited(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1")
     with file_access.open_regular_file(tmp_path / "a") as file:
         assert not os.get_inheritable(file.fileno())
         assert file.read() == b"1"
 
 
-def test_a_name_with_a_nul_character_is_an_os_error() -> None:
+def test_name_with_a_nul_character_raises_os_error() -> None:
     with pytest.raises(OSError, match="null byte"):
         file_access.open_regular_file(Path("a\0b"))
 
 
 @pytest.mark.parametrize("suffix", tuple(FORMATS))
-def test_a_recording(kind: str, suffix: str, tmp_path: Path) -> None:
+def test_irregular_recording_is_refused(kind: str, suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
-    make(kind, path)
+    make_irregular_file(kind, path)
     with pytest.raises(RecordingError) as error:
         load_samples(path)
-    said = "no recordings in this folder" if kind == "directory" else KINDS[kind]
-    assert said in one_line(error.value)
+    expected = "no recordings in this folder" if kind == "directory" else ERROR_TEXTS[kind]
+    assert expected in get_one_line_text(error.value)
 
 
-def test_a_recording_in_a_folder_is_left_out_with_a_note(kind: str, tmp_path: Path) -> None:
+def test_irregular_recording_in_a_folder_is_left_out_with_a_note(kind: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,gx\n0.0,1.0\n0.1,2.0\n")
-    make(kind, tmp_path / "b.csv")
+    make_irregular_file(kind, tmp_path / "b.csv")
     found = load_samples(tmp_path)
     assert len(found) == 2
     (note,) = [note for note in found.notes if "left out" in note]
-    assert KINDS[kind] in note
+    assert ERROR_TEXTS[kind] in note
 
 
 @pytest.mark.parametrize(
     "read",
     [segment_file.read_metadata, segment_file.read_last_piece, lambda path: list(segment_file.read_samples(path))],
 )
-def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) -> None:
+def test_irregular_segment_is_refused(kind: str, read: Callable[[Path], object], tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     path = tmp_path / segment_file.format_segment_name(1, 1.7e9)
-    make(kind, path)
-    with pytest.raises((RecordingError, OSError), match=KINDS[kind]):
+    make_irregular_file(kind, path)
+    with pytest.raises((RecordingError, OSError), match=ERROR_TEXTS[kind]):
         read(path)
 
 
-def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
+def test_irregular_part_file_is_replaced(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv.part")
     with atomic_write_path(tmp_path / "a.csv") as part:
         part.write_text("x")
@@ -138,35 +142,37 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
         ("zenoh file", lambda path: client_configurations((), path)),
     ],
 )
-def test_a_file_of_settings(kind: str, name: str, read: Callable[[Path], object], tmp_path: Path) -> None:
+def test_irregular_settings_file_is_refused(
+    kind: str, name: str, read: Callable[[Path], object], tmp_path: Path
+) -> None:
     path = tmp_path / "name"
-    make(kind, path)
+    make_irregular_file(kind, path)
     if kind in ("fifo", "socket", "device") and name == "model name":
-        assert read(path) == path  # its reader says what is wrong
+        assert read(path) == path  # the reader of the model reports the error
         return
     with pytest.raises(ImuError) as error:
         read(path)
-    assert str(tmp_path) in one_line(error.value)
+    assert str(tmp_path) in get_one_line_text(error.value)
 
 
 @pytest.mark.parametrize("kind", ["socket", "device", "directory", "loop", "dangling"])
-def test_a_thermal_model(kind: str, tmp_path: Path) -> None:
+def test_irregular_thermal_model_is_refused(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
-    make(kind, path)
-    with pytest.raises(ConfigError, match=KINDS[kind]):
+    make_irregular_file(kind, path)
+    with pytest.raises(ConfigError, match=ERROR_TEXTS[kind]):
         thermal.read_model_file(path)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".bin", ".log", ".blf", ".asc", ".csv.gz"])
 @pytest.mark.parametrize("kind", ["fifo", "socket", "device", "loop"])
-def test_what_is_replayed(kind: str, suffix: str, tmp_path: Path) -> None:
+def test_irregular_replay_file_is_refused(kind: str, suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
-    make(kind, path)
-    with pytest.raises(ConfigError, match=KINDS[kind]):
+    make_irregular_file(kind, path)
+    with pytest.raises(ConfigError, match=ERROR_TEXTS[kind]):
         replay_link.build(replay_link.Settings(path=str(path)))
 
 
-def test_a_segment_of_raw_bytes_that_is_replayed(tmp_path: Path) -> None:
+def test_irregular_raw_segment_is_not_replayed(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     os.mkfifo(tmp_path / segment_file.format_segment_name(1, 1.7e9))
     link = replay_link.build(replay_link.Settings(path=str(tmp_path)))
@@ -174,7 +180,7 @@ def test_a_segment_of_raw_bytes_that_is_replayed(tmp_path: Path) -> None:
         link.open()
 
 
-def test_a_file_that_a_zenoh_file_names(tmp_path: Path) -> None:
+def test_irregular_key_file_of_a_zenoh_file_is_refused(tmp_path: Path) -> None:
     import zenoh
 
     os.mkfifo(tmp_path / "key.pem")
@@ -185,28 +191,28 @@ def test_a_file_that_a_zenoh_file_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".dbc", ".kcd"])
-def test_a_can_database(kind: str, suffix: str, tmp_path: Path) -> None:
+def test_irregular_can_database_is_refused(kind: str, suffix: str, tmp_path: Path) -> None:
     from drivers.decoders.dbc import database
 
     path = tmp_path / f"a{suffix}"
-    make(kind, path)
-    with pytest.raises(ConfigError, match=KINDS[kind]):
+    make_irregular_file(kind, path)
+    with pytest.raises(ConfigError, match=ERROR_TEXTS[kind]):
         database._load(path)
 
 
-@pytest.mark.parametrize("end", ["", "-wal", "-shm", "-journal"])
+@pytest.mark.parametrize("suffix", ["", "-wal", "-shm", "-journal"])
 @pytest.mark.parametrize("kind", ["fifo", "socket", "device", "directory", "loop"])
-def test_a_history(kind: str, end: str, tmp_path: Path) -> None:
-    if end:
+def test_irregular_history_is_refused(kind: str, suffix: str, tmp_path: Path) -> None:
+    if suffix:
         sqlite_store.HistoryFileWriter(tmp_path / sqlite_store.FILE_NAME).close()
-    path = tmp_path / f"{sqlite_store.FILE_NAME}{end}"
-    make(kind, path)
-    for look in (
+    path = tmp_path / f"{sqlite_store.FILE_NAME}{suffix}"
+    make_irregular_file(kind, path)
+    for access in (
         lambda: sqlite_store.HistoryFileWriter(tmp_path / sqlite_store.FILE_NAME).close(),
         lambda: list(read_history(tmp_path)),
     ):
-        with pytest.raises((RecordingError, OSError), match=KINDS[kind]):
-            look()
+        with pytest.raises((RecordingError, OSError), match=ERROR_TEXTS[kind]):
+            access()
 
 
 def read_history(folder: Path) -> Iterator[str]:
@@ -217,41 +223,41 @@ def read_history(folder: Path) -> Iterator[str]:
 # --- from the command line
 
 
-def finished(arguments: list[str], **options: object) -> subprocess.CompletedProcess[str]:
+def run_program(arguments: list[str], **options: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(  # type: ignore[call-overload, no-any-return]
         [*IMU_MONITOR, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False, **options
     )
 
 
 @pytest.mark.parametrize("command", [["run"], ["analyze"], ["simulate", "--seconds", "1", "--out", "x.csv"]])
-def test_a_socket_or_device_on_the_command_line_is_status_2_and_one_line(command: list[str], tmp_path: Path) -> None:
+def test_socket_on_the_command_line_gives_status_2_and_one_line(command: list[str], tmp_path: Path) -> None:
     name = tmp_path / "a.csv"
-    make("socket", name)
-    done = finished([command[0], str(name), *command[1:]], cwd=tmp_path)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert "is a socket" in done.stderr
+    make_irregular_file("socket", name)
+    result = run_program([command[0], str(name), *command[1:]], cwd=tmp_path)
+    assert result.returncode == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert "is a socket" in result.stderr
 
 
-def test_a_configuration_and_a_model_from_a_pipe(tmp_path: Path) -> None:
+def test_configuration_and_model_can_be_read_from_a_pipe(tmp_path: Path) -> None:
     text = (shipped_config_paths.CONFIG_FOLDER / "demo.toml").read_text()
-    done = finished(["check", "/dev/stdin"], input=text)
-    assert (done.returncode, done.stderr) == (0, "")
+    result = run_program(["check", "/dev/stdin"], input=text)
+    assert (result.returncode, result.stderr) == (0, "")
     model = (shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
     for name in ("/dev/stdin", "-"):
-        done = finished(["export", name, "--format", "kalibr"], input=model)
-        assert (done.returncode, done.stderr) == (0, "")
-        assert "noise_density" in done.stdout
+        result = run_program(["export", name, "--format", "kalibr"], input=model)
+        assert (result.returncode, result.stderr) == (0, "")
+        assert "noise_density" in result.stdout
 
 
 @pytest.mark.parametrize("number", [2, 15])
-def test_a_pipe_whose_writer_says_nothing_is_waited_for_until_a_signal(number: int, tmp_path: Path) -> None:
+def test_program_waits_for_a_silent_pipe_until_a_signal(number: int, tmp_path: Path) -> None:
     path = tmp_path / "config.toml"
     os.mkfifo(path, 0o600)
     process = subprocess.Popen([*IMU_MONITOR, "run", str(path)], stderr=subprocess.PIPE)
     writer = -1
     try:
-        writer = opened_for_writing(path)
+        writer = open_for_writing(path)
         process.send_signal(number)
         process.communicate(timeout=PATIENCE_S)
     finally:
@@ -260,12 +266,12 @@ def test_a_pipe_whose_writer_says_nothing_is_waited_for_until_a_signal(number: i
     assert process.returncode in (-number, 128 + number)
 
 
-def opened_for_writing(path: Path) -> int:
-    """A descriptor, once somebody reads."""
-    until_s = time.monotonic() + PATIENCE_S
+def open_for_writing(path: Path) -> int:
+    """Wait until another process reads the FIFO. Return a file descriptor for writing."""
+    deadline_s = time.monotonic() + PATIENCE_S
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK)
         except OSError:
-            assert time.monotonic() < until_s, "nobody reads"
+            assert time.monotonic() < deadline_s, "no process reads the FIFO"
             time.sleep(0.01)

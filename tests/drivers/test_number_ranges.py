@@ -1,4 +1,4 @@
-"""Every number that enters the program is checked against a range."""
+"""Tests of the ranges that numbers in settings are checked against."""
 
 import math
 from typing import Annotated
@@ -12,7 +12,7 @@ from drivers.number_ranges import RATE_HZ, SCALE, SEED, SILENCE_S, NumberRange
 from drivers.settings_model import ListOf, SettingsModel
 from tests.support.settings import read_settings
 
-ALL = {name: one for name, one in vars(number_ranges).items() if isinstance(one, NumberRange)}
+RANGES = {name: value for name, value in vars(number_ranges).items() if isinstance(value, NumberRange)}
 
 
 class Inner(SettingsModel):
@@ -26,20 +26,32 @@ class Outer(SettingsModel):
     seed: Annotated[int, SEED] = 1
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_both_ends_are_supported_and_what_is_beyond_is_not(name: str) -> None:
-    one = ALL[name]
-    assert one.low <= one.high
-    for value in (one.low, one.high, *([0] if one.zero else []), *([-one.high] if one.signed else [])):
-        assert one.check(value) == value
-    beyond = (math.nan, math.inf, -math.inf, 2.0 * one.high + 1.0, 10**400, *([] if one.signed else [one.low - 1e4]))
-    for value in beyond:
+@pytest.mark.parametrize("name", RANGES)
+def test_limits_are_accepted_and_numbers_beyond_them_are_refused(name: str) -> None:
+    number_range = RANGES[name]
+    assert number_range.low <= number_range.high
+    for value in (
+        number_range.low,
+        number_range.high,
+        *([0] if number_range.zero else []),
+        *([-number_range.high] if number_range.signed else []),
+    ):
+        assert number_range.check(value) == value
+    refused = (
+        math.nan,
+        math.inf,
+        -math.inf,
+        2.0 * number_range.high + 1.0,
+        10**400,
+        *([] if number_range.signed else [number_range.low - 1e4]),
+    )
+    for value in refused:
         with pytest.raises(ConfigError, match="is outside the supported range"):
-            one.check(value)
+            number_range.check(value)
 
 
 @pytest.mark.parametrize(
-    ("settings", "text"),
+    ("settings", "start"),
     [
         ({"rate": 1e300}, "rate: 1e+300 Hz is outside the supported range 0.001 Hz to 1 MHz"),
         ({"rate": "1"}, 'rate: expected a number from 0.001 Hz to 1 MHz, got "1"'),
@@ -50,19 +62,19 @@ def test_both_ends_are_supported_and_what_is_beyond_is_not(name: str) -> None:
         ({"seed": 1.5}, "seed: expected a whole number from 0 to 9.22337e+18, got 1.5"),
     ],
 )
-def test_a_wrong_number_anywhere_in_settings_is_found(settings: dict[str, object], text: str) -> None:
+def test_wrong_number_in_nested_settings_is_reported(settings: dict[str, object], start: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read_settings(Outer, settings)
-    assert str(caught.value).startswith(text)
+    assert str(caught.value).startswith(start)
 
 
-def test_every_number_outside_its_range_is_found() -> None:
+def test_all_numbers_outside_their_ranges_are_reported() -> None:
     with pytest.raises(ConfigError) as caught:
         read_settings(Outer, {"rate": 0.0, "tau": [1.0, -1.0], "seed": -1})
     assert [line.partition(": ")[0] for line in caught.value.mistake_lines] == ["rate", "tau[1]", "seed"]
 
 
-def test_zero_has_a_meaning_of_its_own() -> None:
+def test_zero_is_allowed_as_a_special_value() -> None:
     assert SILENCE_S.check(0.0) == 0.0
     with pytest.raises(ConfigError, match="1 µs is outside the supported range 1 ms to 36525 d, or 0"):
         SILENCE_S.check(1e-6)

@@ -1,4 +1,4 @@
-"""All mistakes of a table are found at once, and described without names of Python types."""
+"""Tests of checking tables of settings: all mistakes are reported, without names of Python types."""
 
 import re
 from collections.abc import Iterator
@@ -49,12 +49,12 @@ class Whole(SettingsModel):
             yield Conflict("low", "must be less than high", ("high",))
 
 
-def lines(table: dict[str, object]) -> list[str]:
+def list_problems(table: dict[str, object]) -> list[str]:
     return [str(problem) for problem in check_table(Whole, table).problems]
 
 
 @pytest.mark.parametrize(
-    ("table", "says"),
+    ("table", "problem"),
     [
         ({"rate": "fast"}, 'rate: expected a number from 0.001 Hz to 1 MHz, got "fast"'),
         ({"rate": True}, "rate: expected a number from 0.001 Hz to 1 MHz, got true"),
@@ -76,26 +76,26 @@ def lines(table: dict[str, object]) -> list[str]:
         ({"words": "x" * 100}, f'words: expected a list, got "{"x" * 60}…"'),
     ],
 )
-def test_a_mistake_is_described_in_plain_words(table: dict[str, object], says: str) -> None:
-    assert lines(table) == [says]
-    assert not re.search(r"\b(float|int|str|bool|null|None|https|Literal|pydantic)\b", says)
+def test_mistake_is_described_in_plain_words(table: dict[str, object], problem: str) -> None:
+    assert list_problems(table) == [problem]
+    assert not re.search(r"\b(float|int|str|bool|null|None|https|Literal|pydantic)\b", problem)
 
 
-def test_no_mistake_hides_another() -> None:
+def test_all_mistakes_are_reported() -> None:
     table = {"rate": 0, "flag": 3, "part": [{"share": 3.0}, 4], "nonesuch": 1, "low": 5.0, "tau": ["a", 0.5, "b"]}
-    assert sorted(line.partition(": ")[0] for line in lines(table)) == [
+    assert sorted(line.partition(": ")[0] for line in list_problems(table)) == [
         *("flag", "low", "nonesuch", "part[0].name", "part[0].share", "part[1]", "rate", "tau[0]", "tau[2]"),
     ]
 
 
-def test_a_wrong_key_with_a_wrong_value_is_two_mistakes_at_one_place() -> None:
-    found = lines({"scale": {"gw": "x", "gx": "y"}, "low": 5.0})
+def test_wrong_key_with_wrong_value_gives_two_mistakes() -> None:
+    found = list_problems({"scale": {"gw": "x", "gx": "y"}, "low": 5.0})
     assert found[0] == 'scale.gw: "gw"; possible are gx, gy'
     assert [line.partition(": ")[0] for line in found] == ["scale.gw", "scale.gw", "scale.gx", "low"]
 
 
-def test_a_conflict_with_a_wrong_value_is_not_reported() -> None:
-    assert lines({"low": 5.0, "high": "x"}) == ['high: expected a number, got "x"']
+def test_conflict_that_involves_a_wrong_value_is_not_reported() -> None:
+    assert list_problems({"low": 5.0, "high": "x"}) == ['high: expected a number, got "x"']
 
 
 def test_values_keep_their_types() -> None:
@@ -107,7 +107,7 @@ def test_values_keep_their_types() -> None:
     assert len(caught.value.mistake_lines) == 2
 
 
-def test_settings_of_python_code_are_checked_too() -> None:
+def test_settings_created_in_python_are_checked() -> None:
     assert Whole(rate_hz=5.0).rate_hz == 5.0
     with pytest.raises(pydantic.ValidationError, match="must be less than high"):
         Whole(low=2.0)
@@ -118,7 +118,7 @@ class Files(SettingsModel):
     either: FileOrName = ""
 
 
-def test_files_are_beside_the_configuration(tmp_path: Path) -> None:
+def test_relative_paths_are_resolved_from_the_folder_of_the_configuration(tmp_path: Path) -> None:
     (tmp_path / "here").write_text("")
     found = read_settings(Files, {"path": "here", "either": "here"}, tmp_path)
     assert (found.path, found.either) == (str(tmp_path / "here"), str(tmp_path / "here"))

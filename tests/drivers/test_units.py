@@ -1,4 +1,4 @@
-"""Factors against their definitions, and what an unknown unit says."""
+"""Tests of conversion factors of units and of error messages for unknown units."""
 
 import doctest
 import math
@@ -9,7 +9,7 @@ from drivers import units
 from drivers.errors import ConfigError
 
 
-def test_rates() -> None:
+def test_angular_rate_factors() -> None:
     assert units.angular_rate_factor("rad/s") == 1.0
     assert units.angular_rate_factor("deg/s") * 180.0 == pytest.approx(math.pi)
     assert units.angular_rate_factor("°/h") * 3600.0 * 180.0 == pytest.approx(math.pi)
@@ -17,7 +17,7 @@ def test_rates() -> None:
     assert units.angular_rate_factor("mrad/s") == 1e-3
 
 
-def test_accelerations() -> None:
+def test_acceleration_factors() -> None:
     assert units.acceleration_factor("g") == 9.80665
     assert units.acceleration_factor("mg") == pytest.approx(9.80665e-3)
     assert units.acceleration_factor("µg") == pytest.approx(9.80665e-6)
@@ -28,21 +28,21 @@ def test_accelerations() -> None:
     ("unit", "number", "celsius"),
     [("°C", 25.0, 25.0), ("K", 273.15, 0.0), ("°F", 212.0, 100.0), ("F", 32.0, 0.0), ("m°C", 25_000.0, 25.0)],
 )
-def test_temperatures(unit: str, number: float, celsius: float) -> None:
+def test_temperature_factors_and_offsets(unit: str, number: float, celsius: float) -> None:
     factor, offset = units.temperature_factor_and_offset(unit)
     assert factor * number + offset == pytest.approx(celsius, abs=1e-12)
 
 
-def test_times() -> None:
+def test_time_factors() -> None:
     assert [units.time_factor(n) for n in ("s", "ms", "us", "µs", "ns")] == [1.0, 1e-3, 1e-6, 1e-6, 1e-9]
 
 
-def test_both_micro_signs_and_blanks_are_understood() -> None:
+def test_both_micro_signs_and_spaces_are_accepted() -> None:
     assert units.acceleration_factor(" \N{GREEK SMALL LETTER MU}g ") == units.acceleration_factor("\N{MICRO SIGN}g")
 
 
 @pytest.mark.parametrize(
-    ("look_up", "unit", "words"),
+    ("look_up", "unit", "expected_parts"),
     [
         (units.angular_rate_factor, "deg/sek", ("angular rate", '"deg/sek"', "possible are deg/sec, deg/s, ")),
         (units.angular_rate_factor, "furlong", ('"furlong"', "rad/s", "deg/s")),
@@ -51,12 +51,12 @@ def test_both_micro_signs_and_blanks_are_understood() -> None:
         (units.time_factor, "fortnight", ('"fortnight"', "ms", "ns")),
     ],
 )
-def test_an_unknown_unit_is_named_with_what_is_known(look_up, unit: str, words: tuple[str, ...]) -> None:
+def test_error_names_the_unknown_unit_and_known_units(look_up, unit: str, expected_parts: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError) as caught:
         look_up(unit)
-    assert all(word in str(caught.value) for word in words)
+    assert all(part in str(caught.value) for part in expected_parts)
     assert "\n" not in str(caught.value)
 
 
-def test_the_examples_run() -> None:
+def test_docstring_examples_are_correct() -> None:
     assert doctest.testmod(units).failed == 0

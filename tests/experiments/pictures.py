@@ -53,24 +53,24 @@ from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
 from monitor.simulator import AMBIENT_C, WARM_UP_C, WARM_UP_S
 from monitor.simulator.demo_config import build_demo_config
-from tests.monitor.publishing.made import estimate, true_coefficients
+from tests.monitor.publishing.example_results import make_estimate, make_true_coefficients
 
 SIZE = (1600, 1000)
 MODEL = shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml"
 T0 = 1_763_705_400.0  # Unix s of the first sample: 2025-11-21 06:10 UTC
 HOUR_S = 3600.0
-SPARE_S = 900.0  # of the recording beyond the hour, so that it still runs when the service is stopped
-GAP_S = (1403.0, 1404.5)  # since T0: what the recording lost
-CHANGED_S = 2400.0  # since T0: when gz becomes noisier
-MORE_N = 1.7e-4  # rad/√s: so much white noise is added
+SPARE_S = 900.0  # additional length of the recording, so that the replay still runs when the service stops
+GAP_S = (1403.0, 1404.5)  # since T0: gap in the recording
+NOISE_STEP_S = 2400.0  # since T0: time at which gz becomes noisier
+ADDED_N = 1.7e-4  # rad/√s: added white noise
 WINDOW = "5min"
 SPEED = 60.0
-SETTLE_S = 6.0  # for a software renderer to paint what has arrived
-STILL_S = 5.0  # a page that has not changed for so long has caught up with what was sent
-PULLED_S, PLUGGED_S, PULLED_AGAIN_S, LOOKED_S = 30.0, 34.0, 70.0, 74.0  # since the fleet's start
+SETTLE_S = 6.0  # time for a software renderer to draw all data
+UNCHANGED_S = 5.0  # a page that has not changed for this time shows all data
+UNPLUGGED_S, PLUGGED_S, SECOND_UNPLUGGED_S, SCREENSHOT_S = 30.0, 34.0, 70.0, 74.0  # since the fleet's start
 DEMO_LETTERS = (8e-6, 1.5e-4, 2e-4, 4e-5, 1e-9)  # Q N B K R of its gyros
 VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
-SHOWN_S = 45.0  # after the vibration began
+VIBRATION_S = 45.0  # after the vibration began
 CHROMIUM_FLAGS = (
     *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--disable-default-apps"),
@@ -87,7 +87,7 @@ bandwidth = 2.0
 fraction = 2e-4
 scale = 0.02
 """
-TURNED_S, TURNS_S = 2700.0, (900.0, 1300.0, 1700.0)
+TURNED_RECORDING_S, TURNS_S = 2700.0, (900.0, 1300.0, 1700.0)
 WARM_S, WARM_HZ, WARM_SPEED = 48 * 3600.0, 10.0, 4000.0
 WARM = """
 [temperature]
@@ -146,11 +146,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("docs/pictures"))
     parser.add_argument("--only", nargs="*", choices=PICTURES, default=list(PICTURES))
-    asked = parser.parse_args()
-    asked.out.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        for name in asked.only:
-            path = PICTURES[name](asked.out.resolve(), Path(folder))
+        for name in arguments.only:
+            path = PICTURES[name](arguments.out.resolve(), Path(folder))
             print(f"{path} ({path.stat().st_size / 1e3:.0f} kB)")
 
 
@@ -199,7 +199,7 @@ def drift(out: Path, folder: Path) -> Path:
     """Show the tab Drift of a sensor that is turned three times."""
     path = out / "viewer-drift.png"
     source = folder / "turned.npz"
-    n = round(TURNED_S * 100.0)
+    n = round(TURNED_RECORDING_S * 100.0)
     t_s = np.arange(n) / 100.0
     values = (
         read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
@@ -210,12 +210,12 @@ def drift(out: Path, folder: Path) -> Path:
     for axis, since_s in enumerate(TURNS_S):
         turning = (t_s >= since_s) & (t_s < since_s + 60.0)
         values[turning, axis] += np.radians(1.0) * np.sin(2.0 * np.pi * (t_s[turning] - since_s) / 20.0)
-    turning = t_s >= TURNED_S - 12.0
+    turning = t_s >= TURNED_RECORDING_S - 12.0
     values[turning, 2] += np.radians(1.0) * np.sin(2.0 * np.pi * (t_s[turning] - t_s[turning][0]) / 6.0)
     save_samples(source, T0 + t_s, values)
     with window() as (port, shoot):
         with serving(folder, REPLAY.format(recording=source, speed=SPEED), port) as service:
-            wait_until(lambda: has_replayed(service, TURNED_S - 2.0), 120.0)
+            wait_until(lambda: has_replayed(service, TURNED_RECORDING_S - 2.0), 120.0)
         select_tab(port, 3)
         time.sleep(SETTLE_S)
         shoot(path)
@@ -257,13 +257,13 @@ def fleet(out: Path, folder: Path) -> Path:
     with window() as (port, shoot), serving(folder, FLEET, port) as service:
         simulated = {worker.name: worker.simulated for worker in service.workers}
         tail, wing = simulated["tail"], simulated["wing"]
-        wait_until(lambda: all(station.publisher.latest is not None for station in service.workers), 120.0)
+        wait_until(lambda: all(worker.publisher.latest is not None for worker in service.workers), 120.0)
         begun_s = time.monotonic()
         for at_s, act in (
-            (PULLED_S, tail.port.unplug),
+            (UNPLUGGED_S, tail.port.unplug),
             (PLUGGED_S, tail.port.plug),
-            (PULLED_AGAIN_S, wing.port.unplug),
-            (LOOKED_S, lambda: shoot(path)),
+            (SECOND_UNPLUGGED_S, wing.port.unplug),
+            (SCREENSHOT_S, lambda: shoot(path)),
         ):
             time.sleep(max(begun_s + at_s - time.monotonic(), 0.0))
             act()
@@ -273,33 +273,34 @@ def fleet(out: Path, folder: Path) -> Path:
 def view(out: Path, folder: Path) -> Path:
     """Show ``imu-monitor view`` with twelve devices; one of three daemons is stopped, and two cables are unplugged."""
     path = out / "view-fleet.png"
-    with window() as (port, shoot), contextlib.ExitStack() as ending:
-        daemons, places = [], []
+    with window() as (port, shoot), contextlib.ExitStack() as stack:
+        daemons, endpoints = [], []
         for daemon in range(3):
-            places.append(f"tcp/127.0.0.1:{free_port()}")
+            endpoints.append(f"tcp/127.0.0.1:{free_port()}")
             file = folder / f"daemon{daemon}.toml"
             devices = "".join(
                 MEMBER.format(name=name, seed=seed) for seed, name in enumerate(MEMBERS) if seed % 3 == daemon
             )
-            rest = f'[zenoh]\nlisten = ["{places[-1]}"]\nprefix = "fleet"\n[viewer]\nmode = "none"\n'
+            rest = f'[zenoh]\nlisten = ["{endpoints[-1]}"]\nprefix = "fleet"\n[viewer]\nmode = "none"\n'
             file.write_text(devices + rest)
-            daemons.append(ending.enter_context(running(loading.load_config(file))))
+            daemons.append(stack.enter_context(running(loading.load_config(file))))
         detail = [f"fleet/{name}" for name in MEMBERS[:2]]
         viewer = RerunView(
             ViewerSettings("native", port), [ViewerDeviceDescription(key, "over zenoh") for key in detail], fleet=True
         )
-        arriving = ending.enter_context(contextlib.closing(ZenohSubscriber("fleet/**", places, None, detail)))
-        ending.enter_context(contextlib.closing(viewer))
+        arriving = stack.enter_context(contextlib.closing(ZenohSubscriber("fleet/**", endpoints, None, detail)))
+        stack.enter_context(contextlib.closing(viewer))
         stop = threading.Event()
-        looking = threading.Thread(target=FleetView(arriving, viewer, detail).run, args=(stop, print))
+        fleet_thread = threading.Thread(target=FleetView(arriving, viewer, detail).run, args=(stop, print))
         arriving.start()
         viewer.start()
-        looking.start()
+        fleet_thread.start()
         try:
             wait_until(
-                lambda: all(station.publisher.latest is not None for one in daemons for station in one.workers), 120.0
+                lambda: all(worker.publisher.latest is not None for service in daemons for worker in service.workers),
+                120.0,
             )
-            time.sleep(PULLED_AGAIN_S)
+            time.sleep(SECOND_UNPLUGGED_S)
             daemons[0].workers[1].simulated.port.unplug()  # MEMBERS[3]
             daemons[1].workers[1].simulated.port.unplug()  # MEMBERS[4]
             daemons[2].request_stop()
@@ -307,7 +308,7 @@ def view(out: Path, folder: Path) -> Path:
             shoot(path)
         finally:
             stop.set()
-            looking.join()
+            fleet_thread.join()
     return path
 
 
@@ -323,7 +324,7 @@ def yesterday(out: Path, folder: Path) -> Path:
         viewer = config.viewer.model_copy(update={"mode": "native", "port": port, "history": 86_400.0})
         with running(replace(config, zenoh=zenoh, viewer=viewer, storage=storage)) as service:
             wait_until(lambda: has_coefficients(service), 240.0)
-            time.sleep(SHOWN_S)
+            time.sleep(VIBRATION_S)
             shoot(path)
     return path
 
@@ -348,9 +349,9 @@ def write_history(path: Path, device: str, now_s: float) -> None:
             )
     store = HistoryFileWriter(path)
     times = [now_s - 86_400.0 + 60.0 * i for i in (500, 800, 860)]
-    told = [("noise_changed", "gz angle random walk rose by 50 %"), ("link_lost", "/dev/ttyUSB0: gone"),
+    texts = [("noise_changed", "gz angle random walk rose by 50 %"), ("link_lost", "/dev/ttyUSB0: gone"),
             ("link_back", "/dev/ttyUSB0: back after 1 h 00 min")]  # fmt: skip
-    events = [StoredEvent(at, kind, text) for at, (kind, text) in zip(times, told, strict=True)]
+    events = [StoredEvent(at, kind, text) for at, (kind, text) in zip(times, texts, strict=True)]
     store.write_rows_and_events(
         [(device, row) for row in (*rows, minutes.flush()) if row is not None], [(device, one) for one in events]
     )
@@ -359,10 +360,10 @@ def write_history(path: Path, device: str, now_s: float) -> None:
 
 def scale_estimate(scale: Floats, rng: np.random.Generator) -> Estimate:
     """Return the estimate of one hour of the demo's sensor, with one factor on the noise of each axis."""
-    one = estimate(seed=int(rng.integers(1 << 30)))
+    one = make_estimate(seed=int(rng.integers(1 << 30)))
     c = one.coefficients
     wanted = np.outer(DEMO_LETTERS, np.repeat([1.0, 10.0], 3)) * scale
-    factor = np.divide(wanted, true_coefficients(), out=np.ones((5, 6)), where=true_coefficients() > 0.0)
+    factor = np.divide(wanted, make_true_coefficients(), out=np.ones((5, 6)), where=make_true_coefficients() > 0.0)
     return replace(one, coefficients=replace(c, value=c.value * factor, lo=c.lo * factor, hi=c.hi * factor))
 
 
@@ -378,7 +379,7 @@ def effect(out: Path, _: Path) -> Path:
             assert isinstance(sensor, loading.VirtualTable)
             begun_s = time.monotonic()
             wait_until(lambda: service.workers[0].publisher.latest is not None, 60.0)
-            time.sleep(begun_s + sensor.effect_at + SHOWN_S - time.monotonic())
+            time.sleep(begun_s + sensor.effect_at + VIBRATION_S - time.monotonic())
             shoot(path)
     return reduce_colours(path)
 
@@ -511,8 +512,8 @@ def recording(folder: Path, seconds: float, changed: bool = False) -> Path:
         since_s = np.arange(round(seconds * rate_hz)) / rate_hz
         values = model.start_stream(rate_hz, 1).draw_next_samples(since_s.size)
         if changed:
-            after = since_s >= CHANGED_S
-            values[after, 2] += MORE_N * rate_hz**0.5 * np.random.default_rng(1).standard_normal(after.sum())
+            after = since_s >= NOISE_STEP_S
+            values[after, 2] += ADDED_N * rate_hz**0.5 * np.random.default_rng(1).standard_normal(after.sum())
         temperature_c = AMBIENT_C - WARM_UP_C * np.expm1(-since_s / WARM_UP_S)
         kept = (since_s < GAP_S[0]) | (since_s >= GAP_S[1])
         save_samples(path, T0 + since_s[kept], values[kept], temperature_c[kept])
@@ -584,10 +585,10 @@ def page_server() -> Iterator[tuple[int, str]]:
         child.terminate()
 
 
-def wait_until(true: Callable[[], bool], seconds: float) -> None:
+def wait_until(condition: Callable[[], bool], seconds: float) -> None:
     """Wait until the condition is true; raise TimeoutError if it takes too long."""
     end = time.monotonic() + seconds
-    while not true():
+    while not condition():
         if time.monotonic() > end:
             raise TimeoutError(f"not within {seconds} s")
         time.sleep(0.05)
@@ -659,8 +660,8 @@ def settled_screenshot(page: Page) -> bytes:
         if picture == before:
             return picture
         before = picture
-        time.sleep(STILL_S)
-    raise TimeoutError(f"the page still changes after {24 * STILL_S:.0f} s")
+        time.sleep(UNCHANGED_S)
+    raise TimeoutError(f"the page still changes after {24 * UNCHANGED_S:.0f} s")
 
 
 @contextmanager

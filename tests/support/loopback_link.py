@@ -37,14 +37,14 @@ class LoopbackLink:
             self._changed.notify_all()
 
     def drop(self) -> None:
-        """Simulate a lost connection. Unread data are lost, and the next ``read`` raises ``LinkLost``."""
+        """Simulate a lost connection. Unread data are lost, and the next read raises ``LinkLost``."""
         with self._changed:
             self._dropped = True
             self._waiting.clear()
             self._changed.notify_all()
 
     def end(self) -> None:
-        """End the data. After all data have been read, ``read`` raises ``LinkEnded``."""
+        """End the data. After all data have been read, the next read raises ``LinkEnded``."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
@@ -77,11 +77,11 @@ class LoopbackLink:
             return None
 
     def close(self) -> None:
-        """Close the link and end a waiting ``read``."""
+        """Close the link and end a waiting read."""
         with self._changed:
             self._open = False
             self._changed.notify_all()
 
     def _can_return(self) -> bool:
-        """Return True if ``read`` has a reason to return."""
+        """Return True if a waiting read can return."""
         return bool(self._waiting) or self._dropped or self._ended or not self._open

@@ -1,4 +1,4 @@
-"""Real recordings, and made ones as blocks of samples."""
+"""Folder of the real recordings, and simulated recordings as blocks of samples."""
 
 import os
 from pathlib import Path

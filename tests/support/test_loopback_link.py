@@ -1,4 +1,4 @@
-"""The in-memory twin does what its writer tells it."""
+"""Tests of the loopback link."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from drivers.errors import LinkEnded, LinkLost, LinkUnavailable
 from tests.support.loopback_link import LoopbackLink
 
 
-def test_what_was_written_before_opening_waits() -> None:
+def test_data_written_before_opening_are_received() -> None:
     link = LoopbackLink("frames", "unix")
     chunk = Chunk(b"frame", 7, 0x123)
     link.write(chunk)
@@ -16,7 +16,7 @@ def test_what_was_written_before_opening_waits() -> None:
     assert (link.carrier, link.epoch) == ("frames", "unix")
 
 
-def test_drop_loses_what_was_unread_and_opening_heals() -> None:
+def test_drop_discards_unread_data_and_opening_reconnects() -> None:
     link = LoopbackLink()
     link.open()
     link.write(b"lost")
@@ -28,7 +28,7 @@ def test_drop_loses_what_was_unread_and_opening_heals() -> None:
     assert [c.data for c in link.wait_for_chunks_or_timeout(1.0) or ()] == [b"new"]
 
 
-def test_end_comes_behind_what_was_written() -> None:
+def test_link_ends_after_all_data_have_been_read() -> None:
     link = LoopbackLink()
     link.open()
     link.write(b"last")
@@ -38,7 +38,7 @@ def test_end_comes_behind_what_was_written() -> None:
         link.wait_for_chunks_or_timeout(1.0)
 
 
-def test_absent() -> None:
+def test_absent_link_cannot_be_opened() -> None:
     link = LoopbackLink()
     link.absent = True
     with pytest.raises(LinkUnavailable):

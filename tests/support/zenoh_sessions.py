@@ -1,4 +1,4 @@
-"""zenoh sessions and routers in the test process, on loopback, that no other process finds."""
+"""zenoh sessions and routers in the test process. They use only loopback, so other processes do not find them."""
 
 import contextlib
 import json
@@ -8,8 +8,10 @@ from typing import Any
 import zenoh
 
 DROP_WAIT = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
-"""zenoh drops a message that has met a full queue for 1 ms. On a busy machine the thread that empties the queue may not
-run that soon, so tests that count messages wait longer."""
+"""Time for which a message waits in front of a full queue before zenoh drops it.
+
+The default is 1 ms. On a busy machine, the thread that empties the queue may need longer, so tests wait longer.
+"""
 PATIENT_US = 5_000_000
 
 
@@ -32,14 +34,14 @@ def session_config(
 
 
 def patient_file(folder: Path) -> Path:
-    """Write a zenoh file for a program under test, in which a full queue is waited for as in ``session_config``."""
+    """Write a zenoh file for a program under test, with the same waiting time for full queues as ``session_config``."""
     *tables, key = DROP_WAIT.split("/")
     path = folder / "patient.json5"
     path.write_text("".join(f"{{{table}:" for table in tables) + f"{{{key}:{PATIENT_US}}}" + "}" * len(tables))
     return path
 
 
-def session(
+def open_session(
     mode: str = "client", listen: tuple[str, ...] | list[str] = (), connect: tuple[str, ...] | list[str] = ()
 ) -> contextlib.AbstractContextManager[Any]:
     """Open a session that neither scouts nor listens beyond the given endpoints."""
@@ -47,6 +49,6 @@ def session(
     return opened
 
 
-def router(endpoint: str) -> contextlib.AbstractContextManager[Any]:
+def open_router(endpoint: str) -> contextlib.AbstractContextManager[Any]:
     """Open a router that listens on ``endpoint``."""
-    return session(mode="router", listen=[endpoint])
+    return open_session(mode="router", listen=[endpoint])

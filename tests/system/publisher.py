@@ -1,7 +1,7 @@
-"""A process that publishes a recording over zenoh: python -m tests.system.publisher FILE.npz KEY ENDPOINT ROWS.
+"""Publish a recording over zenoh: python -m tests.system.publisher FILE.npz KEY ENDPOINT ROWS.
 
-It publishes ROWS rows for each line on its standard input, so that a reader on a loaded machine can keep up. It ends
-with its standard input.
+The program publishes ROWS rows for each line on its standard input, so that a reader on a loaded machine can keep up.
+It ends when its standard input is closed.
 """
 
 import sys
@@ -12,14 +12,14 @@ import zenoh
 from drivers.recordings import iter_blocks, load_samples
 from drivers.zenoh.sample_message import encode_samples
 from tests.support.waiting import wait_for
-from tests.support.zenoh_sessions import session
+from tests.support.zenoh_sessions import open_session
 
 BLOCK_ROWS = 1000
 
 
 def main() -> None:
     path, key, endpoint, rows = Path(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4])
-    with session(connect=[endpoint]) as opened:
+    with open_session(connect=[endpoint]) as opened:
         publisher = opened.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
         wait_for(lambda: publisher.matching_status.matching, "a subscriber")
         sent = allowed = 0

@@ -1,4 +1,4 @@
-"""What the walks share: a service in this process with its results caught."""
+"""A service that runs in a thread of the test process, with an output that records all results."""
 
 import os
 import threading
@@ -25,16 +25,16 @@ from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S
 
 
-class Caught(Output):
-    """An output that keeps everything."""
+class RecordingOutput(Output):
+    """Output of the service that stores all blocks, results, events and states for each device."""
 
     def __init__(self) -> None:
         self.blocks: dict[str, list[SampleBlock]] = {}
         self.estimates: dict[str, Estimate] = {}
         self.totals: dict[str, TotalAndHadamardCurves] = {}
-        self.gaps: dict[str, ModelComparison] = {}
-        self.thermals: dict[str, list[ThermalIntervalResult]] = {}
-        self.rates: dict[str, list[SampleBlock]] = {}
+        self.comparisons: dict[str, ModelComparison] = {}
+        self.thermal_results: dict[str, list[ThermalIntervalResult]] = {}
+        self.compensated_blocks: dict[str, list[SampleBlock]] = {}
         self.drifts: dict[str, list[MeasuredAndSubtractedDrift]] = {}
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
@@ -47,9 +47,9 @@ class Caught(Output):
             case Estimate():
                 self.estimates[device] = result
             case ModelComparison():
-                self.gaps[device] = result
+                self.comparisons[device] = result
             case ThermalIntervalResult():
-                self.thermals.setdefault(device, []).append(result)
+                self.thermal_results.setdefault(device, []).append(result)
             case MeasuredAndSubtractedDrift():
                 self.drifts.setdefault(device, []).append(result)
             case TotalAndHadamardCurves():
@@ -58,7 +58,7 @@ class Caught(Output):
     def publish_drift_compensated_samples(
         self, device: str, received: int, samples: SampleBlock, offset_ns: int
     ) -> None:
-        self.rates.setdefault(device, []).append(samples)
+        self.compensated_blocks.setdefault(device, []).append(samples)
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((device, event))
@@ -70,20 +70,20 @@ class Caught(Output):
         return concatenate_blocks(self.blocks[device]).values
 
 
-class Running:
-    """A service in a thread; ``prepare`` is called before it starts."""
+class RunningService:
+    """Service in a thread of this process. ``prepare`` is called with the service before the thread starts."""
 
-    def __init__(self, path: Path, caught: Caught, prepare: Callable[[Service], None] | None = None) -> None:
+    def __init__(self, path: Path, output: RecordingOutput, prepare: Callable[[Service], None] | None = None) -> None:
         self.service = Service(loading.load_config(path))
         if prepare is not None:
             prepare(self.service)
-        self.caught = caught
-        self.service.outputs.append(self.caught)
+        self.output = output
+        self.service.outputs.append(self.output)
         self._thread = threading.Thread(target=self.service.run)
         self._thread.start()
 
-    def station(self, name: str) -> DeviceWorker:
-        return next(station for station in self.service.workers if station.name == name)
+    def worker(self, name: str) -> DeviceWorker:
+        return next(worker for worker in self.service.workers if worker.name == name)
 
     def stop(self) -> None:
         self.service.request_stop()
@@ -95,20 +95,21 @@ class Running:
 
 
 @contextmanager
-def running(
-    folder: Path, text: str, caught: Caught | None = None, prepare: Callable[[Service], None] | None = None
-) -> Iterator[Running]:
+def run_service(
+    folder: Path, text: str, output: RecordingOutput | None = None, prepare: Callable[[Service], None] | None = None
+) -> Iterator[RunningService]:
+    """Run a service with this configuration until the end of the ``with`` block."""
     path = folder / "config.toml"
     path.write_text(text)
-    service = Running(path, caught or Caught(), prepare)
+    run = RunningService(path, output or RecordingOutput(), prepare)
     try:
-        yield service
+        yield run
     finally:
-        service.stop()
+        run.stop()
 
 
-class Cable:
-    """A pseudo-terminal whose name stays the same while it is pulled out and put back."""
+class PluggableTerminal:
+    """Pseudo-terminal that can be unplugged and plugged in again under the same path."""
 
     def __init__(self, folder: Path) -> None:
         self.port = folder / "tty"
@@ -134,8 +135,8 @@ class Cable:
             view = view[os.write(self.master, view) :]
 
 
-def paced(send: Callable[[bytes], None], frames: list[bytes], per_second: float, burst: int = 40) -> None:
-    """Send frames in bursts at that rate, or as fast as the machine can."""
+def send_at_rate(send: Callable[[bytes], None], frames: list[bytes], per_second: float, burst: int = 40) -> None:
+    """Send ``per_second`` frames per second in bursts, or as many as the machine can."""
     begun = time.monotonic()
     for start in range(0, len(frames), burst):
         early = begun + start / per_second - time.monotonic()

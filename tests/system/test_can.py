@@ -1,4 +1,4 @@
-"""Real CAN traffic through real links: slcan over a pseudo-terminal, and a log file of python-can."""
+"""Tests of recorded CAN traffic through the service, from a python-can log file and from an slcan adapter."""
 
 import csv
 import gzip
@@ -16,7 +16,7 @@ from drivers.data_types import AXES, Chunk
 from drivers.links.base import Link
 from tests.support.recordings import recordings
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.system.rig import Cable, paced, running
+from tests.system.rig import PluggableTerminal, run_service, send_at_rate
 
 OPTIONS = """
 [device.driver.decoder_options]
@@ -34,10 +34,10 @@ mode = "none"
 [viewer]
 mode = "none"
 """
-HALF_BIT = np.repeat([0.125 * np.pi / 180.0, 0.0625], 3)
+HALF_LSB = np.repeat([0.125 * np.pi / 180.0, 0.0625], 3)
 
 
-def frames(path: Path) -> list[can.Message]:
+def read_frames(path: Path) -> list[can.Message]:
     with gzip.open(path, "rt") as file:
         return [
             can.Message(
@@ -50,12 +50,12 @@ def frames(path: Path) -> list[can.Message]:
         ]
 
 
-def expected(path: Path) -> np.ndarray:
+def read_expected_values(path: Path) -> np.ndarray:
     with np.load(path) as npz:
         return np.column_stack([npz[axis].astype(float) for axis in AXES])
 
 
-def imu_frames(messages: list[can.Message]) -> list[can.Message]:
+def select_imu_frames(messages: list[can.Message]) -> list[can.Message]:
     return [message for message in messages if message.arbitration_id == 9 and not message.is_extended_id]
 
 
@@ -63,9 +63,9 @@ def imu_frames(messages: list[can.Message]) -> list[can.Message]:
 @pytest.mark.parametrize(
     ("name", "kind"), [("can-boat/moored-5min", ".asc"), ("can-car/drive-a", ".blf"), ("can-car/drive-b", ".log")]
 )
-def test_a_log_file_gives_the_recorded_samples(tmp_path: Path, name: str, kind: str) -> None:
+def test_log_file_gives_the_recorded_samples(tmp_path: Path, name: str, kind: str) -> None:
     folder = recordings()
-    messages = frames(folder / f"{name}-frames.csv.gz")
+    messages = read_frames(folder / f"{name}-frames.csv.gz")
     with can.Logger(str(tmp_path / f"drive{kind}")) as log:
         for message in messages:
             log.on_message_received(message)
@@ -79,37 +79,37 @@ path = "drive{kind}"
 speed = "max"
 decoder = "dbc"
 """
-    with running(tmp_path, config + OPTIONS) as run:
-        run.join()  # a replay that has ended ends the service
-        counts = run.station("imu").driver.counts
-    sent = imu_frames(messages)
-    valid = np.array([frame.data[0] & 1 for frame in sent], bool)  # two frames of drive-b say that they are not
+    with run_service(tmp_path, config + OPTIONS) as run:
+        run.join()  # the service ends with the replay
+        counts = run.worker("imu").driver.counts
+    sent = select_imu_frames(messages)
+    valid = np.array([frame.data[0] & 1 for frame in sent], bool)  # two frames of drive-b are marked as invalid
     assert (counts.received, counts.bad, counts.lost) == (valid.sum(), (~valid).sum(), 0)
-    want = expected(folder / f"{name}.npz")
+    want = read_expected_values(folder / f"{name}.npz")
     assert len(want) == len(sent)
-    assert (np.abs(run.caught.values("imu") - want[valid]) <= HALF_BIT).all()
+    assert (np.abs(run.output.values("imu") - want[valid]) <= HALF_LSB).all()
 
 
 class SlcanAdapter(threading.Thread):
-    """The far end of a serial CAN adapter: answers what it is asked, sends frames as lines."""
+    """Simulated serial CAN adapter, which waits for the command that opens the channel."""
 
-    def __init__(self, cable: Cable) -> None:
+    def __init__(self, terminal: PluggableTerminal) -> None:
         super().__init__(daemon=True)
-        self._cable = cable
+        self._terminal = terminal
         self.opened = threading.Event()
 
     def run(self) -> None:
         while not self.opened.is_set():
             try:
-                asked = os.read(self._cable.master, 256)
+                command = os.read(self._terminal.master, 256)
             except OSError:  # nobody has opened the other end yet
                 time.sleep(0.05)
                 continue
-            if b"O" in asked:
+            if b"O" in command:
                 self.opened.set()
 
 
-def slcan(message: can.Message) -> bytes:
+def encode_slcan(message: can.Message) -> bytes:
     address = f"T{message.arbitration_id:08X}" if message.is_extended_id else f"t{message.arbitration_id:03X}"
     return f"{address}{len(message.data)}{message.data.hex().upper()}\r".encode()
 
@@ -117,28 +117,28 @@ def slcan(message: can.Message) -> bytes:
 def stamp_as_recorded(link: Link, messages: list[can.Message]) -> None:
     """Give the frames of the IMU the times at which they were recorded.
 
-    The frames carry no counter, so samples count as lost where a loaded machine stops for a while.
+    The frames have no counter, so a pause of a loaded machine would count as lost samples.
     """
-    recorded = [message.timestamp for message in imu_frames(messages)]
+    recorded = [message.timestamp for message in select_imu_frames(messages)]
     begun_ns = time.monotonic_ns() - round((recorded[-1] - recorded[0]) * 1e9)
     times_ns = iter([begun_ns + round((t_s - recorded[0]) * 1e9) for t_s in recorded])
     read = link.wait_for_chunks_or_timeout
 
-    def stamped(timeout_s: float) -> list[Chunk] | None:
+    def read_and_stamp(timeout_s: float) -> list[Chunk] | None:
         chunks = read(timeout_s)
         return None if chunks is None else [replace(chunk, t_ns=next(times_ns)) for chunk in chunks]
 
-    link.wait_for_chunks_or_timeout = stamped  # type: ignore[method-assign]
+    link.wait_for_chunks_or_timeout = read_and_stamp  # type: ignore[method-assign]
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["can-boat/moored-5min", "can-car/drive-a"])
-def test_a_serial_can_adapter_gives_the_recorded_samples(tmp_path: Path, name: str) -> None:
+def test_serial_can_adapter_gives_the_recorded_samples(tmp_path: Path, name: str) -> None:
     folder = recordings()
-    messages = frames(folder / f"{name}-frames.csv.gz")
+    messages = read_frames(folder / f"{name}-frames.csv.gz")
     messages = [message for message in messages if message.timestamp < messages[0].timestamp + 30.0]
-    cable = Cable(tmp_path)
-    adapter = SlcanAdapter(cable)
+    terminal = PluggableTerminal(tmp_path)
+    adapter = SlcanAdapter(terminal)
     adapter.start()
     config = f"""[[device]]
 name = "imu"
@@ -147,17 +147,17 @@ window = 400.0
 [device.driver]
 link = "can"
 interface = "slcan"
-channel = "{cable.port}"
+channel = "{terminal.port}"
 bitrate = 500000
 decoder = "dbc"
 """
-    with running(tmp_path, config + OPTIONS) as run:
-        stamp_as_recorded(run.station("imu").driver.link, messages)
+    with run_service(tmp_path, config + OPTIONS) as run:
+        stamp_as_recorded(run.worker("imu").driver.link, messages)
         assert adapter.opened.wait(PATIENCE_S)
-        paced(cable.write, [slcan(message) for message in messages], 1500.0)
-        counts = run.station("imu").driver.counts
-        sent = len(imu_frames(messages))
+        send_at_rate(terminal.write, [encode_slcan(message) for message in messages], 1500.0)
+        counts = run.worker("imu").driver.counts
+        sent = len(select_imu_frames(messages))
         wait_for(lambda: counts.received + counts.bad >= sent, "the last frame")
     assert (counts.received, counts.bad, counts.lost) == (sent, 0, 0)
-    want = expected(folder / f"{name}.npz")[:sent]
-    assert (np.abs(run.caught.values("imu") - want) <= HALF_BIT).all()
+    want = read_expected_values(folder / f"{name}.npz")[:sent]
+    assert (np.abs(run.output.values("imu") - want) <= HALF_LSB).all()

@@ -1,4 +1,4 @@
-"""Processes whose terminal is frozen, whose log nobody reads or whose disk is full go on measuring, and end in time."""
+"""Tests that a frozen terminal, an unread log or a full disk stops neither the measurement nor the end of a process."""
 
 import contextlib
 import json
@@ -20,7 +20,7 @@ import pytest
 from drivers.recordings import save_samples
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import router, session
+from tests.support.zenoh_sessions import open_router, open_session
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
 CONFIG = """
@@ -69,13 +69,13 @@ main()
 
 
 class Daemon:
-    """A daemon in a process of its own, and what it publishes."""
+    """Daemon in a separate process, with the messages that it publishes."""
 
     def __init__(self, process: "subprocess.Popen[bytes]", subscriber: Any) -> None:
         self.process = process
         self._subscriber = subscriber
         self.counts = {"samples": 0, "coefficients": 0, "status": 0}
-        self.outputs: dict[str, str] = {}  # of the newest status
+        self.outputs: dict[str, str] = {}  # states in the newest status
 
     def listen(self) -> None:
         """Take all messages that have arrived."""
@@ -86,20 +86,20 @@ class Daemon:
             if topic == "status":
                 self.outputs = json.loads(message.payload.to_bytes())["outputs"]
 
-    def says(self, output: str, right: Callable[[str], Any]) -> str:
-        """Wait until the status says so of an output."""
+    def wait_for_output_state(self, output: str, condition: Callable[[str], Any]) -> str:
+        """Wait until the state of an output in the status fulfils ``condition``. Return the state."""
 
-        def said() -> bool:
+        def has_state() -> bool:
             self.listen()
-            return bool(right(self.outputs.get(output, "")))
+            return bool(condition(self.outputs.get(output, "")))
 
         try:
-            wait_for(said)
+            wait_for(has_state)
         except AssertionError:
             raise AssertionError(f"{output}: {self.outputs}, received {self.counts}") from None
         return self.outputs[output]
 
-    def goes_on(self) -> None:
+    def check_publishing_continues(self) -> None:
         """Wait for more samples, coefficients and states."""
         self.listen()
         before = dict(self.counts)
@@ -112,19 +112,19 @@ class Daemon:
 
 
 @contextlib.contextmanager
-def daemon(folder: Path, stdout: int, stderr: int, source: str | None = None) -> Iterator[Daemon]:
+def start_daemon(folder: Path, stdout: int, stderr: int, source: str | None = None) -> Iterator[Daemon]:
     endpoint = free_endpoint()
     path = folder / "config.toml"
     path.write_text(CONFIG.format(endpoint=endpoint))
     command = PROGRAM if source is None else [sys.executable, "-c", source]
-    with router(endpoint), session(connect=[endpoint]) as client:
+    with open_router(endpoint), open_session(connect=[endpoint]) as client:
         subscriber = client.declare_subscriber("imu/**")
-        with program([*command, "run", str(path)], stdout, stderr) as process:
+        with start_program([*command, "run", str(path)], stdout, stderr) as process:
             yield Daemon(process, subscriber)
 
 
 @contextlib.contextmanager
-def program(
+def start_program(
     command: list[str], stdout: int, stderr: int, folder: Path | None = None
 ) -> Iterator["subprocess.Popen[bytes]"]:
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40", "PYTHONPATH": os.getcwd()}
@@ -138,21 +138,21 @@ def program(
         process.wait(PATIENCE_S)
 
 
-def ended(process: "subprocess.Popen[bytes]", number: int) -> int:
-    """Exit status after a signal."""
+def send_signal_and_wait(process: "subprocess.Popen[bytes]", number: int) -> int:
+    """Send a signal to the process and return its exit status."""
     process.send_signal(number)
     return process.wait(PATIENCE_S)
 
 
-class Place:
-    """A terminal or pipe that nobody reads until ``read``.
+class UnreadStream:
+    """Terminal or pipe that nobody reads before ``start_reading`` is called.
 
     Parameters
     ----------
     reading : int
-        Descriptor that is read.
+        Descriptor of the end that this process reads.
     writing : int
-        Descriptor for the process; it is closed with ``close_writer``.
+        Descriptor of the end that the tested process writes. ``close_writer`` closes it.
     thaw : callable, optional
         Called before reading begins.
     """
@@ -164,7 +164,7 @@ class Place:
         self._thaw = thaw
         self._thread = threading.Thread(target=self._read, daemon=True)
 
-    def read(self) -> None:
+    def start_reading(self) -> None:
         self._thaw(self.writing)
         self._thread.start()
 
@@ -173,8 +173,8 @@ class Place:
             while data := os.read(self._reading, 65536):
                 self.data += data
 
-    def all(self) -> bytes:
-        """Everything, after the process has ended."""
+    def read_all(self) -> bytes:
+        """Return all bytes that the process has written. Call this after the process has ended."""
         self.close_writer()
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
@@ -192,7 +192,7 @@ class Place:
         os.close(self._reading)
 
 
-def fill(descriptor: int) -> None:
+def fill_buffer(descriptor: int) -> None:
     """Write until a write would block."""
     os.set_blocking(descriptor, False)
     for length in (1000, 1):  # to the last byte
@@ -202,20 +202,20 @@ def fill(descriptor: int) -> None:
     os.set_blocking(descriptor, True)
 
 
-def frozen_terminal(how: str) -> contextlib.closing[Place]:
-    """A terminal that nobody reads ("unread"), or that Ctrl-S has stopped ("stopped")."""
+def frozen_terminal(reason: str) -> contextlib.closing[UnreadStream]:
+    """Return a terminal that nobody reads ("unread") or that Ctrl-S has stopped ("stopped")."""
     master, slave = os.openpty()
-    if how == "unread":
-        fill(slave)
-        return contextlib.closing(Place(master, slave))
+    if reason == "unread":
+        fill_buffer(slave)
+        return contextlib.closing(UnreadStream(master, slave))
     termios.tcflow(slave, termios.TCOOFF)
-    return contextlib.closing(Place(master, slave, lambda descriptor: termios.tcflow(descriptor, termios.TCOON)))
+    return contextlib.closing(UnreadStream(master, slave, lambda descriptor: termios.tcflow(descriptor, termios.TCOON)))
 
 
-def unread_pipe() -> contextlib.closing[Place]:
+def unread_pipe() -> contextlib.closing[UnreadStream]:
     reading, writing = os.pipe()
-    fill(writing)
-    return contextlib.closing(Place(reading, writing))
+    fill_buffer(writing)
+    return contextlib.closing(UnreadStream(reading, writing))
 
 
 def waits_for_reader(pid: int) -> bool:
@@ -238,26 +238,28 @@ def waits_for_reader(pid: int) -> bool:
 
 
 @pytest.mark.parametrize(("frozen", "number"), [("unread", signal.SIGTERM), ("stopped", signal.SIGINT)])
-def test_a_frozen_terminal_stops_neither_the_results_nor_the_end(tmp_path: Path, frozen: str, number: int) -> None:
-    with frozen_terminal(frozen) as screen, daemon(tmp_path, screen.writing, screen.writing) as one:
-        one.says("terminal", lambda state: state.startswith("blocked for ") and "frames dropped" in state)
-        assert one.outputs.keys() == {"zenoh", "terminal"}
-        one.goes_on()
-        assert ended(one.process, number) == 0
+def test_frozen_terminal_stops_neither_results_nor_shutdown(tmp_path: Path, frozen: str, number: int) -> None:
+    with frozen_terminal(frozen) as screen, start_daemon(tmp_path, screen.writing, screen.writing) as running_daemon:
+        running_daemon.wait_for_output_state(
+            "terminal", lambda state: state.startswith("blocked for ") and "frames dropped" in state
+        )
+        assert running_daemon.outputs.keys() == {"zenoh", "terminal"}
+        running_daemon.check_publishing_continues()
+        assert send_signal_and_wait(running_daemon.process, number) == 0
 
 
 @pytest.mark.parametrize("frozen", ["unread", "stopped"])
-def test_a_terminal_that_is_read_again_goes_on(tmp_path: Path, frozen: str) -> None:
+def test_terminal_is_updated_again_once_it_is_read(tmp_path: Path, frozen: str) -> None:
     with frozen_terminal(frozen) as screen:
-        with daemon(tmp_path, screen.writing, screen.writing) as one:
-            one.says("terminal", lambda state: "frames dropped" in state)
-            screen.read()
-            state = one.says("terminal", lambda state: state.startswith("ok"))
+        with start_daemon(tmp_path, screen.writing, screen.writing) as running_daemon:
+            running_daemon.wait_for_output_state("terminal", lambda state: "frames dropped" in state)
+            screen.start_reading()
+            state = running_daemon.wait_for_output_state("terminal", lambda state: state.startswith("ok"))
             assert re.fullmatch(r"ok, but [\d,]+ frames? dropped", state)
             wait_for(lambda: screen.data.count("● running".encode()) > 2)
-            one.goes_on()
-            assert ended(one.process, signal.SIGINT) == 0
-        text = screen.all()
+            running_daemon.check_publishing_continues()
+            assert send_signal_and_wait(running_daemon.process, signal.SIGINT) == 0
+        text = screen.read_all()
     hidden, shown = text.index(b"\x1b[?25l"), text.index(b"\x1b[?25h")
     assert hidden < shown
     assert "● running".encode() in text[hidden:shown]
@@ -266,55 +268,62 @@ def test_a_terminal_that_is_read_again_goes_on(tmp_path: Path, frozen: str) -> N
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_log_lines_go_above_the_table_or_where_standard_error_goes(tmp_path: Path, shared: bool) -> None:
+def test_log_lines_are_written_above_the_table_or_to_redirected_standard_error(tmp_path: Path, shared: bool) -> None:
     source = MANY_LINES.replace("range(1000)", "range(3)")
     with open(tmp_path / "log", "wb") as file, frozen_terminal("stopped") as screen:
         log = screen.writing if shared else file.fileno()
-        screen.read()
-        with daemon(tmp_path, screen.writing, log, source) as one:
-            one.says("terminal", lambda state: state == "ok")
+        screen.start_reading()
+        with start_daemon(tmp_path, screen.writing, log, source) as running_daemon:
+            running_daemon.wait_for_output_state("terminal", lambda state: state == "ok")
             wait_for(lambda: "● running".encode() in screen.data)
-            assert ended(one.process, signal.SIGTERM) == 0
-        text = screen.all()
+            assert send_signal_and_wait(running_daemon.process, signal.SIGTERM) == 0
+        text = screen.read_all()
     written = (tmp_path / "log").read_bytes()
     assert (text.count(b"filler"), written.count(b"filler")) == ((3, 0) if shared else (0, 3))
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_a_closed_output_stops_nothing(tmp_path: Path, number: int) -> None:
+def test_run_with_a_closed_standard_stream_succeeds(tmp_path: Path, number: int) -> None:
     (tmp_path / "config.toml").write_text(CONFIG.format(endpoint=free_endpoint()))
     command = ["sh", "-c", f'exec "$@" {number}>&-', "sh", *PROGRAM, "run", "config.toml", "--seconds", "2"]
-    with program(command, subprocess.PIPE, subprocess.PIPE, tmp_path) as process:
-        out, said = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0, said
+    with start_program(command, subprocess.PIPE, subprocess.PIPE, tmp_path) as process:
+        out, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, stderr
     assert (b"imu-monitor  1 device" in out) == (number == 2)
-    assert b"Traceback" not in said
+    assert b"Traceback" not in stderr
 
 
-def test_a_second_interrupt_ends_at_once_on_a_frozen_terminal(tmp_path: Path) -> None:
-    with frozen_terminal("unread") as screen, daemon(tmp_path, *2 * [screen.writing], SLOW_TO_STOP) as one:
-        one.says("terminal", lambda state: state.startswith("blocked"))
-        one.process.send_signal(signal.SIGINT)
+def test_second_interrupt_ends_the_daemon_on_a_frozen_terminal(tmp_path: Path) -> None:
+    with (
+        frozen_terminal("unread") as screen,
+        start_daemon(tmp_path, *2 * [screen.writing], SLOW_TO_STOP) as running_daemon,
+    ):
+        running_daemon.wait_for_output_state("terminal", lambda state: state.startswith("blocked"))
+        running_daemon.process.send_signal(signal.SIGINT)
         wait_for((tmp_path / "stopping").exists)
-        assert ended(one.process, signal.SIGINT) == -signal.SIGINT
+        assert send_signal_and_wait(running_daemon.process, signal.SIGINT) == -signal.SIGINT
 
 
-def test_a_log_that_nobody_reads_stops_neither_the_results_nor_the_end(tmp_path: Path) -> None:
-    with unread_pipe() as log, daemon(tmp_path, subprocess.DEVNULL, log.writing) as one:
-        one.says("log", lambda state: re.fullmatch(r"blocked for \d+ s: nobody reads standard error", state))
-        assert one.outputs.keys() == {"zenoh", "log"}
-        one.goes_on()
-        assert ended(one.process, signal.SIGTERM) == 0
+def test_unread_log_stops_neither_results_nor_shutdown(tmp_path: Path) -> None:
+    with unread_pipe() as log, start_daemon(tmp_path, subprocess.DEVNULL, log.writing) as running_daemon:
+        running_daemon.wait_for_output_state(
+            "log", lambda state: re.fullmatch(r"blocked for \d+ s: nobody reads standard error", state)
+        )
+        assert running_daemon.outputs.keys() == {"zenoh", "log"}
+        running_daemon.check_publishing_continues()
+        assert send_signal_and_wait(running_daemon.process, signal.SIGTERM) == 0
 
 
-def test_a_log_that_is_read_again_says_how_many_lines_are_missing(tmp_path: Path) -> None:
-    with unread_pipe() as log, daemon(tmp_path, subprocess.DEVNULL, log.writing, MANY_LINES) as one:
-        one.says("log", lambda state: state.startswith("blocked") and "log lines dropped" in state)
-        one.goes_on()
-        log.read()
-        state = one.says("log", lambda state: state.startswith("ok"))
-        assert ended(one.process, signal.SIGTERM) == 0
-        text = log.all().decode()
+def test_log_that_is_read_again_reports_the_number_of_dropped_lines(tmp_path: Path) -> None:
+    with unread_pipe() as log, start_daemon(tmp_path, subprocess.DEVNULL, log.writing, MANY_LINES) as running_daemon:
+        running_daemon.wait_for_output_state(
+            "log", lambda state: state.startswith("blocked") and "log lines dropped" in state
+        )
+        running_daemon.check_publishing_continues()
+        log.start_reading()
+        state = running_daemon.wait_for_output_state("log", lambda state: state.startswith("ok"))
+        assert send_signal_and_wait(running_daemon.process, signal.SIGTERM) == 0
+        text = log.read_all().decode()
     found = re.search(r"([\d,]+) log lines were dropped because nobody read standard error", text)
     assert found is not None
     assert state == f"ok, but {found[1]} log lines dropped"
@@ -323,11 +332,13 @@ def test_a_log_that_is_read_again_says_how_many_lines_are_missing(tmp_path: Path
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
-def test_a_full_disk_behind_table_and_log_stops_neither_the_results_nor_the_end(tmp_path: Path) -> None:
-    with open("/dev/full", "wb") as full, daemon(tmp_path, full.fileno(), full.fileno()) as one:
-        one.says("log", lambda state: re.match(r"standard error cannot be written: No space left .*; \d+ log", state))
-        one.goes_on()
-        assert ended(one.process, signal.SIGTERM) == 0
+def test_full_disk_for_table_and_log_stops_neither_results_nor_shutdown(tmp_path: Path) -> None:
+    with open("/dev/full", "wb") as full, start_daemon(tmp_path, full.fileno(), full.fileno()) as running_daemon:
+        running_daemon.wait_for_output_state(
+            "log", lambda state: re.match(r"standard error cannot be written: No space left .*; \d+ log", state)
+        )
+        running_daemon.check_publishing_continues()
+        assert send_signal_and_wait(running_daemon.process, signal.SIGTERM) == 0
 
 
 # --- the final table
@@ -344,20 +355,20 @@ def test_a_full_disk_behind_table_and_log_stops_neither_the_results_nor_the_end(
         ("SIGTERM", "pipe"),
     ],
 )
-def test_the_final_table_is_written_whatever_ended_the_run(tmp_path: Path, ending: str, place: str) -> None:
+def test_final_table_is_written_for_every_way_to_end_a_run(tmp_path: Path, ending: str, place: str) -> None:
     values = np.random.default_rng(1).standard_normal((500, 6))
     save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, values)
     text = REPLAY if ending == "end of the replay" else CONFIG.format(endpoint=free_endpoint())
     (tmp_path / "config.toml").write_text(text)
     more = ["--seconds", "3"] if ending == "seconds" else []
     reading, out = os.pipe() if place == "pipe" else (-1, os.open(tmp_path / "out", os.O_RDWR | os.O_CREAT))
-    with program([*PROGRAM, "run", "config.toml", *more], out, subprocess.PIPE, tmp_path) as process:
+    with start_program([*PROGRAM, "run", "config.toml", *more], out, subprocess.PIPE, tmp_path) as process:
         assert process.stderr is not None
         if ending.startswith("SIG"):
-            until(process, b"state=running")
+            read_stderr_until(process, b"state=running")
             process.send_signal(getattr(signal, ending))
-        said = process.stderr.read()
-        assert process.wait(PATIENCE_S) == 0, said
+        stderr = process.stderr.read()
+        assert process.wait(PATIENCE_S) == 0, stderr
         process.stderr.close()
     os.close(out)
     table = (tmp_path / "out").read_bytes() if place == "file" else os.read(reading, 65536)
@@ -368,14 +379,14 @@ def test_the_final_table_is_written_whatever_ended_the_run(tmp_path: Path, endin
     assert b"\x1b" not in table
 
 
-def until(process: "subprocess.Popen[bytes]", words: bytes) -> None:
-    """Read standard error up to a line with these words."""
+def read_stderr_until(process: "subprocess.Popen[bytes]", words: bytes) -> None:
+    """Read standard error up to the first line that contains ``words``."""
     assert process.stderr is not None
     assert any(words in line for line in process.stderr)
 
 
 @pytest.mark.parametrize("place", ["full disk", "unread pipe"])
-def test_a_final_table_that_is_lost_is_an_error_where_nobody_asked_to_end(tmp_path: Path, place: str) -> None:
+def test_unwritable_final_table_at_the_end_of_a_replay_is_an_error(tmp_path: Path, place: str) -> None:
     values = np.random.default_rng(1).standard_normal((500, 6))
     save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, values)
     (tmp_path / "config.toml").write_text(REPLAY)
@@ -386,49 +397,49 @@ def test_a_final_table_that_is_lost_is_an_error_where_nobody_asked_to_end(tmp_pa
             out = stack.enter_context(open("/dev/full", "wb")).fileno()
         else:
             out = stack.enter_context(unread_pipe()).writing
-        process = stack.enter_context(program([*PROGRAM, "run", "config.toml"], out, subprocess.PIPE, tmp_path))
-        _, said = process.communicate(timeout=PATIENCE_S)
+        process = stack.enter_context(start_program([*PROGRAM, "run", "config.toml"], out, subprocess.PIPE, tmp_path))
+        _, stderr = process.communicate(timeout=PATIENCE_S)
         status = process.returncode
     assert status == 1
     why = "could not be written: No space left on device" if place == "full disk" else "was not written, because nobody"
-    assert said.decode().splitlines()[-1].startswith(f"imu-monitor: standard output: the final table {why}")
+    assert stderr.decode().splitlines()[-1].startswith(f"imu-monitor: standard output: the final table {why}")
 
 
 # --- watch and view
 
 
 @pytest.mark.parametrize("place", ["terminal", "pipe", "pipe, once"])
-def test_watch_ends_although_nobody_reads_it(place: str) -> None:
+def test_watch_ends_although_nobody_reads_its_output(place: str) -> None:
     endpoint = free_endpoint()
     more = ["--seconds", "1"] if place == "pipe, once" else []
     with contextlib.ExitStack() as stack:
-        stack.enter_context(router(endpoint))
+        stack.enter_context(open_router(endpoint))
         out = stack.enter_context(frozen_terminal("unread") if place == "terminal" else unread_pipe())
         command = [*PROGRAM, "watch", "--connect", endpoint, *more]
-        process = stack.enter_context(program(command, out.writing, subprocess.DEVNULL))
+        process = stack.enter_context(start_program(command, out.writing, subprocess.DEVNULL))
         wait_for(lambda: waits_for_reader(process.pid))
-        assert ended(process, signal.SIGTERM) == 0
+        assert send_signal_and_wait(process, signal.SIGTERM) == 0
 
 
-def test_watch_goes_on_when_it_is_read_again(tmp_path: Path) -> None:
+def test_watch_is_updated_again_once_its_output_is_read(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with contextlib.ExitStack() as stack:
-        stack.enter_context(router(endpoint))
+        stack.enter_context(open_router(endpoint))
         screen = stack.enter_context(frozen_terminal("unread"))
         process = stack.enter_context(
-            program([*PROGRAM, "watch", "--connect", endpoint], screen.writing, subprocess.DEVNULL)
+            start_program([*PROGRAM, "watch", "--connect", endpoint], screen.writing, subprocess.DEVNULL)
         )
         wait_for(lambda: waits_for_reader(process.pid))
-        screen.read()
+        screen.start_reading()
         wait_for(lambda: screen.data.count(b"imu-monitor") > 2)
-        assert ended(process, signal.SIGTERM) == 0
+        assert send_signal_and_wait(process, signal.SIGTERM) == 0
         wait_for(lambda: b"\x1b[?25h" in screen.data)
 
 
 def test_view_ends_although_nobody_reads_its_log() -> None:
-    endpoint = free_endpoint()  # nobody is there, which is said on standard error
+    endpoint = free_endpoint()  # nothing listens there, which the program reports on standard error
     with unread_pipe() as log:
         command = [*PROGRAM, "view", "--connect", endpoint, "--viewer", "none"]
-        with program(command, subprocess.DEVNULL, log.writing) as process:
+        with start_program(command, subprocess.DEVNULL, log.writing) as process:
             wait_for(lambda: waits_for_reader(process.pid))
-            assert ended(process, signal.SIGTERM) == 0
+            assert send_signal_and_wait(process, signal.SIGTERM) == 0

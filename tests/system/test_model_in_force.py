@@ -1,5 +1,4 @@
-"""A sensor beside its model, from the wire to the event: it agrees, takes on an effect, and disagrees; asked over zenoh
-why, the window goes through the command while samples go on."""
+"""Tests of the comparison of a simulated sensor with its noise model, and of ``reconcile`` on request over zenoh."""
 
 import json
 import sys
@@ -23,20 +22,20 @@ from monitor.simulator.demo_config import build_demo_config
 from tests.support.paced_sensor import follow_reader
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import session
-from tests.system.rig import Caught
+from tests.support.zenoh_sessions import open_session
+from tests.system.rig import RecordingOutput
 
 MODEL = CONFIG_FOLDER / "models" / "consumer-mems.toml"
 RATE_HZ = 100.0
 SPEED = 50.0
 AT_S = 80.0
-LOOK_SAMPLES = 1000
-"""The sensor waits until the window has been looked at again, which a loaded machine does rarely."""
+COMPARISON_SAMPLES = 1000
+"""Number of samples that the sensor may send before the next comparison, which a loaded machine may delay."""
 VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
 
 
-def watched(zenoh_table: ZenohTable, effects: tuple[str, ...] = (), folder: Path | None = None) -> Config:
-    """The demo, fifty times as fast, with its own model in force."""
+def build_config(zenoh_table: ZenohTable, effects: tuple[str, ...] = (), folder: Path | None = None) -> Config:
+    """Return the configuration of the demo at fifty times its speed, compared with its own noise model."""
     config = build_demo_config(effects=effects, effect_at_s=AT_S)
     (device,) = config.devices
     assert isinstance(device.link, VirtualTable)
@@ -47,57 +46,59 @@ def watched(zenoh_table: ZenohTable, effects: tuple[str, ...] = (), folder: Path
     return replace(config, devices=(device,), zenoh=zenoh_table, viewer=viewer)
 
 
-class Watching(Caught):
-    """Ends the service when the model is contradicted."""
+class StopAtDisagreementOutput(RecordingOutput):
+    """Output that stops the service when the sensor disagrees with its model."""
 
     service: Service | None = None
-    before: ModelComparison | None = None  # the last look without the effect
-    told_s = 0.0  # of the sensor's time
-    looked = 0  # samples that have been looked at
+    before: ModelComparison | None = None  # the last comparison without the effect
+    disagreement_s = 0.0  # time of the sensor
+    compared_samples = 0  # samples in the newest comparison
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         super().publish_result(device, unix_s, received, result)
         if isinstance(result, ModelComparison):
-            self.looked = result.samples
+            self.compared_samples = result.samples
             if result.samples / RATE_HZ < AT_S:
                 self.before = result
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         super().publish_event(device, unix_s, received, event)
         if event.kind == "model_disagrees" and self.service is not None:
-            self.told_s = self.looked / RATE_HZ  # the look that the event is of came just before
+            self.disagreement_s = self.compared_samples / RATE_HZ  # the comparison was published just before
             self.service.request_stop()
 
 
-def test_the_moment_a_sensor_stops_agreeing_with_its_model_is_an_event() -> None:
-    service = Service(watched(ZenohTable(mode="none"), (VIBRATION,)))
-    caught = Watching()
-    caught.service = service
-    service.outputs.append(caught)
-    follow_reader(service.workers[0].simulated, service.workers[0].driver, lambda: caught.looked + LOOK_SAMPLES)
+def test_event_reports_when_a_sensor_stops_agreeing_with_its_model() -> None:
+    service = Service(build_config(ZenohTable(mode="none"), (VIBRATION,)))
+    output = StopAtDisagreementOutput()
+    output.service = service
+    service.outputs.append(output)
+    follow_reader(
+        service.workers[0].simulated, service.workers[0].driver, lambda: output.compared_samples + COMPARISON_SAMPLES
+    )
     service.run(PATIENCE_S)
-    assert caught.before is not None
-    assert caught.before.agrees == dict.fromkeys(AXES, True)
-    told = [event for _, event in caught.events if event.kind == "model_disagrees"]
-    assert [event.axis for event in told] == ["gz"]
-    (event,) = told
-    assert AT_S + 1.0 < caught.told_s < AT_S + 40.0
-    what = event.values["model"]
-    assert what["agrees"] is False
-    assert what["gap"] > 2.0 * what["threshold"]
-    assert what["tau_lo"] <= 0.04 <= what["tau_hi"]  # a vibration of 17 Hz is largest at half its period
-    assert what["ratio"] > 1.5
+    assert output.before is not None
+    assert output.before.agrees == dict.fromkeys(AXES, True)
+    events = [event for _, event in output.events if event.kind == "model_disagrees"]
+    assert [event.axis for event in events] == ["gz"]
+    (event,) = events
+    assert AT_S + 1.0 < output.disagreement_s < AT_S + 40.0
+    comparison = event.values["model"]
+    assert comparison["agrees"] is False
+    assert comparison["gap"] > 2.0 * comparison["threshold"]
+    assert comparison["tau_lo"] <= 0.04 <= comparison["tau_hi"]  # a vibration of 17 Hz is largest at half its period
+    assert comparison["ratio"] > 1.5
     assert "gz disagrees with its model at τ" in event.text
-    assert caught.gaps["demo"].agrees["gz"] is False
+    assert output.comparisons["demo"].agrees["gz"] is False
     counts = service.workers[0].driver.counts
     assert (counts.lost, counts.bad) == (0, 0)
 
 
-def stand_in(go: Path, kept: Path) -> tuple[str, ...]:
-    """In the place of the command: keeps the recording, and answers when it is told to."""
+def build_reconcile_command(go: Path, copy: Path) -> tuple[str, ...]:
+    """Return a substitute for the command: it copies the recording, and answers when the file ``go`` exists."""
     text = f"""
 import json, os, shutil, sys, time
-shutil.copy(sys.argv[1], {str(kept)!r})
+shutil.copy(sys.argv[1], {str(copy)!r})
 while not os.path.exists({str(go)!r}):
     time.sleep(0.01)
 found = {{"kind": "added", "effect": "sinusoidal", "confidence": 0.99}}
@@ -106,35 +107,35 @@ print(json.dumps({{"verdict": "explained", "axes": {{"gz": {{"steps": [found]}}}
     return (sys.executable, "-c", text)
 
 
-def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) -> None:
-    endpoint, go, kept = free_endpoint(), tmp_path / "go", tmp_path / "kept.npz"
+def test_reconcile_on_request_over_zenoh_delays_neither_samples_nor_other_commands(tmp_path: Path) -> None:
+    endpoint, go, copy = free_endpoint(), tmp_path / "go", tmp_path / "copy.npz"
     table = ZenohTable(listen=(endpoint,))
-    service = Service(watched(table), reconciler=Reconciler(stand_in(go, kept)))
-    caught = Caught()
-    service.outputs.append(caught)
+    service = Service(build_config(table), reconciler=Reconciler(build_reconcile_command(go, copy)))
+    output = RecordingOutput()
+    service.outputs.append(output)
     follow_reader(service.workers[0].simulated, service.workers[0].driver)
     thread = threading.Thread(target=service.run)
     thread.start()
     try:
-        wait_for(lambda: "demo" in caught.gaps and caught.gaps["demo"].samples > 3000, "samples")
+        wait_for(lambda: "demo" in output.comparisons and output.comparisons["demo"].samples > 3000, "samples")
         wait_for(lambda: service.zenoh.state == "ok", "zenoh")
-        with session(connect=[endpoint]) as client:
-            gaps = client.declare_subscriber("imu/demo/gap", zenoh.handlers.FifoChannel(1000))
-            asked = client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)
-            wait_for(kept.exists, "the program")
-            (again,) = wait_for(lambda: list(client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)))
-            assert json.loads(bytes(again.err.payload)) == {
+        with open_session(connect=[endpoint]) as client:
+            subscriber = client.declare_subscriber("imu/demo/gap", zenoh.handlers.FifoChannel(1000))
+            first_request = client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)
+            wait_for(copy.exists, "the program")
+            (second_reply,) = wait_for(lambda: list(client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)))
+            assert json.loads(bytes(second_reply.err.payload)) == {
                 "error": "busy: a reconciliation of this device is already running"
             }
             (reset,) = wait_for(lambda: list(client.get("imu/demo/command/reset", timeout=PATIENCE_S)))
-            assert reset.ok is not None  # another command is answered meanwhile
-            before = caught.healths["demo"].received
-            wait_for(lambda: caught.healths["demo"].received > before + 2000, "samples that go on")
+            assert reset.ok is not None  # another command is answered while reconcile runs
+            before = output.healths["demo"].received
+            wait_for(lambda: output.healths["demo"].received > before + 2000, "samples that go on")
             go.touch()
-            (reply,) = list(asked)
+            (reply,) = list(first_request)
             found: dict[str, Any] = json.loads(bytes(reply.ok.payload))
-            told = wait_for(lambda: [event for _, event in caught.events if event.kind == "reconciled"])
-            shown = wait_for(gaps.try_recv)
+            events = wait_for(lambda: [event for _, event in output.events if event.kind == "reconciled"])
+            message = wait_for(subscriber.try_recv)
     finally:
         go.touch()
         service.request_stop()
@@ -143,11 +144,11 @@ def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) 
     assert str(reply.ok.encoding) == topics.JSON
     assert (found["schema"], found["device"], found["verdict"]) == ("imu-monitor/reconcile/1", "demo", "explained")
     assert found["arguments"][-2:] == ["--model", str(MODEL)]
-    assert [event.text for event in told] == ["reconcile: explained: gz sinusoidal added (0.990)"]
-    gap = json.loads(bytes(shown.payload))
+    assert [event.text for event in events] == ["reconcile: explained: gz sinusoidal added (0.990)"]
+    gap = json.loads(bytes(message.payload))
     assert (gap["schema"], gap["device"]) == ("imu-monitor/gap/1", "demo")
-    recording = load_samples(kept)
-    sent = caught.values("demo")
+    recording = load_samples(copy)
+    sent = output.values("demo")
     assert recording.rate_hz == RATE_HZ
     n = len(recording)
     assert n >= 3000

@@ -1,4 +1,4 @@
-"""Samples in over zenoh from another process, and every key out to another process through a router."""
+"""Tests of samples received over zenoh, and of every zenoh key that the service publishes, through a router."""
 
 import csv
 import subprocess
@@ -16,20 +16,19 @@ from monitor.common import topics
 from tests.support.ports import free_endpoint
 from tests.support.recordings import recordings
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import patient_file
-from tests.support.zenoh_sessions import router as zenoh_router
-from tests.system.rig import Cable, running
+from tests.support.zenoh_sessions import open_router, patient_file
+from tests.system.rig import PluggableTerminal, run_service
 
 
 @pytest.fixture
 def router() -> Iterator[str]:
     endpoint = free_endpoint()
-    with zenoh_router(endpoint):
+    with open_router(endpoint):
         yield endpoint
 
 
 @pytest.mark.data
-def test_a_recording_from_another_process_gives_the_authors_table(tmp_path: Path, router: str) -> None:
+def test_recording_from_another_process_gives_the_published_allan_deviations(tmp_path: Path, router: str) -> None:
     folder = recordings()
     path = folder / "adis16405" / "run1.npz"
     with (folder / "reference" / "avar-package-allan-tables.csv").open() as file:
@@ -47,27 +46,27 @@ mode = "none"
 [viewer]
 mode = "none"
 """
-    with running(tmp_path, config) as run:
-        counts = run.station("run1").driver.counts
-        station = run.station("run1")
-        rows = min(20_000, station.ring.capacity // 2)
+    with run_service(tmp_path, config) as run:
+        counts = run.worker("run1").driver.counts
+        worker = run.worker("run1")
+        rows = min(20_000, worker.ring.capacity // 2)
         command = [sys.executable, "-m", "tests.system.publisher", str(path), "lab/run1", router, str(rows)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, text=True) as publisher:
             assert publisher.stdin is not None
             for allowed in range(rows, 1_000_000 + rows, rows):
                 publisher.stdin.write("\n")
                 publisher.stdin.flush()
-                # all but the part of a block that is still to come
+                # a block that is not complete yet has not been sent
                 wanted = min(allowed - allowed % 1000, 1_000_000)
-                wait_for(lambda wanted=wanted: station.publisher.published >= wanted, "the samples")  # type: ignore[misc]
+                wait_for(lambda wanted=wanted: worker.publisher.published >= wanted, "the samples")  # type: ignore[misc]
             publisher.stdin.close()
             assert publisher.wait(PATIENCE_S) == 0
-    assert (counts.received, counts.bad, counts.lost, run.station("run1").ring.overflowed) == (1_000_000, 0, 0, 0)
-    curve = run.caught.estimates["run1"].curve
+    assert (counts.received, counts.bad, counts.lost, run.worker("run1").ring.overflowed) == (1_000_000, 0, 0, 0)
+    curve = run.output.estimates["run1"].curve
     shared = [(i, table[int(m)]) for i, m in enumerate(curve.factors) if int(m) in table]
     assert len(shared) >= 15
-    places, want = map(list, zip(*shared, strict=True))
-    np.testing.assert_allclose(np.sqrt(curve.avar[places, 0]), want, rtol=1e-5)
+    indices, want = map(list, zip(*shared, strict=True))
+    np.testing.assert_allclose(np.sqrt(curve.avar[indices, 0]), want, rtol=1e-5)
 
 
 LISTENER = """
@@ -94,7 +93,7 @@ with zenoh.open(config) as session:
 
 
 class Listener:
-    """A zenoh client in a process of its own."""
+    """zenoh client in a separate process, which receives all messages of the service."""
 
     def __init__(self, endpoint: str) -> None:
         self._process = subprocess.Popen(
@@ -105,7 +104,7 @@ class Listener:
         )
         assert self._process.stdout is not None
         assert self._process.stdout.readline() == "ready\n"
-        self.heard: dict[str, list[tuple[str, bytes]]] = {}
+        self.messages: dict[str, list[tuple[str, bytes]]] = {}
         self.alive: list[tuple[str, bool]] = []
         self.replies: list[tuple[str, Any]] = []
 
@@ -123,9 +122,9 @@ class Listener:
             elif word == "reply":
                 self.replies.append((rest[1], msgspec.json.decode(bytes.fromhex(rest[0]))))
             else:
-                self.heard.setdefault(rest[0], []).append((rest[1], bytes.fromhex(rest[2])))
+                self.messages.setdefault(rest[0], []).append((rest[1], bytes.fromhex(rest[2])))
 
-    def hears(self, condition: Any) -> bool:
+    def poll_and_check(self, condition: Any) -> bool:
         self.poll()
         return bool(condition())
 
@@ -137,12 +136,12 @@ class Listener:
         self._process.stdout.close()
 
 
-def test_a_client_behind_a_router_receives_every_key(tmp_path: Path, router: str) -> None:
+def test_client_behind_a_router_receives_every_key(tmp_path: Path, router: str) -> None:
     config = f"""[[device]]
 name = "bench-1"
 rate = 100.0
 model = "consumer-mems"
-driver = {{ link = "virtual", silence = 300.0 }}  # the loss of the cable is noticed at once
+driver = {{ link = "virtual", silence = 300.0 }}  # an unplugged sensor is detected without this limit
 [zenoh]
 config = "{patient_file(tmp_path)}"
 mode = "peer"
@@ -154,24 +153,26 @@ mode = "none"
     wanted = [t for t in topics.TOPICS if t.when in ("batches", "publish", "event", "1 Hz")]
     keys = {topic.key("imu", "bench-1") for topic in wanted}
     listener = Listener(router)
-    with running(tmp_path, config) as run:
-        imu = run.station("bench-1").simulated
-        wait_for(lambda: listener.hears(lambda: "imu/bench-1/coefficients" in listener.heard), "coefficients")
-        wait_for(lambda: listener.hears(lambda: listener.alive), "the token")
+    with run_service(tmp_path, config) as run:
+        imu = run.worker("bench-1").simulated
+        wait_for(
+            lambda: listener.poll_and_check(lambda: "imu/bench-1/coefficients" in listener.messages), "coefficients"
+        )
+        wait_for(lambda: listener.poll_and_check(lambda: listener.alive), "the token")
         assert listener.alive == [("imu/bench-1/alive", True)]
         imu.port.unplug()
-        wait_for(lambda: listener.hears(lambda: len(listener.alive) == 2), "the token to go")
+        wait_for(lambda: listener.poll_and_check(lambda: len(listener.alive) == 2), "the token to go")
         imu.port.plug()
-        wait_for(lambda: listener.hears(lambda: len(listener.alive) == 3), "the token to come back")
+        wait_for(lambda: listener.poll_and_check(lambda: len(listener.alive) == 3), "the token to come back")
         assert listener.alive[1:] == [("imu/bench-1/alive", False), ("imu/bench-1/alive", True)]
-        wait_for(lambda: listener.hears(lambda: len(events(listener)) >= 2), "both events")
+        wait_for(lambda: listener.poll_and_check(lambda: len(event_kinds(listener)) >= 2), "both events")
         listener.poll("reset", "jump")
-        wait_for(lambda: listener.hears(lambda: keys <= set(listener.heard)), "every key")
+        wait_for(lambda: listener.poll_and_check(lambda: keys <= set(listener.messages)), "every key")
     listener.poll()
     listener.close()
-    assert set(listener.heard) == keys
+    assert set(listener.messages) == keys
     for topic in wanted:
-        for encoding, payload in listener.heard[topic.key("imu", "bench-1")]:
+        for encoding, payload in listener.messages[topic.key("imu", "bench-1")]:
             assert encoding == topic.encoding
             if topic.encoding == topics.JSON:
                 content = msgspec.json.decode(payload)
@@ -179,42 +180,42 @@ mode = "none"
                 assert content["device"] == "bench-1"
                 assert content["t"] > 1.7e9
                 assert content["samples"] >= 0
-    batches = [decode_samples(payload) for _, payload in listener.heard["imu/bench-1/samples"]]
-    # those before the first were sent before zenoh had joined the three sessions
+    batches = [decode_samples(payload) for _, payload in listener.messages["imu/bench-1/samples"]]
+    # samples before the first batch were sent before the three zenoh sessions were connected
     assert sum(len(batch.block) for batch in batches[1:]) == batches[-1].total_samples - batches[0].total_samples
-    assert batches[-1].total_samples == run.station("bench-1").driver.counts.received
-    assert {"link_lost", "link_back"} <= set(events(listener))
+    assert batches[-1].total_samples == run.worker("bench-1").driver.counts.received
+    assert {"link_lost", "link_back"} <= set(event_kinds(listener))
     (ok_encoding, ok), (error_encoding, error) = listener.replies
     assert ok_encoding == error_encoding == topics.JSON
     assert ok["device"] == "bench-1"
     assert "reset" in error["error"]
 
 
-def events(listener: Listener) -> list[str]:
-    return [msgspec.json.decode(payload)["kind"] for _, payload in listener.heard.get("imu/bench-1/event", [])]
+def event_kinds(listener: Listener) -> list[str]:
+    return [msgspec.json.decode(payload)["kind"] for _, payload in listener.messages.get("imu/bench-1/event", [])]
 
 
-def test_a_pulled_cable_costs_what_it_costs(tmp_path: Path) -> None:
-    """Bytes stop in the middle of a frame; the half frame is forgotten, the next frame counts."""
-    cable = Cable(tmp_path)
+def test_unplugged_cable_loses_only_the_incomplete_line(tmp_path: Path) -> None:
+    """The bytes stop in the middle of a line. The partial line is discarded, and the next complete line is decoded."""
+    terminal = PluggableTerminal(tmp_path)
     config = f"""[[device]]
 name = "board"
 rate = 100.0
-driver = {{ link = "serial", port = "{cable.port}", decoder = "text", decoder_options = {{ columns = ["gx"] }} }}
+driver = {{ link = "serial", port = "{terminal.port}", decoder = "text", decoder_options = {{ columns = ["gx"] }} }}
 [zenoh]
 mode = "none"
 [viewer]
 mode = "none"
 """
-    with running(tmp_path, config) as run:
-        station = run.station("board")
-        wait_for(lambda: station.driver.link._port is not None, "the port")
-        cable.write(b"0.1\n0.2\n0.3\n0.")
-        wait_for(lambda: station.driver.counts.received == 2, "two whole lines behind the first")
-        cable.pull()
-        wait_for(lambda: station.driver.state == "lost", "the loss")
-        cable.plug()
-        wait_for(lambda: station.driver.link._port is not None, "the port again")
-        cable.write(b"4\n0.5\n0.6\n")
-        wait_for(lambda: station.driver.counts.received == 4, "two more lines")
-    assert run.caught.values("board")[:, 0].tolist() == [0.2, 0.3, 0.5, 0.6]
+    with run_service(tmp_path, config) as run:
+        worker = run.worker("board")
+        wait_for(lambda: worker.driver.link._port is not None, "the port")
+        terminal.write(b"0.1\n0.2\n0.3\n0.")
+        wait_for(lambda: worker.driver.counts.received == 2, "two complete lines after the first")
+        terminal.pull()
+        wait_for(lambda: worker.driver.state == "lost", "the loss")
+        terminal.plug()
+        wait_for(lambda: worker.driver.link._port is not None, "the port again")
+        terminal.write(b"4\n0.5\n0.6\n")
+        wait_for(lambda: worker.driver.counts.received == 4, "two more lines")
+    assert run.output.values("board")[:, 0].tolist() == [0.2, 0.3, 0.5, 0.6]

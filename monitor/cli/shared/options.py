@@ -57,6 +57,8 @@ ZenohFile = Annotated[
     Path | None,
     typer.Option("--zenoh", metavar="FILE.json5", help="zenoh file: certificates, user and password, endpoints."),
 ]
+Prefix = Annotated[str, typer.Option(metavar="KEY", help="Prefix of the keys of the daemon.")]
+DeviceName = Annotated[str | None, typer.Option(metavar="NAME", help="Device; needed if there are several.")]
 Rate = Annotated[
     float | None,
     typer.Option(
@@ -92,14 +94,16 @@ Inflation = Annotated[
 TimeStep = Annotated[
     float | None,
     typer.Option(
-        metavar="S", help="kalman: time step; by default the sample period.", callback=make_range_callback(DURATION_S)
+        metavar="S",
+        help="Time step of the program that reads the parameters; by default that of the program or the sample period.",
+        callback=make_range_callback(DURATION_S),
     ),
 ]
 CorrelationTime = Annotated[
     float | None,
     typer.Option(
         metavar="S",
-        help="kalman: correlation time of the process that represents B.",
+        help="kalman, gnss_ins_sim: correlation time of the process that represents B.",
         callback=make_range_callback(DURATION_S),
     ),
 ]
@@ -189,8 +193,13 @@ def parse_arma_order(text: str | None) -> "Order | None":
     raise ConfigError(f'--order: "{text}"; possible are {" ".join(f"{p},{q}" for p, q in ORDERS)}')
 
 
-def read_noise_coefficients(source: Path) -> "NoiseCoefficients":
+def read_noise_coefficients(source: str) -> "NoiseCoefficients":
     """Read noise coefficients from a model file or from the JSON output of ``analyze``.
+
+    Parameters
+    ----------
+    source : str
+        Path of the file, name of a shipped model, or ``-`` for standard input.
 
     Raises
     ------
@@ -198,15 +207,52 @@ def read_noise_coefficients(source: Path) -> "NoiseCoefficients":
         If the file cannot be read, or if its content is invalid.
     """
     from drivers import file_access
+    from monitor.common.shipped_config_paths import resolve_model_path
     from monitor.noise.model import NoiseModel
     from monitor.publishing.exporters import from_analysis_json, from_model
 
+    path = Path(source) if source == "-" else resolve_model_path(source, Path.cwd())
     try:
-        text = sys.stdin.buffer.read() if source == Path("-") else file_access.read_small_file(source, allow_pipe=True)
+        text = sys.stdin.buffer.read() if source == "-" else file_access.read_small_file(path, allow_pipe=True)
         if text.lstrip().startswith(b"{"):
-            return from_analysis_json(text, source.name)
-        return from_model(NoiseModel.from_toml(text.decode()), source.name)
+            return from_analysis_json(text, path.name)
+        return from_model(NoiseModel.from_toml(text.decode()), path.name)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{source}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from error
+
+
+def select_device(name: str | None, there: list[str], where: str, what: str) -> str:
+    """Return the name of the requested device, or of the only device if no name is given.
+
+    Parameters
+    ----------
+    name : str or None
+        Name of the requested device.
+    there : list of str
+        Names of all devices.
+    where : str
+        Place of the results, for error messages.
+    what : str
+        Kind of the results, such as ``history``, for error messages.
+
+    Raises
+    ------
+    NotReady
+        If there is no device yet.
+    ConfigError
+        If no device has this name, or if there are several devices and no name is given.
+    """
+    from drivers.errors import NotReady
+    from drivers.module_lookup import format_suggestion
+
+    if not there:
+        raise NotReady(f"{where}: there is no {what} yet")
+    if name is None and len(there) == 1:
+        return there[0]
+    if name is None:
+        raise ConfigError(f"{where}: {what} of {len(there)} devices; choose one with --device: {', '.join(there)}")
+    if name not in there:
+        raise ConfigError(f'--device: "{name}"{format_suggestion(name, there)}')
+    return name

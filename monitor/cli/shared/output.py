@@ -10,6 +10,7 @@ from drivers.errors import ConfigError
 from monitor.commands.progress import ProgressCallback, ignore_progress
 
 if TYPE_CHECKING:
+    from monitor.common.unit_formatting import UnitSystem
     from monitor.estimation.analysis import RecordingAnalysis
 
 
@@ -95,8 +96,16 @@ def compile_analysis_kernels(report_progress: ProgressCallback) -> None:
                     pass
 
 
-def print_analysis(result: "RecordingAnalysis") -> None:
-    """Print the number of samples, the coefficients and the notes of an analysis."""
+def print_analysis(result: "RecordingAnalysis", units: "UnitSystem") -> None:
+    """Print the number of samples, the coefficients and the notes of an analysis.
+
+    Parameters
+    ----------
+    result : RecordingAnalysis
+        Analysis of a recording.
+    units : UnitSystem
+        Units of the table.
+    """
     from rich.console import Console
 
     from monitor.publishing.terminal.coefficient_tables import analysis_table
@@ -104,6 +113,6 @@ def print_analysis(result: "RecordingAnalysis") -> None:
     console = Console()
     estimate = result.estimate
     console.print(f"{estimate.curve.n} samples at {estimate.rate_hz:g} Hz, {result.seconds:.6g} s")
-    console.print(analysis_table(estimate, result.axes_of_temperature))
+    console.print(analysis_table(estimate, result.axes_of_temperature, units))
     for note in result.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)

@@ -1,4 +1,7 @@
-"""Groups and parts of the numerical kernels. Each part has a function that calls all its kernels."""
+"""Groups and parts of the numerical kernels. Each part has a function that calls all its kernels.
+
+The functions import the modules of the kernels, so that a command does not import them if its kernels are compiled.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,12 +11,6 @@ import numpy as np
 
 from drivers.data_types import SampleBlock, make_block
 from drivers.extras import find_missing_packages
-from monitor.drift.compensation.arma import fit_arma
-from monitor.drift.compensation.compensator import Compensator
-from monitor.drift.thermal import thermal_response
-from monitor.estimation.detection.change_detection import NoiseAndBiasChangeDetector
-from monitor.estimation.detection.signal_monitor import SignalMonitor
-from monitor.estimation.estimator import Estimator
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,25 +34,37 @@ def _samples(n: int) -> SampleBlock:
 
 
 def _call_window() -> None:
+    from monitor.estimation.estimator import Estimator
+
     Estimator(100.0, 1.0).add_samples(_samples(100))
 
 
 def _call_fit() -> None:
+    from monitor.estimation.estimator import Estimator
+
     estimator = Estimator(100.0, 1.0)
     estimator.add_samples(_samples(100))
     estimator.get_estimate()
 
 
 def _call_motion_detection() -> None:
+    from monitor.estimation.detection.signal_monitor import SignalMonitor
+
     SignalMonitor(100.0, alarms_per_day=0.0).process_samples(_samples(100))
 
 
 def _call_change_detection() -> None:
+    from monitor.estimation.detection.change_detection import NoiseAndBiasChangeDetector
+    from monitor.estimation.detection.signal_monitor import SignalMonitor
+
     SignalMonitor(100.0).process_samples(_samples(100))
     NoiseAndBiasChangeDetector(100.0).restart_references()
 
 
 def _call_compensation() -> None:
+    from monitor.drift.compensation.arma import fit_arma
+    from monitor.drift.compensation.compensator import Compensator
+
     compensator = Compensator(100.0)
     compensator.compensate(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
     compensator.apply_identification_result(
@@ -66,6 +75,8 @@ def _call_compensation() -> None:
 
 
 def _call_slow_statistics() -> None:
+    from monitor.estimation.estimator import Estimator
+
     estimator = Estimator(100.0, 1.0)
     estimator.add_samples(_samples(100))
     estimator.restart_axis(0, 10)
@@ -74,15 +85,19 @@ def _call_slow_statistics() -> None:
 
 
 def _call_refit() -> None:
+    from monitor.estimation.estimator import Estimator
+
     Estimator(100.0, 1.0, every_sample=True).add_samples(_samples(100))
 
 
 def _call_temperature_lag() -> None:
+    from monitor.drift.thermal import thermal_response
+
     thermal_response.apply_first_order_lag(np.zeros(2), 0.5)
 
 
 def _call_analysis() -> None:
-    from monitor.estimation.analysis import analyze  # the service does not need this import
+    from monitor.estimation.analysis import analyze
 
     analyze([_samples(100)], 100.0)
 
@@ -91,7 +106,7 @@ def _call_reconciliation() -> None:
     from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
     from monitor.noise.model import NoiseModel
     from monitor.reconcile.preparation.reconcile_input import Recording
-    from monitor.reconcile.reconcile import reconcile  # the service does not need this import
+    from monitor.reconcile.reconcile import reconcile
 
     model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4), BiasInstability(B=3e-5), RateRandomWalk(K=1e-6))})
     series, rng = model.simulate(4200, 10.0, 1)[:, 2], np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""Export of noise coefficients as parameter files for Kalibr, MATLAB and Kalman filters.
+"""Export of noise coefficients as parameter files of other programs.
 
 Each exporter returns the text of a file that states units, the source of the coefficients and the inflation factor. The
 coefficient N of IEEE Std 952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. The coefficient K in
@@ -6,14 +6,15 @@ rad/s/√s equals the density, in rad/s²/√Hz, of the white noise that drives 
 
 The inflation factor multiplies N, B and K, because a sensor on a vehicle has more noise than a sensor at rest. If only
 an upper bound of a coefficient is known, exporters for filters use the bound as the value and add a comment. The
-exporter for simulation ignores upper bounds. The text is ASCII, because some target programs require ASCII.
+exporters for simulation ignore upper bounds. The text is ASCII, because some target programs require ASCII.
 """
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from drivers.errors import ConfigError
 from drivers.number_ranges import COEFFICIENT, INFLATION
+from monitor.publishing.exporters.estimator_parameters import PARAMETER_FILES
 from monitor.publishing.exporters.exported_coefficients import (
     AxisCoefficientOrBound,
     NoiseCoefficients,
@@ -21,18 +22,29 @@ from monitor.publishing.exporters.exported_coefficients import (
     from_model,
     missing_coefficient_error,
 )
+from monitor.publishing.exporters.gnss_ins_sim import export_gnss_ins_sim
 from monitor.publishing.exporters.gyroparams import export_gyroparams
-from monitor.publishing.exporters.kalibr import export_kalibr
+from monitor.publishing.exporters.imu_utils import export_imu_utils
 from monitor.publishing.exporters.kalman import export_kalman_process_noise
 
 __all__ = ["FORMATS", "AxisCoefficientOrBound", "NoiseCoefficients", "export", "from_analysis_json", "from_model"]
 
-FORMATS: Final[dict[str, Callable[..., str]]] = {
-    "kalibr": export_kalibr,
-    "gyroparams": export_gyroparams,
-    "kalman": export_kalman_process_noise,
+
+class Exporter(NamedTuple):
+    """Function that exports noise coefficients, and the names of its options."""
+
+    write: Callable[..., str]
+    options: frozenset[str]
+
+
+FORMATS: Final[dict[str, Exporter]] = {
+    **{one.name: Exporter(one.export, one.options) for one in PARAMETER_FILES},
+    "imu_utils": Exporter(export_imu_utils, frozenset({"dt_s"})),
+    "gnss_ins_sim": Exporter(export_gnss_ins_sim, frozenset({"correlation_time_s"})),
+    "gyroparams": Exporter(export_gyroparams, frozenset()),
+    "kalman": Exporter(export_kalman_process_noise, frozenset({"dt_s", "correlation_time_s"})),
 }
-"""Functions that export noise coefficients, by file format."""
+"""Exporters by file format."""
 
 
 def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, **options: Any) -> str:
@@ -47,7 +59,7 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
     inflation
         Factor that multiplies N, B and K, at least 1.
     options
-        Options of the file format: rostopic for ``kalibr``, dt_s and correlation_time_s for ``kalman``.
+        Options of the file format, whose names ``FORMATS`` lists.
 
     Raises
     ------
@@ -68,4 +80,4 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
         for letter, term in terms.items():
             if term.value and not COEFFICIENT.supports(term.value):
                 raise ConfigError(f"{axis}: {letter} = {term.value:g}; no sensor has that")
-    return FORMATS[format_name](noise, inflation, **options)
+    return FORMATS[format_name].write(noise, inflation, **options)

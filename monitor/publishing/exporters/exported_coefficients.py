@@ -51,7 +51,19 @@ class AxisCoefficientOrBound:
     """Noise coefficient of one axis in SI units, as a value or an upper bound."""
 
     value: float
-    bound: bool = False  # True if the value is an upper bound
+    bound: bool = False  # True if the value is a one-sided 95 % upper bound
+    interval: tuple[float, float] | None = None  # 95 % interval of the value, if it is known
+
+    def describe(self) -> str:
+        """Describe the value in ASCII, with its 95 % interval or as an upper bound.
+
+        >>> AxisCoefficientOrBound(1.5e-4, interval=(1.4e-4, 1.6e-4)).describe()
+        '0.00015 (95 % interval 0.00014 to 0.00016)'
+        """
+        if self.bound:
+            return f"<= {self.value:.3g} (one-sided 95 % bound)"
+        interval = self.interval and f" (95 % interval {self.interval[0]:.3g} to {self.interval[1]:.3g})"
+        return f"{self.value:.3g}{interval or ''}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +124,7 @@ class _Coefficient(msgspec.Struct):
     value: float | None
     hi: float | None
     status: str
+    lo: float | None = None
 
 
 class _Temperature(msgspec.Struct):
@@ -123,35 +136,52 @@ class _Axis(msgspec.Struct):
     temperature: _Temperature | None = None
 
 
+class _Schema(msgspec.Struct):
+    schema: str
+
+
 class _Analysis(msgspec.Struct):
     """Keys of the JSON output of ``analyze`` that an export needs."""
 
-    schema: str
     axes: dict[str, _Axis]
     rate: float | None = None
 
 
+class _CoefficientsMessage(msgspec.Struct):
+    """Keys of the message ``imu/<device>/coefficients`` of a daemon that an export needs."""
+
+    axes: dict[str, dict[str, _Coefficient]]
+    rate: float | None = None
+
+
 def from_analysis_json(json_text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
-    """Read noise coefficients from the output of ``imu-monitor analyze --json``.
+    """Read noise coefficients from the output of ``imu-monitor analyze --json`` or from a message of a daemon.
 
     Parameters
     ----------
         json_text
-        Output of ``imu-monitor analyze --json``.
+        Output of ``imu-monitor analyze --json``, or message ``imu/<device>/coefficients``.
     source
         Source of the coefficients, for the header of the file.
 
     Raises
     ------
     ConfigError
-        If the text is not the output of ``analyze --json``, or if the sample rate is outside the supported range.
+        If the text is neither of these, or if the sample rate is outside the supported range.
     """
     try:
-        found = msgspec.json.decode(json_text, type=_Analysis)
+        schema = msgspec.json.decode(json_text, type=_Schema).schema
+        if schema.startswith("imu-monitor/coefficients/"):
+            message = msgspec.json.decode(json_text, type=_CoefficientsMessage)
+            found = _Analysis({axis: _Axis(terms) for axis, terms in message.axes.items()}, message.rate)
+        elif schema.startswith("imu-monitor/analyze/"):
+            found = msgspec.json.decode(json_text, type=_Analysis)
+        else:
+            raise ConfigError(
+                f'schema "{schema}"; an export needs "imu-monitor/analyze/1" or "imu-monitor/coefficients/1"'
+            )
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"not the JSON of an analysis: {error}") from error
-    if not found.schema.startswith("imu-monitor/analyze/"):
-        raise ConfigError(f'schema "{found.schema}"; an export needs "imu-monitor/analyze/1"')
     try:
         if found.rate is not None:
             RATE_HZ.check(found.rate)
@@ -161,7 +191,8 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
     for axis in (axis for axis in AXES if axis in found.axes):
         for letter, one in found.axes[axis].coefficients.items():
             if one.status == "estimated" and one.value is not None:
-                axes.setdefault(axis, {})[letter] = AxisCoefficientOrBound(one.value)
+                interval = None if one.lo is None or one.hi is None else (one.lo, one.hi)
+                axes.setdefault(axis, {})[letter] = AxisCoefficientOrBound(one.value, interval=interval)
             elif one.status == "upper_bound" and one.hi is not None:
                 axes.setdefault(axis, {})[letter] = AxisCoefficientOrBound(one.hi, bound=True)
     warnings = tuple(
@@ -186,6 +217,62 @@ def missing_coefficient_error(noise: NoiseCoefficients, message: str) -> ImuErro
     return NotReady(f"{message}: a longer recording is needed") if noise.measured else ConfigError(message)
 
 
+def find_worst_axis(
+    noise: NoiseCoefficients, kind: Kind, letter: str, format_name: str
+) -> tuple[AxisCoefficientOrBound, str]:
+    """Return the largest coefficient of the three axes, and a comment that names the axis and its 95 % interval.
+
+    An estimate takes precedence over an upper bound. If no axis has an estimate, the largest bound is returned.
+
+    Parameters
+    ----------
+    noise
+        Noise coefficients to export.
+    kind
+        Kind of sensor: gyro or accel.
+    letter
+        Symbol of the coefficient: N or K.
+    format_name
+        Name of the file format, for the error message.
+
+    Raises
+    ------
+    ConfigError
+        If the noise model has no such coefficient.
+    NotReady
+        If the recording is too short to determine the coefficient.
+    """
+    known = noise.coefficient_by_axis(kind, letter)
+    if not known:
+        raise missing_coefficient_error(
+            noise, f"{format_name} needs {letter} ({COEFFICIENT_EFFECTS[letter].name}) above 0 on the {kind} axes"
+        )
+    rank = {axis: (not term.bound, term.value) for axis, term in known.items()}
+    axis = max(rank, key=lambda one: rank[one])
+    listed = ", ".join(f"{one} {'<= ' if term.bound else ''}{term.value:.3g}" for one, term in known.items())
+    only = ", UPPER BOUND instead of a value" if known[axis].bound else ""
+    alike = len(known) > 1 and len(set(rank.values())) == 1
+    return known[
+        axis
+    ], f"{'all axes alike' if alike else f'worst axis {axis}'}{only} ({listed}): {known[axis].describe()}"
+
+
+def describe_coefficients(terms: Mapping[str, AxisCoefficientOrBound], letters: str) -> str:
+    """Describe the coefficients of one axis in ASCII, with their 95 % intervals.
+
+    >>> describe_coefficients({"N": AxisCoefficientOrBound(2e-4), "K": AxisCoefficientOrBound(9e-6, bound=True)}, "NBK")
+    'N 0.0002, B unknown, K <= 9e-06 (one-sided 95 % bound)'
+
+    Parameters
+    ----------
+    terms
+        Coefficients of the axis by symbol.
+    letters
+        Symbols to describe.
+    """
+    return ", ".join(f"{one} {terms[one].describe() if one in terms else 'unknown'}" for one in letters)
+
+
 def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: str) -> list[str]:
     """Return comment lines that state the source of the coefficients, the inflation factor and warnings.
 
@@ -198,7 +285,7 @@ def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: st
     comment_sign
         Characters that begin a comment in the file.
     """
-    source = noise.source.encode("ascii", "replace").decode()
+    source = " ".join(noise.source.encode("ascii", "replace").decode().split())  # a line break would end the comment
     done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times the values of the source"
     return [
         f"{comment_sign} source: {source}",

@@ -17,6 +17,7 @@ from monitor.publishing.exporters.exported_coefficients import (
     NoiseCoefficients,
     ascii_unit,
     comment_on_omitted_terms,
+    describe_coefficients,
     format_float,
     header_comments,
     join_lines,
@@ -54,6 +55,11 @@ def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
         made.append(f", '{name}', {kind}")
         lines += [
             "",
+            *(
+                f"% {axis}: {describe_coefficients(noise.axes[axis], 'NBK')}"
+                for axis in axes_of(kind)
+                if axis in noise.axes
+            ),
             f"{kind} = {maker}( ...",
             _property(noise, kind, "N", "NoiseDensity", f"({unit})/sqrt(Hz)", inflation),
             _property(noise, kind, "B", "BiasInstability", unit, inflation),

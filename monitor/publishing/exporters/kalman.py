@@ -34,6 +34,7 @@ from monitor.publishing.exporters.exported_coefficients import (
     NoiseCoefficients,
     ascii_unit,
     comment_on_omitted_terms,
+    describe_coefficients,
     format_float,
     header_comments,
     join_lines,
@@ -95,23 +96,24 @@ def export_kalman_process_noise(
         f"inflation = {float(inflation)!r}",
     ]
     for axis, terms in noise.axes.items():
-        lines += ["", f"[{axis}]", *_axis(axis, terms, inflation, step_s, correlation_time_s)]
+        described = f"# {axis}: {describe_coefficients(terms, 'NBK')}"
+        lines += ["", described, f"[{axis}]", *_axis(axis, terms, inflation, step_s, correlation_time_s)]
     return join_lines([*lines, *comment_on_omitted_terms(noise, "NBK", "#")])
 
 
-def _markov_sigma(B: float) -> float:
+def markov_sigma(B: float) -> float:
     """Return the standard deviation σ of the Gauss-Markov process whose Allan deviation peaks at 0.664 B.
 
-    >>> round(_markov_sigma(1.0), 3)
+    >>> round(markov_sigma(1.0), 3)
     1.075
     """
     return float(np.sqrt(BiasInstability(B).avar(FLICKER_TAU_S, 1.0)[0])) / MARKOV_PEAK_RATIO
 
 
-def _markov_time_s(N: float, K: float) -> float:
+def markov_time_s(N: float, K: float) -> float:
     """Return the correlation time [s] of the Gauss-Markov process whose Allan deviation peaks at τ = √3 N/K.
 
-    >>> round(_markov_time_s(N=1.5e-4, K=1.5e-6), 1)
+    >>> round(markov_time_s(N=1.5e-4, K=1.5e-6), 1)
     91.6
     """
     return math.sqrt(3.0) * N / K / MARKOV_PEAK_AT
@@ -175,14 +177,14 @@ def _axis(
     kind = sensor_kind(axis)
     rate, drift = ascii_unit("B", kind), ascii_unit("R", kind)
     N, B, K = (terms[letter].value * inflation if letter in terms else 0.0 for letter in "NBK")
-    time_s = correlation_time_s or (_markov_time_s(N, K) if N and K else None)
+    time_s = correlation_time_s or (markov_time_s(N, K) if N and K else None)
     lines = _remarks(terms)
     states = ["angle" if kind == "gyro" else "velocity", "bias_walk"]
     densities = [
         f"psd_white = {format_float(N**2)}  # ({rate})^2/Hz, N^2",
         f"psd_walk = {format_float(K**2)}  # ({drift})^2/Hz, K^2",
     ]
-    sigma = _markov_sigma(B)
+    sigma = markov_sigma(B)
     if B and time_s is None:
         lines.append("# B is omitted: without N and K, the correlation time must be given (--correlation-time S)")
     elif B and time_s is not None:

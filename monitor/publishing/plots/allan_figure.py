@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
-from monitor.common.unit_formatting import DEVIATION_UNITS, KIND_NAMES, Kind, axes_of
+from monitor.common.unit_formatting import DEFAULT_UNITS, KIND_NAMES, Kind, UnitSystem, axes_of
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.estimate import Estimate
@@ -107,7 +107,13 @@ class _Ring:
     line: Floats  # Allan deviation of the noise term at the two values of LINE_TAU_S
 
 
-def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequence[AdditionalDeviation] = ()) -> None:
+def draw_allan_panel(
+    panel: "Axes",
+    estimate: Estimate,
+    kind: Kind,
+    others: Sequence[AdditionalDeviation] = (),
+    units: UnitSystem = DEFAULT_UNITS,
+) -> None:
     """Draw the Allan plot of the gyroscopes or the accelerometers.
 
     Parameters
@@ -120,8 +126,10 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
         Kind of sensor: gyro or accel.
     others
         Total and Hadamard deviations of the same recording.
+    units
+        Units of the plot.
     """
-    factor = DEVIATION_UNITS[kind].factor
+    factor = units.deviation(kind).factor
     tau_s, minimum_tau_s = estimate.curve.tau_s, _tau_of_minimum_s(estimate, kind)
     shown: list[Floats] = []
     rings: list[_Ring] = []
@@ -149,7 +157,7 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
         rings += _rings(estimate, i, factor, minimum_tau_s, float(measured.min()))
     _set_limits(panel, shown, rings)
     _draw_terms(panel, rings)
-    _draw_labels(panel, kind, others, drawn)
+    _draw_labels(panel, kind, others, drawn, units)
 
 
 def _draw_other(
@@ -236,14 +244,16 @@ def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
     return groups
 
 
-def _draw_labels(panel: "Axes", kind: Kind, others: Sequence[AdditionalDeviation], drawn: Collection[str]) -> None:
+def _draw_labels(
+    panel: "Axes", kind: Kind, others: Sequence[AdditionalDeviation], drawn: Collection[str], units: UnitSystem
+) -> None:
     panel.plot([], [], "--", color=GREY, label="fit")
     panel.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")
     for line_style, other in zip(OTHER_LINE_STYLES, others, strict=False):
         if other.name in drawn:
             marker = "o" if other.only_beyond else ""
             panel.plot([], [], line_style, marker=marker, mfc="white", color=GREY, linewidth=0.9, label=other.name)
-    panel.set(xlabel="averaging time τ, s", ylabel=f"Allan deviation σ(τ), {DEVIATION_UNITS[kind].name}")
+    panel.set(xlabel="averaging time τ, s", ylabel=f"Allan deviation σ(τ), {units.deviation(kind).name}")
     panel.set_title(KIND_NAMES[kind])
     for which in "xy":
         style_log_axis(panel, which)

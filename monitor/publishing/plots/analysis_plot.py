@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.data_types import AXES
-from monitor.common.unit_formatting import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of, format_duration
+from monitor.common.unit_formatting import DEFAULT_UNITS, KINDS, Kind, UnitSystem, axes_of, format_duration
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 INCHES: Final = (7.2, 7.6)  # width and height of one Allan plot with table
+CURVES_RATIO: Final = 3.6  # height of the Allan plot
+ROW_RATIO: Final = 1.75 / 6.0  # height of a row of the table, relative to the Allan plot; the first row names the axes
 COLUMNS: Final = (0.0, 0.46, 0.65, 0.84)  # left edges of the table columns, as shares of the table width
 TABLE_LEGEND: Final = (
     "small print: 95 % interval;  ≤ one-sided 95 % bound;  — too few data;  K or R: the data do not show which"
@@ -46,6 +48,7 @@ class AnalysisPlotData:
     others: Sequence[AdditionalDeviation] = ()  # total and Hadamard deviations
     dynamic: DynamicAllan | None = None
     marks: Sequence[ChangeMark] = ()  # changes that are marked in the plots over time
+    units: UnitSystem = DEFAULT_UNITS
 
 
 def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "") -> None:
@@ -68,17 +71,18 @@ def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "")
     estimate, dynamic = plot_data.analysis.estimate, plot_data.dynamic
     with figure_style():
         kinds = measured_kinds(estimate)
-        heights = [INCHES[1]]
+        table_ratio = ROW_RATIO * (1 + max(len(plot_data.units.columns(kind)) for kind in kinds))
+        heights = [INCHES[1] * (CURVES_RATIO + table_ratio) / (CURVES_RATIO + ROW_RATIO * (1 + len(SYMBOLS)))]
         if dynamic is not None:
             heights.append(max(dynamic_figure_height_inches(dynamic, kind) for kind in kinds))
         figure = create_figure(INCHES[0] * len(kinds), sum(heights))
         parts = figure.subfigures(len(heights), len(kinds), squeeze=False, height_ratios=heights)
         for column, kind in enumerate(kinds):
-            curves, table = parts[0, column].subplots(2, 1, height_ratios=[3.6, 1.75])
-            draw_allan_panel(curves, estimate, kind, plot_data.others)
-            _draw_table(table, plot_data.analysis, kind)
+            curves, table = parts[0, column].subplots(2, 1, height_ratios=[CURVES_RATIO, table_ratio])
+            draw_allan_panel(curves, estimate, kind, plot_data.others, plot_data.units)
+            _draw_table(table, plot_data.analysis, kind, plot_data.units)
             if dynamic is not None:
-                draw_dynamic_panels(parts[1, column], dynamic, kind, plot_data.marks)
+                draw_dynamic_panels(parts[1, column], dynamic, kind, plot_data.marks, plot_data.units)
         figure.suptitle("\n".join([*([title] if title else []), describe_recording(estimate)]))
         save_figure(figure, path)
 
@@ -114,19 +118,19 @@ def is_k_r_ambiguous(estimate: Estimate, letter: str, axis: str) -> bool:
     return letter in ("K", "R") and bool(estimate.k_or_r[i] and bounded)
 
 
-def _draw_table(panel: "Axes", analysis: RecordingAnalysis, kind: Kind) -> None:
+def _draw_table(panel: "Axes", analysis: RecordingAnalysis, kind: Kind, units: UnitSystem) -> None:
     estimate = analysis.estimate
     panel.axis("off")
-    rows = np.linspace(0.97, 0.19, len(SYMBOLS) + 1)
+    coefficients = units.columns(kind)
+    rows = np.linspace(0.97, 0.19, len(coefficients) + 1)
     columns = list(zip(axes_of(kind), COLUMNS[1:], COLOURS, strict=True))
     for axis, x, colour in columns:
         name = mark_temperature_axis(axis, analysis.axes_of_temperature)
         panel.text(x, rows[0], name, color=colour, fontweight="bold", va="center")
-    for letter, y in zip(SYMBOLS, rows[1:], strict=True):
-        unit = COEFFICIENT_UNITS[kind][letter].name
-        panel.text(COLUMNS[0], y, f"{letter}  {COEFFICIENT_NAMES[kind][letter]}, {unit}", va="center")
+    for (letter, name, unit), y in zip(coefficients, rows[1:], strict=True):
+        panel.text(COLUMNS[0], y, f"{letter}  {name}, {unit.name}", va="center")
         for axis, x, _ in columns:
-            cell = format_coefficient(estimate.coefficients, letter, axis)
+            cell = format_coefficient(estimate.coefficients, letter, axis, unit=unit)
             panel.text(x, y + 0.02, cell.value, va="center")
             small = "K or R" if is_k_r_ambiguous(estimate, letter, axis) else cell.interval
             panel.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
-from monitor.common.unit_formatting import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
+from monitor.common.unit_formatting import COEFFICIENT_NAMES, DEFAULT_UNITS, KIND_NAMES, Kind, Unit, UnitSystem, axes_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.plots import style
@@ -82,7 +82,11 @@ def divide_by_time_median(dynamic: DynamicAllan) -> Floats:
 
 
 def draw_dynamic_panels(
-    figure: "Figure | SubFigure", dynamic: DynamicAllan, kind: Kind, marks: Sequence[ChangeMark] = ()
+    figure: "Figure | SubFigure",
+    dynamic: DynamicAllan,
+    kind: Kind,
+    marks: Sequence[ChangeMark] = (),
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> None:
     """Draw heat maps and noise coefficients of the gyroscopes or the accelerometers over time.
 
@@ -96,6 +100,8 @@ def draw_dynamic_panels(
         Kind of sensor: gyro or accel.
     marks
         Detected changes to mark. Changes on axes of the other kind are ignored.
+    units
+        Units of the coefficients.
     """
     axes, letters = _shown_axes(dynamic, kind), _shown_coefficients(dynamic, kind)
     ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
@@ -106,7 +112,7 @@ def draw_dynamic_panels(
     for panel, axis in zip(panels, axes, strict=False):
         mesh = _draw_heat_map(panel, dynamic, axis, edges, ratio)
     for panel, letter in zip(panels[len(axes) :], letters, strict=True):
-        _draw_coefficient(panel, dynamic, kind, letter, dynamic.t_s / unit_s)
+        _draw_coefficient(panel, dynamic, kind, letter, dynamic.t_s / unit_s, units.coefficients[kind][letter])
     panels[0].set_xlim(edges[0], edges[-1])
     inside = [mark for mark in marks if mark.axis in axes and edges[0] <= mark.t_s / unit_s <= edges[-1]]
     for panel, axis in zip(panels, axes, strict=False):
@@ -180,8 +186,8 @@ def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "li
     bar.outline.set_visible(False)
 
 
-def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: str, t: Floats) -> None:
-    row, unit = SYMBOLS.index(letter), COEFFICIENT_UNITS[kind][letter]
+def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: str, t: Floats, unit: Unit) -> None:
+    row = SYMBOLS.index(letter)
     values, ends = [], []
     for axis in axes_of(kind):
         i, colour = AXES.index(axis), style.axis_colour(axis)

@@ -8,7 +8,14 @@ from typing import Any, Final
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from monitor.common.unit_formatting import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_duration, format_number
+from monitor.common.unit_formatting import (
+    KIND_NAMES,
+    CoefficientColumn,
+    Kind,
+    axes_of,
+    format_duration,
+    format_number,
+)
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
@@ -63,7 +70,7 @@ def render_page(plot_data: AnalysisPlotData, title: str = "") -> str:
         parts=[_part(plot_data, kind) for kind in measured_kinds(analysis.estimate)],
         axis_colour=axis_colour,
         mark_axis=lambda axis: mark_temperature_axis(axis, analysis.axes_of_temperature),
-        format_value_and_interval=lambda letter, axis: format_value_and_interval(analysis.estimate, letter, axis),
+        format_value_and_interval=lambda column, axis: format_value_and_interval(analysis.estimate, column, axis),
         temperature=f"{TEMPERATURE_MARK} {TEMPERATURE_MEANS}." if analysis.axes_of_temperature else "",
         legend=LEGEND_TEXT,
         window="" if plot_data.dynamic is None else format_duration(plot_data.dynamic.window_s),
@@ -84,20 +91,21 @@ def recording_facts(analysis: RecordingAnalysis) -> tuple[tuple[str, str], ...]:
     )
 
 
-def format_value_and_interval(estimate: Estimate, letter: str, axis: str) -> tuple[str, str]:
+def format_value_and_interval(estimate: Estimate, column: CoefficientColumn, axis: str) -> tuple[str, str]:
     """Return a noise coefficient with its unit, and its 95 % interval or the reason why there is no interval.
 
     Parameters
     ----------
     estimate
         Estimate of the noise coefficients.
-        letter
-        Symbol of the coefficient: Q, N, B, K or R.
+    column
+        Coefficient and its unit.
     axis
         Name of the axis.
     """
+    letter = column.symbol
     status = Status(int(estimate.coefficients.status[SYMBOLS.index(letter), AXES.index(axis)]))
-    text = format_coefficient(estimate.coefficients, letter, axis)
+    text = format_coefficient(estimate.coefficients, letter, axis, unit=column.unit)
     value = text.value if status == Status.UNESTIMATED else f"{text.value} {text.unit}"
     if is_k_r_ambiguous(estimate, letter, axis):
         return value, "(upper bound; K or R)"
@@ -108,11 +116,11 @@ def _part(plot_data: AnalysisPlotData, kind: Kind) -> dict[str, Any]:
     name, heat_maps = KIND_NAMES[kind], ""
     with figure_style():
         figure = create_figure(*ALLAN_INCHES)
-        draw_allan_panel(figure.subplots(), plot_data.analysis.estimate, kind, plot_data.others)
+        draw_allan_panel(figure.subplots(), plot_data.analysis.estimate, kind, plot_data.others, plot_data.units)
         allan = to_svg_element(figure, f"{name}: Allan deviation over averaging time")
         if plot_data.dynamic is not None:
             figure = create_figure(ALLAN_INCHES[0], dynamic_figure_height_inches(plot_data.dynamic, kind))
-            draw_dynamic_panels(figure, plot_data.dynamic, kind, plot_data.marks)
+            draw_dynamic_panels(figure, plot_data.dynamic, kind, plot_data.marks, plot_data.units)
             heat_maps = to_svg_element(figure, f"{name}: Allan deviation and coefficients over time")
-    texts = {"name": name, "axes": axes_of(kind), "coefficients": COEFFICIENT_NAMES[kind]}
+    texts = {"name": name, "axes": axes_of(kind), "columns": plot_data.units.columns(kind)}
     return texts | {"allan": allan, "dynamic": heat_maps}

@@ -21,7 +21,7 @@ def render_page(c: Comparison) -> str:
     Raises
     ------
     ConfigError
-        If matplotlib or Jinja2 is not installed.
+        If Jinja2 is not installed.
     """
     return render_template(
         "reconcile_runs.html.j2",

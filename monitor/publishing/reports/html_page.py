@@ -4,7 +4,7 @@ from typing import Any, Final
 
 from drivers.errors import ConfigError
 
-MISSING_MESSAGE: Final = 'matplotlib and Jinja2 are needed: pip install "imu-monitor[plot]"'
+MISSING_MESSAGE: Final = 'Jinja2 is not installed: pip install "imu-monitor[plot]"'
 
 
 def render_template(name: str, **values: Any) -> str:
@@ -20,10 +20,9 @@ def render_template(name: str, **values: Any) -> str:
     Raises
     ------
     ConfigError
-        If matplotlib or Jinja2 is not installed.
+        If Jinja2 is not installed.
     """
     try:
-        import matplotlib.figure as _  # noqa: F401
         from jinja2 import Environment, PackageLoader, StrictUndefined
     except ImportError as error:
         raise ConfigError(MISSING_MESSAGE) from error

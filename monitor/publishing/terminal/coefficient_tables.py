@@ -8,16 +8,17 @@ from rich.table import Table
 from rich.text import Text
 
 from monitor.common.unit_formatting import (
-    COEFFICIENT_UNITS,
+    DEFAULT_UNITS,
     KIND_NAMES,
     KINDS,
     NO_VALUE,
+    CoefficientColumn,
     Kind,
+    UnitSystem,
     axes_of,
     format_duration,
 )
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.publishing.coefficient_cells import (
     TEMPERATURE_MARK,
     TEMPERATURE_MEANS,
@@ -31,7 +32,9 @@ K_OR_R: Final = "K or R"
 """Text that the tables show for K and R if the data cannot distinguish K from R."""
 
 
-def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:
+def analysis_table(
+    estimate: Estimate, axes_of_temperature: Collection[str] = (), units: UnitSystem = DEFAULT_UNITS
+) -> RenderableType:
     """Return the table of noise coefficients with 95 % intervals that ``analyze`` prints.
 
     Parameters
@@ -40,12 +43,14 @@ def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()
         Estimate of the noise coefficients.
     axes_of_temperature
         Axes to mark, on which temperature explains most of the slow variance.
+    units
+        Units of the table.
     """
-    return Group(*coefficient_tables(DeviceCoefficients.from_estimate(estimate), axes_of_temperature))
+    return Group(*coefficient_tables(DeviceCoefficients.from_estimate(estimate), axes_of_temperature, units))
 
 
 def coefficient_tables(
-    coefficients: DeviceCoefficients, axes_of_temperature: Collection[str] = ()
+    coefficients: DeviceCoefficients, axes_of_temperature: Collection[str] = (), units: UnitSystem = DEFAULT_UNITS
 ) -> list[RenderableType]:
     """Return a legend, and tables of the noise coefficients of gyroscopes and accelerometers.
 
@@ -55,33 +60,41 @@ def coefficient_tables(
         Noise coefficients of the device.
     axes_of_temperature
         Axes to mark, on which temperature explains most of the slow variance.
+    units
+        Units of the tables.
     """
     time_text = "" if coefficients.filled_s is None else f"last {format_duration(coefficients.filled_s)}; "
     marks = f"; {K_OR_R}: one of them" if coefficients.k_or_r else ""
     marks += f"; {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
+    marks += "; densities are one-sided" if units.densities else ""
     legend = Text(f"{time_text}[95 % interval]; ≤ bound; {NO_VALUE} too few data yet{marks}", style="dim")
     parts: list[RenderableType] = [legend]
     for kind in KINDS:
         if set(axes_of(kind)) & set(coefficients.axes):
-            wide, narrow = (_kind_table(coefficients, kind, stacked, axes_of_temperature) for stacked in (False, True))
+            wide, narrow = (
+                _kind_table(coefficients, kind, stacked, axes_of_temperature, units) for stacked in (False, True)
+            )
             parts.append(WidthDependentTable(wide, narrow))
     return parts
 
 
-def _kind_table(known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_temperature: Collection[str]) -> Table:
+def _kind_table(
+    known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_temperature: Collection[str], units: UnitSystem
+) -> Table:
     table = plain_table(kind if stacked else KIND_NAMES[kind])
-    for symbol in SYMBOLS:
-        table.add_column(f"{symbol} {COEFFICIENT_UNITS[kind][symbol].name}", justify="right", no_wrap=True)
+    columns = units.columns(kind)
+    for one in columns:
+        table.add_column(f"{one.symbol} {one.unit.name}", justify="right", no_wrap=True)
     separator = "\n" if stacked else " "
     for axis in (axis for axis in axes_of(kind) if axis in known.axes):
-        cells = [_cell(known, symbol, axis, separator) for symbol in SYMBOLS]
+        cells = [_cell(known, column, axis, separator) for column in columns]
         table.add_row(Text(mark_temperature_axis(axis, axes_of_temperature), style="bold"), *cells)
     return table
 
 
-def _cell(known: DeviceCoefficients, symbol: str, axis: str, separator: str) -> Text:
-    one = format_coefficient(known.coefficients, symbol, axis)
+def _cell(known: DeviceCoefficients, column: CoefficientColumn, axis: str, separator: str) -> Text:
+    one = format_coefficient(known.coefficients, column.symbol, axis, unit=column.unit)
     small = [f"[{one.interval}]"] if one.interval else []
-    if axis in known.k_or_r and symbol in ("K", "R"):
+    if axis in known.k_or_r and column.symbol in ("K", "R"):
         small.append(K_OR_R)
     return Text.assemble(one.value, *((separator + part, "dim") for part in small))

@@ -29,6 +29,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.reconcile.likelihood.axis_fit import Regressor
+from monitor.reconcile.likelihood.effect_roles import regressor_count
 from monitor.reconcile.likelihood.variance_change_tests import count_variance_blocks
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.cosine_bins import SMOOTHING_BINS, build_frequency_bins, inverse_cosine_transform
@@ -275,8 +276,7 @@ def diagnose_temperature_dependence(whitened: WhitenedAxis) -> Finding:
     reference = float(temperature_c.mean())
 
     def temperature_effect_gain(effect: TemperatureBias | TemperatureLag | TemperatureHysteresis) -> float:
-        count = len(whitened.axis.regressor_cosine_transforms(effect))
-        return _regressor_gain(whitened, [(effect, at) for at in range(count)])
+        return _regressor_gain(whitened, [(effect, at) for at in range(regressor_count(effect))])
 
     gains = [
         temperature_effect_gain(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0, cubic=1.0))

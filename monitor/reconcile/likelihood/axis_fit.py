@@ -34,6 +34,7 @@ from monitor.reconcile.likelihood.effect_roles import (
     build_unit_regressors,
     effect_size,
     is_noise_effect,
+    regressor_count,
     with_effect_size,
     with_regressor_factors,
 )
@@ -252,7 +253,7 @@ class Axis:
     def _noise_variances(
         self, effects: Sequence[Effect], fixed_noise: frozenset[int], transforms: Sequence[Transform]
     ) -> _NoiseVariances:
-        constant = _density_after(transforms, None, self.bins) / (1.0 / self.rate_hz)
+        constant = self._variance_of_transforms(transforms).copy()
         found = _NoiseVariances([], [], [], constant)
         for at, effect in enumerate(effects):
             if not is_noise_effect(effect):
@@ -284,7 +285,7 @@ class Axis:
         columns: list[Regressor] = []
         for at, effect in enumerate(effects):
             if type(effect) in DETERMINISTIC_SIZE_PARAMETERS:
-                count = len(self.regressor_cosine_transforms(effect))
+                count = regressor_count(effect)
                 slices.append((at, slice(len(columns), len(columns) + count)))
                 columns += [(effect, i) for i in range(count)]
         return tuple(slices), columns
@@ -306,8 +307,16 @@ class Axis:
             source = white_noise_spectrum(1.0 / tau0_s, tau0_s)
         else:
             source = self._unit_spectrum(effect, gains)
-        density = _density_after(transforms, source, self.bins) - _density_after(transforms, None, self.bins)
-        return np.asarray(density / tau0_s)
+        return np.asarray(
+            _density_after(transforms, source, self.bins) / tau0_s - self._variance_of_transforms(transforms)
+        )
+
+    def _variance_of_transforms(self, transforms: Sequence[Transform]) -> Floats:
+        """Return the variance that the signal chain itself adds to each frequency bin, shape (m,)."""
+        key = ("chain", *transforms)
+        if key not in self._bases:
+            self._bases[key] = _density_after(transforms, None, self.bins) * self.rate_hz
+        return self._bases[key]
 
     def _unit_spectrum(self, effect: Effect, gains: Effects) -> Spectrum:
         """Return the spectrum of a noise effect of size one before the transforms."""

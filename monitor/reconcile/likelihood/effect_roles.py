@@ -99,6 +99,7 @@ _EFFECTS_BY_DIAGNOSTIC: Final = {
     "psd": (
         *("quantization_noise", "angle_random_walk", "bias_instability", "rate_random_walk"),
         *("exponentially_correlated", "scale_factor", "narrowband", "bandwidth_limit", "power_law"),
+        "wandering_line",
     ),
     "lines": ("sinusoidal", "pulse_train"),
     "temperature": ("temperature_bias", "temperature_lag", "temperature_hysteresis"),
@@ -118,6 +119,15 @@ def linear_coefficient_names(effect: Effect) -> tuple[str, ...]:
     """Return the names of the linear coefficients of a deterministic effect, beginning with the size."""
     names = COEFFICIENTS.get(type(effect), (SIZE_PARAMETERS[type(effect)],))
     return tuple(name for name in names if getattr(effect, name) is not None)
+
+
+def regressor_count(effect: Effect) -> int:
+    """Return the number of regressors of a deterministic effect.
+
+    A sinusoid has a regressor for each of two phases. An effect in ``COEFFICIENTS`` has a regressor for each
+    coefficient. Other effects have one regressor.
+    """
+    return 2 if isinstance(effect, Sinusoidal) else len(linear_coefficient_names(effect))
 
 
 def is_noise_effect(effect: Effect) -> bool:
@@ -162,9 +172,6 @@ def with_effect_size(effect: Effect, size: float) -> Effect:
 def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
     """Build the regressors of a deterministic effect.
 
-    A sinusoid has a regressor for each of two phases. An effect in ``COEFFICIENTS`` has a regressor for each
-    coefficient. Other effects have one regressor.
-
     Parameters
     ----------
     effect : Effect
@@ -179,7 +186,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     Returns
     -------
     list of ndarray of float64, shape (n,)
-        One to three series.
+        Series of each of the ``regressor_count(effect)`` regressors.
 
     Raises
     ------
@@ -192,8 +199,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     if isinstance(effect, Sinusoidal):
         variants = [replace(effect, amplitude=1.0, phase=phase) for phase in (0.0, 0.5 * pi)]
     else:
-        count = len(linear_coefficient_names(effect))
-        variants = [with_regressor_factors(effect, unit) for unit in np.eye(count)]
+        variants = [with_regressor_factors(effect, unit) for unit in np.eye(regressor_count(effect))]
     return [_series_of(one, n, rate_hz, temperature_c) for one in variants]
 
 

@@ -266,21 +266,40 @@ def fit_event_process(
         Names and starting values of the two parameters.
     """
     height, at = maximise_over_log_parameters(lambda a, b: log_likelihood(a, b, 1.0), list(start_values.values()))
-    deviations = _log_deviations(lambda x: log_likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height)
+    deviations = compute_log_deviations(
+        lambda x: log_likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height
+    )
     first, second = np.exp(at).tolist()
     events = (log_likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
-    bounds = [_log_interval(*one) for one in zip((first, second), deviations.tolist(), strict=True)]
+    bounds = [log_interval(*one) for one in zip((first, second), deviations.tolist(), strict=True)]
     return EventProcessFit(height, dict(zip(start_values, bounds, strict=True)), events)
 
 
-def _log_interval(value: float, deviation: float) -> ParameterInterval:
+def log_interval(value: float, deviation: float) -> ParameterInterval:
+    """Return the 95 % interval of a positive parameter from the standard deviation of its logarithm."""
     wide = Z95 * deviation
     if not wide < MAX_LOG_PARAMETER_RANGE:
         return ParameterInterval(value)
     return ParameterInterval(value, value * exp(-wide), value * exp(wide))
 
 
-def _log_deviations(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
+def compute_log_deviations(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
+    """Return the standard deviations of log parameters from the curvature of a log-likelihood at its maximum.
+
+    Parameters
+    ----------
+    function : callable
+        Log-likelihood as a function of the logarithms of the parameters.
+    at : ndarray of float64, shape (k,)
+        Logarithms of the parameters at the maximum.
+    height : float
+        Log-likelihood at the maximum.
+
+    Returns
+    -------
+    ndarray of float64, shape (k,)
+        Standard deviations, or NaN if the log-likelihood has no curvature.
+    """
     curvature = _curvature(function, at, height)
     if (np.linalg.eigvalsh(curvature) < 0.0).all():
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(-curvature))))

@@ -6,13 +6,13 @@ al. 1983).
 """
 
 from dataclasses import dataclass
-from math import lgamma, log
+from math import ceil, lgamma, log
 from typing import Final
 
 import numpy as np
 from scipy.special import gammaincc
 
-from drivers.data_types import Floats
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 
 HARMONICS: Final = (4, 16, 32)
@@ -72,12 +72,11 @@ def find_harmonic_series(periodogram: Floats, n: int, rate_hz: float) -> Harmoni
     last = m - 2  # the gains at the highest frequencies are those of one real coefficient
     step_hz = 0.5 * rate_hz / m
     best = HarmonicSeries(0.0, 0.0, step_hz)
-    highest = int(2.0 * m / MIN_PERIOD_SAMPLES)
-    for count in HARMONICS:
-        lowest = int(np.ceil(MIN_PERIODS * rate_hz / n / step_hz))
-        if lowest >= highest:
-            continue
-        power, at = _largest_harmonic_sum(periodogram, lowest * count, min(highest * count, last), count)
+    lowest, highest = ceil(MIN_PERIODS * rate_hz / n / step_hz), int(2.0 * m / MIN_PERIOD_SAMPLES)
+    if lowest >= highest:
+        return best
+    powers, places = _largest_harmonic_sums(periodogram, lowest, highest, last)
+    for count, power, at in zip(HARMONICS, powers.tolist(), places.tolist(), strict=True):
         gain = _gamma_tail_nats(power, count)
         if gain > best.gain:
             best = HarmonicSeries(gain, at * step_hz / count, step_hz / count)
@@ -181,26 +180,31 @@ def _gamma_tail_nats(power: float, count: int) -> float:
 
 
 @compiled
-def _largest_harmonic_sum(power: Floats, first: int, end: int, count: int) -> tuple[float, int]:
-    """Return the largest sum of ``count`` harmonics, and the index of the highest harmonic.
+def _largest_harmonic_sums(power: Floats, lowest: int, highest: int, last: int) -> tuple[Floats, Ints]:
+    """Return the largest sum for each number of harmonics in ``HARMONICS``, and the index of the highest harmonic.
 
-    The number of harmonics is a power of two. The harmonics are added in blocks of fundamental frequencies.
+    The fundamental frequencies have indices from ``lowest`` to ``highest``, and the highest harmonic has an index below
+    ``last``. Let j be the index of the highest of n harmonics. Harmonic k has the index kj/n, rounded. The even
+    harmonics of 2n harmonics are thus the harmonics of n harmonics with the same j, and only the odd ones are added.
+    The harmonics are added in blocks of indices j.
     """
-    best, place = -1.0, first
-    shift = 1  # division by 2 count
-    while 1 << (shift - 1) < count:
-        shift += 1
+    best, places = np.full(len(HARMONICS), -1.0), np.zeros(len(HARMONICS), np.int64)
     sums = np.empty(HARMONIC_SUM_BLOCK)
-    for start in range(first, end, HARMONIC_SUM_BLOCK):
-        size = min(HARMONIC_SUM_BLOCK, end - start)
+    for start in range(lowest * HARMONICS[0], min(highest * HARMONICS[-1], last), HARMONIC_SUM_BLOCK):
+        size = min(HARMONIC_SUM_BLOCK, last - start)
         sums[:size] = 0.0
-        for k in range(1, count + 1):
-            for i in range(size):
-                sums[i] += power[(2 * k * (start + i) + count) >> shift]
-        for i in range(size):
-            if sums[i] > best:
-                best, place = sums[i], start + i
-    return best, place
+        count, shift, step, rank = 1, 1, 1, 0
+        while rank < len(HARMONICS):
+            for k in range(1, count + 1, step):
+                for i in range(size):
+                    sums[i] += power[(2 * k * (start + i) + count) >> shift]
+            if count == HARMONICS[rank]:
+                for at in range(max(lowest * count, start), min(highest * count, start + size)):
+                    if sums[at - start] > best[rank]:
+                        best[rank], places[rank] = sums[at - start], at
+                rank += 1
+            count, shift, step = 2 * count, shift + 1, 2
+    return best, places
 
 
 @compiled
@@ -221,15 +225,19 @@ def _fold(series: Floats, period: float, bins: int) -> tuple[Floats, Floats]:
 def _best_rectangle(sums: Floats, counts: Floats, shortest: int, longest: int) -> tuple[float, int, int]:
     """Return the largest log-likelihood gain of a rectangular pulse, the first bin and the width in bins."""
     bins, total, whole = sums.size, sums.sum(), counts.sum()
+    mean, share = total / whole, 1.0 / whole
     best, place, length = 0.0, 0, 1
     for first in range(bins):
-        inside, number = 0.0, 0.0
+        inside, number, at = 0.0, 0.0, first
         for width in range(1, longest + 1):
-            inside += sums[(first + width - 1) % bins]
-            number += counts[(first + width - 1) % bins]
+            inside += sums[at]
+            number += counts[at]
+            at += 1
+            if at == bins:
+                at = 0
             if width < shortest or number < 1.0 or number >= whole:
                 continue
-            gain = 0.5 * (inside - number * total / whole) ** 2 / (number * (1.0 - number / whole))
+            gain = 0.5 * (inside - number * mean) ** 2 / (number * (1.0 - number * share))
             if gain > best:
                 best, place, length = gain, first, width
     return best, place, length

@@ -25,12 +25,10 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
     StateSpaceNoise,
     build_state_space_noise,
     compute_block_means,
-    difference_from_predicted_block_mean,
     fit_event_process,
     initial_state_covariance,
     kalman_log_likelihood,
     maximise_over_log_parameters,
-    predict_block_mean_variance,
     prior_level_variance,
 )
 
@@ -145,108 +143,185 @@ class _JumpProbabilities(NamedTuple):
     variance: float  # variance of the sum of all jumps in a block with at least one jump
 
 
-class _GaussianMixture(NamedTuple):
-    weight: Floats  # [k] probability of each component, or its logarithm
-    mean: Floats  # [k, d]
-    covariance: Floats  # [k, d, d]
+class _JumpFilterState(NamedTuple):
+    """Probability and Gaussian state of each hypothesis about the age of the last jump."""
+
+    probability: Floats  # [JUMP_AGES]
+    mean: Floats  # [JUMP_AGES, d]
+    covariance: Floats  # [JUMP_AGES, d, d], of which only the lower triangle is up to date
+
+
+class _JumpFilterUpdate(NamedTuple):
+    """Update of each hypothesis with one block mean, for no jump (0) and for a jump (1) in the block."""
+
+    weight: Floats  # [2, JUMP_AGES] probability
+    inverse_variance: Floats  # [2, JUMP_AGES] inverse of the variance of the innovation
+    state_covariance: Floats  # [2, JUMP_AGES, d] covariance of the block mean with the next state
+    mean: Floats  # [2, JUMP_AGES, d] mean of the next state
 
 
 @compiled
 def _jump_log_likelihood(
     means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: _JumpProbabilities
 ) -> float:
-    d = noise.table.shape[0]
-    by_age = _GaussianMixture(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
-    # entries 0 to JUMP_AGES − 1 have no jump in this block, the other entries have a jump
-    branches = _GaussianMixture(np.empty(2 * JUMP_AGES), np.zeros((2 * JUMP_AGES, d)), np.zeros((2 * JUMP_AGES, d, d)))
-    by_age.weight[JUMP_AGES - 1] = 1.0
-    by_age.covariance[JUMP_AGES - 1] = initial_state_covariance(noise, level_variance)
+    d, last = noise.table.shape[0], JUMP_AGES - 1
+    state = _JumpFilterState(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
+    state.probability[last] = 1.0
+    state.covariance[last] = initial_state_covariance(noise, level_variance)
+    update = _JumpFilterUpdate(
+        np.zeros((2, JUMP_AGES)), np.zeros((2, JUMP_AGES)), np.zeros((2, JUMP_AGES, d)), np.zeros((2, JUMP_AGES, d))
+    )
+    jumped_mean, jumped_covariance = np.zeros(d), np.zeros((d, d))
+    merged_mean, merged_covariance = np.zeros(d), np.zeros((d, d))
     total: float = -0.5 * means.size * np.log(2.0 * np.pi)
     for block_mean in means:
-        for age in range(JUMP_AGES):
-            _branch(block_mean, age, by_age, branches, noise, jumps)
-        total += _normalise(branches.weight)
-        for age in range(JUMP_AGES):
-            if age == 0:  # merge all hypotheses with a jump in this block
-                first, end = JUMP_AGES, 2 * JUMP_AGES
-            else:  # without a jump, the age increases by one block; the last age includes all older jumps
-                first, end = age - 1, age + age // (JUMP_AGES - 1)
-            _merge(branches, first, end, by_age, age)
+        density, log_scale = _weigh_branches(block_mean, noise, jumps, state, update)
+        total += np.log(density) - log_scale
+        update.weight[:] /= density
+        # all hypotheses with a jump in this block become the hypothesis with age 0
+        jumped = _merge(1, 0, JUMP_AGES, noise.table, state.covariance, update, jumped_mean, jumped_covariance)
+        # the last age includes all older jumps
+        state.probability[last] = _merge(
+            0, last - 1, JUMP_AGES, noise.table, state.covariance, update, merged_mean, merged_covariance
+        )
+        state.mean[last] = merged_mean
+        state.covariance[last] = merged_covariance
+        _increase_ages(noise.table, state, update)
+        state.probability[0] = jumped
+        state.mean[0] = jumped_mean
+        state.covariance[0] = jumped_covariance
+        state.covariance[0, 0, 0] += jumps.variance
     return total
 
 
 @compiled
-def _branch(
+def _weigh_branches(
     block_mean: float,
-    age: int,
-    by_age: _GaussianMixture,
-    branches: _GaussianMixture,
     noise: StateSpaceNoise,
     jumps: _JumpProbabilities,
-) -> None:
-    """Update one hypothesis with a block mean, once with and once without a jump in the block.
+    state: _JumpFilterState,
+    update: _JumpFilterUpdate,
+) -> tuple[float, float]:
+    """Compute the update of each hypothesis, once with and once without a jump in the block.
 
     The time of a jump is uniformly distributed in the block. On average, the jump changes the block mean by half of the
     height. The variance of the block mean increases by one third of the height variance.
+
+    Returns
+    -------
+    density : float
+        Sum of the weights.
+    log_scale : float
+        Logarithm of the factor by which the weights were multiplied.
     """
-    branches.weight[age] = branches.weight[JUMP_AGES + age] = -np.inf
-    if by_age.weight[age] < MIN_HYPOTHESIS_PROBABILITY:
-        return
-    table = noise.table
+    table, probability, mean, covariance = noise.table, state.probability, state.mean, state.covariance
+    weight, inverse_variance, state_covariance, next_mean = (
+        update.weight,
+        update.inverse_variance,
+        update.state_covariance,
+        update.mean,
+    )
     d = table.shape[0]
-    covariance, state_covariance = by_age.covariance[age], np.empty(d)
-    variance = predict_block_mean_variance(noise, covariance, state_covariance)
-    innovation = difference_from_predicted_block_mean(block_mean, noise, by_age.mean[age])
-    for jump in range(2):
-        to, chance = (JUMP_AGES + age, jumps.some) if jump else (age, jumps.none)
-        if jump:
-            variance += jumps.variance / 3.0
-            state_covariance[0] += 0.5 * jumps.variance
-        likelihood = -0.5 * (innovation * innovation / variance + np.log(variance))
-        branches.weight[to] = np.log(by_age.weight[age] * chance) + likelihood
-        spread = branches.covariance[to]
+    least = np.inf
+    for age in range(JUMP_AGES):
+        if probability[age] < MIN_HYPOTHESIS_PROBABILITY:
+            continue
+        variance, innovation = noise.white, block_mean
         for i in range(d):
-            branches.mean[to, i] = table[i, 0] * by_age.mean[age, i] + state_covariance[i] * innovation / variance
-            for j in range(d):
-                spread[i, j] = table[i, 0] * table[j, 0] * covariance[i, j]
-                spread[i, j] -= state_covariance[i] * state_covariance[j] / variance
-            spread[i, i] += table[i, 2]
-        spread[0, 0] += jump * jumps.variance
-
-
-@compiled
-def _normalise(weight: Floats) -> float:
-    """Normalise probabilities, given as logarithms, in place. Return the logarithm of the sum before normalisation."""
-    highest = weight[0]
-    for k in range(1, weight.size):
-        highest = max(highest, weight[k])
+            total = 0.0
+            for j in range(i + 1):
+                total += covariance[age, i, j] * table[j, 1]
+            for j in range(i + 1, d):
+                total += covariance[age, j, i] * table[j, 1]
+            variance += table[i, 1] * total
+            innovation -= table[i, 1] * mean[age, i]
+            state_covariance[0, age, i] = state_covariance[1, age, i] = table[i, 0] * total + table[i, 3]
+        state_covariance[1, age, 0] += 0.5 * jumps.variance
+        inverse_variance[0, age] = 1.0 / variance
+        inverse_variance[1, age] = 1.0 / (variance + jumps.variance / 3.0)
+        for jump in range(2):
+            pull = innovation * inverse_variance[jump, age]
+            weight[jump, age] = 0.5 * innovation * pull
+            least = min(least, weight[jump, age])
+            for i in range(d):
+                next_mean[jump, age, i] = table[i, 0] * mean[age, i] + state_covariance[jump, age, i] * pull
     density = 0.0
-    for k in range(weight.size):
-        weight[k] = np.exp(weight[k] - highest)
-        density += weight[k]
-    for k in range(weight.size):
-        weight[k] /= density
-    log_sum: float = highest + np.log(density)
-    return log_sum
+    for jump in range(2):
+        chance = jumps.some if jump else jumps.none
+        for age in range(JUMP_AGES):
+            if probability[age] < MIN_HYPOTHESIS_PROBABILITY:
+                weight[jump, age] = 0.0
+            else:
+                prior = probability[age] * chance * np.sqrt(inverse_variance[jump, age])
+                weight[jump, age] = prior * np.exp(least - weight[jump, age])
+                density += weight[jump, age]
+    return density, least
 
 
 @compiled
-def _merge(branches: _GaussianMixture, first: int, end: int, merged: _GaussianMixture, to: int) -> None:
+def _merge(
+    jump: int,
+    first: int,
+    end: int,
+    table: Floats,
+    covariance: Floats,
+    update: _JumpFilterUpdate,
+    merged_mean: Floats,
+    merged_covariance: Floats,
+) -> float:
+    """Merge the updated hypotheses ``first`` to ``end`` − 1 into one Gaussian, and return the probability.
+
+    The mean and the lower triangle of the covariance are written in place. The jumps are independent of the earlier
+    state, and the caller adds their variance.
+    """
+    weight, inverse_variance, state_covariance, mean = (
+        update.weight,
+        update.inverse_variance,
+        update.state_covariance,
+        update.mean,
+    )
     share = 0.0
-    for k in range(first, end):
-        share += branches.weight[k]
-    merged.weight[to] = share
+    for age in range(first, end):
+        share += weight[jump, age]
     if share < MIN_HYPOTHESIS_PROBABILITY:
-        return
-    d = branches.mean.shape[1]
-    mean, covariance = merged.mean[to], merged.covariance[to]
+        return share
+    d = table.shape[0]
     for i in range(d):
-        mean[i] = 0.0
-        for k in range(first, end):
-            mean[i] += branches.weight[k] / share * branches.mean[k, i]
+        total = 0.0
+        for age in range(first, end):
+            total += weight[jump, age] * mean[jump, age, i]
+        merged_mean[i] = total / share
+    merged_covariance[:] = 0.0
+    for age in range(first, end):
+        if weight[jump, age] == 0.0:
+            continue
+        part, known = weight[jump, age] / share, inverse_variance[jump, age]
+        for i in range(d):
+            decay, pull, apart = (
+                table[i, 0],
+                state_covariance[jump, age, i] * known,
+                mean[jump, age, i] - merged_mean[i],
+            )
+            for j in range(i + 1):
+                own = decay * table[j, 0] * covariance[age, i, j] - pull * state_covariance[jump, age, j]
+                merged_covariance[i, j] += part * (own + apart * (mean[jump, age, j] - merged_mean[j]))
     for i in range(d):
-        for j in range(d):
-            covariance[i, j] = 0.0
-            for k in range(first, end):
-                apart = (branches.mean[k, i] - mean[i]) * (branches.mean[k, j] - mean[j])
-                covariance[i, j] += branches.weight[k] / share * (branches.covariance[k, i, j] + apart)
+        merged_covariance[i, i] += table[i, 2]
+    return share
+
+
+@compiled
+def _increase_ages(table: Floats, state: _JumpFilterState, update: _JumpFilterUpdate) -> None:
+    """Update the hypotheses with ages from 1 to ``JUMP_AGES`` − 2, which have no jump in the block."""
+    probability, mean, covariance = state.probability, state.mean, state.covariance
+    weight, next_mean = update.weight, update.mean
+    inverse_variance, state_covariance = update.inverse_variance, update.state_covariance
+    for age in range(JUMP_AGES - 2, 0, -1):
+        old = age - 1
+        probability[age] = weight[0, old]
+        for i in range(table.shape[0]):
+            mean[age, i] = next_mean[0, old, i]
+            decay, pull = table[i, 0], state_covariance[0, old, i] * inverse_variance[0, old]
+            for j in range(i + 1):
+                covariance[age, i, j] = decay * table[j, 0] * covariance[old, i, j] - pull * state_covariance[0, old, j]
+            covariance[age, i, i] += table[i, 2]

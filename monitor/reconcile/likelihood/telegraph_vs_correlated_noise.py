@@ -160,6 +160,7 @@ class _BlockFilterUpdate(NamedTuple):
     scaled_innovation: Floats  # [2, 3] innovation divided by its variance
     inverse_variance: Floats  # [2, 3] inverse of the variance of the innovation
     state_covariance: Floats  # [2, d] covariance of the block mean with the next state
+    mean_difference: Floats  # [d] difference of the state means of the two cases that are merged
 
 
 @compiled
@@ -182,7 +183,7 @@ def _switching_log_likelihood(
     upper level.
     """
     d = noise.table.shape[0]
-    update = _BlockFilterUpdate(np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, d)))
+    update = _BlockFilterUpdate(np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, d)), np.empty(d))
     moved, merged = np.empty((2, d)), np.empty((2, d, d))
     total: float = -0.5 * means.size * np.log(2.0 * np.pi)
     for block_mean in means:
@@ -252,7 +253,7 @@ def _merge_into_level(
         state.mean,
         state.covariance,
     )
-    step = np.empty(d)
+    step = update.mean_difference
     stays, comes = update.weight[level, 0], update.weight[other, 2]
     state.probability[level] = (stays + comes) / density
     came = comes / (stays + comes)
@@ -261,7 +262,7 @@ def _merge_into_level(
         step[i] = table[i, 0] * at[other, i] + state_covariance[other, i] * pull[other, 2] - stay
         moved[i] = stay + came * step[i]
     for i in range(d):
-        for j in range(d):
+        for j in range(i + 1):
             decay = table[i, 0] * table[j, 0]
             stay = (
                 covariance[level, i, j] * decay
@@ -272,5 +273,5 @@ def _merge_into_level(
                 - state_covariance[other, i] * state_covariance[other, j] * known[other, 2]
             )
             apart = (1.0 - came) * step[i] * step[j]
-            merged[i, j] = stay + came * (come - stay + apart)
+            merged[i, j] = merged[j, i] = stay + came * (come - stay + apart)
         merged[i, i] += table[i, 2]

@@ -2,7 +2,8 @@
 
 ``fill_missing_samples`` adds a random deviation to the mean of neighbouring samples. The deviation is taken from a
 randomly chosen valid sample (**donor**). Mean level, drift and white noise therefore continue through missing samples.
-A long run of missing samples is filled by a random walk with the drift of the recording.
+A long run of missing samples is filled with successive samples from the neighbourhood, so that the spectrum of the
+noise continues too.
 
 ``restore_clipped_samples`` replaces each clipped sample by a random sample from the tail of a Gaussian.
 """
@@ -25,9 +26,7 @@ MAX_WIDTH_TEST_SAMPLES: Final = 20_000
 DONOR_RANGE_SAMPLES: Final = 1024
 """Number of valid samples on each side from which the donor is chosen."""
 LONG_GAP_SAMPLES: Final = 100
-"""Number of consecutive missing samples above which a Brownian bridge is used."""
-MIN_WANDER_INTERVALS: Final = 16
-"""Smallest ratio of recording length to the interval of the drift measurement."""
+"""Number of consecutive missing samples above which successive samples are copied."""
 CLIP_LEVEL_SAMPLES: Final = 64
 """Number of samples on each side that determine the mean level of clipped samples."""
 MAX_CLIP_ITERATIONS: Final = 50
@@ -76,16 +75,55 @@ def fill_missing_samples(y: Floats, replace_mask: Mask, rng: np.random.Generator
     middle = float(y[where[where.size // 2]])
     sums, counts = _running_sums(y, good, middle)
     width = _neighbourhood_width(y, where, sums, counts, middle)
-    _draw_missing(new, where, missing, sums, counts, middle, width, rng.random(missing.size))
     breaks = np.flatnonzero(np.diff(missing) > 1)
     firsts = missing[np.concatenate([[0], breaks + 1])]
     lasts = missing[np.concatenate([breaks, [missing.size - 1]])]
-    for first, last in zip(firsts, lasts, strict=True):
-        if last - first >= LONG_GAP_SAMPLES and first > 0 and last < y.size - 1:
-            length = int(last - first + 1)
-            wander = _wander_variance(sums, counts, length, width)
-            new[first : last + 1] += _brownian_bridge(length, wander, rng)
+    is_long = lasts - firsts >= LONG_GAP_SAMPLES
+    short = missing[~np.repeat(is_long, lasts - firsts + 1)]
+    _draw_missing(new, where, short, sums, counts, middle, width, rng.random(short.size))
+    known = np.ones(y.size, np.bool_)
+    known[missing[np.repeat(is_long, lasts - firsts + 1)]] = False
+    known_at = np.flatnonzero(known)
+    for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
+        _copy_samples(new, known_at, first, last, width, rng)
     return new
+
+
+def _copy_samples(new: Floats, known_at: Ints, first: int, last: int, width: int, rng: np.random.Generator) -> None:
+    """Fill a long run of missing samples with successive samples from the side of the run with more samples.
+
+    A line is added to the copied samples, so that the changes of the mean level at both ends of the run equal those at
+    the ends of the copied samples. If there are too few samples, their mirror image continues them.
+
+    Parameters
+    ----------
+    new : ndarray of float64, shape (n,)
+        Series, which is changed in place.
+    known_at : ndarray of int64, shape (m,)
+        Indices of the samples that are not part of a long run.
+    first, last : int
+        First and last missing sample.
+    width : int
+        Number of samples that determine the mean level.
+    rng : numpy.random.Generator
+        Generator for the place of the copied samples.
+    """
+    length, place = last - first + 1, int(np.searchsorted(known_at, first))
+    left, right = new[known_at[max(place - width, 0) : place]], new[known_at[place : place + width]]
+    size = length + left.size + right.size
+    reach, use_before = size + DONOR_RANGE_SAMPLES, 2 * place > known_at.size
+    chosen = known_at[max(place - reach, 0) : place][::-1] if use_before else known_at[place : place + reach]
+    near = np.pad(new[chosen], (0, max(size - chosen.size, 0)), "reflect" if chosen.size > 1 else "edge")
+    start = int(rng.integers(near.size - size + 1))
+    copied = near[start : start + size]
+    copied = copied[::-1] if use_before else copied
+    ends = [
+        float(beside.mean() - one.mean())
+        for beside, one in ((left, copied[: left.size]), (right, copied[size - right.size :]))
+        if beside.size
+    ]
+    part = np.arange(1, length + 1) / (length + 1)
+    new[first : last + 1] = copied[left.size : left.size + length] + ends[0] + (ends[-1] - ends[0]) * part
 
 
 def restore_clipped_samples(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
@@ -189,16 +227,8 @@ def _draw_missing(
         before, after = left - first, last - left
         lo = where[first]
         hi = where[last - 1] + 1
-        gap = where[left] - where[left - 1] if before > 0 and after > 0 else 1
-        if gap > LONG_GAP_SAMPLES:  # interpolate between the levels at both ends
-            start = (sums[where[left - 1] + 1] - sums[lo]) / before
-            end = (sums[hi] - sums[where[left]]) / after
-            part = (at - where[left - 1]) / gap
-            level = start + (end - start) * part
-            used = 1.0 / ((1.0 - part) ** 2 / before + part**2 / after)
-        else:
-            level = (sums[hi] - sums[lo]) / (before + after)
-            used = float(before + after)
+        level = (sums[hi] - sums[lo]) / (before + after)
+        used = float(before + after)
         pool, stop = max(left - DONOR_RANGE_SAMPLES, 0), min(left + DONOR_RANGE_SAMPLES, where.size)
         donor = where[pool + int(chances[k] * (stop - pool))]
         from_, to = max(donor - width, 0), min(donor + width + 1, n)
@@ -209,31 +239,3 @@ def _draw_missing(
         if used > 1.0 and others > 1:
             grown = ((1.0 - 1.0 / used) / (1.0 - 1.0 / others)) ** 0.5
         new[at] = middle + level + grown * away
-
-
-def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> float:
-    n = counts.size - 1
-    length = min(length, n // MIN_WANDER_INTERVALS)
-    begins = np.arange(0, n - length - 2 * width, max(width, (n - length) // 2000 or 1))
-    if begins.size < 8:
-        return 0.0
-    left, right = counts[begins + width] - counts[begins], counts[begins + length + 2 * width]
-    right = right - counts[begins + length + width]
-    full = (left > 0.9 * width) & (right > 0.9 * width)
-    begins, left, right = begins[full], left[full], right[full]
-    if begins.size < 8:
-        return 0.0
-    first = (sums[begins + width] - sums[begins]) / left
-    second = (sums[begins + length + 2 * width] - sums[begins + length + width]) / right
-    near = np.diff(first)  # changes of the mean due to white noise and to drift within a neighbourhood
-    moved = float(np.median((second - first) ** 2)) - float(np.median(near**2))
-    return max(moved, 0.0) / 0.4549364231195724 / (length + width)  # median of χ² with one degree of freedom
-
-
-def _brownian_bridge(length: int, variance: float, rng: np.random.Generator) -> Floats:
-    """Return a random walk that is zero just before the first sample and just after the last sample.
-
-    ``variance`` is the variance per sample.
-    """
-    walk = np.cumsum(rng.standard_normal(length + 1)) * variance**0.5
-    return np.asarray(walk[:-1] - walk[-1] * np.arange(1, length + 1) / (length + 1))

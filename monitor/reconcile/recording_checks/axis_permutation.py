@@ -3,8 +3,9 @@
 The spectrum of each recorded axis is compared with the spectrum of each axis of a simulation. One common factor of the
 three axes is fitted, because the unit may also be wrong. The noise of a real sensor varies from run to run, so the
 noise level of each axis and the power in each band may differ from the model. A permutation is reported if the
-permuted axes fit clearly better than the axes in the order of the file. Two axes with the same spectrum cannot be
-distinguished and keep their order. Noise spectra do not show the sign of an axis.
+permuted axes fit clearly better than the axes in the order of the file, and if the permutation explains most of their
+differences. An axis with an additional noise may fit another axis slightly better, but not well. Two axes with the same
+spectrum cannot be distinguished and keep their order. Noise spectra do not show the sign of an axis.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,14 +31,17 @@ MAX_AXIS_COST_NATS: Final = 32.0
 """Largest cost in nats of a different noise level on one axis."""
 CORRELATED_BANDS: Final = 3.0
 """Number of neighbouring bands with correlated deviations (empirical)."""
-SWAP_PENALTY_NATS: Final = 1.0
-ROTATION_PENALTY_NATS: Final = 8.0
-"""Penalty in nats for a permutation of three axes. If two axes are similar, a rotation fits as well as a swap."""
+PENALTIES_NATS: Final = {
+    order: {0: 0.0, 2: 1.0, 3: 8.0}[sum(at != to for at, to in enumerate(order))] for order in permutations(range(3))
+}
+"""Penalty in nats for each permutation. If two axes are similar, a permutation of three axes fits as well as a swap."""
 MIN_GAIN_NATS: Final = 6.0
 """Smallest gain in nats of a permutation over the order of the file.
 
 The gain of 46 unchanged triads of real sensors was at most 4.0 nats (``tests/experiments/blind/corruptions``).
 """
+MIN_EXPLAINED_SHARE: Final = 0.5
+"""Smallest decrease of the cost of the permuted axes, relative to their cost in the order of the file."""
 IDENTITY: Final = (0, 1, 2)
 
 
@@ -66,13 +70,13 @@ def find_axis_order(
         Frequency in Hz, and variance of the logarithm of the power, of each resonance of the model.
     """
     cells = [[_compare_spectra(one, other, peaks) for other in simulated] for one in recorded]
-    costs = {
-        order: _assignment_cost([cells[at][to] for at, to in enumerate(order)], order)
-        for order in permutations(IDENTITY)
+    axis_costs = {
+        order: _axis_costs([cells[at][to] for at, to in enumerate(order)]) for order in permutations(IDENTITY)
     }
+    costs = {order: float(each.sum()) + PENALTIES_NATS[order] for order, each in axis_costs.items()}
     best = min(costs, key=lambda order: costs[order])
-    gain = costs[IDENTITY] - costs[best]
-    if gain < MIN_GAIN_NATS:
+    gain, moved = costs[IDENTITY] - costs[best], np.array(best) != IDENTITY
+    if gain < max(MIN_GAIN_NATS, MIN_EXPLAINED_SHARE * float(axis_costs[IDENTITY][moved].sum())):
         best, gain = IDENTITY, 0.0
     levels = np.array([cells[at][to][0] for at, to in enumerate(best)])
     return TriadOrder(best, gain, 0.5 * levels, 0.5 * LEVEL_LOG_SIGMA / float(np.sqrt(3.0)))
@@ -111,13 +115,11 @@ def _compare_spectra(
     return level, max(float(cost.sum()) / CORRELATED_BANDS, float(cost.max()))  # one band contains a whole line
 
 
-def _assignment_cost(cells: Sequence[tuple[float, float]], order: tuple[int, ...]) -> float:
-    """Return the cost in nats of one assignment with the best common factor."""
-    levels = np.array([level for level, _ in cells])
-    level_cost = np.minimum(0.5 * ((levels - np.median(levels)) / LEVEL_LOG_SIGMA) ** 2, MAX_AXIS_COST_NATS).sum()
-    moved = sum(at != to for at, to in enumerate(order))
-    penalty = {0: 0.0, 2: SWAP_PENALTY_NATS, 3: ROTATION_PENALTY_NATS}[moved]
-    return float(level_cost) + sum(cost for _, cost in cells) + penalty
+def _axis_costs(cells: Sequence[tuple[float, float]]) -> Floats:
+    """Return the cost in nats of each axis, shape (3,), for one assignment with the best common factor."""
+    levels, shape_costs = np.array(cells).T
+    level_costs = 0.5 * ((levels - np.median(levels)) / LEVEL_LOG_SIGMA) ** 2
+    return np.asarray(np.minimum(level_costs, MAX_AXIS_COST_NATS) + shape_costs)
 
 
 def describe_axis_order(triad: Sequence[str], found: TriadOrder) -> RecordingFinding | None:

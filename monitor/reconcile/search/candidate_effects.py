@@ -55,6 +55,7 @@ PENALTY_NATS: Final[dict[str, float]] = {
     "exponentially_correlated": 10.0,
     "sinusoidal": 23.0,
     "narrowband": 14.5 + 2.0,
+    "wandering_line": 14.5 + 2.0 + 2.0,
     "common_vibration": 9.5 + 3.5,
     "temperature_bias": 9.0,
     "temperature_lag": 10.0,
@@ -98,6 +99,8 @@ REVERSAL_FRACTIONS: Final = (0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)
 """Values of the hysteresis parameter ``reversal`` in the first search, as fractions of the temperature range."""
 MIN_AGEING_FRACTION: Final = 0.003
 """Shortest time constant of a logarithmic drift, as a fraction of the recording length."""
+MIN_REFINED_SHARE: Final = 0.15
+"""Smallest gain for which a time constant is refined, relative to the penalty. Trials need twice this gain."""
 MAX_PEAKS: Final = 2
 POWER_LAW_EXPONENTS: Final = (0.4, 0.7, 1.0, 1.4, 1.8, 2.3, 2.8)
 FILTERS: Final = (
@@ -334,8 +337,16 @@ def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
 def _best_time_constant(
     whitened: WhitenedAxis, trials: Sequence[Effect], search_factor: float, shortest_s: float
 ) -> list[Effect]:
-    """Return the most likely effect, or an empty list if the fitted time constant is out of range."""
+    """Return the most likely effect, or an empty list if the fitted time constant is out of range.
+
+    If the first search finds only a small gain, the time constant is not refined and the list is empty. With adjacent
+    time constants T and 1.84 T, the correlation of an exponential with the nearer one is at least
+    2 √1.36/(1 + 1.36) = 0.988. The first search therefore finds nearly the largest gain.
+    """
     best = _most_likely(whitened.axis, whitened.effects, trials)
+    gain = whitened.axis.fit((*whitened.effects, best)).log_likelihood
+    if gain - whitened.axis.fit(whitened.effects).log_likelihood < MIN_REFINED_SHARE * PENALTY_NATS[best.name]:
+        return []
     refined = fit_shape_parameter(whitened.axis, whitened.effects, best, "time_constant", search_factor)
     assert isinstance(refined, (TurnOnTransient, TemperatureLag, BiasCurve))
     assert refined.time_constant is not None

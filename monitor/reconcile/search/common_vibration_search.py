@@ -56,7 +56,7 @@ MAX_LOG_GAIN_CHANGE: Final = 1.5
 MAX_LOG_BANDWIDTH_CHANGE: Final = 1.0
 """Largest change of the logarithm of a bandwidth from the first search."""
 MIN_HALF_SHARE: Final = 0.2
-"""Smallest share of the gain that each half of the recording must contribute."""
+"""Smallest share of the gain that each half of the recording must contribute, for all axes and for each axis."""
 MAX_SAME_BANDWIDTH_RATIO: Final = 4.0
 """Largest ratio of the bandwidths of a vibration and a noise effect that the vibration replaces."""
 VALIDATION_REASON: Final = "both halves of the recording contain the correlation of the axes"
@@ -158,8 +158,13 @@ def _with_strongest_vibration(
     if best.gain_nats < best.penalty_nats:
         return {}
     joint = _fit_gains_with_spectra(spectra, best, hypotheses)
+    halves = _cross_spectra_of_halves(joint, whitened, shapes)
+    joint = _without_weak_axes(joint, spectra, halves)
     best = joint.vibration
-    if best.gain_nats < best.penalty_nats or not _acts_in_both_halves(joint, whitened, shapes):
+    if best.gain_nats < best.penalty_nats or not all(
+        one.gain_nats(_unit_variance(one.bins, best.shape), best.gains) >= MIN_HALF_SHARE * best.gain_nats
+        for one in halves
+    ):
         return {}
     used = [e.source_number for one in hypotheses for e in one.effects if isinstance(e, CommonVibration)]
     number = 1.0 + max(used, default=0.0)
@@ -176,16 +181,70 @@ def _significant_gain(search: AxisSearchResult, null: AxisNull) -> float:
     return sum(one.gain for diagnostic, one in search.final.findings.items() if one.gain > null[diagnostic].threshold)
 
 
-def _acts_in_both_halves(joint: "_JointFit", whitened: Sequence[WhitenedAxis], shapes: Sequence[Shape]) -> bool:
-    """Return True if each half of the recording contributes enough to the gain."""
-    n, best = whitened[0].axis.n, joint.vibration
+def _cross_spectra_of_halves(
+    joint: "_JointFit", whitened: Sequence[WhitenedAxis], shapes: Sequence[Shape]
+) -> list[CrossSpectra]:
+    """Return the correlations of both halves of the recording, with the deviations of the joint fit."""
+    n, found = whitened[0].axis.n, []
     for part in (slice(0, n // 2), slice(n - n // 2, n)):
         half = build_cross_spectra(whitened, shapes, part)
         deviation = [np.interp(half.bins.f_hz, joint.spectra.bins.f_hz, one) for one in joint.spectra.deviation]
-        gain = replace(half, deviation=np.array(deviation)).gain_nats(_unit_variance(half.bins, best.shape), best.gains)
-        if gain < MIN_HALF_SHARE * best.gain_nats:
-            return False
-    return True
+        found.append(replace(half, deviation=np.array(deviation)))
+    return found
+
+
+def _without_weak_axes(joint: "_JointFit", spectra: CrossSpectra, halves: Sequence[CrossSpectra]) -> "_JointFit":
+    """Leave out the axes on which the vibration explains too little, as long as more than two axes remain.
+
+    The gain of an axis is the gain of the correlations with the other axes and of the spectrum. The gain must exceed
+    ``RESIZE_PENALTY_NATS``, and each half of the recording must contribute to the gain of the correlations.
+
+    Parameters
+    ----------
+    joint : _JointFit
+        Fit of all gains.
+    spectra : CrossSpectra
+        Correlations with the deviations before the fit.
+    halves : sequence of CrossSpectra
+        Correlations of both halves of the recording.
+    """
+    while np.count_nonzero(joint.vibration.gains) > 2:
+        axes = np.flatnonzero(joint.vibration.gains).tolist()
+        gains = [_gain_of_axis(joint, spectra, halves, at) for at in axes]
+        least = int(np.argmin(gains))
+        if gains[least] > RESIZE_PENALTY_NATS:
+            break
+        joint = _without_axis(joint, spectra, axes[least])
+    return joint
+
+
+def _gain_of_axis(joint: "_JointFit", spectra: CrossSpectra, halves: Sequence[CrossSpectra], at: int) -> float:
+    """Return the log-likelihood gain of the vibration on one axis.
+
+    If a half of the recording contributes too little, the value is negative.
+    """
+    vibration, hypothesis = joint.vibration, joint.hypotheses[at]
+    rest = np.where(np.arange(vibration.gains.size) == at, 0.0, vibration.gains)
+    whole, *parts = (
+        one.gain_nats(unit, vibration.gains) - one.gain_nats(unit, rest)
+        for one in (joint.spectra, *halves)
+        for unit in [_unit_variance(one.bins, vibration.shape)]
+    )
+    if min(parts) < MIN_HALF_SHARE * whole:
+        return min(parts) - MIN_HALF_SHARE * whole
+    common = frozenset(i for i, effect in enumerate(hypothesis.effects) if isinstance(effect, CommonVibration))
+    without = hypothesis.axis.fit(hypothesis.effects, common).log_likelihood
+    without += _without_axis(joint, spectra, at).vibration.gain_nats
+    saved = sum(PENALTY_NATS[effect.name] for effect in hypothesis.added if effect not in joint.kept[at])
+    return _joint_log_likelihood(joint, at, float(vibration.gains[at])) - without + saved
+
+
+def _without_axis(joint: "_JointFit", spectra: CrossSpectra, at: int) -> "_JointFit":
+    deviation, gains = joint.spectra.deviation.copy(), joint.vibration.gains.copy()
+    deviation[at], gains[at] = spectra.deviation[at], 0.0
+    left, shape = replace(joint.spectra, deviation=deviation), joint.vibration.shape
+    gain_nats = left.gain_nats(_unit_variance(left.bins, shape), gains)
+    return replace(joint, spectra=left, vibration=_Vibration(shape, gains, gain_nats))
 
 
 def _candidate_shapes(hypotheses: Sequence[Hypothesis]) -> list[Shape]:

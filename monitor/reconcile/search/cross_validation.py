@@ -22,6 +22,7 @@ from monitor.noise.effects import (
     Saturation,
     Sinusoidal,
     VarianceModulation,
+    WanderingLine,
 )
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
@@ -39,7 +40,15 @@ from monitor.reconcile.search.sample_repair import repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest log-likelihood gain of an effect in one half of the recording, in nats."""
-SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers, HeavyTails, VarianceModulation)
+SAMPLE_EFFECTS: Final = (
+    Resolution,
+    Saturation,
+    RandomSampleHold,
+    Outliers,
+    HeavyTails,
+    VarianceModulation,
+    WanderingLine,
+)
 """Effects that do not change the Whittle likelihood. They are validated by the gap of the diagnostic."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
 
@@ -99,7 +108,7 @@ def cross_validate(
         gains = [_expected_gain(_fit_half(half, after), after.effects[-1]) for half in repaired]
         if min(gains) < MIN_HALF_GAIN_NATS:
             return accept_without_validation(TOO_LITTLE_EVIDENCE)
-    return _exchange_halves(repaired, before, after, diagnostic, null)
+    return _exchange_halves(repaired, before, after, added_effect, diagnostic, null)
 
 
 def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
@@ -112,13 +121,26 @@ def _summed_gap(halves: list[Axis], hypothesis: Hypothesis, diagnostic: str) -> 
 
 
 def _exchange_halves(
-    halves: list[Axis], before: Hypothesis, after: Hypothesis, diagnostic: str, null: NullDistribution
+    halves: list[Axis],
+    before: Hypothesis,
+    after: Hypothesis,
+    added_effect: Effect | None,
+    diagnostic: str,
+    null: NullDistribution,
 ) -> CrossValidationResult:
+    """Test each half with the effect that the other half has.
+
+    If an effect was added, only this effect is predicted. The sizes of all other noise are fitted to each half, and the
+    fitted sizes are the same in both hypotheses. A drift that differs between the halves then cannot outweigh the
+    effect.
+    """
     gaps = np.zeros(2)
     better = 0.0
+    others = (range(len(before.effects)), range(len(after.effects) - 1))
     for learn, test in ((0, 1), (1, 0)):
         for at, hypothesis in enumerate((before, after)):
-            predicted = _predict_half(halves[test], _fit_half(halves[learn], hypothesis))
+            fitted = frozenset(others[at] if added_effect is not None else ()) - after.fit.fixed_noise
+            predicted = _predict_half(halves[test], _fit_half(halves[learn], hypothesis), fitted)
             gaps[at] += DIAGNOSTICS[diagnostic](whiten_axis(predicted)).gain
             better += predicted.log_likelihood * (2 * at - 1)
     gap_before, gap_after = (sqrt(gain) for gain in gaps)
@@ -163,16 +185,17 @@ def _expected_gain(fit: AxisFit, effect: Effect) -> float:
     return 0.5 * float((made**2 * weight).sum())
 
 
-def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
+def _predict_half(half: Axis, learned: AxisFit, fitted: frozenset[int]) -> AxisFit:
     """Apply the fit of one half of an axis to the other half.
 
-    Noise effects keep the learned sizes. Let β₁ be the learned regressor sizes with the covariance C₁, and β₂ the sizes
-    fitted to the other half with the covariance C₂. The prediction uses the weighted mean of β₁ and β₂. With the
-    difference Δ = β₂ − β₁, the log-likelihood for β₂ is reduced by ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln(|C₁ + C₂|/|C₂|). A sinusoid
-    keeps the learned amplitude, and the phase is fitted again.
+    Noise effects keep the learned sizes, except for the effects with the indices ``fitted``. Let β₁ be the learned
+    regressor sizes with the covariance C₁, and β₂ the sizes fitted to the other half with the covariance C₂. The
+    prediction uses the weighted mean of β₁ and β₂. With the difference Δ = β₂ − β₁, the log-likelihood for β₂ is
+    reduced by ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln(|C₁ + C₂|/|C₂|). A sinusoid keeps the learned amplitude, and the phase is
+    fitted again.
     """
     effects = learned.effects
-    free = half.fit(effects, noise_effect_indices(effects))
+    free = half.fit(effects, noise_effect_indices(effects) - fitted)
     beta = free.whittle.beta.copy()
     known: list[int] = []
     for at, place in free.regressor_slices:

@@ -1,7 +1,9 @@
 """Non-Gaussian alternatives that have the same spectrum as a Gaussian effect.
 
-A random telegraph can replace correlated noise. Poisson steps can replace a random walk or single steps. The Gaussian
-effect is replaced if the full log-likelihood of the alternative is larger by ``MIN_ALTERNATIVE_GAIN_NATS``.
+A random telegraph can replace correlated noise. Poisson steps can replace a random walk or single steps. A wandering
+line can replace a resonance. The Gaussian effect is replaced if the full log-likelihood of the alternative is larger by
+``MIN_ALTERNATIVE_GAIN_NATS``. No effect describes a line whose amplitude varies and whose phase is constant. If such a
+line is more likely than a resonance, the resonance is rejected.
 """
 
 from collections.abc import Mapping
@@ -14,6 +16,7 @@ from monitor.noise.effects import (
     BiasInstability,
     BiasStep,
     ExponentiallyCorrelated,
+    Narrowband,
     PoissonSteps,
     RandomTelegraph,
     RateRandomWalk,
@@ -25,6 +28,10 @@ from monitor.reconcile.likelihood.hypothesis_fit import RESIZE_PENALTY_NATS, Hyp
 from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
 from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
 from monitor.reconcile.likelihood.telegraph_vs_correlated_noise import compare_telegraph_with_correlated_noise
+from monitor.reconcile.likelihood.wandering_line_vs_resonance import (
+    WanderingLineComparison,
+    compare_wandering_line_with_resonance,
+)
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidate_effects import PENALTY_NATS, fit_correlated_noise, initial_effect_size
@@ -35,6 +42,8 @@ MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0
 
 In 2 of 4000 simulated recordings, a wrong alternative exceeded this gain.
 """
+MIN_LINE_GAIN_NATS: Final = MIN_ALTERNATIVE_GAIN_NATS + PENALTY_NATS["wandering_line"] - PENALTY_NATS["narrowband"]
+"""Log-likelihood gain over a resonance that a wandering line must exceed, in nats."""
 POISSON_PENALTY_NATS: Final = 1.0
 """Penalty for Poisson steps, in nats. A random walk is a limit of Poisson steps and never fits better."""
 MAX_FREE_STEPS: Final = 2
@@ -75,6 +84,7 @@ class NonGaussianAlternative:
             slow_noise_score=replaced.slow_noise_score,
             intervals=self.intervals,
             event_count=self.event_count,
+            gain_over_same_spectrum=max(self.gain, 0.0),
         )
         return (trial, *(self.runner_up.as_trials(replaced) if self.runner_up else ()))
 
@@ -107,6 +117,25 @@ def replace_by_likelier_alternative(hypothesis: Hypothesis, trials: list[Trial])
     if alternative.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return hypothesis, [trials[0], *added, *trials[1:]]
     return hypothesis.refit_with_other_added_effects(alternative.added), [*added, *trials]
+
+
+def compare_resonance_with_lines(hypothesis: Hypothesis) -> WanderingLineComparison | None:
+    """Compare a new resonance with a wandering line and with a line of varying amplitude.
+
+    Return None if the last added effect is not a resonance, or if the recording is too short.
+    """
+    if not hypothesis.added or not isinstance(hypothesis.added[-1], Narrowband):
+        return None
+    return compare_wandering_line_with_resonance(
+        _residual_series(hypothesis.fit), hypothesis.axis.rate_hz, hypothesis.added[-1]
+    )
+
+
+def wandering_line_trial(compared: WanderingLineComparison, replaced: Trial) -> Trial:
+    """Return the trial of a wandering line that competes with the trial of a resonance."""
+    score = replaced.score + compared.gain + PENALTY_NATS["narrowband"] - PENALTY_NATS["wandering_line"]
+    line = compared.line
+    return Trial(line.name, line, score, slow_noise_score=replaced.slow_noise_score, intervals=compared.parameters)
 
 
 def choose_poisson_steps_or_telegraph(hypothesis: Hypothesis) -> NonGaussianAlternative | None:

@@ -1,7 +1,8 @@
 """Replacement of the missing and altered samples of an axis.
 
 Missing samples are always replaced. Repeated, outlying and clipped samples are replaced if an effect of the axis causes
-such samples. Measured and simulated recordings are repaired in the same way.
+such samples. A wandering line of the axis is drawn from its distribution given the data, and the drawn line is
+subtracted. Measured and simulated recordings are repaired in the same way.
 """
 
 from collections.abc import Mapping
@@ -10,12 +11,17 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effects import Outliers, RandomSampleHold, Saturation
+from monitor.noise.effects import Outliers, RandomSampleHold, Saturation, WanderingLine
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
 from monitor.reconcile.likelihood.outlier_fit import fit_outliers
+from monitor.reconcile.likelihood.wandering_line_vs_resonance import draw_wandering_line
 from monitor.reconcile.likelihood.whitening import whiten_axis
-from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform
+from monitor.reconcile.preparation.cosine_bins import (
+    build_frequency_bins,
+    cosine_transform,
+    inverse_cosine_transform,
+)
 from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.preparation.sample_repair import fill_missing_samples, restore_clipped_samples
 from monitor.reconcile.preparation.value_artifacts import ValueArtifacts
@@ -61,7 +67,7 @@ def build_repaired_axes(
             statistics[name],
             regressors,
         )
-        axes[name] = _replace_outliers(axis, effects[name], rng)
+        axes[name] = _replace_outliers(_subtract_wandering_lines(axis, effects[name], rng), effects[name], rng)
     return axes
 
 
@@ -77,9 +83,8 @@ def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) ->
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
-    return _replace_outliers(
-        axis.with_repaired_samples(_repair_samples(axis.raw, axis.value_artifacts, effects, rng)), effects, rng
-    )
+    repaired = axis.with_repaired_samples(_repair_samples(axis.raw, axis.value_artifacts, effects, rng))
+    return _replace_outliers(_subtract_wandering_lines(repaired, effects, rng), effects, rng)
 
 
 def _may_leak(source: str, axis: str) -> bool:
@@ -110,6 +115,16 @@ def _restore_clipped_samples(y: Floats, limit: float, rng: np.random.Generator) 
         if abs(sigma - before) < SIGMA_RELATIVE_TOLERANCE * sigma:
             break
     return whole
+
+
+def _subtract_wandering_lines(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
+    for line in effects:
+        if isinstance(line, WanderingLine):
+            series = inverse_cosine_transform(
+                fit_with_fixed_noise(axis, effects).fit.cosine_transform_without_deterministic_effects()
+            )
+            axis = axis.with_repaired_samples(axis.repaired - draw_wandering_line(series, axis.rate_hz, line, rng))
+    return axis
 
 
 def _replace_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:

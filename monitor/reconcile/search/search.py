@@ -15,11 +15,13 @@ from monitor.noise.effects import (
     BiasCurve,
     BiasStep,
     ExponentiallyCorrelated,
+    Narrowband,
     Outliers,
     PulseTrain,
     RandomSampleHold,
     RateRandomWalk,
     Saturation,
+    WanderingLine,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
 from monitor.reconcile.diagnostics.plot_data import build_plot_data
@@ -45,20 +47,27 @@ from monitor.reconcile.search.candidate_effects import PENALTY_NATS, find_broad_
 from monitor.reconcile.search.cross_validation import CrossValidationResult, accept_without_validation, cross_validate
 from monitor.reconcile.search.non_gaussian_alternatives import (
     MIN_ALTERNATIVE_GAIN_NATS,
+    MIN_LINE_GAIN_NATS,
     choose_poisson_steps_or_telegraph,
     compare_poisson_with_added_noise,
+    compare_resonance_with_lines,
     replace_by_likelier_alternative,
+    wandering_line_trial,
 )
 from monitor.reconcile.search.sample_repair import repair_axis_again
 from monitor.reconcile.search.trials import Trial, generate_trial_groups, try_alternatives_to_slow_noise
-from monitor.reconcile.search.withdrawal_of_contradicted_effects import SMOOTH_SPECTRA, keep_uncontradicted_effects
+from monitor.reconcile.search.withdrawal_of_contradicted_effects import (
+    SMOOTH_SPECTRA,
+    keep_uncontradicted_effects,
+    leaves_difference,
+)
 
 MAX_ROUNDS: Final = 8
 MAX_VALIDATION_ATTEMPTS: Final = 3
 """Largest number of candidates of one group for which cross-validation is attempted."""
 MIN_FINER_BINS: Final = 8
 """Smallest number of additional bins for a new fit."""
-REPAIRED_EFFECTS: Final = frozenset({Saturation, RandomSampleHold, Outliers})
+REPAIRED_EFFECTS: Final = frozenset({Saturation, RandomSampleHold, Outliers, WanderingLine})
 """Effects that require a new repair of the samples."""
 DISTRIBUTION_DIAGNOSTICS: Final = ("tails", "variance")
 """Diagnostics of non-Gaussian or non-stationary samples."""
@@ -233,6 +242,18 @@ def _select_trial(
         if trial.name in ONE_TIME_EFFECTS and DIAGNOSTICS[diagnostic](whitened).gain >= findings[diagnostic].gain:
             continue
         tried = [trial, *trials[:at], *trials[at + 1 :]]  # a rejected trial still reduces the confidence
+        lines = compare_resonance_with_lines(after) if isinstance(added, Narrowband) else None
+        if lines is not None and lines.is_modulated:
+            continue
+        if lines is not None:
+            line = wandering_line_trial(lines, trial)
+            tried = [trial, line, *tried[1:]]
+            if lines.gain > MIN_LINE_GAIN_NATS:
+                tried[:2] = line, trial
+                after, added = _add_effect(current.hypothesis, line, rng), lines.line
+                whitened = whiten_axis(after.fit)
+                if leaves_difference(lines.line, findings, run_diagnostics(whitened), null):
+                    continue
         if _is_gaussian_and_stationary(whitened, null):
             after, tried = replace_by_likelier_alternative(after, tried)
             whitened = whitened if after.fit is whitened.fit else whiten_axis(after.fit)

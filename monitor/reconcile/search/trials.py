@@ -72,7 +72,7 @@ SINGLE_SIZE_MARGIN_NATS: Final = 1.5
 SCALE_SEARCH_ITERATIONS: Final = 16
 FREQUENCY_BANDS: Final = 8
 """Number of frequency bands in the test for a constant leak coefficient."""
-MIN_LEAK_PROBABILITY: Final = 1e-5
+MIN_LEAK_PROBABILITY: Final = 1e-3
 """A leak is rejected if the scatter of its coefficient between frequency bands is less probable than this value."""
 COEFFICIENT_PENALTY_NATS: Final = 3.3
 """Penalty for each further coefficient of a polynomial, in nats.
@@ -116,6 +116,7 @@ class Trial:
     )  # parameters that the fit does not determine
     event_count: int = 0  # number of events that were detected
     misfit_nats: float = 0.0  # difference from the data that ``effect`` hides from the diagnostics
+    gain_over_same_spectrum: float = 0.0  # gain over the Gaussian effect with the same spectrum, nats
     moved: int | None = None  # index of the model effect that ``effect`` replaces; None for an additional effect
 
     @property

@@ -5,7 +5,8 @@ resonances, low-pass filters and power laws are withdrawn in these cases:
 
 - Several lines or resonances overlap.
 - ``MIN_COMB_LINES`` or more lines are harmonics of one frequency.
-- A significant difference remains at the frequency of the effect.
+- A significant difference remains at the frequency of the effect. If a line or resonance at this frequency is kept, the
+  difference comes from the line or resonance and does not contradict a filter or a power law.
 
 A leak is withdrawn if more than half of the dependence on other axes remains. Pulses are withdrawn if more than a tenth
 of the harmonics remains, or if several lines are harmonics of the pulses. A step or a curve is withdrawn if the mean
@@ -28,6 +29,7 @@ from monitor.noise.effects import (
     PowerLaw,
     PulseTrain,
     Sinusoidal,
+    WanderingLine,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
 from monitor.reconcile.likelihood.axis_fit import Effects
@@ -46,6 +48,8 @@ HARMONIC_TOLERANCE: Final = 2e-4
 """Largest distance of a line from a harmonic, relative to the highest line frequency."""
 RESONANCE_REACH_HALF_WIDTHS: Final = 2.0
 """Distance from a resonance, in half widths, within which other lines and resonances overlap."""
+WANDERING_REACH_DEVIATIONS: Final = 3.0
+"""Distance from the mean frequency of a wandering line, in standard deviations, within which other effects overlap."""
 LINE_REACH_HZ: Final = 0.1
 MAX_REMAINING_SHARE: Final = 0.1
 """Largest remaining gain, relative to the gain that an effect should explain."""
@@ -53,6 +57,7 @@ MAX_REMAINING_LEAK_SHARE: Final = 0.5
 """Largest remaining gain, relative to the gain that a leak should explain."""
 MAX_FOREIGN_RATIO: Final = 100.0
 """Largest gain of the non-spectral diagnostics, relative to the gain that a smooth spectrum should explain."""
+PEAKS: Final = (Narrowband, Sinusoidal)
 SMOOTH_SPECTRA: Final = (BandwidthLimit, ExponentiallyCorrelated, PowerLaw)
 NON_SPECTRAL_DIAGNOSTICS: Final = ("tails", "variance", "other_axes")
 """Diagnostics of non-Gaussian, non-stationary or common noise."""
@@ -93,7 +98,10 @@ def keep_uncontradicted_effects(
         place = findings[diagnostic].where.frequency
         if place is not None:
             candidates = contradicted_effects(Effect, significant_gain(diagnostic), MAX_REMAINING_SHARE)
-            withdrawn |= {at for at in candidates if _overlaps(added[at], place)}
+            overlapping = {at for at, effect in enumerate(added) if _overlaps(effect, place)}
+            peaks = {at for at in overlapping if isinstance(added[at], PEAKS)}
+            # a small difference at a peak that is kept comes from this peak and not from the smooth spectrum below
+            withdrawn |= candidates & (peaks if peaks - candidates else overlapping)
     withdrawn |= contradicted_effects(AxisLeak, significant_gain("other_axes"), MAX_REMAINING_LEAK_SHARE)
     withdrawn |= contradicted_effects(PulseTrain, significant_gain("lines"), MAX_REMAINING_SHARE)
     withdrawn |= contradicted_effects((BiasStep, BiasCurve), significant_gain("level"), MAX_REMAINING_SHARE)
@@ -103,9 +111,34 @@ def keep_uncontradicted_effects(
     return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)
 
 
+def leaves_difference(line: WanderingLine, before: Findings, after: Findings, null: AxisNull) -> bool:
+    """Return True if a significant difference remains in the frequency range of a wandering line.
+
+    Parameters
+    ----------
+    line : WanderingLine
+        Line that was subtracted from the axis.
+    before, after : Findings
+        Findings before and after the subtraction.
+    null : AxisNull
+        Null distribution of each diagnostic.
+    """
+    largest = max(before[diagnostic].gain for diagnostic in FREQUENCY_DIAGNOSTICS)
+    for diagnostic in FREQUENCY_DIAGNOSTICS:
+        one = after[diagnostic]
+        if one.gain > max(null[diagnostic].threshold, MAX_REMAINING_SHARE * largest) and one.where.frequency:
+            lo, hi = _frequency_range(line)
+            if lo < one.where.frequency[1] and one.where.frequency[0] < hi:
+                return True
+    return False
+
+
 def _frequency_range(effect: Effect) -> tuple[float, float]:
     if isinstance(effect, Narrowband):
         half = max(RESONANCE_REACH_HALF_WIDTHS * 0.5 * effect.bandwidth, LINE_REACH_HZ)
+        return effect.frequency - half, effect.frequency + half
+    if isinstance(effect, WanderingLine):
+        half = max(WANDERING_REACH_DEVIATIONS * effect.frequency_deviation, LINE_REACH_HZ)
         return effect.frequency - half, effect.frequency + half
     assert isinstance(effect, Sinusoidal)
     return effect.frequency - LINE_REACH_HZ, effect.frequency + LINE_REACH_HZ
@@ -117,14 +150,14 @@ def _overlaps(effect: Effect, place: tuple[float, float]) -> bool:
         return True
     if isinstance(effect, BandwidthLimit):
         return place[1] > 0.5 * effect.cutoff
-    if not isinstance(effect, (Narrowband, Sinusoidal)):
+    if not isinstance(effect, PEAKS):
         return False
     lo, hi = _frequency_range(effect)
     return lo < place[1] and place[0] < hi
 
 
 def _overlapping_features(added: Effects) -> set[int]:
-    features = {at: effect for at, effect in enumerate(added) if isinstance(effect, (Sinusoidal, Narrowband))}
+    features = {at: effect for at, effect in enumerate(added) if isinstance(effect, PEAKS)}
     overlapping: set[int] = set()
     for at, one in features.items():
         lo, hi = _frequency_range(one)

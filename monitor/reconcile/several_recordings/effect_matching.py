@@ -16,6 +16,7 @@ from monitor.reconcile.result import AddedOrResizedEffect, ParameterInterval
 IDENTIFYING_PARAMETERS: Final[Mapping[str, tuple[str, float]]] = {
     "sinusoidal": ("frequency", 0.005),
     "narrowband": ("frequency", 0.05),
+    "wandering_line": ("frequency", 0.05),
     "common_vibration": ("source_number", 0.0),
     "exponentially_correlated": ("correlation_time", 1 / 3),
     "random_telegraph": ("dwell_time", 1 / 3),

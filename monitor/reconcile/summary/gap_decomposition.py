@@ -5,8 +5,9 @@ distributed among the changes of the model: in each step, the change whose remov
 sizes are fitted again, and the loss is the gain of this change. The gains are never negative, and their sum is the
 explained gap.
 
-Outliers, heavy tails, changes of the variance and random jumps are not fully visible in the likelihood of the spectrum.
-The gain of the test that found them is added. The gain of a moved line is the score of its trial. The likelihood of
+Outliers, heavy tails, changes of the variance, random jumps and wandering lines are not fully visible in the likelihood
+of the spectrum. The gain of the test that found them is added. For random jumps and wandering lines, only the gain over
+Gaussian noise with the same spectrum is added. The gain of a moved line is the score of its trial. The likelihood of
 quantized, clipped or repeated values is unbounded, because a continuous distribution never yields equal values. The
 gain of these effects is the gain of their influence on the noise (``value_artifact_gain``). If the model was fitted to
 the same recording, only added effects have a gain, because the sizes of the model cannot serve as a reference.
@@ -34,6 +35,7 @@ from monitor.noise.effects import (
     Resolution,
     Saturation,
     VarianceModulation,
+    WanderingLine,
 )
 from monitor.reconcile.diagnostics.whiteness_tests import fitted_variance_gain_nats
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit
@@ -50,7 +52,9 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "values": ("values",),
 }
 """Diagnostics that detect the same difference, by the name of the group."""
-EFFECTS_OUTSIDE_SPECTRUM: Final = (Outliers, HeavyTails, NoiseStep, VarianceModulation, PoissonSteps, RandomTelegraph)
+NON_GAUSSIAN_EFFECTS: Final = (PoissonSteps, RandomTelegraph, WanderingLine)
+"""Effects for which Gaussian noise with the same spectrum exists."""
+EFFECTS_OUTSIDE_SPECTRUM: Final = (Outliers, HeavyTails, NoiseStep, VarianceModulation, *NON_GAUSSIAN_EFFECTS)
 """Effects that are not fully visible in the likelihood of the spectrum."""
 SATURATED_BANDS: Final = 64
 """Number of frequency bands with a separately fitted power, equally wide on a logarithmic scale."""
@@ -116,8 +120,10 @@ def _gains_outside_spectrum(search: AxisSearchResult) -> dict[int, float]:
         if isinstance(effect, (Resolution, Saturation, RandomSampleHold)):
             found[at] = value_artifact_gain(hypothesis.fit, type(effect))
         elif isinstance(effect, EFFECTS_OUTSIDE_SPECTRUM):
-            scores = [one.trials[0].score for one in search.rounds if one.trials[0].name == effect.name]
-            found[at] = max(scores, default=0.0)
+            trials = [one.trials[0] for one in search.rounds if one.trials[0].name == effect.name]
+            # the likelihood of the spectrum already contains the power of non-Gaussian effects
+            has_spectrum = isinstance(effect, NON_GAUSSIAN_EFFECTS)
+            found[at] = max((one.gain_over_same_spectrum if has_spectrum else one.score for one in trials), default=0.0)
         elif isinstance(effect, CommonVibration):
             trials = [one.trials[0] for one in search.rounds]
             found[at] = next((one.score for one in trials if one.effect == effect), 0.0)

@@ -34,7 +34,7 @@ from monitor.reconcile.several_recordings.effect_matching import (
     identifying_parameter_name,
 )
 
-PEAK_NAMES: Final = ("sinusoidal", "narrowband")
+PEAK_NAMES: Final = ("sinusoidal", "narrowband", "wandering_line")
 """Effects that one oscillation produces on different axes."""
 MAX_LOG_RATIO_DIFFERENCE: Final = log(1.1)
 """Largest difference between the logarithms of two size ratios in the same finding."""
@@ -162,8 +162,8 @@ def _size_ratio(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> flo
     if step.kind != "retuned":
         return None
     before = _effect_before(axis, step, r, name)
-    old = getattr(before, name) if before is not None else 0.0
-    return now.value / old if old > 0.0 else None
+    old = getattr(before, name, None)  # an optional size is None if the model lacks it
+    return now.value / old if old else None
 
 
 def _old_frequency(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> float | None:

@@ -48,7 +48,7 @@ GROUP_PHRASES: Final = {
     "values": "irregular values",
 }
 """Phrase for each group of diagnostics."""
-OSCILLATIONS: Final = frozenset({"sinusoidal", "narrowband", "common_vibration"})
+OSCILLATIONS: Final = frozenset({"sinusoidal", "narrowband", "wandering_line", "common_vibration"})
 ADVISED_SHARE: Final = 0.5
 """Share of the gap above which the recommendation refers to vibration or to disturbances."""
 UNIT_FAULTS: Final = frozenset({"unit_error", "axes_permuted", "sample_rate_error"})

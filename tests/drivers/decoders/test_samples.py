@@ -1,4 +1,4 @@
-"""The samples decoder: what it counts. The message itself is tested in test_sample_message."""
+"""Tests of the counts of the samples decoder. ``test_sample_message`` tests the message itself."""
 
 import numpy as np
 from hypothesis import given
@@ -10,13 +10,13 @@ from drivers.decoders.base import HINT_FRAMES
 from drivers.zenoh.sample_message import encode_samples
 
 
-def message(count: int, n: int = 10, lost: int = 0, bad_rows: tuple[int, ...] = ()) -> Chunk:
+def make_message(count: int, n: int = 10, lost: int = 0, bad_rows: tuple[int, ...] = ()) -> Chunk:
     values = np.arange(6 * n, dtype=np.float64).reshape(n, 6) / 100
     values[list(bad_rows)] = np.inf
     return Chunk(encode_samples("d", count, make_block(np.arange(n) * 10_000_000, values, lost=lost)), 0)
 
 
-def test_times_are_given() -> None:
+def test_decoder_takes_messages_with_sender_times() -> None:
     decoder = samples.build(samples.Settings())
     assert decoder.timing == SenderTimedFormat()
     assert decoder.carrier == "messages"
@@ -24,43 +24,45 @@ def test_times_are_given() -> None:
 
 def test_lost_messages_are_counted_by_their_samples() -> None:
     decoder = samples.build(samples.Settings())
-    blocks = decoder.feed([message(510), message(520), message(550), message(560, lost=3)])
+    blocks = decoder.feed([make_message(510), make_message(520), make_message(550), make_message(560, lost=3)])
     assert [b.lost for b in blocks] == [0, 0, 20, 3]
     assert decoder.bad == 0
 
 
-def test_a_publisher_started_anew_is_no_loss() -> None:
+def test_restart_of_the_publisher_is_no_loss() -> None:
     decoder = samples.build(samples.Settings())
-    blocks = decoder.feed([message(1000), message(10), message(20), message(40)])
+    blocks = decoder.feed([make_message(1000), make_message(10), make_message(20), make_message(40)])
     assert [b.lost for b in blocks] == [0, 0, 0, 10]
 
 
-def test_a_link_opened_anew_is_no_loss_of_messages() -> None:
+def test_reopening_the_link_is_no_loss() -> None:
     decoder = samples.build(samples.Settings())
-    decoder.feed([message(10)])
+    decoder.feed([make_message(10)])
     decoder.forget_stream_state()
-    assert [b.lost for b in decoder.feed([message(500)])] == [0]
+    assert [b.lost for b in decoder.feed([make_message(500)])] == [0]
 
 
-def test_impossible_rows_leave_their_places_empty() -> None:
+def test_impossible_rows_count_as_lost() -> None:
     decoder = samples.build(samples.Settings())
-    blocks = decoder.feed([message(10, bad_rows=(0, 4)), message(20, bad_rows=tuple(range(10)), lost=7), message(30)])
+    blocks = decoder.feed(
+        [make_message(10, bad_rows=(0, 4)), make_message(20, bad_rows=tuple(range(10)), lost=7), make_message(30)]
+    )
     assert [(len(b), b.lost) for b in blocks] == [(3, 1), (5, 1), (10, 17)]
     assert decoder.bad == 12
 
 
 def test_a_rejected_message_is_counted_and_explained() -> None:
     decoder = samples.build(samples.Settings())
-    blocks = decoder.feed([message(10), Chunk(b"no message", 0), message(30)])
+    blocks = decoder.feed([make_message(10), Chunk(b"no message", 0), make_message(30)])
     assert [b.lost for b in blocks] == [0, 10]
     assert decoder.bad == 1
     assert "samples message" in decoder.recent_problem
     for i in range(HINT_FRAMES):
-        decoder.feed([message(40 + 10 * i)])
+        decoder.feed([make_message(40 + 10 * i)])
     assert decoder.recent_problem == ""
 
 
-def test_encode_feeds_back() -> None:
+def test_feeding_encoded_samples_returns_them() -> None:
     decoder = samples.build(samples.Settings())
     sent = make_block(np.arange(50) ** 2 * 1_000_000, np.random.default_rng(0).normal(size=(50, 6)))
     chunks = [c for i in range(0, 50, 7) for c in decoder.encode(sent[i : i + 7])]
@@ -71,7 +73,7 @@ def test_encode_feeds_back() -> None:
 
 
 @given(st.lists(st.binary(max_size=100), max_size=5))
-def test_noise_raises_nothing(noise: list[bytes]) -> None:
+def test_noise_raises_no_error(noise: list[bytes]) -> None:
     decoder = samples.build(samples.Settings())
     assert decoder.feed([Chunk(data, 0) for data in noise]) == []
     assert decoder.bad == len(noise)

@@ -1,6 +1,4 @@
-"""STIM300: the published frame, sizes and CRC padding, ranges, increments, status bits."""
-
-import math
+"""Tests of the STIM300 decoder: published frame, datagram sizes, CRC, ranges, increments and status bits."""
 
 import numpy as np
 import pytest
@@ -9,39 +7,39 @@ from drivers.data_types import Chunk, CounterTimedFormat, SampleBlock, concatena
 from drivers.decoders.base import MAX_BYTES_WITHOUT_FRAME
 from drivers.decoders.stim300 import IDENTIFIERS, SIZES, Settings, build, datagram_crc, has_valid_crc
 from drivers.errors import ConfigError
+from drivers.units import DEGREE, G0
 from tests.support.settings import read_settings
 
 PUBLISHED = bytes.fromhex(
     "AF 00 01 24 FF FA D6 00 03 5B 00 FF E7 A6 FF DD 36 08 1C 52 00 FF 7E 70 FE BA 0C 3F FA 1D 00"
     "23 A0 23 C0 23 A0 00 23 19 23 0A 23 1C 00 23 95 23 B6 23 95 00 FF EF 02 00 E1 01 FA C6 49 42 C6"
 )
-DEGREE, G = math.pi / 180.0, 9.80665
 GYRO_STATUS, ACCEL_STATUS, INCL_STATUS, TEMPERATURE_STATUS = 10, 20, 30, 37
 
 
-def changed(at: int, byte: int) -> bytes:
-    """The published frame with one byte set and the CRC made anew."""
+def replace_byte(at: int, byte: int) -> bytes:
+    """Return the published frame with one byte replaced and a valid CRC."""
     body = PUBLISHED[:at] + bytes([byte]) + PUBLISHED[at + 1 : -4]
     return body + datagram_crc(body)
 
 
-def decoded(data: bytes, **settings: object) -> SampleBlock | None:
+def decode_bytes(data: bytes, **settings: object) -> SampleBlock | None:
     blocks = build(Settings(**settings)).feed([Chunk(data, 77)])
     return concatenate_blocks(blocks) if blocks else None
 
 
-def test_the_published_frame() -> None:
-    got = decoded(PUBLISHED)
+def test_published_frame_is_decoded() -> None:
+    got = decode_bytes(PUBLISHED)
     assert got is not None
     gyro = np.array([0.017822265625, -0.0806884765625, 0.05242919921875]) * DEGREE
-    accel = np.array([-0.011890411376953125, -0.016986846923828125, 1.0138282775878906]) * G
+    accel = np.array([-0.011890411376953125, -0.016986846923828125, 1.0138282775878906]) * G0
     np.testing.assert_allclose(got.values[0], [*gyro, *accel], rtol=1e-14)
     assert got.temperature_c[0] == pytest.approx((35.625 + 35.75 + 35.625) / 3, abs=1e-12)
     assert got.ticks.tolist() == [225]
     assert build(Settings()).timing == CounterTimedFormat(256, 1 / 2000)
 
 
-def test_the_crc_against_one_bit_after_the_other() -> None:
+def test_crc_equals_a_bitwise_computation() -> None:
     register = 0xFFFFFFFF
     for byte in PUBLISHED[:-4] + b"\0":
         register ^= byte << 24
@@ -56,7 +54,7 @@ def test_the_crc_against_one_bit_after_the_other() -> None:
 @pytest.mark.parametrize(
     ("identifier", "size"), [(0xAF, 63), (0x91, 28), (0x93, 38), (0xA5, 42), (0x90, 18), (0x97, 59)]
 )
-def test_sizes(identifier: int, size: int) -> None:
+def test_datagram_sizes(identifier: int, size: int) -> None:
     assert SIZES[identifier] == size
 
 
@@ -67,12 +65,12 @@ def test_sizes(identifier: int, size: int) -> None:
         *((0x98, 2), (0x99, 0), (0x9A, 0), (0x9B, 2), (0x9C, 3), (0xAD, 2), (0xAE, 2), (0xAF, 1)),
     ],
 )
-def test_the_manuals_table_of_padding_is_the_rule_of_four(identifier: int, padding: int) -> None:
+def test_padding_makes_the_crc_input_a_multiple_of_four_bytes(identifier: int, padding: int) -> None:
     assert -(SIZES[identifier] - 4) % 4 == padding
 
 
 @pytest.mark.parametrize("identifier", sorted(IDENTIFIERS))
-def test_every_datagram_comes_back(identifier: int) -> None:
+def test_every_datagram_survives_encoding_and_decoding(identifier: int) -> None:
     rng = np.random.default_rng(identifier)
     n = 5
     samples = make_block(np.arange(n), rng.normal(0, 1, (n, 6)), np.full(n, 20.0), np.arange(253, 253 + n) % 256)
@@ -81,7 +79,7 @@ def test_every_datagram_comes_back(identifier: int) -> None:
     parts = IDENTIFIERS[identifier]
     np.testing.assert_allclose(got.values[:, :3], samples.values[:, :3], atol=DEGREE / 2**15)
     if parts & 1:
-        np.testing.assert_allclose(got.values[:, 3:], samples.values[:, 3:], atol=G / 2**20)
+        np.testing.assert_allclose(got.values[:, 3:], samples.values[:, 3:], atol=G0 / 2**20)
     else:
         assert np.isnan(got.values[:, 3:]).all()
     assert (got.temperature_c == 20.0).all() if parts & 4 else np.isnan(got.temperature_c).all()
@@ -89,14 +87,14 @@ def test_every_datagram_comes_back(identifier: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "bits"), [("2g", 21), ("5g", 20), ("10g", 19), ("30g", 18), ("80g", 16)])
-def test_ranges(name: str, bits: int) -> None:
-    got = decoded(PUBLISHED, accelerometer_range=name)
+def test_accelerometer_range_sets_the_scale(name: str, bits: int) -> None:
+    got = decode_bytes(PUBLISHED, accelerometer_range=name)
     assert got is not None
-    assert got.values[0, 5] == pytest.approx(0x081C52 / 2**bits * G, rel=1e-14)
+    assert got.values[0, 5] == pytest.approx(0x081C52 / 2**bits * G0, rel=1e-14)
 
 
-def test_increments_become_rates() -> None:
-    got = decoded(PUBLISHED, gyro_output="increment", accelerometer_output="increment", rate=250.0)
+def test_increments_are_converted_to_rates() -> None:
+    got = decode_bytes(PUBLISHED, gyro_output="increment", accelerometer_output="increment", rate=250.0)
     assert got is not None
     assert got.values[0, 0] == pytest.approx(0x000124 / 2**21 * DEGREE * 250.0, rel=1e-14)
     assert got.values[0, 5] == pytest.approx(0x081C52 / 2**22 * 250.0, rel=1e-14)
@@ -104,9 +102,9 @@ def test_increments_become_rates() -> None:
 
 @pytest.mark.parametrize("at", [GYRO_STATUS, ACCEL_STATUS])
 @pytest.mark.parametrize("bit", [0x80, 0x40, 0x10, 0x08])
-def test_an_error_in_the_status_is_bad(at: int, bit: int) -> None:
+def test_error_bit_in_the_status_makes_the_sample_bad(at: int, bit: int) -> None:
     decoder = build(Settings())
-    blocks = decoder.feed([Chunk(PUBLISHED + changed(at, bit | 1), 0)])
+    blocks = decoder.feed([Chunk(PUBLISHED + replace_byte(at, bit | 1), 0)])
     assert [(len(b), b.lost) for b in blocks] == [(1, 0)]
     assert decoder.bad == 1
     assert ("starting" if bit == 0x40 else "status 0x") in decoder.recent_problem
@@ -116,24 +114,24 @@ def test_an_error_in_the_status_is_bad(at: int, bit: int) -> None:
 
 
 @pytest.mark.parametrize(("at", "byte"), [(GYRO_STATUS, 0x20), (ACCEL_STATUS, 0x20), (INCL_STATUS, 0x88)])
-def test_outside_operating_conditions_and_the_inclinometer_are_let_through(at: int, byte: int) -> None:
-    assert decoded(changed(at, byte)) is not None
+def test_operating_condition_and_inclinometer_bits_are_accepted(at: int, byte: int) -> None:
+    assert decode_bytes(replace_byte(at, byte)) is not None
 
 
-def test_a_temperature_with_an_error_is_not_measured() -> None:
-    got = decoded(changed(TEMPERATURE_STATUS, 0x08))
+def test_temperature_with_an_error_bit_becomes_nan() -> None:
+    got = decode_bytes(replace_byte(TEMPERATURE_STATUS, 0x08))
     assert got is not None
     assert np.isnan(got.temperature_c).all()
 
 
-def test_cr_lf_is_passed_over() -> None:
+def test_cr_lf_after_a_frame_is_ignored() -> None:
     decoder = build(Settings())
     blocks = decoder.feed([Chunk((PUBLISHED + b"\r\n") * 9, 0)])
     assert [(len(b), b.lost) for b in blocks] == [(9, 0)]
     assert decoder.bad == 0
 
 
-def test_auto_follows_a_device_that_is_set_anew() -> None:
+def test_auto_identifier_follows_a_reconfigured_device() -> None:
     short = [c.data for c in build(Settings(identifier=0x91)).encode(make_block(np.arange(200), np.zeros((200, 6))))]
     decoder = build(Settings())
     assert len(decoder.feed([Chunk(PUBLISHED * 3, 0)])) == 1
@@ -148,7 +146,7 @@ def test_auto_follows_a_device_that_is_set_anew() -> None:
     assert decoder.feed([Chunk(b"".join(short), 0)]) == []
 
 
-def test_an_unmeasured_axis_is_sent_as_a_channel_error() -> None:
+def test_missing_axis_is_encoded_as_a_channel_error() -> None:
     values = np.zeros((3, 6))
     values[1, 2] = np.nan
     decoder = build(Settings())
@@ -165,7 +163,7 @@ def test_an_unmeasured_axis_is_sent_as_a_channel_error() -> None:
         ({"rate": -1.0}, "rate: -1 Hz is outside"),
     ],
 )
-def test_wrong_settings_say_what_is_right(settings: dict[str, object], words: str) -> None:
+def test_error_for_wrong_settings_names_valid_values(settings: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words) as caught:
         build(read_settings(Settings, settings))
     assert "\n" not in str(caught.value)

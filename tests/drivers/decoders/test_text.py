@@ -1,27 +1,27 @@
-"""Text lines: columns and units, ends of lines, what is bad and what is not, wrong settings."""
+"""Tests of the decoder for text lines: columns, units, line ends, bad lines and wrong settings."""
 
 import math
 
 import numpy as np
 import pytest
 
-from drivers.data_types import ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
-from drivers.decoders.base import xor_checksum
+from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from drivers.decoders.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
+from tests.support.nmea_sentences import make_sentence
 from tests.support.settings import read_settings
 
-SIX = ("gx", "gy", "gz", "ax", "ay", "az")
 LINE = b"1,2,3,4,5,6\n"
 
 
-def blocks_of(data: bytes, **settings: object) -> list[tuple[int, int]]:
-    decoder = build(Settings(**{"columns": SIX, "first_line": "keep", **settings}))
+def decode_and_count(data: bytes, **settings: object) -> list[tuple[int, int]]:
+    """Return the number of rows and of lost samples before them, for each block."""
+    decoder = build(Settings(**{"columns": AXES, "first_line": "keep", **settings}))
     return [(len(b), b.lost) for b in decoder.feed([Chunk(data, 77)])]
 
 
-def decoded(data: bytes, **settings: object) -> SampleBlock:
-    decoder = build(Settings(**{"columns": SIX, "first_line": "keep", **settings}))
+def decode_bytes(data: bytes, **settings: object) -> SampleBlock:
+    decoder = build(Settings(**{"columns": AXES, "first_line": "keep", **settings}))
     return concatenate_blocks(decoder.feed([Chunk(data, 77)]))
 
 
@@ -37,20 +37,20 @@ def decoded(data: bytes, **settings: object) -> SampleBlock:
     ],
 )
 @pytest.mark.parametrize("end", [b"\n", b"\r", b"\r\n", b"\n\n"])
-def test_delimiters_and_line_ends(line: bytes, end: bytes) -> None:
-    got = decoded((line + end) * 3)
+def test_all_delimiters_and_line_ends_are_decoded(line: bytes, end: bytes) -> None:
+    got = decode_bytes((line + end) * 3)
     assert got.values.tolist() == [[1, 2, 3, 4, 5, 6]] * 3
     assert got.lost == 0
 
 
-def test_a_delimiter_of_its_own() -> None:
-    assert decoded(b"1|2|3|4|5|6\n", delimiter="|").values.tolist() == [[1, 2, 3, 4, 5, 6]]
-    assert decoded(b"1 2   3 4 5 6\n", delimiter=" ").values.tolist() == [[1, 2, 3, 4, 5, 6]]
-    assert blocks_of(LINE + b"1,2|3|4|5|6\n" + LINE, delimiter="|") == []
+def test_delimiter_can_be_configured() -> None:
+    assert decode_bytes(b"1|2|3|4|5|6\n", delimiter="|").values.tolist() == [[1, 2, 3, 4, 5, 6]]
+    assert decode_bytes(b"1 2   3 4 5 6\n", delimiter=" ").values.tolist() == [[1, 2, 3, 4, 5, 6]]
+    assert decode_and_count(LINE + b"1,2|3|4|5|6\n" + LINE, delimiter="|") == []
 
 
-def test_columns_units_and_scale() -> None:
-    got = decoded(
+def test_columns_units_and_scale_are_applied() -> None:
+    got = decode_bytes(
         b"IMU:,1000,180,77,2,298.15\n",
         columns=("-", "az", "gz", "-", "gx", "temperature"),
         gyro_unit="deg/s",
@@ -63,8 +63,8 @@ def test_columns_units_and_scale() -> None:
     assert got.temperature_c[0] == pytest.approx(25.0)
 
 
-def test_nan_and_empty_are_not_measured() -> None:
-    got = decoded(b"1,nan,,NaN,5, \n" + LINE)
+def test_nan_and_empty_columns_become_nan() -> None:
+    got = decode_bytes(b"1,nan,,NaN,5, \n" + LINE)
     np.testing.assert_array_equal(got.values[0], [1, np.nan, np.nan, np.nan, 5, np.nan])
     assert got.values[1].tolist() == [1, 2, 3, 4, 5, 6]
 
@@ -85,16 +85,16 @@ def test_nan_and_empty_are_not_measured() -> None:
         b"1 2 3 4 5",
     ],
 )
-def test_a_line_that_cannot_be_read_is_bad_and_leaves_a_place(line: bytes) -> None:
-    decoder = build(Settings(columns=SIX, first_line="keep"))
+def test_unreadable_line_is_bad_and_counts_as_lost(line: bytes) -> None:
+    decoder = build(Settings(columns=AXES, first_line="keep"))
     blocks = decoder.feed([Chunk(LINE * 2 + line + b"\r\n" + LINE * 2, 0)])
     assert [(len(b), b.lost) for b in blocks] == [(2, 0), (2, 1)]
     assert all(b.values.tolist() == [[1, 2, 3, 4, 5, 6]] * 2 for b in blocks)
     assert decoder.bad == 1
 
 
-def test_the_hint_says_what_is_wrong_and_goes_away() -> None:
-    decoder = build(Settings(columns=SIX))
+def test_recent_problem_describes_the_error_until_lines_are_good() -> None:
+    decoder = build(Settings(columns=AXES))
     decoder.feed([Chunk(b"\n1,2,3\n", 0)])
     assert "3 columns, expected 6" in decoder.recent_problem
     decoder.feed([Chunk(b"1,2,3,4,5,gyro\n", 0)])
@@ -103,12 +103,12 @@ def test_the_hint_says_what_is_wrong_and_goes_away() -> None:
     assert decoder.recent_problem == ""
 
 
-def test_the_first_line_is_left_out_unless_it_is_known_to_be_whole() -> None:
-    assert blocks_of(LINE * 3, first_line="drop") == [(2, 0)]
-    assert blocks_of(LINE * 3, first_line="keep") == [(3, 0)]
-    assert blocks_of(b"\n" + LINE * 3, first_line="drop") == [(3, 0)]
-    assert blocks_of(b"3,4,5\n" + LINE * 3, first_line="keep") == [(3, 0)]
-    decoder = build(Settings(columns=SIX))
+def test_first_line_is_dropped_unless_it_is_complete() -> None:
+    assert decode_and_count(LINE * 3, first_line="drop") == [(2, 0)]
+    assert decode_and_count(LINE * 3, first_line="keep") == [(3, 0)]
+    assert decode_and_count(b"\n" + LINE * 3, first_line="drop") == [(3, 0)]
+    assert decode_and_count(b"3,4,5\n" + LINE * 3, first_line="keep") == [(3, 0)]
+    decoder = build(Settings(columns=AXES))
     decoder.feed([Chunk(b"5,6\n" + LINE, 0)])
     assert decoder.bad == 0
     decoder.forget_stream_state()
@@ -116,33 +116,29 @@ def test_the_first_line_is_left_out_unless_it_is_known_to_be_whole() -> None:
     assert decoder.bad == 0
 
 
-def test_header_and_comments_are_passed_over() -> None:
+def test_header_and_comments_are_ignored() -> None:
     head = b"# made by a board\r\ngx,gy,gz,ax,ay,az\r\n"
-    assert blocks_of(head + LINE + b"#\n" + LINE, header=1) == [(2, 0)]
-    assert blocks_of(b"\n% note\n" + LINE, comment="%") == [(1, 0)]
-    assert blocks_of(b"\n# note\n" + LINE, comment="") == [(1, 1)]
+    assert decode_and_count(head + LINE + b"#\n" + LINE, header=1) == [(2, 0)]
+    assert decode_and_count(b"\n% note\n" + LINE, comment="%") == [(1, 0)]
+    assert decode_and_count(b"\n# note\n" + LINE, comment="") == [(1, 1)]
 
 
-def test_an_overlong_line_is_one_bad_line() -> None:
-    decoder = build(Settings(columns=SIX, first_line="keep"))
+def test_overlong_line_counts_as_one_bad_line() -> None:
+    decoder = build(Settings(columns=AXES, first_line="keep"))
     feeds = [LINE, *[b"7" * 1000] * (3 * MAX_LINE_BYTES // 1000), b"\n", LINE]
     blocks = [b for data in feeds for b in decoder.feed([Chunk(data, 0)])]
     assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
     assert "line end" in decoder.recent_problem
-    assert blocks_of(LINE + b"7" * (MAX_LINE_BYTES + 1) + b"\n" + LINE) == [(1, 0), (1, 1)]
+    assert decode_and_count(LINE + b"7" * (MAX_LINE_BYTES + 1) + b"\n" + LINE) == [(1, 0), (1, 1)]
 
 
-def sentence(body: bytes) -> bytes:
-    return b"$%b*%02X\r\n" % (body, xor_checksum(body))
-
-
-def test_nmea_checksum() -> None:
-    good = sentence(b"1,2,3,4,5,6")
-    assert blocks_of(good * 3, nmea=True, first_line="drop") == [(3, 0)]
-    assert blocks_of(good[5:] + good * 2, nmea=True) == [(2, 0)]
-    assert blocks_of(good + good.lower() + b"noise" + good, nmea=True) == [(3, 0)]
+def test_sentence_with_wrong_nmea_checksum_is_bad() -> None:
+    good = make_sentence(b"1,2,3,4,5,6")
+    assert decode_and_count(good * 3, nmea=True, first_line="drop") == [(3, 0)]
+    assert decode_and_count(good[5:] + good * 2, nmea=True) == [(2, 0)]
+    assert decode_and_count(good + good.lower() + b"noise" + good, nmea=True) == [(3, 0)]
     for wrong in (good.replace(b"3", b"4", 1), b"1,2,3,4,5,6\n", good.replace(b"*", b"+"), b"$*00\n"):
-        assert blocks_of(good + wrong + good, nmea=True) == [(1, 0), (1, 1)]
+        assert decode_and_count(good + wrong + good, nmea=True) == [(1, 0), (1, 1)]
 
 
 @pytest.mark.parametrize(
@@ -154,29 +150,29 @@ def test_nmea_checksum() -> None:
         ("ns", b"17", 17, 2**62),
     ],
 )
-def test_the_devices_own_time(unit: str, text: bytes, ticks: int, modulus: int) -> None:
-    settings = {"columns": ("t", *SIX), "time_unit": unit}
-    assert decoded(text + b"," + LINE, **settings).ticks.tolist() == [ticks]
+def test_time_column_gives_ticks(unit: str, text: bytes, ticks: int, modulus: int) -> None:
+    settings = {"columns": ("t", *AXES), "time_unit": unit}
+    assert decode_bytes(text + b"," + LINE, **settings).ticks.tolist() == [ticks]
     assert build(Settings(**settings)).timing == CounterTimedFormat(modulus, 1e-9)
 
 
-def test_a_counter() -> None:
-    settings = {"columns": (*SIX, "counter"), "counter_modulus": 100}
-    got = decoded(b"1,2,3,4,5,6,99\n1,2,3,4,5,6,0\n", **settings)
+def test_counter_column_gives_ticks() -> None:
+    settings = {"columns": (*AXES, "counter"), "counter_modulus": 100}
+    got = decode_bytes(b"1,2,3,4,5,6,99\n1,2,3,4,5,6,0\n", **settings)
     assert got.ticks.tolist() == [99, 0]
     assert build(Settings(**settings)).timing == CounterTimedFormat(100)
-    assert build(Settings(columns=SIX)).timing == ArrivalTimedFormat()
-    assert blocks_of(b"1,2,3,4,5,6,1\n1,2,3,4,5,6,nan\n1,2,3,4,5,6,3\n", **settings) == [(1, 0), (1, 1)]
+    assert build(Settings(columns=AXES)).timing == ArrivalTimedFormat()
+    assert decode_and_count(b"1,2,3,4,5,6,1\n1,2,3,4,5,6,nan\n1,2,3,4,5,6,3\n", **settings) == [(1, 0), (1, 1)]
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "expected_parts"),
     [
         ({"gyro_unit": "deg/sek"}, ('"deg/sek"', "deg/s")),
         ({"gyro_unit": "LSB"}, ("gyro_unit: ", "rad/s, ", "deg/s", "for raw counts", "scale = { gx = 0.0305 }")),
         ({"accel_unit": "counts"}, ("accel_unit: ", "m/s², ", "for raw counts", "scale = { ax = 0.0305 }")),
         ({"accel_unit": "furlong"}, ('"furlong"', "m/s²", "mg")),
-        ({"columns": (*SIX, "temperature"), "temperature_unit": "Re"}, ('"Re"', "°C")),
+        ({"columns": (*AXES, "temperature"), "temperature_unit": "Re"}, ('"Re"', "°C")),
         ({"columns": ("gx", "temprature")}, ('"temprature"', "possible are temperature, ")),
         ({"columns": ("gx", "gx")}, ("twice",)),
         ({"columns": ("-", "temperature")}, ("gx", "az")),
@@ -187,14 +183,16 @@ def test_a_counter() -> None:
         ({"counter_modulus": 1}, ("counter_modulus",)),
     ],
 )
-def test_wrong_settings_say_what_is_right(settings: dict[str, object], words: tuple[str, ...]) -> None:
+def test_error_for_wrong_settings_names_valid_values(
+    settings: dict[str, object], expected_parts: tuple[str, ...]
+) -> None:
     with pytest.raises(ConfigError) as caught:
-        build(read_settings(Settings, {"columns": SIX, **settings}))
-    assert all(word in str(caught.value) for word in words), caught.value
+        build(read_settings(Settings, {"columns": AXES, **settings}))
+    assert all(part in str(caught.value) for part in expected_parts), caught.value
     assert "\n" not in str(caught.value)
 
 
-def test_all_wrong_settings_are_told_at_once() -> None:
+def test_all_wrong_settings_are_reported() -> None:
     settings = {"columns": ["gx", "gx", "qz"], "gyro_unit": "LSB", "scale": {"gw": 1.0, "gx": 0.0}, "delimiter": ""}
     with pytest.raises(ConfigError) as caught:
         read_settings(Settings, settings)

@@ -1,4 +1,4 @@
-"""VectorNav binary: the manual's frames, every place of an axis, and what is rejected."""
+"""Tests of the VectorNav binary decoder: example messages, all fields with axes, and rejected messages."""
 
 import binascii
 import struct
@@ -21,47 +21,47 @@ EXAMPLE_1 = bytes.fromhex("FA 01 08 00 93 50 2E 42 83 3E F1 3F 48 B5 04 BB 92 88
 EXAMPLE_2_WRONG = bytes.fromhex("FA 05 08 00 01 00" + "00" * 20 + "A8 3A")
 
 
-def message(masks: dict[int, int], payload: bytes) -> bytes:
-    """Any groups, masks and payload with the right CRC."""
+def make_message(masks: dict[int, int], payload: bytes) -> bytes:
+    """Return a message with the given field mask of each group, the payload and a valid CRC."""
     groups = sum(1 << (g - 1) for g in masks)
     body = bytes([groups]) + b"".join(struct.pack("<H", m) for _, m in sorted(masks.items())) + payload
     return b"\xfa" + body + binascii.crc_hqx(body, 0).to_bytes(2, "big")
 
 
-def decoded(data: bytes, **settings: object) -> SampleBlock | None:
+def decode_bytes(data: bytes, **settings: object) -> SampleBlock | None:
     decoder = build(Settings(**settings))
     blocks = decoder.feed([Chunk(data, 77)])
     return concatenate_blocks(blocks) if blocks else None
 
 
-def vector(*numbers: float) -> bytes:
+def pack_floats(*numbers: float) -> bytes:
     return struct.pack(f"<{len(numbers)}f", *numbers)
 
 
-def test_the_manuals_first_example_is_a_message_but_no_sample() -> None:
+def test_first_example_of_the_manual_is_a_message_without_a_sample() -> None:
     decoder = build(Settings())
     assert decoder.feed([Chunk(EXAMPLE_1, 0)]) == []
-    form = build_message_dtype(EXAMPLE_1[1:4], False)
-    assert form is not None
-    assert form.itemsize == len(EXAMPLE_1)
-    assert not {"gyro", "accel"} & {*(form.names or ())}
+    message_dtype = build_message_dtype(EXAMPLE_1[1:4], False)
+    assert message_dtype is not None
+    assert message_dtype.itemsize == len(EXAMPLE_1)
+    assert not {"gyro", "accel"} & {*(message_dtype.names or ())}
     np.testing.assert_allclose(np.frombuffer(EXAMPLE_1, "<f4", 3, 4), [43.578686, 1.8847202, -0.0020249654], rtol=1e-7)
     assert decoder.bad == 0
 
 
-def test_the_manuals_second_example_fails_its_crc_and_is_rejected() -> None:
+def test_second_example_of_the_manual_has_a_wrong_crc_and_is_rejected() -> None:
     decoder = build(Settings())
-    good = message({1: 0x0201}, struct.pack("<Q", 5) + vector(0, 0, -9.8, 0.1, 0.2, 0.3))
+    good = make_message({1: 0x0201}, struct.pack("<Q", 5) + pack_floats(0, 0, -9.8, 0.1, 0.2, 0.3))
     blocks = decoder.feed([Chunk(good + EXAMPLE_2_WRONG + good, 0)])
     assert sum(len(b) for b in blocks) == 2
     assert decoder.bad == 1
 
 
-def test_the_recommended_message() -> None:
-    data = message({1: 0x0201}, struct.pack("<Q", 123_456_789) + vector(0.5, -0.25, -9.75, 0.125, -0.5, 1.0))
+def test_recommended_message_is_decoded() -> None:
+    data = make_message({1: 0x0201}, struct.pack("<Q", 123_456_789) + pack_floats(0.5, -0.25, -9.75, 0.125, -0.5, 1.0))
     assert data[:4] == bytes.fromhex("FA 01 01 02")
     assert len(data) == 38
-    got = decoded(data)
+    got = decode_bytes(data)
     assert got is not None
     assert got.values.tolist() == [[0.125, -0.5, 1.0, 0.5, -0.25, -9.75]]
     assert got.ticks.tolist() == [123_456_789]
@@ -83,7 +83,7 @@ def test_the_recommended_message() -> None:
         ({1: 0x7FFF}, 124, 112, 148, 0),
     ],
 )
-def test_every_place_of_an_axis(
+def test_axes_are_decoded_from_every_field(
     masks: dict[int, int], gyro: int | None, accel: int | None, temperature: int | None, time: int | None
 ) -> None:
     size = sum(n for g, m in masks.items() for bit, n in enumerate(FIELD_SIZES[g]) if m >> bit & 1)
@@ -94,7 +94,7 @@ def test_every_place_of_an_axis(
             struct.pack_into(f"<{len(numbers)}f", payload, offset, *numbers)
     if time is not None:
         struct.pack_into("<Q", payload, time, 9_000)
-    got = decoded(message(masks, bytes(payload)))
+    got = decode_bytes(make_message(masks, bytes(payload)))
     assert got is not None
     expected = [*(nan if gyro is None else (1.0, 2.0, 3.0)), *(nan if accel is None else (4.0, 5.0, 6.0))]
     np.testing.assert_array_equal(got.values[0], expected)
@@ -102,9 +102,9 @@ def test_every_place_of_an_axis(
     assert got.ticks.tolist() == [NO_TICK if time is None else 9_000]
 
 
-def test_which_of_both_is_a_setting() -> None:
-    data = message({1: 1 << 5 | 1 << 8 | 1 << 9}, vector(1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4))
-    raw, corrected = decoded(data), decoded(data, compensated=True)
+def test_setting_selects_compensated_or_uncompensated_values() -> None:
+    data = make_message({1: 1 << 5 | 1 << 8 | 1 << 9}, pack_floats(1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4))
+    raw, corrected = decode_bytes(data), decode_bytes(data, compensated=True)
     assert raw is not None
     assert corrected is not None
     assert raw.values.tolist() == [[4, 4, 4, 3, 3, 3]]
@@ -112,27 +112,27 @@ def test_which_of_both_is_a_setting() -> None:
 
 
 @pytest.mark.parametrize("masks", [{4: 1}, {6: 3}, {1: 0x8001}, {1: 0}, {3: 0x0800}])
-def test_groups_and_bits_of_unknown_size_are_no_message(masks: dict[int, int]) -> None:
-    assert decoded(message(masks, bytes(30))) is None
+def test_messages_with_fields_of_unknown_size_are_ignored(masks: dict[int, int]) -> None:
+    assert decode_bytes(make_message(masks, bytes(30))) is None
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
-def test_what_is_no_number_is_bad(wrong: float) -> None:
+def test_sample_with_nan_or_infinity_is_bad(wrong: float) -> None:
     decoder = build(Settings())
-    data = message({1: 1 << 9}, vector(0, wrong, 0, 0, 0, 0))
+    data = make_message({1: 1 << 9}, pack_floats(0, wrong, 0, 0, 0, 0))
     assert decoder.feed([Chunk(data, 0)]) == []
     assert decoder.bad == 1
 
 
-def test_other_messages_between_cost_nothing() -> None:
-    good = message({1: 0x0201}, struct.pack("<Q", 5) + vector(0, 0, -9.8, 0.1, 0.2, 0.3))
+def test_other_messages_between_samples_are_ignored() -> None:
+    good = make_message({1: 0x0201}, struct.pack("<Q", 5) + pack_floats(0, 0, -9.8, 0.1, 0.2, 0.3))
     decoder = build(Settings())
     blocks = decoder.feed([Chunk((good + EXAMPLE_1) * 5, 0)])
     assert [(len(b), b.lost) for b in blocks] == [(5, 0)]
 
 
-def test_without_a_time_the_hint_says_what_to_do() -> None:
-    data = message({1: 1 << 9}, vector(0, 0, -9.8, 0, 0, 0))
+def test_hint_asks_for_the_time_if_it_is_missing() -> None:
+    data = make_message({1: 1 << 9}, pack_floats(0, 0, -9.8, 0, 0, 0))
     decoder = build(Settings())
     decoder.feed([Chunk(data, 0)])
     assert "TimeStartup" in decoder.recent_problem
@@ -142,9 +142,9 @@ def test_without_a_time_the_hint_says_what_to_do() -> None:
     assert decoder.timing == ArrivalTimedFormat()
 
 
-def test_time_beyond_62_bits_wraps() -> None:
+def test_time_beyond_62_bits_wraps_around() -> None:
     decoder = build(Settings())
-    data = message({1: 0x0201}, struct.pack("<Q", TICKS + 3) + vector(0, 0, -9.8, 0, 0, 0))
+    data = make_message({1: 0x0201}, struct.pack("<Q", TICKS + 3) + pack_floats(0, 0, -9.8, 0, 0, 0))
     assert decoder.feed([Chunk(data, 0)])[0].ticks.tolist() == [3]
 
 

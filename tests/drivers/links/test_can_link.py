@@ -1,4 +1,4 @@
-"""CAN on python-can's virtual bus, on slcan over a pseudo terminal, and on a bus that fails as told."""
+"""Tests of the CAN link on a virtual bus, on slcan over a pseudo-terminal, and on a bus that raises errors."""
 
 import errno
 import itertools
@@ -46,34 +46,34 @@ def peer(channel: str) -> Iterator[can.BusABC]:
         yield bus
 
 
-def message(identifier: int, extended: bool = False, **keys: Any) -> can.Message:
+def make_message(identifier: int, extended: bool = False, **keys: Any) -> can.Message:
     return can.Message(arbitration_id=identifier, is_extended_id=extended, data=b"\1\2\3", **keys)
 
 
-def collect(link: CanLink) -> list[Chunk]:
-    """All that is there: a read on a busy computer may give it in parts."""
+def read_all_chunks(link: CanLink) -> list[Chunk]:
+    """Read until no chunk arrives for 0.2 s, because a read on a busy computer may return only a part."""
     chunks: list[Chunk] = []
     while more := link.wait_for_chunks_or_timeout(0.2):
         chunks += more
     return chunks
 
 
-def test_identifiers_and_data(peer: can.BusABC, channel: str) -> None:
+def test_link_receives_identifiers_and_data(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
     link.open()
     for i in range(50):
-        peer.send(message(i, extended=i % 2 == 1))
-    chunks = collect(link)
+        peer.send(make_message(i, extended=i % 2 == 1))
+    chunks = read_all_chunks(link)
     link.close()
     assert [c.address for c in chunks] == [i | (EXTENDED_ID if i % 2 else 0) for i in range(50)]
     assert {c.data for c in chunks} == {b"\1\2\3"}
 
 
-def test_a_read_is_never_without_end(peer: can.BusABC, channel: str) -> None:
+def test_number_of_frames_per_read_is_limited(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
     link.open()
     for _ in range(can_link.MAX_FRAMES + 5):
-        peer.send(message(1))
+        peer.send(make_message(1))
     sizes = []
     while sum(sizes) < can_link.MAX_FRAMES + 5:
         sizes.append(len(link.wait_for_chunks_or_timeout(0.1) or ()))
@@ -82,7 +82,7 @@ def test_a_read_is_never_without_end(peer: can.BusABC, channel: str) -> None:
     assert sum(sizes) == can_link.MAX_FRAMES + 5
 
 
-def test_a_late_reader_still_gives_the_time_of_arrival(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_read_keeps_the_arrival_time(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(can_link, "MAX_FRAME_AGE_S", 3600.0)  # a loaded machine may take seconds between the frames
     with can.Bus(interface="virtual", channel=channel, preserve_timestamps=True) as peer:
         link = build(interface="virtual", channel=channel)
@@ -90,16 +90,16 @@ def test_a_late_reader_still_gives_the_time_of_arrival(channel: str, monkeypatch
         sent = []
         for age_s in (300.0, 200.0, 100.0):
             before = time.monotonic_ns() - age_s * 1e9
-            peer.send(message(1, timestamp=time.time() - age_s))
+            peer.send(make_message(1, timestamp=time.time() - age_s))
             sent.append((before, time.monotonic_ns() - age_s * 1e9))
-        chunks = collect(link)
+        chunks = read_all_chunks(link)
         link.close()
     assert len(chunks) == 3
     for chunk, (before, after) in zip(chunks, sent, strict=True):
         assert before - 20e6 <= chunk.t_ns <= after + 20e6
 
 
-def test_an_interruption_between_two_clocks_moves_no_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interruption_between_reading_two_clocks_does_not_change_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     unix_ns, now_ns, interruptions_ns = 1_700_000_000 * 10**9, [10**12], iter([50_000_000, 0, 0])
 
     def time_ns() -> int:
@@ -112,52 +112,52 @@ def test_an_interruption_between_two_clocks_moves_no_stamp(monkeypatch: pytest.M
         "time",
         SimpleNamespace(monotonic_ns=lambda: now_ns[0], time_ns=time_ns, time=lambda: time_ns() / 1e9),
     )
-    chunk = link._to_chunk(message(1, timestamp=(unix_ns + 10**12 - 10_000_000) / 1e9))
+    chunk = link._to_chunk(make_message(1, timestamp=(unix_ns + 10**12 - 10_000_000) / 1e9))
     assert chunk.t_ns == pytest.approx(10**12 - 10_000_000, abs=1000)
 
 
-def test_stamps_that_cannot_be_believed_are_left_aside(channel: str) -> None:
+def test_implausible_time_stamps_are_ignored(channel: str) -> None:
     with can.Bus(interface="virtual", channel=channel, preserve_timestamps=True) as peer:
         link = build(interface="virtual", channel=channel)
         link.open()
         begun = time.monotonic_ns()
-        peer.send(message(1, timestamp=12.5))
-        peer.send(message(1, timestamp=time.time() + 3600.0))
-        chunks = collect(link)
+        peer.send(make_message(1, timestamp=12.5))
+        peer.send(make_message(1, timestamp=time.time() + 3600.0))
+        chunks = read_all_chunks(link)
         link.close()
     now = time.monotonic_ns()
     assert len(chunks) == 2
     assert all(begun <= c.t_ns <= now for c in chunks)
 
 
-def test_only_what_the_decoder_asks_for(peer: can.BusABC, channel: str) -> None:
+def test_address_filter_selects_frames(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
     link.set_address_filter([0x09, 0x0CF02AFE | EXTENDED_ID | ANY_SOURCE, 0x18EF00FE | EXTENDED_ID | ANY_SOURCE])
     link.open()
     kept = [(0x09, False), (0x0CF02A80, True), (0x18F02AE2, True), (0x18EF55AA, True)]
     others = [(0x0A, False), (0x09, True), (0x0CF02BFE, True), (0x0DF02AFE, True), (0x02A, False)]
     for identifier, extended in kept + others:
-        peer.send(message(identifier, extended))
-    chunks = collect(link)
+        peer.send(make_message(identifier, extended))
+    chunks = read_all_chunks(link)
     link.close()
     assert [c.address for c in chunks] == [i | (EXTENDED_ID if e else 0) for i, e in kept]
 
 
-def test_accepting_nothing_in_particular_is_accepting_all(peer: can.BusABC, channel: str) -> None:
+def test_empty_address_filter_accepts_all_frames(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
     link.set_address_filter([])
     link.open()
-    peer.send(message(0x55))
+    peer.send(make_message(0x55))
     assert link.wait_for_chunks_or_timeout(1.0)
     link.close()
 
 
-def test_error_and_remote_frames_are_left_aside(peer: can.BusABC, channel: str) -> None:
+def test_error_and_remote_frames_are_ignored(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
     link.open()
     peer.send(can.Message(is_error_frame=True, arbitration_id=0x04))
     peer.send(can.Message(is_remote_frame=True, arbitration_id=5, is_extended_id=False))
-    peer.send(message(7))
+    peer.send(make_message(7))
     got: list[Chunk] = []
     for _ in range(10):
         got += link.wait_for_chunks_or_timeout(0.05) or []
@@ -166,8 +166,8 @@ def test_error_and_remote_frames_are_left_aside(peer: can.BusABC, channel: str) 
     assert link.error_frames == 1
 
 
-class ToldBus:
-    """A bus that gives what it was told to."""
+class ScriptedBus:
+    """A bus that returns or raises the given answers in turn."""
 
     def __init__(self, *answers: can.Message | Exception) -> None:
         self.answers = list(answers)
@@ -185,19 +185,19 @@ class ToldBus:
 
 
 @pytest.mark.parametrize(
-    ("answer", "says"),
+    ("answer", "problem"),
     [
         (can.Message(is_error_frame=True, arbitration_id=0x40), "bus off"),
         (can.CanOperationError("Network is down", 100), "interface down"),
         (OSError(errno.ENODEV, "No such device"), "unplugged"),
     ],
 )
-def test_losing_the_bus(monkeypatch: pytest.MonkeyPatch, answer: Any, says: str) -> None:
-    bus = ToldBus(answer)
+def test_lost_bus_raises_link_lost(monkeypatch: pytest.MonkeyPatch, answer: Any, problem: str) -> None:
+    bus = ScriptedBus(answer)
     monkeypatch.setattr(can, "Bus", lambda **_: bus)
     link = build(channel="can0")
     link.open()
-    with pytest.raises(LinkLost, match=says):
+    with pytest.raises(LinkLost, match=problem):
         link.wait_for_chunks_or_timeout(1.0)
     assert bus.closed
     with pytest.raises(LinkLost, match="closed"):
@@ -205,7 +205,7 @@ def test_losing_the_bus(monkeypatch: pytest.MonkeyPatch, answer: Any, says: str)
 
 
 @pytest.mark.parametrize(
-    ("keys", "error", "says"),
+    ("keys", "error", "problem"),
     [
         ({}, OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol"), "modprobe can_raw"),
         ({}, OSError(errno.ENODEV, "No such device"), "no such network interface"),
@@ -216,30 +216,32 @@ def test_losing_the_bus(monkeypatch: pytest.MonkeyPatch, answer: Any, says: str)
         ({"interface": "pcan"}, can.CanInitializationError("PCAN\nbusy"), "PCAN busy"),
     ],
 )
-def test_advice(monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], error: Exception, says: str) -> None:
+def test_error_text_gives_advice(
+    monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], error: Exception, problem: str
+) -> None:
     def refuse(**_: object) -> None:
         raise error
 
     monkeypatch.setattr(can, "Bus", refuse)
-    with pytest.raises(LinkUnavailable, match=says) as raised:
+    with pytest.raises(LinkUnavailable, match=problem) as raised:
         build(channel="can0", **keys).open()
     assert raised.value.__cause__ is error
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("interface", can_link.PACKAGES)
-def test_a_missing_package_is_named_with_the_command_that_installs_it(
+def test_error_names_the_missing_package_and_the_command_that_installs_it(
     monkeypatch: pytest.MonkeyPatch, interface: str
 ) -> None:
     module, package, requirement = can_link.PACKAGES[interface]
     monkeypatch.setitem(sys.modules, module, None)  # as if it were not installed
     with pytest.raises(LinkUnavailable) as raised:
         build(interface=interface, channel="239.74.163.2").open()
-    said = f'CAN interface {interface} needs the package {package}: pip install "{requirement}"'
-    assert str(raised.value) == said
+    expected = f'CAN interface {interface} needs the package {package}: pip install "{requirement}"'
+    assert str(raised.value) == expected
 
 
-def test_the_extra_that_a_message_names_brings_the_package() -> None:
+def test_extra_that_a_message_names_contains_the_package() -> None:
     text = (Path(__file__).parents[3] / "pyproject.toml").read_text("utf-8")
     extras = tomllib.loads(text)["project"]["optional-dependencies"]
     ours = {
@@ -248,32 +250,32 @@ def test_the_extra_that_a_message_names_brings_the_package() -> None:
         if requirement.startswith("imu-monitor[")
     }
     for extra, package in ours.items():
-        assert any(re.match(rf"{package}\b", one) for one in extras[extra])
+        assert any(re.match(rf"{package}\b", requirement) for requirement in extras[extra])
         assert extra in extras["all"][0]
 
 
-def test_the_packages_of_python_can_are_those_of_its_own_extras() -> None:
-    brought = requires("python-can") or []
+def test_extras_of_python_can_contain_the_named_packages() -> None:
+    requirements = requires("python-can") or []
     for _, package, requirement in can_link.PACKAGES.values():
         if requirement.startswith("python-can["):
             extra = requirement.removeprefix("python-can[").removesuffix("]")
-            assert any(re.match(rf'{package}\b.*extra == "{extra}"', one) for one in brought), package
+            assert any(re.match(rf'{package}\b.*extra == "{extra}"', required) for required in requirements), package
 
 
-def test_settings_reach_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: dict[str, Any] = {}
+def test_settings_are_passed_to_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    passed_keys: dict[str, Any] = {}
 
-    def note(**keys: Any) -> ToldBus:
-        seen.update(keys)
-        return ToldBus()
+    def open_bus(**keys: Any) -> ScriptedBus:
+        passed_keys.update(keys)
+        return ScriptedBus()
 
-    monkeypatch.setattr(can, "Bus", note)
+    monkeypatch.setattr(can, "Bus", open_bus)
     build(interface="pcan", channel="PCAN_USBBUS1", bitrate=500_000, fd=True, options={"state": 1}).open()
     expected = {"interface": "pcan", "channel": "PCAN_USBBUS1", "bitrate": 500_000, "fd": True, "state": 1}
-    assert expected.items() <= seen.items()
+    assert expected.items() <= passed_keys.items()
 
 
-def test_absent_socketcand_is_told_at_once() -> None:
+def test_absent_socketcand_raises_link_unavailable() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     link = build(interface="socketcand", channel="can0", options={"host": "127.0.0.1", "port": port})
@@ -281,7 +283,7 @@ def test_absent_socketcand_is_told_at_once() -> None:
         link.open()
 
 
-def test_an_adapter_that_garbles_a_line_goes_on() -> None:
+def test_link_continues_after_garbled_lines() -> None:
     master, slave = os.openpty()
     tty.setraw(master)
     tty.setraw(slave)
@@ -304,7 +306,7 @@ def test_an_adapter_that_garbles_a_line_goes_on() -> None:
     assert link.garbled == 2
 
 
-def test_from_the_bus_to_samples(peer: can.BusABC, channel: str) -> None:
+def test_frames_from_the_bus_are_decoded_to_samples(peer: can.BusABC, channel: str) -> None:
     axes = {"gx": "RollRate", "gy": "PitchRate", "gz": "YawRate"}
     signals = {axis: f"AngularRateInformation.{name}" for axis, name in axes.items()}
     decoder = dbc.build(read_settings(dbc.Settings, {"file": "j1939_imu", "signals": signals}))
@@ -313,10 +315,10 @@ def test_from_the_bus_to_samples(peer: can.BusABC, channel: str) -> None:
     link.set_address_filter(decoder.addresses)
     link.open()
     for i in range(20):
-        peer.send(message(0x18FEF100, True))  # other traffic of a truck
+        peer.send(make_message(0x18FEF100, True))  # other traffic of a truck
         data = (32000 + 128 * i).to_bytes(2, "little") * 3 + b"\0\5"
         peer.send(can.Message(arbitration_id=0x0CF02A80, is_extended_id=True, data=data))
-    chunks = collect(link)
+    chunks = read_all_chunks(link)
     link.close()
     assert len(chunks) == 20
     got = concatenate_blocks(decoder.feed(chunks))
@@ -324,6 +326,6 @@ def test_from_the_bus_to_samples(peer: can.BusABC, channel: str) -> None:
     assert (np.diff(got.t_ns) >= 0).all()
 
 
-def test_an_unknown_interface_is_a_wrong_file():
+def test_unknown_interface_is_refused():
     with pytest.raises(ConfigError, match='interface: "socketscan"; possible are socketcan, '):
         can_link.build(can_link.Settings(interface="socketscan"))

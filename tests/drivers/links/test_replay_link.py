@@ -1,4 +1,4 @@
-"""Replay: every kind of file, its pace, its end, and files that are damaged."""
+"""Tests of the replay link: kinds of files, replay speed, end of the file, and damaged files."""
 
 import gzip
 from pathlib import Path
@@ -24,7 +24,7 @@ def build(path: Path, speed: str | float = "max", **keys: Any) -> Link:
 
 
 def read_all(link: Link) -> tuple[list[Chunk], str]:
-    """All chunks, and what the link said at its end."""
+    """Return all chunks and the text of ``LinkEnded``."""
     chunks: list[Chunk] = []
     link.open()
     try:
@@ -34,11 +34,11 @@ def read_all(link: Link) -> tuple[list[Chunk], str]:
         return chunks, str(end)
     finally:
         link.close()
-    raise AssertionError("no end")
+    raise AssertionError("the replay did not end")
 
 
-class Clock:
-    """The clock of a replay: it advances only while the replay waits."""
+class SimulatedClock:
+    """Clock that replaces the clock of the replay. It advances only while the replay waits."""
 
     def __init__(self, link: Link, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_s = 0.0
@@ -66,21 +66,21 @@ def write_recording(path: Path, n: int = 1000, rate_hz: float = 100.0) -> None:
 # --- recordings ----------------------------------------------------------------------------------
 
 
-def test_a_recording_arrives_as_it_is(tmp_path: Path) -> None:
+def test_recording_is_replayed_without_changes(tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     write_recording(path)
     link = build(path)
     assert (link.carrier, link.epoch) == ("messages", "unix")
     chunks, _ = read_all(link)
     got = concatenate_blocks(samples.build(samples.Settings()).feed(chunks))
-    kept = load_samples(path)
-    np.testing.assert_array_equal(got.values, kept.values)
-    np.testing.assert_array_equal(got.temperature_c, kept.temperature_c)
+    recording = load_samples(path)
+    np.testing.assert_array_equal(got.values, recording.values)
+    np.testing.assert_array_equal(got.temperature_c, recording.temperature_c)
     np.testing.assert_allclose(got.t_ns, np.arange(1000) * 1e7, atol=500)
     assert got.lost == 0
 
 
-def test_no_read_brings_hours_at_once(tmp_path: Path) -> None:
+def test_size_of_one_read_is_limited(tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     write_recording(path, 200_000)
     link = build(path)
@@ -103,7 +103,7 @@ def test_uneven_times_of_a_recording_are_kept(tmp_path: Path) -> None:
     np.testing.assert_array_equal(got.values[:, 3], [2, np.nan, 6, 8])
 
 
-def test_rate_of_a_recording_without_times(tmp_path: Path) -> None:
+def test_recording_without_times_needs_a_rate(tmp_path: Path) -> None:
     path = tmp_path / "r.csv"
     path.write_text("gz\n1\n2\n3\n")
     with pytest.raises(LinkUnavailable, match="rate"):
@@ -114,20 +114,20 @@ def test_rate_of_a_recording_without_times(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("speed", "expected_s"), [("recorded", 0.99), (4, 0.2475)])
-def test_recorded_pace_and_factor(
+def test_replay_follows_the_recorded_times_divided_by_the_speed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speed: str | float, expected_s: float
 ) -> None:
     path = tmp_path / "r.npz"
     write_recording(path, n=100)
     link = build(path, speed)
-    clock = Clock(link, monkeypatch)
+    clock = SimulatedClock(link, monkeypatch)
     chunks, _ = read_all(link)
     assert clock.now_s == pytest.approx(expected_s, abs=1e-6)
-    # pieces of 20 ms of the reader's time, not one lump
+    # each read returns about 20 ms of data and not the whole file
     assert len(chunks) >= 10
 
 
-def test_each_opening_starts_anew(tmp_path: Path) -> None:
+def test_opening_again_restarts_the_replay(tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     write_recording(path, n=10)
     link = build(path)
@@ -138,7 +138,7 @@ def test_each_opening_starts_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".log", ".trc", ".csv", ".log.gz", ".asc.gz"])
-def test_logs_of_python_can(tmp_path: Path, suffix: str) -> None:
+def test_logs_of_python_can_are_replayed(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"drive{suffix}"
     with can.Logger(path) as logger:
         for i, (identifier, extended, data) in enumerate(FRAMES):
@@ -167,35 +167,35 @@ def write_frames(path: Path) -> None:
             stream.write(f"{0.01 * i:.6f},{1 + i % 2},{identifier:x},{int(extended)},{len(data)},{data.hex()}\n")
 
 
-def test_frames_as_csv(tmp_path: Path) -> None:
+def test_csv_file_of_frames_is_replayed(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv.gz"
     write_frames(path)
     chunks, _ = read_all(build(path))
     assert [c.data for c in chunks] == [f[2] for f in FRAMES]
     assert [c.t_ns for c in chunks] == [i * 10_000_000 for i in range(len(FRAMES))]
-    only, _ = read_all(build(path, channel="2"))
-    assert {c.address for c in only} == {0x0CF02AE2 | EXTENDED_ID}
+    selected, _ = read_all(build(path, channel="2"))
+    assert {c.address for c in selected} == {0x0CF02AE2 | EXTENDED_ID}
 
 
-def test_frames_as_csv_without_the_optional_columns(tmp_path: Path) -> None:
+def test_optional_columns_of_a_csv_file_of_frames_may_be_missing(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     path.write_text("t,bus,id_hex,data_hex\n0.5,0,7ff,00ff\n0.6,0,800,\n")
     chunks, _ = read_all(build(path))
     assert [(c.address, c.data) for c in chunks] == [(0x7FF, b"\x00\xff"), (0x800 | EXTENDED_ID, b"")]
 
 
-def test_a_log_cut_off_is_given_up_to_the_cut(tmp_path: Path) -> None:
+def test_truncated_log_is_replayed_up_to_its_end(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv.gz"
     rows = [f"{0.01 * i:.6f},9,{i * 2654435761 % (1 << 32):08x}" for i in range(5000)]
-    packed = gzip.compress(("t,id_hex,data_hex\n" + "\n".join(rows) + "\n").encode())
-    path.write_bytes(packed[: len(packed) // 2])
+    compressed = gzip.compress(("t,id_hex,data_hex\n" + "\n".join(rows) + "\n").encode())
+    path.write_bytes(compressed[: len(compressed) // 2])
     chunks, end = read_all(build(path))
     assert 100 < len(chunks) < 5000
     assert "cut off" in end
     assert [c.data.hex() for c in chunks] == [row[-8:] for row in rows[: len(chunks)]]
 
 
-def test_a_damaged_line_ends_the_log(tmp_path: Path) -> None:
+def test_damaged_line_ends_the_replay(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     path.write_text("t,id_hex,data_hex\n0.1,9,00\n0.2,9,0x\n0.3,9,02\n")
     chunks, end = read_all(build(path))
@@ -203,11 +203,11 @@ def test_a_damaged_line_ends_the_log(tmp_path: Path) -> None:
     assert "damaged" in end
 
 
-def test_logs_keep_their_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_is_replayed_at_the_recorded_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "frames.csv.gz"
     write_frames(path)
     link = build(path, "recorded")
-    clock = Clock(link, monkeypatch)
+    clock = SimulatedClock(link, monkeypatch)
     chunks, _ = read_all(link)
     assert clock.now_s == pytest.approx(0.39, abs=1e-6)
     assert len(chunks) == len(FRAMES)
@@ -217,7 +217,7 @@ def test_logs_keep_their_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("name", ["a.bin", "a.raw", "a.txt", "a.txt.gz"])
-def test_bytes(tmp_path: Path, name: str) -> None:
+def test_file_of_bytes_is_replayed(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     data = np.random.default_rng(2).bytes(20_000)
     path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
@@ -228,19 +228,21 @@ def test_bytes(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(("speed", "expected_s"), [("recorded", 0.5), ("max", 0.0)])
-def test_bytes_at_a_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speed: str, expected_s: float) -> None:
+def test_bytes_are_replayed_at_the_configured_rate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speed: str, expected_s: float
+) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(bytes(10_000))
     link = build(path, speed, bytes_per_second=20_000.0)
-    clock = Clock(link, monkeypatch)
+    clock = SimulatedClock(link, monkeypatch)
     chunks, _ = read_all(link)
     assert clock.now_s == pytest.approx(expected_s, abs=1e-6)
-    # the times are those of the line, whatever the pace of reading
+    # the times are those of the serial line and do not depend on the replay speed
     spacing = np.diff([c.t_ns for c in chunks]) / [len(c.data) for c in chunks[1:]]
     assert spacing == pytest.approx(np.full(len(chunks) - 1, 1e9 / 20_000), rel=1e-4)
 
 
-# --- what is wrong -------------------------------------------------------------------------------
+# --- wrong settings and files -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -255,21 +257,21 @@ def test_bytes_at_a_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speed:
         ("a.bin", {"bytes_per_second": -5.0}),
     ],
 )
-def test_wrong_settings_refuse_to_start(tmp_path: Path, name: str, keys: dict[str, Any]) -> None:
+def test_wrong_settings_are_refused(tmp_path: Path, name: str, keys: dict[str, Any]) -> None:
     with pytest.raises(ConfigError) as raised:
         build(tmp_path / name, **keys)
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.csv", "a.log", "a.blf", "a.bin", "a.txt.gz"])
-def test_a_file_that_is_not_there(tmp_path: Path, name: str) -> None:
+def test_missing_file_raises_link_unavailable(tmp_path: Path, name: str) -> None:
     with pytest.raises(LinkUnavailable, match=r"a\.") as raised:
         build(tmp_path / name).open()
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.blf", "a.bin.gz"])
-def test_a_file_that_is_something_else(tmp_path: Path, name: str) -> None:
+def test_file_of_another_kind_raises_link_unavailable(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"this is none of it, " * 20)
     with pytest.raises(LinkUnavailable):
         build(tmp_path / name).open()

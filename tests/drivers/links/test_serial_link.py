@@ -1,4 +1,4 @@
-"""Serial ports: pseudo terminals and pyserial's URLs in place of cables."""
+"""Tests of the serial link with pseudo-terminals and URLs of pyserial."""
 
 import contextlib
 import errno
@@ -25,7 +25,7 @@ def build(**keys: Any) -> Link:
 
 
 @pytest.fixture
-def pty() -> Iterator[tuple[int, str]]:
+def pseudo_terminal() -> Iterator[tuple[int, str]]:
     master, slave = os.openpty()
     tty.setraw(master)
     tty.setraw(slave)
@@ -35,19 +35,20 @@ def pty() -> Iterator[tuple[int, str]]:
         os.close(master)
 
 
-def read_all(link: Link, n: int) -> bytes:
+def read_bytes(link: Link, n: int) -> bytes:
+    """Read until ``n`` bytes have been received."""
     got = bytearray()
 
     def read() -> bool:
         got.extend(b"".join(c.data for c in link.wait_for_chunks_or_timeout(0.2) or ()))
         return len(got) >= n
 
-    wait_for(read, lambda: f"{n} bytes, {len(got)} came")
+    wait_for(read, lambda: f"{n} bytes, {len(got)} received")
     return bytes(got)
 
 
-def test_every_byte_comes_once_and_in_order(pty: tuple[int, str]) -> None:
-    master, port = pty
+def test_every_byte_is_received_once_and_in_order(pseudo_terminal: tuple[int, str]) -> None:
+    master, port = pseudo_terminal
     link = build(port=port, baudrate=921600)
     link.open()
     sent = os.urandom(60_000)
@@ -58,15 +59,17 @@ def test_every_byte_comes_once_and_in_order(pty: tuple[int, str]) -> None:
 
     writer = threading.Thread(target=write)
     writer.start()
-    got = read_all(link, len(sent))
+    got = read_bytes(link, len(sent))
     writer.join()
     link.close()
     assert got == sent
 
 
-def test_a_flow_faster_than_the_buffer_is_not_held_up(pty: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the first read waits for more bytes; the reads after a full one find the next bytes there already."""
-    master, port = pty
+def test_continuous_data_are_read_without_waiting(
+    pseudo_terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the first read waits for more bytes. After a full read, the next bytes are already in the buffer."""
+    master, port = pseudo_terminal
     link = build(port=port, read_timeout=0.1)
     assert isinstance(link, serial_link.SerialLink)
     link.open()
@@ -82,14 +85,14 @@ def test_a_flow_faster_than_the_buffer_is_not_held_up(pty: tuple[int, str], monk
         wait_for(lambda: link._port is not None and link._port.in_waiting > serial_link.READ_BYTES // 2 + 1)
         got += b"".join(chunk.data for chunk in link.wait_for_chunks_or_timeout(1.0) or ())
     assert len(waits) == 1
-    got += read_all(link, len(sent) - len(got))
+    got += read_bytes(link, len(sent) - len(got))
     assert got == sent
     writer.join()
     link.close()
 
 
-def test_bytes_do_not_wait_for_the_timeout_of_the_reader(pty: tuple[int, str]) -> None:
-    master, port = pty
+def test_read_returns_before_its_timeout_when_bytes_arrive(pseudo_terminal: tuple[int, str]) -> None:
+    master, port = pseudo_terminal
     link = build(port=port)
     link.open()
     os.write(master, b"x")
@@ -97,35 +100,35 @@ def test_bytes_do_not_wait_for_the_timeout_of_the_reader(pty: tuple[int, str]) -
     link.close()
 
 
-def test_a_steady_flow_is_handed_over_at_the_port_timeout(pty: tuple[int, str]) -> None:
-    master, port = pty
+def test_continuous_data_are_returned_at_the_port_timeout(pseudo_terminal: tuple[int, str]) -> None:
+    master, port = pseudo_terminal
     link = build(port=port, read_timeout=0.02)
     link.open()
     stop = threading.Event()
 
-    def flow() -> None:
+    def write_continuously() -> None:
         while not stop.wait(0.001):
             os.write(master, b"abc")
 
-    writer = threading.Thread(target=flow)
+    writer = threading.Thread(target=write_continuously)
     writer.start()
     for _ in range(10):
-        assert link.wait_for_chunks_or_timeout(FOREVER_S)  # returns, although the flow never pauses
+        assert link.wait_for_chunks_or_timeout(FOREVER_S)  # returns, although the data never pause
     stop.set()
     writer.join()
     link.close()
 
 
-def test_loop_and_socket_urls() -> None:
+def test_loop_and_socket_urls_can_be_opened() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = build(port=f"socket://127.0.0.1:{server.getsockname()[1]}")
         link.open()
         peer, _ = server.accept()
         peer.sendall(b"over the network")
-        assert read_all(link, 16) == b"over the network"
+        assert read_bytes(link, 16) == b"over the network"
         peer.close()
         with pytest.raises(LinkLost):
-            read_all(link, 1)
+            read_bytes(link, 1)
         link.close()
     link = build(port="loop://")
     link.open()
@@ -133,34 +136,34 @@ def test_loop_and_socket_urls() -> None:
     link.close()
 
 
-def test_nobody_at_the_network_port() -> None:
+def test_closed_network_port_raises_link_unavailable() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(LinkUnavailable, match=f"127.0.0.1:{port}"):
         build(port=f"socket://127.0.0.1:{port}").open()
 
 
-def test_port_held_by_another(pty: tuple[int, str]) -> None:
-    holder, second = build(port=pty[1]), build(port=pty[1])
-    holder.open()
+def test_port_in_use_raises_link_unavailable(pseudo_terminal: tuple[int, str]) -> None:
+    first, second = build(port=pseudo_terminal[1]), build(port=pseudo_terminal[1])
+    first.open()
     with pytest.raises(LinkUnavailable, match="held by another program"):
         second.open()
-    holder.close()
+    first.close()
     second.open()
     second.close()
 
 
-def test_not_exclusive_lets_others_read(pty: tuple[int, str]) -> None:
-    pair = build(port=pty[1], exclusive=False), build(port=pty[1], exclusive=False)
+def test_port_that_is_not_exclusive_can_be_opened_twice(pseudo_terminal: tuple[int, str]) -> None:
+    pair = build(port=pseudo_terminal[1], exclusive=False), build(port=pseudo_terminal[1], exclusive=False)
     for link in pair:
         link.open()
-    os.write(pty[0], b"abc")
+    os.write(pseudo_terminal[0], b"abc")
     assert b"c" in b"".join(chunk.data for link in pair for chunk in link.wait_for_chunks_or_timeout(0.3) or ())
     for link in pair:
         link.close()
 
 
-def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
+def test_regular_file_is_no_serial_port(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("x")
     with pytest.raises(LinkUnavailable, match=r"notes\.txt"):
@@ -178,7 +181,7 @@ def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
         (errno.EMFILE, "cannot be opened"),
     ],
 )
-def test_advice(monkeypatch: pytest.MonkeyPatch, number: int, advice: str) -> None:
+def test_error_text_gives_advice(monkeypatch: pytest.MonkeyPatch, number: int, advice: str) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise serial.SerialException(number, f"could not open port: {os.strerror(number)}")
 
@@ -189,11 +192,11 @@ def test_advice(monkeypatch: pytest.MonkeyPatch, number: int, advice: str) -> No
     assert "/dev/ttyUSB0" in str(raised.value)
 
 
-def test_ports_that_there_are_are_listed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_error_lists_the_available_ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     from serial.tools import list_ports, list_ports_common
 
-    there = [list_ports_common.ListPortInfo("/dev/ttyACM7", skip_link_detection=True)]
-    monkeypatch.setattr(list_ports, "comports", lambda: there)
+    available_ports = [list_ports_common.ListPortInfo("/dev/ttyACM7", skip_link_detection=True)]
+    monkeypatch.setattr(list_ports, "comports", lambda: available_ports)
     with pytest.raises(LinkUnavailable, match="/dev/ttyACM7"):
         build(port=str(tmp_path / "ttyNONE")).open()
 
@@ -209,14 +212,14 @@ def test_ports_that_there_are_are_listed(monkeypatch: pytest.MonkeyPatch, tmp_pa
         {"port": "x", "read_timeout": 5.0},
     ],
 )
-def test_wrong_settings_refuse_to_start(keys: dict[str, Any]) -> None:
+def test_wrong_settings_are_refused(keys: dict[str, Any]) -> None:
     with pytest.raises(ConfigError) as raised:
         build(**keys)
     assert "\n" not in str(raised.value)
 
 
-def test_unplugging_is_noticed_while_waiting(pty: tuple[int, str]) -> None:
-    master, port = pty
+def test_unplugging_ends_a_waiting_read(pseudo_terminal: tuple[int, str]) -> None:
+    master, port = pseudo_terminal
     link = build(port=port)
     link.open()
     threading.Timer(0.1, os.close, (master,)).start()

@@ -1,4 +1,7 @@
-"""Repeats, order and the pace of limiter, each by itself; with the clock around them in ``test_sample_clock``."""
+"""Unit tests of duplicate detection, row order and event rate limiting.
+
+``test_sample_clock`` tests them as parts of the sample clock.
+"""
 
 import numpy as np
 import pytest
@@ -10,43 +13,44 @@ from drivers.timing.sender_time_gaps import find_evenly_spaced_order
 MS = 10**6
 
 
-def found(repeats, keys, first=0.0):
+def feed_keys(detector, keys, first=0.0):
+    """Pass rows with these keys and distinct values to the detector."""
     values = np.tile(first + np.arange(len(keys), dtype=float)[:, None], 6)
-    return repeats.find_repeats_and_count_shared_keys(np.array(keys, np.int64), values)
+    return detector.find_repeats_and_count_shared_keys(np.array(keys, np.int64), values)
 
 
-def test_nothing_is_called_a_repeat_before_enough_is_seen():
-    repeats = DuplicateDetector(ordered=True)
-    assert repeats.find_repeats_and_count_shared_keys(np.zeros(5, np.int64), np.zeros((5, 6))) == (None, 0)
-    assert found(repeats, range(1, MIN_NEW_KEYS + 1)) == (None, 0)
-    mask, others = repeats.find_repeats_and_count_shared_keys(np.array([99, 99]), np.ones((2, 6)))
-    assert (mask.tolist(), others) == ([False, True], 0)
+def test_no_row_is_a_repeat_before_enough_new_keys():
+    detector = DuplicateDetector(ordered=True)
+    assert detector.find_repeats_and_count_shared_keys(np.zeros(5, np.int64), np.zeros((5, 6))) == (None, 0)
+    assert feed_keys(detector, range(1, MIN_NEW_KEYS + 1)) == (None, 0)
+    mask, shared = detector.find_repeats_and_count_shared_keys(np.array([99, 99]), np.ones((2, 6)))
+    assert (mask.tolist(), shared) == ([False, True], 0)
 
 
-def test_absent_axes_are_equal():
-    repeats = DuplicateDetector(ordered=True)
-    found(repeats, range(100))
+def test_missing_axes_are_equal():
+    detector = DuplicateDetector(ordered=True)
+    feed_keys(detector, range(100))
     values = np.full((2, 6), np.nan)
     values[:, 0] = 1.0
-    assert repeats.find_repeats_and_count_shared_keys(np.array([100, 100]), values)[0].tolist() == [False, True]
+    assert detector.find_repeats_and_count_shared_keys(np.array([100, 100]), values)[0].tolist() == [False, True]
 
 
-def test_a_counter_that_wraps_repeats_only_the_row_before():
-    repeats = DuplicateDetector(ordered=False)
+def test_row_is_compared_only_with_the_previous_row_if_the_counter_wraps():
+    detector = DuplicateDetector(ordered=False)
     for _ in range(3):
-        assert repeats.find_repeats_and_count_shared_keys(np.arange(50), np.zeros((50, 6)))[0] is None
-    assert repeats.find_repeats_and_count_shared_keys(np.array([50, 50, 7]), np.zeros((3, 6)))[0].tolist() == [
+        assert detector.find_repeats_and_count_shared_keys(np.arange(50), np.zeros((50, 6)))[0] is None
+    assert detector.find_repeats_and_count_shared_keys(np.array([50, 50, 7]), np.zeros((3, 6)))[0].tolist() == [
         False,
         True,
         False,
     ]
 
 
-def test_a_clock_set_back_by_hours_does_not_slow_what_follows():
-    repeats = DuplicateDetector(ordered=True)
-    found(repeats, np.arange(100) * MS + 10**13)
-    found(repeats, np.arange(100) * MS)
-    assert repeats._last == 99 * MS
+def test_detector_continues_after_the_clock_was_set_back():
+    detector = DuplicateDetector(ordered=True)
+    feed_keys(detector, np.arange(100) * MS + 10**13)
+    feed_keys(detector, np.arange(100) * MS)
+    assert detector._last == 99 * MS
 
 
 @pytest.mark.parametrize(
@@ -55,32 +59,32 @@ def test_a_clock_set_back_by_hours_does_not_slow_what_follows():
         ([0, 10, 20, 30], None),
         ([0, 20, 10, 30], [0, 2, 1, 3]),
         ([0, 10, 40, 50, 20, 30, 60], [0, 1, 4, 5, 2, 3, 6]),
-        ([0, 10, 30, 20, 50, 60], [0, 1, 3, 2, 4, 5]),  # and one is missing
+        ([0, 10, 30, 20, 50, 60], [0, 1, 3, 2, 4, 5]),  # one row is missing
         ([0, 10, 8, 20, 18], None),  # jitter
-        ([0, 10, 20, 10, 20, 30], None),  # set back
+        ([0, 10, 20, 10, 20, 30], None),  # the clock is set back
     ],
 )
-def test_only_a_steady_sequence_is_put_in_order(t, order):
+def test_only_evenly_spaced_rows_are_sorted(t, order):
     result = find_evenly_spaced_order(np.array(t) * MS, 0.01)
     assert (result if result is None else result.tolist()) == order
 
 
-def test_events_keep_their_distance_and_nothing_is_forgotten():
+def test_events_are_limited_to_one_per_interval_and_all_rows_are_counted():
     limiter = EventRateLimiter()
     for i in range(100):
         limiter.report_event("a", i * 100 * MS, "{n} rows", 2)
     limiter.report_event("b", 9900 * MS, "once")
-    told = limiter.take_events()
-    assert [event.text for event in told if event.kind == "b"] == ["once"]
-    of_a = [event for event in told if event.kind == "a"]
-    assert len(of_a) == 10
-    assert np.diff([event.t_ns for event in of_a]).min() >= MIN_EVENT_INTERVAL_S * 1e9
+    events = limiter.take_events()
+    assert [event.text for event in events if event.kind == "b"] == ["once"]
+    events_a = [event for event in events if event.kind == "a"]
+    assert len(events_a) == 10
+    assert np.diff([event.t_ns for event in events_a]).min() >= MIN_EVENT_INTERVAL_S * 1e9
     last = limiter.take_events(ended=True)
-    assert sum(int(event.text.split()[0]) for event in of_a + last) == 200
+    assert sum(int(event.text.split()[0]) for event in events_a + last) == 200
     assert limiter.take_events(ended=True) == []
 
 
-def test_other_texts_of_a_kind_are_counted_while_they_are_held_back():
+def test_event_that_follows_delayed_events_contains_their_number():
     limiter = EventRateLimiter()
     for text in ("first", "second", "third", "fourth"):
         limiter.report_event("a", 5 * MS, text)

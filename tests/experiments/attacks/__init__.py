@@ -1,4 +1,4 @@
-"""Attack suite: hostile files, absurd numbers, shared resources and foreign environments.
+"""Attack suite: hostile files, absurd numbers, shared resources and unusual environments.
 
-Cheap cases run with all tests, the others with ``pytest tests/experiments/attacks -m attack``.
+Quick cases run with all tests. The other cases run with ``pytest tests/experiments/attacks -m attack``.
 """

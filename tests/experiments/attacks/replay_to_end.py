@@ -1,4 +1,4 @@
-"""Replay the file that is named on the command line to its end: one line of error and status 2 if it is not whole."""
+"""Replay the file on the command line to its end. If it is damaged, print one line of error and exit with status 2."""
 
 import logging
 import sys
@@ -9,7 +9,7 @@ from drivers.links.replay_link import Settings, build
 
 def main() -> None:
     """Read until the link ends."""
-    logging.getLogger("can").addHandler(logging.NullHandler())  # as the daemon, which keeps these lines for its log
+    logging.getLogger("can").addHandler(logging.NullHandler())  # as in the daemon, which writes these lines to its log
     link = build(Settings(path=sys.argv[1], speed="max"))
     try:
         link.open()

@@ -1,8 +1,8 @@
-"""Hostile files end a command with one line and status 2, within bounds of memory and processor time.
+"""Tests that commands reject hostile files with one line and status 2, with limited memory and processor time.
 
-Each file is read by a command in a process of its own, with its address space and its processor time limited. The
-process writes down the largest memory that was resident. The cases that are cheap to generate run by default, the
-others with ``pytest tests/experiments/attacks -m attack``.
+A command reads each file in a separate process with limited address space and processor time. The process records its
+largest resident memory. The cases that are quick to generate run by default. The other cases run with
+``pytest tests/experiments/attacks -m attack``.
 """
 
 import re
@@ -22,9 +22,9 @@ ROOT: Final = Path(__file__).resolve().parents[3]
 MAX_RESIDENT_BYTES: Final = 500_000_000
 ADDRESS_SPACE_BYTES: Final = 4_000_000_000
 CPU_S: Final = 40
-"""Four times what is allowed on an idle machine."""
+"""Limit of processor time, which is four times the limit on an idle machine."""
 
-LIMITED: Final = f"""
+RUN_LIMITED: Final = f"""
 import resource, runpy, sys
 resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), int(sys.argv[2])))
 resource.setrlimit(resource.RLIMIT_CPU, ({CPU_S}, {CPU_S}))
@@ -38,39 +38,41 @@ finally:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a limited process did."""
+class ProcessResult:
+    """Result of a process with limited resources."""
 
     status: int
     stdout: str
     stderr: str
-    resident_bytes: int  # largest
+    resident_bytes: int  # largest resident memory
 
 
-def run_limited(tmp_path: Path, module: str, *args: str, address_space_bytes: int = ADDRESS_SPACE_BYTES) -> Outcome:
-    """Run a module as a program in a limited process."""
+def run_limited(
+    tmp_path: Path, module: str, *args: str, address_space_bytes: int = ADDRESS_SPACE_BYTES
+) -> ProcessResult:
+    """Run a module as a program in a process with limited resources."""
     peak = tmp_path / "peak"
-    command = [sys.executable, "-c", LIMITED, str(peak), str(address_space_bytes), module, *args]
+    command = [sys.executable, "-c", RUN_LIMITED, str(peak), str(address_space_bytes), module, *args]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=900, check=False)
     resident = 1024 * int(peak.read_text().split()[1]) if peak.exists() else sys.maxsize
-    return Outcome(done.returncode, done.stdout, done.stderr, resident)
+    return ProcessResult(done.returncode, done.stdout, done.stderr, resident)
 
 
-def check_refused(outcome: Outcome, path: Path, why: str) -> None:
-    """Assert that a file was refused in one line that names it and says why."""
-    assert outcome.status == 2, outcome
-    assert outcome.stderr.count("\n") == 1, outcome.stderr
-    assert str(path) in outcome.stderr
-    assert re.search(why, outcome.stderr), outcome.stderr
-    assert outcome.stdout == ""
-    assert outcome.resident_bytes < MAX_RESIDENT_BYTES, outcome
+def check_rejected(result: ProcessResult, path: Path, reason: str) -> None:
+    """Check that a file was rejected in one line that contains its path and the reason."""
+    assert result.status == 2, result
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert str(path) in result.stderr
+    assert re.search(reason, result.stderr), result.stderr
+    assert result.stdout == ""
+    assert result.resident_bytes < MAX_RESIDENT_BYTES, result
 
 
 Case = tuple[hostile.Generator, str, str]
-"""A generator, the suffix of its file, and what the message says."""
+"""Generator, suffix of its file, and pattern of the message."""
 
 MEMORY_OR_ROWS: Final = "of memory would be needed|are not measured samples"
-CHEAP: Final[Sequence[Case]] = (
+QUICK_CASES: Final[Sequence[Case]] = (
     (hostile.csv_hundred_thousand_columns, ".csv", "100002 columns, expected at most 10000"),
     (hostile.csv_line_without_end, ".csv", "Line 2 is longer than 1048576 bytes"),
     (hostile.gz_header_without_end, ".csv.gz", "not one complete line.*Line 1 is longer"),
@@ -84,7 +86,7 @@ CHEAP: Final[Sequence[Case]] = (
     (hostile.arrow_run_ends, ".arrows", "gx contains run_end_encoded"),
     (hostile.folder_of_bombs, "", "none of 9 segments can be read|of memory would be needed"),
 )
-COSTLY: Final[Sequence[Case]] = (
+SLOW_CASES: Final[Sequence[Case]] = (
     (hostile.csv_header_without_end, ".csv", "Line 1 is longer"),
     (hostile.csv_ten_million_columns, ".csv", "Line 1 is longer"),
     (hostile.gz_comments_without_end, ".csv.gz", "no header line within its first|are not measured samples|of memory"),
@@ -115,29 +117,33 @@ COSTLY: Final[Sequence[Case]] = (
 )
 
 
-def case_id(case: object) -> str | None:
-    """Return the name of a generator for the name of a test."""
+def get_case_id(case: object) -> str | None:
+    """Return the name of a generator for the identifier of a test."""
     return getattr(case, "__name__", None)
 
 
-def check_analyze(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
-    """Assert that ``analyze`` refuses a generated file."""
+def check_analyze_rejects(tmp_path: Path, generate: hostile.Generator, suffix: str, reason: str) -> None:
+    """Check that ``analyze`` rejects a generated file."""
     path = tmp_path / f"hostile{suffix}"
     generate(path)
-    check_refused(run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100"), path, why)
+    check_rejected(run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100"), path, reason)
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("generate", "suffix", "why"), CHEAP, ids=case_id)
-def test_analyze_refuses_in_one_line(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
-    check_analyze(tmp_path, generate, suffix, why)
+@pytest.mark.parametrize(("generate", "suffix", "reason"), QUICK_CASES, ids=get_case_id)
+def test_analyze_rejects_hostile_file_in_one_line(
+    tmp_path: Path, generate: hostile.Generator, suffix: str, reason: str
+) -> None:
+    check_analyze_rejects(tmp_path, generate, suffix, reason)
 
 
 @pytest.mark.attack
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("generate", "suffix", "why"), COSTLY, ids=case_id)
-def test_analyze_refuses_costly_cases(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
-    check_analyze(tmp_path, generate, suffix, why)
+@pytest.mark.parametrize(("generate", "suffix", "reason"), SLOW_CASES, ids=get_case_id)
+def test_analyze_rejects_slow_cases_in_one_line(
+    tmp_path: Path, generate: hostile.Generator, suffix: str, reason: str
+) -> None:
+    check_analyze_rejects(tmp_path, generate, suffix, reason)
 
 
 @pytest.mark.attack
@@ -147,26 +153,26 @@ def test_analyze_refuses_costly_cases(tmp_path: Path, generate: hostile.Generato
     [("reconcile", "--out", "report"), ("compensate", "--out", "out.csv"), ("thermal", "fit", "--out", "model.json")],
     ids=lambda command: command[0],
 )
-def test_other_commands_refuse_the_same(tmp_path: Path, command: tuple[str, ...]) -> None:
+def test_other_commands_reject_hostile_file_in_one_line(tmp_path: Path, command: tuple[str, ...]) -> None:
     path = tmp_path / "hostile.csv.gz"
     hostile.gz_rows_without_end(path)
     *words, out = command
-    outcome = run_limited(tmp_path, "monitor.cli", *words, str(tmp_path / out), str(path), "--rate", "100")
-    check_refused(outcome, path, MEMORY_OR_ROWS)
+    result = run_limited(tmp_path, "monitor.cli", *words, str(tmp_path / out), str(path), "--rate", "100")
+    check_rejected(result, path, MEMORY_OR_ROWS)
 
 
-@pytest.mark.parametrize("generate", [hostile.arrow_other_column, hostile.npz_large_rate], ids=case_id)
-def test_what_is_not_read_costs_nothing(tmp_path: Path, generate: Callable[[Path], None]) -> None:
-    """A few samples beside a large column that is not needed: read, and too short for an answer."""
+@pytest.mark.parametrize("generate", [hostile.arrow_other_column, hostile.npz_large_rate], ids=get_case_id)
+def test_large_unused_column_needs_little_memory(tmp_path: Path, generate: Callable[[Path], None]) -> None:
+    """The few samples beside a large unused column are read, and are too few for an analysis."""
     path = tmp_path / f"hostile{'.npz' if generate is hostile.npz_large_rate else '.arrows'}"
     generate(path)
-    outcome = run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100")
-    assert outcome.status == 3, outcome
-    assert outcome.stderr.count("\n") == 1
-    assert outcome.resident_bytes < MAX_RESIDENT_BYTES
+    result = run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100")
+    assert result.status == 3, result
+    assert result.stderr.count("\n") == 1
+    assert result.resident_bytes < MAX_RESIDENT_BYTES
 
 
-LOGS: Final[Sequence[Case]] = (
+LOG_CASES: Final[Sequence[Case]] = (
     *((hostile.log_line_without_end, f"{suffix}.gz", "a line is longer than") for suffix in hostile.LOG_STARTS),
     (hostile.log_blank_lines, ".asc.gz", "8000000 bytes hold no CAN frame"),
     (hostile.log_blank_lines, ".log.gz", "8000000 bytes hold no CAN frame"),
@@ -180,11 +186,13 @@ LOGS: Final[Sequence[Case]] = (
 
 @pytest.mark.attack
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("generate", "suffix", "why"), LOGS, ids=lambda value: case_id(value) or None)
-def test_replay_refuses_in_one_line(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
+@pytest.mark.parametrize(("generate", "suffix", "reason"), LOG_CASES, ids=lambda value: get_case_id(value) or None)
+def test_replay_rejects_hostile_log_in_one_line(
+    tmp_path: Path, generate: hostile.Generator, suffix: str, reason: str
+) -> None:
     path = tmp_path / f"hostile{suffix}"
     generate(path)
-    check_refused(run_limited(tmp_path, "tests.experiments.attacks.replay_to_end", str(path)), path, why)
+    check_rejected(run_limited(tmp_path, "tests.experiments.attacks.replay_to_end", str(path)), path, reason)
 
 
 # --- valid recordings of the same shape ------------------------------------------------------------
@@ -204,17 +212,17 @@ def parquet_of_zeros(path: Path) -> None:
 
 
 def gz_of_zeros(path: Path) -> None:
-    """Write 10^7 rows of six columns of zeros, 240 kB: a thousand to one."""
-    hostile_rows = hostile.gzip_of(b"gx,gy,gz,ax,ay,az\n", b"0,0,0,0,0,0\n", 120_000_000)
+    """Write 10^7 rows of six columns of zeros with a compression ratio of a thousand, 240 kB."""
+    hostile_rows = hostile.build_gzip(b"gx,gy,gz,ax,ay,az\n", b"0,0,0,0,0,0\n", 120_000_000)
     path.write_bytes(hostile_rows)
 
 
 def gz_of_steps(path: Path) -> None:
-    """Write more than 10^7 rows in coarse steps, of which the same second comes again and again."""
+    """Write more than 10^7 rows with coarse steps, which repeat the same 200 rows."""
     rng = np.random.default_rng(1)
     rows = np.round(rng.normal(size=(200, 6))).astype(int)
     block = "".join(",".join(f"{n * 0.0078125:g}" for n in row) + "\n" for row in rows)
-    path.write_bytes(hostile.gzip_of(b"gx,gy,gz,ax,ay,az\n", block.encode(), 10**7 // 200 * len(block)))
+    path.write_bytes(hostile.build_gzip(b"gx,gy,gz,ax,ay,az\n", block.encode(), 10**7 // 200 * len(block)))
 
 
 @pytest.mark.attack
@@ -222,9 +230,9 @@ def gz_of_steps(path: Path) -> None:
 @pytest.mark.parametrize(
     ("generate", "suffix"),
     [(gz_of_zeros, ".csv.gz"), (gz_of_steps, ".csv.gz"), (npz_of_zeros, ".npz"), (parquet_of_zeros, ".parquet")],
-    ids=case_id,
+    ids=get_case_id,
 )
-def test_a_large_recording_that_compresses_well_is_read(
+def test_large_valid_recording_with_high_compression_ratio_is_read(
     tmp_path: Path, generate: hostile.Generator, suffix: str
 ) -> None:
     path = tmp_path / f"valid{suffix}"

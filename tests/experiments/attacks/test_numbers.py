@@ -1,8 +1,7 @@
-"""Absurd numbers in every numeric option, configuration key, model parameter and recording.
+"""Tests of absurd numbers in every numeric option, configuration key, model parameter and recording.
 
-Each is refused with exit status 2 and one line, or answered. There is no traceback, no warning on the terminal, and
-neither time nor memory without bound. The quick part takes a few values for every place; the marker ``attack`` selects
-all of them.
+Each number is accepted, or rejected with exit status 2 and one line. There is no traceback, no warning on the terminal,
+and no unlimited use of time or memory. The quick tests use a few values. The marker ``attack`` selects all values.
 """
 
 import itertools
@@ -36,61 +35,64 @@ from monitor.settings import driver_settings, loading, schema
 
 pytestmark = pytest.mark.timeout(900)
 ROOT: Final = Path(cli.__file__).resolve().parents[2]
-ALL: Final = (
+ALL_VALUES: Final = (
     *("0", "-1", "1e-300", "1e-9", "1e300", "nan", "inf", "-inf", "1e9", "1e12", str(1 << 63), "", "text"),
     *("9" * 5000, "0x10", "1e400", "1_000", " 5", "1e-3", "1e6"),
 )
-"""Values that a careful user would not give, and two ends of supported ranges."""
-FEW: Final = ("-1", "1e-300", "1e300", "nan", "", "9" * 5000)
+"""Unreasonable values, and two values at the ends of supported ranges."""
+FEW_VALUES: Final = ("-1", "1e-300", "1e300", "nan", "", "9" * 5000)
 DURATIONS: Final = ("1e300d", "0s", "-1h", "1e-300ms", "h", "9" * 400 + "d", "1 fortnight")
 NUMERIC_METAVARS: Final = ("S", "HZ", "N", "F", "T", "P,Q", "octave|decade10|S,S,…")
-ALLOWED: Final = (0, 2, 3)
+ALLOWED_STATUS: Final = (0, 2, 3)
 
 
 # --- options of commands
 
 
-def numeric_options() -> Iterator[tuple[tuple[str, ...], str]]:
-    """Command and option, of every option that takes a number or a duration."""
-    for path, callback in commands():
+def iter_numeric_options() -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield command and name of every option that takes a number or a duration."""
+    for path, callback in iter_commands():
         for name, kind in get_type_hints(callback, include_extras=True).items():
-            for info in option_infos(kind):
-                if {int, float} & set(leaves(kind)) or info.metavar in NUMERIC_METAVARS:
-                    # in Annotated, typer takes the first name for a default
+            for info in get_option_infos(kind):
+                if {int, float} & set(iter_leaf_types(kind)) or info.metavar in NUMERIC_METAVARS:
+                    # in Annotated, typer stores the first name as the default
                     names = (info.default, *(info.param_decls or ()))
-                    long = [one for one in names if isinstance(one, str) and one.startswith("--")]
+                    long = [option for option in names if isinstance(option, str) and option.startswith("--")]
                     yield path, long[0] if long else f"--{name.replace('_', '-')}"
 
 
-def commands() -> Iterator[tuple[tuple[str, ...], Callable[..., Any]]]:
-    groups = [((), cli.app), *(((one.name,), one.typer_instance) for one in cli.app.registered_groups)]
+def iter_commands() -> Iterator[tuple[tuple[str, ...], Callable[..., Any]]]:
+    groups = [((), cli.app), *(((group.name,), group.typer_instance) for group in cli.app.registered_groups)]
     for path, app in groups:
-        for one in app.registered_commands:
-            assert one.callback is not None
-            yield (*path, one.name or one.callback.__name__), one.callback
+        for command in app.registered_commands:
+            assert command.callback is not None
+            yield (*path, command.name or command.callback.__name__), command.callback
 
 
-def option_infos(kind: Any) -> list[Any]:
-    """Typer's descriptions of a parameter that is an option."""
-    found = [one for one in getattr(kind, "__metadata__", ()) if type(one).__name__ == "OptionInfo"]
-    return found + [info for part in get_args(kind) if get_origin(kind) is not Annotated for info in option_infos(part)]
+def get_option_infos(kind: Any) -> list[Any]:
+    """Return typer's descriptions of the option that a parameter type contains."""
+    found = [item for item in getattr(kind, "__metadata__", ()) if type(item).__name__ == "OptionInfo"]
+    return found + [
+        info for part in get_args(kind) if get_origin(kind) is not Annotated for info in get_option_infos(part)
+    ]
 
 
-def leaves(kind: Any) -> Iterator[Any]:
+def iter_leaf_types(kind: Any) -> Iterator[Any]:
     parts = get_args(kind)[:1] if get_origin(kind) is Annotated else get_args(kind)
     if not parts:
         yield kind
     for part in parts:
-        yield from leaves(part)
+        yield from iter_leaf_types(part)
 
 
 @pytest.fixture
 def arguments(tmp_path: Path) -> dict[tuple[str, ...], list[str]]:
-    """Valid arguments of each command, without the options."""
+    """Return valid arguments of each command, without options."""
     rng = np.random.default_rng(1)
     recording, model = tmp_path / "r.npz", str(shipped_config_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
-    warm = 25.0 + 5.0 * np.sin(np.arange(2000) / 200.0)
-    np.savez(recording, t=np.arange(2000) / 100.0, temperature=warm, **{a: rng.normal(size=2000) for a in AXES})  # type: ignore[arg-type]
+    temperature_c = 25.0 + 5.0 * np.sin(np.arange(2000) / 200.0)
+    samples: dict[str, Any] = {axis: rng.normal(size=2000) for axis in AXES}
+    np.savez(recording, t=np.arange(2000) / 100.0, temperature=temperature_c, **samples)
     config = tmp_path / "c.toml"
     config.write_text('[[device]]\nname = "a"\ndriver = { link = "virtual" }\n[storage]\nfolder = "kept"\n')
     out = ["--out", str(tmp_path / "out.npz")]
@@ -111,7 +113,7 @@ def arguments(tmp_path: Path) -> dict[tuple[str, ...], list[str]]:
 
 
 def test_every_kind_of_numeric_option_is_found() -> None:
-    found = set(numeric_options())
+    found = set(iter_numeric_options())
     for expected in (
         (("analyze",), "--rate"), (("analyze",), "--tau"), (("simulate",), "--seed"), (("simulate",), "--seconds"),
         (("run",), "--history"), (("export",), "--inflation"), (("export",), "--dt"),
@@ -121,15 +123,17 @@ def test_every_kind_of_numeric_option_is_found() -> None:
         assert expected in found
 
 
-def test_options(arguments: dict[tuple[str, ...], list[str]], tmp_path: Path) -> None:
-    try_options(tuple(arguments), FEW, arguments, tmp_path)
+def test_options_with_few_values(arguments: dict[tuple[str, ...], list[str]], tmp_path: Path) -> None:
+    try_options(tuple(arguments), FEW_VALUES, arguments, tmp_path)
 
 
 @pytest.mark.attack
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("command", sorted({path for path, _ in numeric_options()}), ids=" ".join)
-def test_all_options(command: tuple[str, ...], arguments: dict[tuple[str, ...], list[str]], tmp_path: Path) -> None:
-    try_options((command,), ALL + DURATIONS, arguments, tmp_path)
+@pytest.mark.parametrize("command", sorted({path for path, _ in iter_numeric_options()}), ids=" ".join)
+def test_options_with_all_values(
+    command: tuple[str, ...], arguments: dict[tuple[str, ...], list[str]], tmp_path: Path
+) -> None:
+    try_options((command,), ALL_VALUES + DURATIONS, arguments, tmp_path)
 
 
 def try_options(
@@ -138,36 +142,36 @@ def try_options(
     arguments: dict[tuple[str, ...], list[str]],
     folder: Path,
 ) -> None:
-    options = [(command, option) for command, option in numeric_options() if command in chosen]
+    options = [(command, option) for command, option in iter_numeric_options() if command in chosen]
     assert options
     cases = [[*command, *arguments[command], option, value] for command, option in options for value in values]
-    for one in run_in_child(cases, folder):
-        check_one(one)
+    for result in run_in_child(cases, folder):
+        check_command_result(result)
 
 
 def run_in_child(cases: list[list[str]], folder: Path) -> list[dict[str, Any]]:
-    """Run command lines in one child process, which has bounds on memory and on the time of each."""
-    given, results = folder / "cases.json", folder / "results.json"
-    given.write_text(json.dumps(cases))
-    program = [sys.executable, str(Path(__file__).with_name("child.py")), str(given), str(results)]
+    """Run command lines in one child process with limits of memory and of the time of each command."""
+    cases_file, results_file = folder / "cases.json", folder / "results.json"
+    cases_file.write_text(json.dumps(cases))
+    program = [sys.executable, str(Path(__file__).with_name("child.py")), str(cases_file), str(results_file)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stderr == ""
-    found: list[dict[str, Any]] = json.loads(results.read_text())
+    found: list[dict[str, Any]] = json.loads(results_file.read_text())
     assert len(found) == len(cases)
     return found
 
 
-def check_one(one: dict[str, Any]) -> None:
-    shown = [argument[:60] for argument in one["arguments"]]
-    assert one["escaped"] == "", (shown, one["escaped"])
-    assert one["warnings"] == [], shown
-    assert one["status"] in ALLOWED, (shown, one["err"])
-    assert "Traceback" not in one["err"], shown
-    assert "internal error" not in one["err"], (shown, one["err"])
-    assert one["err"].count("\n") == (1 if one["status"] else 0), (shown, one["err"])
-    assert len(one["err"]) < 3000, shown
+def check_command_result(result: dict[str, Any]) -> None:
+    shown = [argument[:60] for argument in result["arguments"]]
+    assert result["uncaught"] == "", (shown, result["uncaught"])
+    assert result["warnings"] == [], shown
+    assert result["status"] in ALLOWED_STATUS, (shown, result["err"])
+    assert "Traceback" not in result["err"], shown
+    assert "internal error" not in result["err"], (shown, result["err"])
+    assert result["err"].count("\n") == (1 if result["status"] else 0), (shown, result["err"])
+    assert len(result["err"]) < 3000, shown
 
 
 # --- keys of a configuration
@@ -175,7 +179,7 @@ def check_one(one: dict[str, Any]) -> None:
 DEVICE: Final = '[[device]]\nname = "a"\nrate = 100.0\n{keys}\n[device.driver]\n{driver}\n'
 CAN: Final = 'file = "canmod_gps", signals = { gz = "ImuData.GyroZ" }'
 VIRTUAL: Final = 'link = "virtual"'
-TOML_VALUES: Final = (
+ALL_TOML_VALUES: Final = (
     *("0", "-1", "1e-300", "1e300", "nan", "inf", "-inf", "1e9", "1e12", str((1 << 63) - 1), str(1 << 63), "9" * 5000),
     *('""', '"text"', '"1e300 Hz"', '"1e-300 Hz"', '"nan Hz"', '"1e300s"', '"1e-300s"', '"99999999999999999999d"'),
     *(
@@ -190,11 +194,11 @@ TOML_VALUES: Final = (
     ),
     *('["1e300"]', "{ a = 1e300 }", "1979-05-27"),
 )
-FEW_TOML: Final = ("-1", "1e-300", "1e300", "nan", '"1e300 Hz"', '"1e300s"')
+FEW_TOML_VALUES: Final = ("-1", "1e-300", "1e300", "nan", '"1e300 Hz"', '"1e300s"')
 
 
-def key_cases() -> Iterator[tuple[str, type[SettingsModel], str]]:
-    """A text with {} for ``key = value``, the model whose keys belong there, and a name."""
+def iter_config_tables() -> Iterator[tuple[str, type[SettingsModel], str]]:
+    """Yield a configuration with {} in place of ``key = value``, the model of the keys, and a name."""
     quiet = '[viewer]\nmode = "none"\n'
     virtual = DEVICE.format(keys="", driver=VIRTUAL)
     yield '[[device]]\nname = "a"\n{}\ndriver = { link = "virtual" }\n', schema.Device, "device"
@@ -231,23 +235,23 @@ def key_cases() -> Iterator[tuple[str, type[SettingsModel], str]]:
         )
 
 
-def numeric_keys(kind: type[SettingsModel]) -> list[str]:
-    """Keys that take a number, and keys whose text stands for one."""
+def find_numeric_keys(kind: type[SettingsModel]) -> list[str]:
+    """Return the keys that take a number, or a text that contains a number."""
     found = []
     for key, field in fields_by_key(kind).items():
-        worded = isinstance(field.default, str) and any(c.isdigit() for c in field.default)
-        if worded or key == "listen" or {int, float} & set(leaves(field.annotation)):
+        has_number_as_text = isinstance(field.default, str) and any(c.isdigit() for c in field.default)
+        if has_number_as_text or key == "listen" or {int, float} & set(iter_leaf_types(field.annotation)):
             found.append(key)
     return found
 
 
-def all_keys() -> list[tuple[str, str, str]]:
-    """Text with {}, key, name; a bool is an int to Python, but not in the settings."""
-    return [(text, key, name) for text, kind, name in key_cases() for key in numeric_keys(kind)]
+def list_numeric_keys() -> list[tuple[str, str, str]]:
+    """Return a text with {}, a key and a name for each numeric key. In the settings, a bool is no number."""
+    return [(text, key, name) for text, kind, name in iter_config_tables() for key in find_numeric_keys(kind)]
 
 
 def test_every_kind_of_numeric_key_is_found() -> None:
-    found = {(name, key) for _, key, name in all_keys()}
+    found = {(name, key) for _, key, name in list_numeric_keys()}
     for expected in (
         ("device", "rate"), ("device", "tau"), ("device", "refit"), ("device", "alarms_per_day"), ("limit", "hold"),
         ("faults", "jitter"), ("virtual", "seed"), ("virtual", "silence"), ("viewer", "memory"), ("viewer", "port"),
@@ -259,13 +263,15 @@ def test_every_kind_of_numeric_key_is_found() -> None:
         assert expected in found
 
 
-@pytest.mark.parametrize("values", [FEW_TOML, pytest.param(TOML_VALUES, marks=pytest.mark.attack)], ids=["few", "all"])
+@pytest.mark.parametrize(
+    "values", [FEW_TOML_VALUES, pytest.param(ALL_TOML_VALUES, marks=pytest.mark.attack)], ids=["few", "all"]
+)
 def test_configuration_keys(values: Sequence[str], tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     np.savez(tmp_path / "r.npz", fs=100.0, gz=np.zeros(10))
-    for (text, key, name), value in itertools.product(all_keys(), values):
-        for written in (value, f"{{ gz = {value} }}") if key in ("scale", "signals") else (value,):
-            path.write_text(text.replace("{}", f"{key} = {written}"))
+    for (text, key, name), value in itertools.product(list_numeric_keys(), values):
+        for text_value in (value, f"{{ gz = {value} }}") if key in ("scale", "signals") else (value,):
+            path.write_text(text.replace("{}", f"{key} = {text_value}"))
             path.chmod(0o600)
             wrong = loading.examine_config_file(path).wrong
             for line in wrong:
@@ -274,42 +280,44 @@ def test_configuration_keys(values: Sequence[str], tmp_path: Path) -> None:
 
 
 @pytest.mark.attack
-def test_a_configuration_key_in_the_program(tmp_path: Path) -> None:
-    """``check`` goes further than reading: it builds the simulated sensors."""
+def test_check_with_absurd_configuration_keys(tmp_path: Path) -> None:
+    """The command ``check`` also builds the simulated sensors."""
     cases = []
-    for i, ((text, key, _), value) in enumerate(itertools.product(all_keys(), FEW_TOML)):
+    for i, ((text, key, _), value) in enumerate(itertools.product(list_numeric_keys(), FEW_TOML_VALUES)):
         path = tmp_path / f"{i}.toml"
         path.write_text(text.replace("{}", f"{key} = {value}"))
         path.chmod(0o600)
         cases.append(["check", str(path)])
-    for one in run_in_child(cases, tmp_path):
-        assert (one["escaped"], one["warnings"]) == ("", []), one
-        assert one["status"] in (0, 2)
-        assert one["status"] == 0 or 1 <= one["err"].count("\n") <= 3, one
+    for result in run_in_child(cases, tmp_path):
+        assert (result["uncaught"], result["warnings"]) == ("", []), result
+        assert result["status"] in (0, 2)
+        assert result["status"] == 0 or 1 <= result["err"].count("\n") <= 3, result
 
 
-def test_every_number_of_the_settings_names_its_quantity() -> None:
-    """A new key cannot be forgotten: its type names the range that is supported."""
+def test_every_numeric_key_has_a_number_range() -> None:
+    """The type of every numeric key must contain the supported range, so no new key is forgotten."""
     lacking = []
-    for _, kind, name in key_cases():
+    for _, kind, name in iter_config_tables():
         for key, field in fields_by_key(kind).items():
-            if {int, float} & set(leaves(field.annotation)) and not names_quantity((field.annotation, field.metadata)):
+            if {int, float} & set(iter_leaf_types(field.annotation)) and not has_number_range(
+                (field.annotation, field.metadata)
+            ):
                 lacking.append(f"{name}: {key}")
-    # checked against a list of what exists, converted from a rate with its own check, or passed on to a library
+    # these keys are compared with a list, converted from a rate with a separate check, or passed to a library
     assert sorted(set(lacking)) == [
         *("decoder stim300: identifier", "device: publish", "device: refit"),
         *("link can: channel", "link serial: stopbits"),
     ]
 
 
-def names_quantity(parts: Any) -> bool:
-    """Whether a quantity is among annotations, or in a type that a word may replace."""
+def has_number_range(parts: Any) -> bool:
+    """Return True if annotations contain a number range, also in a type that a keyword may replace."""
     if isinstance(parts, NumberRange):
         return True
     if isinstance(parts, KeywordOrType):
-        return names_quantity(parts._kind)
+        return has_number_range(parts._kind)
     inner = parts if isinstance(parts, tuple | list) else (*get_args(parts), *getattr(parts, "__metadata__", ()))
-    return any(names_quantity(one) for one in inner)
+    return any(has_number_range(part) for part in inner)
 
 
 # --- parameters of models
@@ -317,46 +325,47 @@ def names_quantity(parts: Any) -> bool:
 PARAMETERS: Final = (
     *("0", "-1", "1e-300", "1e-30", "1e30", "1e300", "nan", "inf", "1e9", str((1 << 63) - 1), '"text"', "true"),
 )
-TEMPERATURE: Final = {"mean": "20.0", "swing": "1.0", "period": "60.0", "wander": "1.0", "wander_time": "60.0"}
-NOISE: Final = "[gz.angle_random_walk]\nN = 1e-3\n"
-OTHERS: Final = "[ax.bias]\nvalue = 1.0\n[temperature]\nmean = 20.0\n"
+TEMPERATURE_KEYS: Final = {"mean": "20.0", "swing": "1.0", "period": "60.0", "wander": "1.0", "wander_time": "60.0"}
+NOISE_EFFECT: Final = "[gz.angle_random_walk]\nN = 1e-3\n"
+OTHER_EFFECTS: Final = "[ax.bias]\nvalue = 1.0\n[temperature]\nmean = 20.0\n"
 
 
-def model_texts(values: Sequence[str]) -> Iterator[str]:
-    """Models in which one number is absurd."""
-    assert set(TEMPERATURE) == {f.name for f in fields(Temperature)}
+def generate_models(values: Sequence[str]) -> Iterator[str]:
+    """Yield models with one absurd number each."""
+    assert set(TEMPERATURE_KEYS) == {f.name for f in fields(Temperature)}
     for value in values:
-        yield f"sample_rate = {value}\n{NOISE}"
-        for key in TEMPERATURE:
-            yield f"sample_rate = 100.0\n{NOISE}[temperature]\n{assignments(TEMPERATURE | {key: value})}"
+        yield f"sample_rate = {value}\n{NOISE_EFFECT}"
+        for key in TEMPERATURE_KEYS:
+            keys = format_assignments(TEMPERATURE_KEYS | {key: value})
+            yield f"sample_rate = 100.0\n{NOISE_EFFECT}[temperature]\n{keys}"
         for effect in EFFECTS.values():
-            given = {f.name: example(f.name) for f in fields(effect)}  # type: ignore[arg-type]
+            given = {f.name: example_value(f.name) for f in fields(effect)}  # type: ignore[arg-type]
             for name in given:
-                around = OTHERS if effect.name == "angle_random_walk" else OTHERS + NOISE
-                yield f"sample_rate = 100.0\n{around}[gz.{effect.name}]\n{assignments(given | {name: value})}"
+                around = OTHER_EFFECTS if effect.name == "angle_random_walk" else OTHER_EFFECTS + NOISE_EFFECT
+                yield f"sample_rate = 100.0\n{around}[gz.{effect.name}]\n{format_assignments(given | {name: value})}"
 
 
-def assignments(table: Mapping[str, str]) -> str:
+def format_assignments(table: Mapping[str, str]) -> str:
     return "".join(f"{name} = {value}\n" for name, value in table.items())
 
 
-def example(parameter: str) -> str:
+def example_value(parameter: str) -> str:
     return '"ax"' if parameter == "source" else "1.0"
 
 
-def test_model_parameters() -> None:
-    for text in model_texts(("1e300",)):
+def test_model_parameters_with_few_values() -> None:
+    for text in generate_models(("1e300",)):
         try_model(text)
 
 
 @pytest.mark.attack
-def test_all_model_parameters() -> None:
-    for text in model_texts(PARAMETERS):
+def test_model_parameters_with_all_values() -> None:
+    for text in generate_models(PARAMETERS):
         try_model(text)
 
 
 def try_model(text: str) -> None:
-    """What is accepted is simulated, and its Allan variance worked out; a warning is an error here."""
+    """Read a model, simulate it, and compute its Allan variance. Warnings are errors in tests."""
     try:
         model = NoiseModel.from_toml(text)
         rate_hz = model.sample_rate_hz or 100.0
@@ -371,7 +380,7 @@ def try_model(text: str) -> None:
 
 # --- recordings
 
-FS: Final = (
+STATED_RATES: Final = (
     0.0,
     -1.0,
     1e-300,
@@ -387,85 +396,85 @@ FS: Final = (
 )
 
 
-def columns(n: int = 400) -> dict[str, Any]:
+def draw_columns(n: int = 400) -> dict[str, Any]:
     return {axis: np.random.default_rng(1).normal(size=n) for axis in AXES}
 
 
-@pytest.mark.parametrize("fs", FS, ids=str)
+@pytest.mark.parametrize("fs", STATED_RATES, ids=str)
 def test_stated_rate_of_a_recording(fs: Any, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
-    np.savez(path, fs=fs, **columns())
-    answer_or_refuse(AnalysisRequest(path, total_and_hadamard=True))
+    np.savez(path, fs=fs, **draw_columns())
+    is_answered(AnalysisRequest(path, total_and_hadamard=True))
 
 
 @pytest.mark.parametrize("step_s", [1e-300, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 15.0, 900.0, 1e4, 1e7])
 def test_time_stamps_of_a_recording(step_s: float, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
-    np.savez(path, t=np.arange(400) * step_s, **columns())
-    answered = answer_or_refuse(AnalysisRequest(path, total_and_hadamard=True))
+    np.savez(path, t=np.arange(400) * step_s, **draw_columns())
+    answered = is_answered(AnalysisRequest(path, total_and_hadamard=True))
     assert answered == (1e-6 <= step_s <= 900.0), step_s
 
 
-@pytest.mark.parametrize(("far", "row"), [(-4.59e9, 198), (4.59e9, 0), (1e300, 399)])
-def test_one_outlying_time_stamp(far: float, row: int, tmp_path: Path) -> None:
-    try_outlier(1.7e9, row, far, tmp_path)
+@pytest.mark.parametrize(("outlier", "row"), [(-4.59e9, 198), (4.59e9, 0), (1e300, 399)])
+def test_one_outlying_time_stamp(outlier: float, row: int, tmp_path: Path) -> None:
+    try_outlier(1.7e9, row, outlier, tmp_path)
 
 
 @pytest.mark.attack
 def test_outlying_time_stamps_everywhere(tmp_path: Path) -> None:
-    far = (4.59e9, -4.59e9, 0.0, 1e18, 1e300, np.nan)
-    for t0, row, one in itertools.product((0.0, 1.7e9, -1e9), (0, 1, 200, 398, 399), far):
-        try_outlier(t0, row, one, tmp_path)
+    outliers = (4.59e9, -4.59e9, 0.0, 1e18, 1e300, np.nan)
+    for t0, row, outlier in itertools.product((0.0, 1.7e9, -1e9), (0, 1, 200, 398, 399), outliers):
+        try_outlier(t0, row, outlier, tmp_path)
 
 
-def try_outlier(t0: float, row: int, far: float, tmp_path: Path) -> None:
+def try_outlier(t0: float, row: int, outlier: float, tmp_path: Path) -> None:
     path, t = tmp_path / "r.npz", t0 + np.arange(400) / 100.0
-    t[row] = far
-    np.savez(path, t=t, **columns())
-    answer_or_refuse(AnalysisRequest(path))
-    answer_or_refuse(AnalysisRequest(path, last_s=2.0))
+    t[row] = outlier
+    np.savez(path, t=t, **draw_columns())
+    is_answered(AnalysisRequest(path))
+    is_answered(AnalysisRequest(path, last_s=2.0))
 
 
 @pytest.mark.parametrize("value", [np.longdouble("1e4000"), np.longdouble("-1e4000"), np.longdouble("nan")])
-def test_a_column_of_long_doubles(value: Any, tmp_path: Path) -> None:
-    path, data = tmp_path / "r.npz", columns()
+def test_column_of_long_doubles(value: Any, tmp_path: Path) -> None:
+    path, data = tmp_path / "r.npz", draw_columns()
     data["gx"] = data["gx"].astype(np.longdouble)
     data["gx"][7] = value
     np.savez(path, fs=100.0, **data)
     found = load_samples(path)
     assert np.isnan(found.values[7, 0])
     assert np.isfinite(found.values[8, 0])
-    assert answer_or_refuse(AnalysisRequest(path))
+    assert is_answered(AnalysisRequest(path))
 
 
 @pytest.mark.parametrize("value", [1e30, 1e155, 1e300, 1e-300, 5e-324, -1e307])
 @pytest.mark.attack
 def test_absurd_samples(value: float, tmp_path: Path) -> None:
-    path, data = tmp_path / "r.npz", columns()
+    path, data = tmp_path / "r.npz", draw_columns()
     data["gx"][100:110] = value
     data["gz"] = data["gz"] * value
     np.savez(path, fs=100.0, **data)
-    answer_or_refuse(AnalysisRequest(path, total_and_hadamard=True))
+    is_answered(AnalysisRequest(path, total_and_hadamard=True))
 
 
 @pytest.mark.parametrize("last_s", [1e-6, 1e-3, 1e9])
-def test_a_short_or_endless_end_of_a_recording(last_s: float, tmp_path: Path) -> None:
+def test_very_short_or_very_long_end_of_a_recording(last_s: float, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
-    np.savez(path, t=np.arange(400) / 100.0, **columns())
+    np.savez(path, t=np.arange(400) / 100.0, **draw_columns())
     assert len(load_samples(path, last_s=last_s)) == (400 if last_s > 1.0 else 1)
 
 
 @pytest.mark.parametrize("rate_hz", [number_ranges.RATE_HZ.low, 20e3, number_ranges.RATE_HZ.high])
 def test_every_supported_rate_is_answered(rate_hz: float, tmp_path: Path) -> None:
-    """Both ends of the range, and a sensor of vibration; slow sensors are above, by their time stamps."""
+    """The rates are both ends of the range and that of a vibration sensor. Another test covers slow sensors."""
     path = tmp_path / "r.npz"
-    np.savez(path, t=np.arange(2000) / rate_hz, **columns(2000))
+    np.savez(path, t=np.arange(2000) / rate_hz, **draw_columns(2000))
     found = run_analysis(AnalysisRequest(path, total_and_hadamard=True, window_s=500.0 / rate_hz))
     assert found.analysis.estimate.rate_hz == pytest.approx(rate_hz, rel=1e-3)
 
 
-def answer_or_refuse(request: AnalysisRequest) -> bool:
-    """Return True if there is an answer; a warning is an error here."""
+def is_answered(request: AnalysisRequest) -> bool:
+    """Return True if the analysis succeeds. Warnings are errors in tests."""
     try:
         run_analysis(request)
     except ImuError:

@@ -1,16 +1,15 @@
-"""Two of everything: daemons that share a folder, a port, a key or a sensor. The second says so in one line each."""
+"""Tests of two daemons that share a folder, a port, a zenoh key or a sensor. The second one reports it in one line."""
 
 import contextlib
 import importlib.util
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,33 +27,22 @@ from monitor.daemon.operations.prometheus_metrics import MetricsOutput
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings.loading import MetricsAddress, ZenohTable
 from tests.experiments.benchmarks import faults
+from tests.support.ports import free_endpoint, free_port
+from tests.support.waiting import PATIENCE_S, wait_for
 
 IMU_MONITOR = [sys.executable, "-m", "monitor.cli"]
-DEADLINE_S = 150.0
 RATE = 100
 needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun-sdk is not installed")
-
-
-def eventually(true: Callable[[], object], what: str) -> None:
-    until_s = time.monotonic() + DEADLINE_S
-    while not true():
-        assert time.monotonic() < until_s, f"not within {DEADLINE_S:g} s: {what}"
-        time.sleep(0.02)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
 
 
 # --- one storage folder
 
 
-class Publisher:
-    """A sensor that several daemons can listen to: samples over zenoh, each of which carries its number."""
+class SharedSensor:
+    """Simulated sensor that sends numbered samples over zenoh, so that several daemons can receive them."""
 
     def __init__(self) -> None:
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.endpoint = free_endpoint()
         self.sent = 0
         self._session = zenoh.open(build_session_config({"listen/endpoints": [self.endpoint]}))
         self._publisher = self._session.declare_publisher("lab/imu", congestion_control=zenoh.CongestionControl.BLOCK)
@@ -83,7 +71,7 @@ class Publisher:
 
 
 class Daemon:
-    """A daemon in a process of its own, with its log."""
+    """Daemon in a separate process, with its log."""
 
     def __init__(self, folder: Path, name: str, text: str) -> None:
         config, self._log = folder / f"{name}.toml", folder / f"{name}.log"
@@ -93,7 +81,7 @@ class Daemon:
             self.process = subprocess.Popen([*IMU_MONITOR, "run", str(config)], stdout=log, stderr=log)
         self.pid = self.process.pid
 
-    def says(self, *words: str) -> bool:
+    def has_logged(self, *words: str) -> bool:
         return any(all(word in line for word in words) for line in self.log().splitlines())
 
     def log(self) -> str:
@@ -105,17 +93,17 @@ class Daemon:
 
 
 @contextlib.contextmanager
-def daemons() -> Iterator[list[Daemon]]:
+def kill_at_end() -> Iterator[list[Daemon]]:
     running: list[Daemon] = []
     try:
         yield running
     finally:
-        for one in running:
-            one.process.kill()
-            one.process.wait()
+        for daemon in running:
+            daemon.process.kill()
+            daemon.process.wait()
 
 
-LISTENING = """
+CONFIG = """
 [[device]]
 name = "imu"
 rate = {rate}
@@ -133,14 +121,14 @@ format = "json"
 """
 
 
-def numbers(folder: Path) -> list[int]:
-    """Numbers of all samples in the recording, in its order."""
+def read_sample_numbers(folder: Path) -> list[int]:
+    """Return the numbers of all samples in the recording, in the order of the recording."""
     pieces = [piece for path in segment_file.list_segments(folder) for piece in segment_file.read_samples(path)]
     return [round(value * 1e6) for piece in pieces for value in piece.samples.values[:, 0]]
 
 
-def missing(folder: Path) -> int:
-    """Samples that are not in the recording; AssertionError for one kept twice, or missing without being counted."""
+def count_missing_samples(folder: Path) -> int:
+    """Return the number of lost samples. Fail if a sample is stored twice or is lost without being counted."""
     due, total = None, 0
     for path in segment_file.list_segments(folder):
         for piece in segment_file.read_samples(path):
@@ -156,80 +144,82 @@ def missing(folder: Path) -> int:
 @pytest.mark.timeout(600)
 def test_two_daemons_on_one_folder_record_each_sample_once(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    folder, sensor = tmp_path / "store", Publisher()
-    text = LISTENING.format(rate=RATE, endpoint=sensor.endpoint, folder=folder)
+    folder, sensor = tmp_path / "store", SharedSensor()
+    text = CONFIG.format(rate=RATE, endpoint=sensor.endpoint, folder=folder)
     try:
-        with daemons() as running:
+        with kill_at_end() as running:
             first = Daemon(tmp_path, "first", text)
             running.append(first)
-            eventually(lambda: segment_file.list_segments(folder / "imu"), "the first records")
+            wait_for(lambda: segment_file.list_segments(folder / "imu"), "the first records")
             second = Daemon(tmp_path, "second", text)
             running.append(second)
-            held = f"{folder}: in use by process {first.pid}; "
-            eventually(lambda: second.says("recording_stopped", held, "choose another folder"), second.log())
-            eventually(lambda: second.says("history", held, "choose another folder"), second.log())
+            reason = f"{folder}: in use by process {first.pid}; "
+            wait_for(lambda: second.has_logged("recording_stopped", reason, "choose another folder"), second.log)
+            wait_for(lambda: second.has_logged("history", reason, "choose another folder"), second.log)
 
-            looked = subprocess.run(
+            doctor = subprocess.run(
                 [*IMU_MONITOR, "doctor", str(tmp_path / "second.toml"), "--json", "-"],
-                capture_output=True, text=True, timeout=DEADLINE_S, check=False,
+                capture_output=True, text=True, timeout=PATIENCE_S, check=False,
             )  # fmt: skip
-            assert f"{folder}: in use by process {first.pid}" in looked.stdout
-            live = subprocess.run(
+            assert f"{folder}: in use by process {first.pid}" in doctor.stdout
+            analysis = subprocess.run(
                 [*IMU_MONITOR, "analyze", str(folder / "imu"), "--json", "-"],
-                capture_output=True, text=True, timeout=DEADLINE_S, check=False,
+                capture_output=True, text=True, timeout=PATIENCE_S, check=False,
             )  # fmt: skip
-            assert live.returncode in (0, 3), live.stderr
+            assert analysis.returncode in (0, 3), analysis.stderr
 
-            count = len(numbers(folder / "imu"))
-            eventually(lambda: len(numbers(folder / "imu")) > count + 3 * RATE, "the first records on")
+            count = len(read_sample_numbers(folder / "imu"))
+            wait_for(
+                lambda: len(read_sample_numbers(folder / "imu")) > count + 3 * RATE, "more records of the first daemon"
+            )
             first.process.send_signal(signal.SIGKILL)
             first.process.wait()
-            had = numbers(folder / "imu")
-            eventually(lambda: second.says("recording_back", "recording continues"), second.log())
-            eventually(lambda: len(numbers(folder / "imu")) > len(had) + 2 * RATE, "the second records")
+            recorded = read_sample_numbers(folder / "imu")
+            wait_for(lambda: second.has_logged("recording_back", "recording continues"), second.log)
+            wait_for(lambda: len(read_sample_numbers(folder / "imu")) > len(recorded) + 2 * RATE, "the second records")
             assert second.end() == 0
             assert "Traceback" not in first.log() + second.log()
     finally:
         sensor.close()
-    assert numbers(folder / "imu")[: len(had)] == had
-    assert missing(folder / "imu") == 0
+    assert read_sample_numbers(folder / "imu")[: len(recorded)] == recorded
+    assert count_missing_samples(folder / "imu") == 0
     assert not [note for note in load_samples(folder / "imu").notes if "left out" in note]
 
 
 # --- one endpoint, one key
 
 
-def opened(settings: ZenohTable) -> ZenohPublisher:
-    one = ZenohPublisher(settings, ["bench"])
-    one.start()
-    eventually(lambda: one.state.startswith("ok"), "the session")
-    return one
+def open_publisher(settings: ZenohTable) -> ZenohPublisher:
+    publisher = ZenohPublisher(settings, ["bench"])
+    publisher.start()
+    wait_for(lambda: publisher.state.startswith("ok"), "the session")
+    return publisher
 
 
 def test_two_daemons_on_one_zenoh_port(tmp_path: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with contextlib.closing(opened(ZenohTable(listen=(endpoint,)))) as first:
-        with contextlib.closing(opened(ZenohTable(listen=(endpoint,)))) as second:
+    endpoint = free_endpoint()
+    with contextlib.closing(open_publisher(ZenohTable(listen=(endpoint,)))) as first:
+        with contextlib.closing(open_publisher(ZenohTable(listen=(endpoint,)))) as second:
             assert second.state.startswith(f"ok, but {endpoint} is busy: listening on tcp/127.0.0.1:")
         assert first.state == "ok"
 
 
 def test_two_daemons_with_one_prefix_and_the_same_device_name(tmp_path: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     with (
-        contextlib.closing(opened(ZenohTable(listen=(endpoint,)))) as first,
-        contextlib.closing(opened(ZenohTable(listen=(), connect=(endpoint,)))) as second,
+        contextlib.closing(open_publisher(ZenohTable(listen=(endpoint,)))) as first,
+        contextlib.closing(open_publisher(ZenohTable(listen=(), connect=(endpoint,)))) as second,
     ):
-        said = "another program publishes imu/bench too; change a device's name, or zenoh.prefix"
+        message = "another program publishes imu/bench too; change a device's name, or zenoh.prefix"
 
-        def both_say() -> bool:
+        def both_report() -> bool:
             first.put(topics.STATUS, "bench", b"{}")
             second.put(topics.STATUS, "bench", b"{}")
-            return said in first.state and said in second.state
+            return message in first.state and message in second.state
 
-        eventually(both_say, "both say it")
-        assert first.state == f"ok, but {said}"
-        with contextlib.closing(opened(ZenohTable(listen=(), connect=(endpoint,), prefix="lab"))) as other:
+        wait_for(both_report, "both states")
+        assert first.state == f"ok, but {message}"
+        with contextlib.closing(open_publisher(ZenohTable(listen=(), connect=(endpoint,), prefix="lab"))) as other:
             for _ in range(20):
                 first.put(topics.STATUS, "bench", b"{}")
                 other.put(topics.STATUS, "bench", b"{}")
@@ -246,10 +236,10 @@ def test_two_daemons_on_one_metrics_port() -> None:
     port = free_port()
     with contextlib.closing(MetricsOutput(MetricsAddress("127.0.0.1", port))) as first:
         first.start()
-        eventually(lambda: first.state == "ok", first.state)
+        wait_for(lambda: first.state == "ok", lambda: first.state)
         with contextlib.closing(MetricsOutput(MetricsAddress("127.0.0.1", port))) as second:
             second.start()
-            eventually(lambda: second.state != "starting", second.state)
+            wait_for(lambda: second.state != "starting", lambda: second.state)
             assert second.state == f"127.0.0.1:{port}: {os.strerror(98)}; trying again"
             assert first.state == "ok"
 
@@ -264,10 +254,10 @@ def test_two_daemons_on_one_viewer_port() -> None:
     settings = ViewerSettings("web", free_port(), free_port())
     with contextlib.closing(RerunView(settings, [ViewerDeviceDescription("a")])) as first:
         first.start()
-        eventually(lambda: first.state == "ok", first.state)
+        wait_for(lambda: first.state == "ok", lambda: first.state)
         with contextlib.closing(RerunView(settings, [ViewerDeviceDescription("b")])) as second:
             second.start()
-            eventually(lambda: second.state.startswith("ok"), second.state)
+            wait_for(lambda: second.state.startswith("ok"), lambda: second.state)
             assert f"ok, but port {settings.port} is busy: " in second.state
             assert f"port {settings.web_port} is busy: " in second.state
             assert first.state == "ok"
@@ -297,36 +287,36 @@ def test_two_daemons_on_one_serial_port(tmp_path: Path) -> None:
 
 @pytest.mark.attack
 @pytest.mark.timeout(900)
-def test_two_whole_services_on_one_serial_port_and_one_endpoint(tmp_path: Path) -> None:
+def test_two_daemons_on_one_serial_port_and_one_zenoh_endpoint(tmp_path: Path) -> None:
     outcome = faults.two_daemons(tmp_path, 1)
-    assert "held by another program" in outcome.said
-    assert "is busy" in outcome.said
+    assert "held by another program" in outcome.reported
+    assert "is busy" in outcome.reported
     assert (outcome.received, outcome.lost, outcome.bad) == (outcome.sent, 0, 0)
 
 
 @pytest.mark.attack
 @pytest.mark.timeout(900)
-def test_a_folder_that_four_daemons_share_keeps_each_sample_once(tmp_path: Path) -> None:
-    """Whoever holds it is killed, again and again."""
+def test_four_daemons_on_one_folder_record_each_sample_once(tmp_path: Path) -> None:
+    """The daemon that records is killed until one daemon is left."""
     pytest.importorskip("pyarrow")
-    folder, sensor = tmp_path / "store", Publisher()
-    text = LISTENING.format(rate=RATE, endpoint=sensor.endpoint, folder=folder)
+    folder, sensor = tmp_path / "store", SharedSensor()
+    text = CONFIG.format(rate=RATE, endpoint=sensor.endpoint, folder=folder)
     try:
-        with daemons() as running:
+        with kill_at_end() as running:
             for i in range(4):
                 running.append(Daemon(tmp_path, f"daemon{i}", text))
             alive = list(running)
             while len(alive) > 1:
-                count = len(numbers(folder / "imu"))
-                eventually(lambda count=count: len(numbers(folder / "imu")) > count + 3 * RATE, "somebody records")
+                count = len(read_sample_numbers(folder / "imu"))
+                wait_for(lambda count=count: len(read_sample_numbers(folder / "imu")) > count + 3 * RATE, "new records")
                 pid = int((folder / "recording.lock").read_text().split()[0])
-                (holder,) = [one for one in alive if one.pid == pid]
+                (holder,) = [daemon for daemon in alive if daemon.pid == pid]
                 holder.process.kill()
                 holder.process.wait()
                 alive.remove(holder)
-            count = len(numbers(folder / "imu"))
-            eventually(lambda: len(numbers(folder / "imu")) > count + 3 * RATE, "the last records")
+            count = len(read_sample_numbers(folder / "imu"))
+            wait_for(lambda: len(read_sample_numbers(folder / "imu")) > count + 3 * RATE, "the last records")
             assert alive[0].end() == 0
     finally:
         sensor.close()
-    missing(folder / "imu")
+    count_missing_samples(folder / "imu")

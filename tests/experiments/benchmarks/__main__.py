@@ -1,4 +1,4 @@
-"""All benchmarks with short settings, in a few minutes: ``python -m tests.experiments.benchmarks``."""
+"""Run all benchmarks with short settings in a few minutes: ``python -m tests.experiments.benchmarks``."""
 
 import subprocess
 import sys
@@ -19,7 +19,7 @@ RUNS: Final = (
 
 
 def main() -> None:
-    """Each in a process of its own, so that none inherits the other's threads and memory."""
+    """Run each benchmark in a separate process."""
     failed = []
     for name, *arguments in RUNS:
         command = [sys.executable, "-m", f"tests.experiments.benchmarks.{name}", *arguments]

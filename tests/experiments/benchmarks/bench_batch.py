@@ -1,10 +1,11 @@
-"""A whole recording at once: ``overlapping`` and ``analyze`` beside ``allantools.oadev``.
+"""Processor time of ``overlapping_avar`` and ``analyze`` for a whole recording, compared with ``allantools.oadev``.
 
     python -m tests.experiments.benchmarks.bench_batch [--samples 10000000] [--rounds 5]
 
-Both get the same rates in memory and the same τ, an octave grid to a quarter of the recording. allantools does one
-axis a call; six times that stand beside ``analyze``, which also checks the times of the samples and fits. Processor
-time of one thread; where threads are used, the clock on the wall beside the processor time of all.
+Both get the same rates in memory and the same τ, an octave grid up to a quarter of the recording. allantools computes
+one axis in each call, so six times its time is compared with ``analyze``. ``analyze`` also checks the times of the
+samples and fits coefficients. The times are processor times of one thread. For several threads, the table contains the
+elapsed time and the processor time of all threads.
 """
 
 import argparse
@@ -25,36 +26,36 @@ from monitor.estimation.allan.batch import (
     rate_slope_from_thirds,
 )
 from monitor.estimation.analysis import analyze
-from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine, time_alternately
 
 RATE_HZ: Final = 100.0
 NOISE: Final = 1e-4
 THREADS: Final = 2
 
 
-def made(n: int) -> Floats:
-    """White noise on all axes and gravity on az."""
+def simulate_noise(n: int) -> Floats:
+    """Return white noise on all axes and gravity on az."""
     values = np.random.default_rng(1).standard_normal((n, len(AXES)))
     values *= NOISE
     values[:, 5] += 9.81
     return values
 
 
-def peer(column: Floats, factors: Ints) -> Floats:
-    """Overlapping Allan deviation of one axis by allantools."""
+def allantools_deviation(column: Floats, factors: Ints) -> Floats:
+    """Return the overlapping Allan deviation of one axis by allantools."""
     deviation: Floats = allantools.oadev(column, rate=1.0, data_type="freq", taus=factors)[1]
     return deviation
 
 
-def agreement(values: Floats, factors: Ints) -> float:
-    """Largest relative difference of the two in deviation."""
-    theirs = peer(values[:, 5].copy(), factors)
+def largest_difference(values: Floats, factors: Ints) -> float:
+    """Return the largest relative difference of both Allan deviations."""
+    theirs = allantools_deviation(values[:, 5].copy(), factors)
     ours = np.sqrt(overlapping_avar_axis(values[:, 5], factors)[0][: theirs.size])
     return float(np.abs(ours / theirs - 1.0).max())
 
 
-def on_the_wall(work: Callable[[], object], rounds: int) -> tuple[float, float]:
-    """Median wall and processor seconds."""
+def measure_elapsed_and_processor_time(work: Callable[[], object], rounds: int) -> tuple[float, float]:
+    """Return the median elapsed time and processor time in seconds."""
     took = []
     for _ in range(rounds):
         wall, processor = time.perf_counter(), time.process_time()
@@ -64,8 +65,8 @@ def on_the_wall(work: Callable[[], object], rounds: int) -> tuple[float, float]:
     return float(median[0]), float(median[1])
 
 
-def one_thread(values: Floats, rounds: int) -> None:
-    """One axis, six axes, and all of ``analyze``, in turn with allantools."""
+def measure_one_thread(values: Floats, rounds: int) -> None:
+    """Measure one axis, six axes and ``analyze`` alternately with allantools."""
     load = Load()
     n = len(values)
     recording = Recording(np.arange(n) / RATE_HZ, values, np.full(n, np.nan), None, AXES, ())
@@ -73,17 +74,17 @@ def one_thread(values: Floats, rounds: int) -> None:
     octave, decade = cluster_sizes(n, RATE_HZ), cluster_sizes(n, RATE_HZ, "decade10")
     column = values[:, 5].copy()
     works = {
-        "allantools": lambda: peer(column, octave),
+        "allantools": lambda: allantools_deviation(column, octave),
         "one axis": lambda: overlapping_avar_axis(column, octave),
         "of six": lambda: overlapping_avar_axis(values[:, 5], octave),
         "six": lambda: overlapping_avar(values, octave),
         "slope": lambda: rate_slope_from_thirds(values),
         "analyze": lambda: analyze(blocks, RATE_HZ),
-        "allantools, decade10": lambda: peer(column, decade),
+        "allantools, decade10": lambda: allantools_deviation(column, decade),
         "decade10": lambda: overlapping_avar_axis(column, decade),
     }
-    took = alternate(works, rounds)  # type: ignore[arg-type]
-    shown = table(
+    took = time_alternately(works, rounds)  # type: ignore[arg-type]
+    table = create_table(
         f"{n:,} samples, median (best) of {rounds} rounds, one thread", "", "τ", "processor", "allantools over this"
     )
     theirs, theirs_decade = took["allantools"][0], took["allantools, decade10"][0]
@@ -97,32 +98,34 @@ def one_thread(values: Floats, rounds: int) -> None:
         ("allantools.oadev, one axis", "allantools, decade10", decade, theirs_decade),
         ("overlapping_axis, in one piece", "decade10", decade, theirs_decade),
     )
-    for said, name, factors, against in rows:
+    for title, name, factors, reference in rows:
         median, best = took[name]
-        ratio = "" if against is None else f"{against / median:.1f}"
-        shown.add_row(said, f"{factors.size}", f"{median:.3f} ({best:.3f}) s", ratio)
-    console.print(shown)
+        ratio = "" if reference is None else f"{reference / median:.1f}"
+        table.add_row(title, f"{factors.size}", f"{median:.3f} ({best:.3f}) s", ratio)
+    console.print(table)
     rest = took["analyze"][0] - took["six"][0] - took["slope"][0]
     console.print(f"of analyze: times, grid, covariances and fit {rest:.3f} s")
-    console.print(f"largest relative difference of deviations, 9.81 on {NOISE:g}: {agreement(values, octave):.1e}")
-    console.print(load.said() + "\n")
+    console.print(
+        f"largest relative difference of deviations, 9.81 on {NOISE:g}: {largest_difference(values, octave):.1e}"
+    )
+    console.print(load.describe() + "\n")
 
 
-def threads(values: Floats, rounds: int) -> None:
-    """Six axes, mapped over threads by the caller."""
+def measure_threads(values: Floats, rounds: int) -> None:
+    """Measure six axes with one thread and with several threads."""
     load = Load()
     factors = cluster_sizes(len(values), RATE_HZ)
-    shown = table(f"overlapping, six axes of {len(values):,} samples", "", "on the wall", "processor")
+    table = create_table(f"overlapping, six axes of {len(values):,} samples", "", "on the wall", "processor")
     with ThreadPoolExecutor(THREADS) as pool:
         works = {
             "one thread": lambda: overlapping_avar(values, factors),
             f"{THREADS} threads": lambda: overlapping_avar(values, factors, map_axes=pool.map),
         }
         for name, work in works.items():
-            wall, processor = on_the_wall(work, rounds)
-            shown.add_row(name, f"{wall:.3f} s", f"{processor:.3f} s")
-    console.print(shown)
-    console.print(load.said() + "\n")
+            wall, processor = measure_elapsed_and_processor_time(work, rounds)
+            table.add_row(name, f"{wall:.3f} s", f"{processor:.3f} s")
+    console.print(table)
+    console.print(load.describe() + "\n")
 
 
 def main() -> None:
@@ -130,12 +133,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--samples", type=int, default=10_000_000)
     parser.add_argument("--rounds", type=int, default=5)
-    given = parser.parse_args()
-    console.print(about())
-    values = made(given.samples)
+    arguments = parser.parse_args()
+    console.print(describe_machine())
+    values = simulate_noise(arguments.samples)
     analyze(list(iter_blocks(Recording(None, values[:10_000], np.full(10_000, np.nan), RATE_HZ, AXES, ()))), RATE_HZ)
-    one_thread(values, given.rounds)
-    threads(values, given.rounds)
+    measure_one_thread(values, arguments.rounds)
+    measure_threads(values, arguments.rounds)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""How long the command line takes to answer, and which heavy libraries each command loads.
+"""Duration of short commands, and the heavy libraries that each command loads.
 
     python -m tests.experiments.benchmarks.bench_imports [--rounds 5]
 
-Each command runs in a process of its own; the time is the whole process on the wall, and its processor time. Modules
-are counted when the command has done its work.
+Each command runs in a separate process. The times are the elapsed time and the processor time of the whole process. The
+modules are counted at the end of the command.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from tests.experiments.benchmarks.machine import Load, about, console, table
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
 
 ROOT: Final = Path(__file__).parents[3]
 COMMANDS: Final = {
@@ -46,8 +46,8 @@ with open(path, "w") as file:
 """
 
 
-def once(arguments: list[str] | None, modules: Path) -> tuple[float, float]:
-    """Seconds on the wall and of the processor."""
+def run_command(arguments: list[str] | None, modules: Path) -> tuple[float, float]:
+    """Run a command once and return elapsed time and processor time in seconds."""
     before, start = os.times(), time.perf_counter()
     command = [sys.executable, "-c", RUN, str(modules), *(arguments or [])]
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
@@ -61,22 +61,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
     rounds = parser.parse_args().rounds
-    console.print(about())
-    shown = table(
+    console.print(describe_machine())
+    table = create_table(
         f"imu-monitor, whole process; median (best) of {rounds}", "command", "wall", "processor", "modules", "of them"
     )
     load = Load()
     with TemporaryDirectory() as folder:
         modules = Path(folder) / "modules.json"
         for name, arguments in COMMANDS.items():
-            took = np.array([once(arguments, modules) for _ in range(rounds)])
+            took = np.array([run_command(arguments, modules) for _ in range(rounds)])
             median, best = np.median(took, axis=0), took.min(axis=0)
             loaded = json.loads(modules.read_text())
             heavy = ", ".join(library for library in HEAVY if library in loaded)
             times = [f"{m:.2f} ({b:.2f}) s" for m, b in zip(median, best, strict=True)]
-            shown.add_row(name, *times, f"{len(loaded)}", heavy)
-    console.print(shown)
-    console.print(load.said())
+            table.add_row(name, *times, f"{len(loaded)}", heavy)
+    console.print(table)
+    console.print(load.describe())
 
 
 if __name__ == "__main__":

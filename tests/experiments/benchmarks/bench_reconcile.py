@@ -40,7 +40,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.noise.model import NoiseModel
-from tests.experiments.benchmarks.machine import Load, about, console, table
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
 
 RATE_HZ: Final = 100.0
 HOUR_ROWS: Final = 360_000
@@ -119,35 +119,35 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--rounds", type=int, default=1)
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     load = Load()
-    made = table("reconcile", "recording", "processor time (best)", "peak memory", "findings")
+    table = create_table("reconcile", "recording", "processor time (best)", "peak memory", "findings")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         known = NoiseModel(dict.fromkeys(AXES, KNOWN), RATE_HZ)
         model = folder / "model.toml"
         model.write_text(known.to_toml())
-        hidden = hidden_effects(chosen.rows / RATE_HZ)
+        hidden = hidden_effects(arguments.rows / RATE_HZ)
         full = NoiseModel({axis: (*KNOWN, *hidden[axis]) for axis in AXES}, RATE_HZ)
         hour = write_recording(folder / "hour.npz", known, HOUR_ROWS)
         measure(hour, folder)  # compiles the kernels
         works: dict[str, tuple[Path, tuple[str, ...]]] = {
             "one hour, agrees with the model": (hour, ("--model", str(model))),
             "one hour, agrees with fitted terms": (hour, ()),
-            f"{chosen.rows} rows, 20 effects": (
-                write_recording(folder / "hidden.npz", full, chosen.rows),
+            f"{arguments.rows} rows, 20 effects": (
+                write_recording(folder / "hidden.npz", full, arguments.rows),
                 ("--model", str(model)),
             ),
         }
         if "IMU_MONITOR_DATA" in os.environ:
             works[f"real, {REAL}"] = (Path(os.environ["IMU_MONITOR_DATA"]) / REAL, ())
         for title, (recording, options) in works.items():
-            runs = [measure(recording, folder, *options) for _ in range(chosen.rounds)]
-            times = [one[0] for one in runs]
-            cells = (f"{np.median(times):.1f} ({min(times):.1f}) s", f"{max(one[1] for one in runs):.0f} MB")
-            made.add_row(title, *cells, str(runs[0][2]))
-    console.print(made)
-    console.print(about(), load.said(), sep="\n")
+            runs = [measure(recording, folder, *options) for _ in range(arguments.rounds)]
+            times = [processor_s for processor_s, _, _ in runs]
+            cells = (f"{np.median(times):.1f} ({min(times):.1f}) s", f"{max(peak_mb for _, peak_mb, _ in runs):.0f} MB")
+            table.add_row(title, *cells, str(runs[0][2]))
+    console.print(table)
+    console.print(describe_machine(), load.describe(), sep="\n")
 
 
 if __name__ == "__main__":

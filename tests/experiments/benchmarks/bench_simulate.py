@@ -1,17 +1,17 @@
-"""Samples a second of the simulator, beside a Python loop and plain NumPy, and how much of it is drawing numbers.
+"""Speed of the simulator compared with a Python loop and plain NumPy, and the share of random number generation.
 
     python -m tests.experiments.benchmarks.bench_simulate [--rounds 7] [--memory 1e9]
 
-All in one run and in turn, in processor seconds of one core; a sample is one of all six axes. The competitors:
+All methods run alternately in one process. The times are processor times of one core, and a sample has six axes. The
+other methods are:
 
-- a Python loop: white noise at once and a first-order Gauss–Markov drift sample by sample over rows of three axes,
-  which is how gnss-ins-sim's ``gyro_gen`` goes about it. That is two terms, not five.
-- plain NumPy: the five terms of a whole record at once, B by shaping white noise with the fast Fourier transform. It
-  needs the whole record in memory, so it has no stream.
-- drawing: the normal numbers that the terms need, and nothing else. What takes that long cannot be made quicker without
-  another generator.
+- a Python loop: vectorised white noise and a first-order Gauss–Markov drift, which is computed sample by sample for
+  three axes, as in ``gyro_gen`` of gnss-ins-sim. This method has two terms instead of five.
+- plain NumPy: the five terms of a whole record at once. B is white noise that is shaped by a fast Fourier transform.
+  This method needs the whole record in memory.
+- normal numbers: only the normal random numbers that the terms need. A faster simulator would need another generator.
 
-``--memory N`` draws N samples and prints the resident memory on the way; 1e9 takes some ten minutes.
+``--memory N`` draws N samples and prints the resident memory in between. 1e9 samples take about ten minutes.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.noise.model import NoiseModel
-from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine, time_alternately
 
 RATE_HZ: Final = 100.0
 Q, N, B, K, R = 8e-6, 1.5e-4, 2e-4, 4e-5, 1e-7
@@ -52,16 +52,16 @@ THREE_MORE: Final[tuple[Effect, ...]] = (
     RandomTelegraph(amplitude=1e-4, dwell_time=20.0),
 )
 SAMPLES: Final = 1 << 18
-LOOPED: Final = 1 << 13
+LOOP_SAMPLES: Final = 1 << 13
 BLOCK: Final = 10_000
 NORMALS: Final = {"five": 4, "eight": 5}
-"""Normal numbers a sample and axis: Q, N, B and K; with the correlated noise. Flips of the telegraph are rare."""
+"""Normal numbers per sample and axis, for Q, N, B and K, and with correlated noise. Telegraph flips are rare."""
 
 
-def streamed(effects: tuple[Effect, ...], n: int) -> Callable[[], None]:
-    """A stream of six axes, in blocks."""
+def make_stream(effects: tuple[Effect, ...], n: int) -> Callable[[], None]:
+    """Return a function that draws a stream of six axes in blocks."""
     stream = NoiseModel(dict.fromkeys(AXES, effects)).start_stream(RATE_HZ, 1)
-    stream.draw_next_samples(BLOCK)  # compiles
+    stream.draw_next_samples(BLOCK)  # compiles the kernels
 
     def work() -> None:
         for _ in range(n // BLOCK):
@@ -70,19 +70,19 @@ def streamed(effects: tuple[Effect, ...], n: int) -> Callable[[], None]:
     return work
 
 
-def drawing(normals: int, n: int) -> Callable[[], None]:
-    """Normal numbers only, into one small array."""
-    rng, room = np.random.default_rng(1), np.empty(2048)
+def make_normal_numbers(normals: int, n: int) -> Callable[[], None]:
+    """Return a function that draws only normal numbers, into a small array."""
+    rng, buffer = np.random.default_rng(1), np.empty(2048)
 
     def work() -> None:
-        for _ in range(n * normals * len(AXES) // room.size):
-            rng.standard_normal(out=room)
+        for _ in range(n * normals * len(AXES) // buffer.size):
+            rng.standard_normal(out=buffer)
 
     return work
 
 
-def looped(n: int) -> Callable[[], None]:
-    """White noise and a drift that a Python loop carries on, three axes at a time."""
+def make_python_loop(n: int) -> Callable[[], None]:
+    """Return a function that simulates white noise and a drift in a Python loop, for three axes at a time."""
     rng = np.random.default_rng(1)
     keep = 1.0 - 1.0 / (RATE_HZ * CORRELATION_S)
     drive = B * np.sqrt(1.0 - np.exp(-2.0 / (RATE_HZ * CORRELATION_S)))
@@ -101,8 +101,8 @@ def looped(n: int) -> Callable[[], None]:
     return work
 
 
-def at_once(n: int) -> Callable[[], None]:
-    """The five terms of a whole record in plain NumPy."""
+def make_numpy_record(n: int) -> Callable[[], None]:
+    """Return a function that simulates the five terms of a whole record in plain NumPy."""
     rng = np.random.default_rng(1)
     f = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
     shape = np.zeros(f.size)
@@ -120,22 +120,22 @@ def at_once(n: int) -> Callable[[], None]:
     return work
 
 
-def speed(rounds: int) -> None:
-    """The table."""
+def print_speed(rounds: int) -> None:
+    """Print the table of the print_speed."""
     load = Load()
     whole = SAMPLES // BLOCK * BLOCK
     works = {
-        "five": (streamed(FIVE, SAMPLES), whole),
-        "eight": (streamed(FIVE + THREE_MORE, SAMPLES), whole),
-        "draw five": (drawing(NORMALS["five"], SAMPLES), SAMPLES),
-        "draw eight": (drawing(NORMALS["eight"], SAMPLES), SAMPLES),
-        "at once": (at_once(SAMPLES), SAMPLES),
-        "looped": (looped(LOOPED), LOOPED),
+        "five": (make_stream(FIVE, SAMPLES), whole),
+        "eight": (make_stream(FIVE + THREE_MORE, SAMPLES), whole),
+        "draw five": (make_normal_numbers(NORMALS["five"], SAMPLES), SAMPLES),
+        "draw eight": (make_normal_numbers(NORMALS["eight"], SAMPLES), SAMPLES),
+        "at once": (make_numpy_record(SAMPLES), SAMPLES),
+        "looped": (make_python_loop(LOOP_SAMPLES), LOOP_SAMPLES),
     }
-    took = alternate({name: work for name, (work, _) in works.items()}, rounds)
+    took = time_alternately({name: work for name, (work, _) in works.items()}, rounds)
     a_sample = {name: np.array(took[name]) / count for name, (_, count) in works.items()}
     title = f"simulation of six axes on one core; median (best) of {rounds} rounds"
-    shown = table(title, "", "ns a sample", "million samples/s", "five terms streamed are")
+    table = create_table(title, "", "ns a sample", "million samples/s", "five terms make_stream are")
     names = {
         "five": "five terms, streamed",
         "eight": "and three more: correlated, line, telegraph",
@@ -144,28 +144,28 @@ def speed(rounds: int) -> None:
     }
     for key, name in names.items():
         median, best = a_sample[key]
-        times = f"{median / a_sample['five'][0]:.1f} times as quick"
+        times = f"{median / a_sample['five'][0]:.1f} times as fast"
         million = f"{1e-6 / median:.3g} ({1e-6 / best:.3g})"
-        shown.add_row(name, f"{median * 1e9:.0f} ({best * 1e9:.0f})", million, times)
-    console.print(shown)
+        table.add_row(name, f"{median * 1e9:.0f} ({best * 1e9:.0f})", million, times)
+    console.print(table)
     for key in ("five", "eight"):
         share = a_sample[f"draw {key}"][0] / a_sample[key][0]
-        console.print(f"{names[key]}: {100.0 * share:.0f} % of the time is drawing normal numbers")
-    console.print(load.said() + "\n")
+        console.print(f"{names[key]}: {100.0 * share:.0f} % of the time is spent on normal numbers")
+    console.print(load.describe() + "\n")
 
 
-def memory(samples: int) -> None:
-    """Resident memory while so many samples are drawn."""
+def print_memory(samples: int) -> None:
+    """Print the resident memory while samples are drawn."""
     stream = NoiseModel(dict.fromkeys(AXES, FIVE + THREE_MORE)).start_stream(RATE_HZ, 1)
     process = psutil.Process()
-    shown = table(f"resident memory, five terms and three more, blocks of {BLOCK}", "samples drawn", "MB")
+    table = create_table(f"resident memory, five terms and three more, blocks of {BLOCK}", "samples drawn", "MB")
     drawn = 0
     for mark in np.unique(np.geomspace(BLOCK, samples, 6).astype(np.int64) // BLOCK * BLOCK):
         while drawn < mark:
             stream.draw_next_samples(BLOCK)
             drawn += BLOCK
-        shown.add_row(f"{drawn:,}", f"{process.memory_info().rss / 1e6:.1f}")
-    console.print(shown)
+        table.add_row(f"{drawn:,}", f"{process.memory_info().rss / 1e6:.1f}")
+    console.print(table)
 
 
 def main() -> None:
@@ -173,10 +173,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--memory", type=float, default=1e7, help="samples to draw for the table of memory")
-    given = parser.parse_args()
-    console.print(about())
-    speed(given.rounds)
-    memory(int(given.memory))
+    arguments = parser.parse_args()
+    console.print(describe_machine())
+    print_speed(arguments.rounds)
+    print_memory(int(arguments.memory))
 
 
 if __name__ == "__main__":

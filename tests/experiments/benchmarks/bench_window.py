@@ -1,10 +1,10 @@
-"""Cost of the sliding window beside allantools' real-time class, of a refit, and of the first use.
+"""Cost of the sliding window compared with the real-time class of allantools, of a fit, and of the first use.
 
     python -m tests.experiments.benchmarks.bench_window [--rounds 15]
 
-The window holds six axes; ``allantools.realtime.oadev_realtime`` one axis and no window: it evicts nothing. Both get
-the same 20 cluster sizes, in logarithmic steps up to a quarter of the window, and are measured when every τ takes a
-term with each sample. allantools' list of phase is filled directly, as its own way there would take minutes.
+The window has six axes. ``allantools.realtime.oadev_realtime`` has one axis and removes no samples. Both get the same
+20 cluster sizes, in logarithmic steps up to a quarter of the window. They are measured when each sample adds a term to
+every τ. The phase list of allantools is filled directly, because its normal way takes minutes.
 """
 
 import argparse
@@ -23,15 +23,15 @@ from allantools.realtime import oadev_realtime
 from drivers.data_types import Floats, Ints, make_block
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
-from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine, time_alternately
 
 LENGTHS: Final = (1_000, 3_600_000)
 TAUS: Final = 20
 AXES: Final = 6
 BLOCK: Final = 100
 CHUNK: Final = 10
-"""Samples that 10 ms of a serial port hold at 1 kHz."""
-A_CALL: Final = {"blocks": BLOCK, "chunks": CHUNK, "singles": 1}
+"""Number of samples in 10 ms at 1 kHz."""
+SAMPLES_PER_CALL: Final = {"blocks": BLOCK, "chunks": CHUNK, "singles": 1}
 NOISE: Final = 1e-4
 FIRST_USE: Final = """
 import time
@@ -49,43 +49,43 @@ print(imported - start, time.perf_counter() - imported)
 
 
 def cluster_sizes(length: int) -> Ints:
-    """TAUS distinct cluster sizes, in steps as even in the logarithm as whole numbers allow."""
+    """Return TAUS cluster sizes in logarithmic steps."""
     for steps in range(TAUS, 10 * TAUS):
         sizes = np.unique(np.rint(np.geomspace(1, length // 4, steps)).astype(np.int64))
         if sizes.size == TAUS:
             return sizes
-    raise SystemExit(f"{length} samples have no room for {TAUS} cluster sizes")
+    raise SystemExit(f"{length} samples are too few for {TAUS} cluster sizes")
 
 
-def made(n: int, seed: int = 1) -> Floats:
-    """White noise on all axes and gravity on az."""
+def simulate_noise(n: int, seed: int = 1) -> Floats:
+    """Return white noise on all axes and gravity on az."""
     return NOISE * np.random.default_rng(seed).standard_normal((n, AXES)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
 
 
-def filled(length: int) -> AllanWindow:
-    """A window that evicts with each sample."""
+def fill_window(length: int) -> AllanWindow:
+    """Return a full window, which removes a sample for each new sample."""
     window = AllanWindow(length, cluster_sizes(length))
     for _ in range(-(-(length + BLOCK) // 100_000)):
-        window.append_samples(made(min(100_000, length + BLOCK)))
+        window.append_samples(simulate_noise(min(100_000, length + BLOCK)))
     return window
 
 
-def in_blocks(window: AllanWindow, values: Floats, size: int) -> Callable[[], None]:
-    """Advance by all values, ``size`` samples a call."""
+def make_append_loop(window: AllanWindow, values: Floats, size: int) -> Callable[[], None]:
+    """Return a function that appends all values, with ``size`` samples in each call."""
     blocks = [values[i : i + size] for i in range(0, len(values), size)]
 
     def work() -> None:
-        for one in blocks:
-            window.append_samples(one)
+        for block in blocks:
+            window.append_samples(block)
 
     return work
 
 
-def peer(length: int, values: Floats) -> Callable[[], None]:
-    """allantools' class, advanced by one axis of the values."""
+def make_allantools_loop(length: int, values: Floats) -> Callable[[], None]:
+    """Return a function that adds one axis of the values to the class of allantools."""
     sizes = cluster_sizes(length)
     rt = oadev_realtime(afs=sizes.tolist(), tau0=1.0)
-    rt.x = np.cumsum(np.resize(made(100_000)[:, 0], 2 * int(sizes[-1]) + 1)).tolist()
+    rt.x = np.cumsum(np.resize(simulate_noise(100_000)[:, 0], 2 * int(sizes[-1]) + 1)).tolist()
     column = values[:, 0].tolist()
 
     def work() -> None:
@@ -95,19 +95,19 @@ def peer(length: int, values: Floats) -> Callable[[], None]:
     return work
 
 
-def window_costs(rounds: int) -> None:
-    """Cost a sample of both window lengths, and ratios to the peer."""
-    singles, many, few = made(2_000, 2), made(20_000, 3), made(400, 4)
+def print_window_costs(rounds: int) -> None:
+    """Print the cost per sample for both window lengths, and the ratio to allantools."""
+    singles, many, few = simulate_noise(2_000, 2), simulate_noise(20_000, 3), simulate_noise(400, 4)
     load = Load()
     works = {}
     for length in LENGTHS:
-        window = filled(length)
-        works[f"{length} blocks"] = in_blocks(window, many, BLOCK)
-        works[f"{length} chunks"] = in_blocks(window, many, CHUNK)
-        works[f"{length} singles"] = in_blocks(window, singles, 1)
-        works[f"{length} peer"] = peer(length, few)
-    took = alternate(works, rounds)
-    shown = table(
+        window = fill_window(length)
+        works[f"{length} blocks"] = make_append_loop(window, many, BLOCK)
+        works[f"{length} chunks"] = make_append_loop(window, many, CHUNK)
+        works[f"{length} singles"] = make_append_loop(window, singles, 1)
+        works[f"{length} peer"] = make_allantools_loop(length, few)
+    took = time_alternately(works, rounds)
+    table = create_table(
         f"a window of L samples, six axes, {TAUS} τ; median (best) of {rounds} rounds",
         "samples a call", "L", "a sample", "ns a τ·axis", "allantools over this, a sample·axis",
     )  # fmt: skip
@@ -117,8 +117,8 @@ def window_costs(rounds: int) -> None:
             median, best = (t / count for t in took[f"{length} {how}"])
             theirs = took[f"{length} peer"][0] / len(few)
             medians[how, length] = median
-            shown.add_row(
-                f"{A_CALL[how]}",
+            table.add_row(
+                f"{SAMPLES_PER_CALL[how]}",
                 f"{length:,}",
                 f"{median * 1e6:.3f} ({best * 1e6:.3f}) µs",
                 f"{median * 1e9 / AXES / TAUS:.2f} ({best * 1e9 / AXES / TAUS:.2f})",
@@ -127,44 +127,44 @@ def window_costs(rounds: int) -> None:
     for length in LENGTHS:
         median, best = (t / len(few) for t in took[f"{length} peer"])
         text = f"{median * 1e6:.1f} ({best * 1e6:.1f}) µs"
-        shown.add_row("allantools, one axis, no window", f"{length:,}", text, f"{median * 1e9 / TAUS:.0f}", "1")
-    console.print(shown)
+        table.add_row("allantools, one axis, no window", f"{length:,}", text, f"{median * 1e9 / TAUS:.0f}", "1")
+    console.print(table)
     short, long = LENGTHS
     ratios = {how: medians[how, long] / medians[how, short] for how in ("blocks", "chunks", "singles")}
     console.print("long window over short: " + ", ".join(f"{how} {ratio:.2f}" for how, ratio in ratios.items()))
-    console.print(load.said() + "\n")
+    console.print(load.describe() + "\n")
 
 
-def refit_cost(rounds: int) -> None:
-    """``Estimator.get_estimate`` on a full and on a growing window."""
+def print_fit_cost(rounds: int) -> None:
+    """Print the cost of ``Estimator.get_estimate`` for full windows and a growing window."""
     load = Load()
-    shown = table("a refit: curve, fit and intervals of six axes", "window", "τ", "median (best)")
+    table = create_table("a refit: curve, fit and intervals of six axes", "window", "τ", "median (best)")
     for seconds, rate_hz in ((10.0, 100.0), (3600.0, 100.0), (3600.0, 1000.0)):
-        estimator = full_estimator(seconds, rate_hz)
-        estimator.get_estimate()  # the table of covariances of a full window is made once
-        median, best = alternate({"get": estimator.get_estimate}, 20 * rounds)["get"]  # type: ignore[dict-item]
+        estimator = fill_estimator(seconds, rate_hz)
+        estimator.get_estimate()  # computes the table of covariances, which is stored
+        median, best = time_alternately({"get": estimator.get_estimate}, 20 * rounds)["get"]  # type: ignore[dict-item]
         taus = estimator.get_estimate().curve.factors.size
-        shown.add_row(f"full, {seconds:g} s at {rate_hz:g} Hz", f"{taus}", f"{median * 1e6:.0f} ({best * 1e6:.0f}) µs")
-    took = sorted(growing_refits())
+        table.add_row(f"full, {seconds:g} s at {rate_hz:g} Hz", f"{taus}", f"{median * 1e6:.0f} ({best * 1e6:.0f}) µs")
+    took = sorted(time_fits_of_growing_window())
     text = f"{took[len(took) // 2] * 1e6:.0f} µs, 99 of 100 within {took[int(0.99 * len(took))] * 1e6:.0f} µs, "
-    shown.add_row("growing to 60 s, 1000 Hz, each 10 samples", "14", text + f"slowest {took[-1] * 1e3:.1f} ms")
-    console.print(shown)
-    console.print(load.said() + "\n")
+    table.add_row("growing to 60 s, 1000 Hz, each 10 samples", "14", text + f"slowest {took[-1] * 1e3:.1f} ms")
+    console.print(table)
+    console.print(load.describe() + "\n")
 
 
-def full_estimator(seconds: float, rate_hz: float) -> Estimator:
-    """An estimator whose window is full."""
+def fill_estimator(seconds: float, rate_hz: float) -> Estimator:
+    """Return an estimator with a full window."""
     estimator = Estimator(rate_hz, seconds)
     for start in range(0, round(seconds * rate_hz), 100_000):
         n = min(100_000, round(seconds * rate_hz) - start)
-        estimator.add_samples(make_block(np.arange(n), made(n), np.full(n, np.nan), np.arange(n)))
+        estimator.add_samples(make_block(np.arange(n), simulate_noise(n), np.full(n, np.nan), np.arange(n)))
     return estimator
 
 
-def growing_refits() -> list[float]:
-    """Seconds of each refit while a window of a minute fills, ten samples at a time."""
+def time_fits_of_growing_window() -> list[float]:
+    """Return the duration of each fit while a window of 60 s fills, in seconds."""
     estimator, took = Estimator(1000.0, 60.0), []
-    values = made(60_000)
+    values = simulate_noise(60_000)
     for start in range(0, len(values), CHUNK):
         part = values[start : start + CHUNK]
         estimator.add_samples(make_block(np.arange(CHUNK), part, np.full(CHUNK, np.nan), np.arange(CHUNK)))
@@ -174,10 +174,10 @@ def growing_refits() -> list[float]:
     return took[1:]
 
 
-def first_use() -> None:
-    """Import and first answer of a new process, with an empty and with a filled cache of compiled code."""
+def print_first_use() -> None:
+    """Print the times of import and first fit in a new process, with and without compiled code on disk."""
     load = Load()
-    shown = table("first use, in a process of its own", "compiled code", "imports", "first update and fit")
+    table = create_table("first use, in a process of its own", "compiled code", "imports", "first update and fit")
     with TemporaryDirectory() as folder:
         for state in ("not there yet", "on disk", "on disk, again"):
             run = subprocess.run(
@@ -189,9 +189,9 @@ def first_use() -> None:
                 text=True,
             )
             imports, first = map(float, run.stdout.split())
-            shown.add_row(state, f"{imports:.2f} s", f"{first:.2f} s")
-    console.print(shown)
-    console.print(load.said() + "\n")
+            table.add_row(state, f"{imports:.2f} s", f"{first:.2f} s")
+    console.print(table)
+    console.print(load.describe() + "\n")
 
 
 def main() -> None:
@@ -199,10 +199,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--rounds", type=int, default=15)
     rounds = parser.parse_args().rounds
-    console.print(about())
-    window_costs(rounds)
-    refit_cost(rounds)
-    first_use()
+    console.print(describe_machine())
+    print_window_costs(rounds)
+    print_fit_cost(rounds)
+    print_first_use()
 
 
 if __name__ == "__main__":

@@ -45,12 +45,12 @@ class Recorder(event.Listener):  # type: ignore[misc]
 
     def on_end(self, event: Any) -> None:
         """End the compilation that began last."""
-        one = self._open.pop()
-        total_s = time.thread_time() - one.began_s
-        one.own_s = total_s - one.within_s
+        compilation = self._open.pop()
+        total_s = time.thread_time() - compilation.began_s
+        compilation.own_s = total_s - compilation.within_s
         if self._open:
             self._open[-1].within_s += total_s
-        self.done.append(one)
+        self.done.append(compilation)
 
 
 def stages() -> Iterator[str]:
@@ -68,7 +68,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--functions", action="store_true", help="list each compilation")
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["NUMBA_CACHE_DIR"] = folder
         config.CACHE_DIR = folder
@@ -78,14 +78,14 @@ def main() -> None:
         for stage in stages():
             print(f"  {time.process_time():6.2f} s  {stage}", flush=True)
     modules: dict[str, list[Compilation]] = defaultdict(list)
-    for one in recorder.done:
-        modules[one.module].append(one)
-    print(f"{len(recorder.done)} compilations, {sum(one.own_s for one in recorder.done):.2f} s")
-    for module, each in sorted(modules.items(), key=lambda item: -sum(one.own_s for one in item[1])):
-        print(f"  {sum(one.own_s for one in each):6.2f} s  {len(each):4d}  {module}")
-        if chosen.functions:
-            for one in sorted(each, key=lambda one: -one.own_s):
-                print(f"          {one.own_s:6.2f} s  {one.function} {one.signature}")
+    for compilation in recorder.done:
+        modules[compilation.module].append(compilation)
+    print(f"{len(recorder.done)} compilations, {sum(compilation.own_s for compilation in recorder.done):.2f} s")
+    for module, group in sorted(modules.items(), key=lambda item: -sum(compilation.own_s for compilation in item[1])):
+        print(f"  {sum(compilation.own_s for compilation in group):6.2f} s  {len(group):4d}  {module}")
+        if arguments.functions:
+            for compilation in sorted(group, key=lambda compilation: -compilation.own_s):
+                print(f"          {compilation.own_s:6.2f} s  {compilation.function} {compilation.signature}")
 
 
 if __name__ == "__main__":

@@ -4,11 +4,11 @@
 
 Each round starts the program twice, first with an empty folder for compiled kernels and then with the folder that the
 first start has filled. Another process listens over zenoh: ``curve`` is the first Allan deviation, ``coefficients`` the
-first estimated value, ``everything`` the first status after the last kernel. The times are those of the wall clock,
-from the start of the process. ``lost`` is what the simulated sensor or the service lost meanwhile.
+first estimated value, ``everything`` the first status after the last kernel. The times are elapsed times
+from the start of the process. ``lost`` is the number of samples that the sensor or the service lost in this time.
 
-``--load`` starts as many busy processes beside it. ``--share`` stands for a smaller board: program and compilers run on
-one processor, with as many busy processes beside them as leave them about that share of it.
+``--load`` also starts busy processes. ``--share`` simulates a slower board: program and compilers run on one processor
+with so many busy processes that they get about this share of the processor.
 """
 
 import argparse
@@ -26,8 +26,8 @@ from typing import Any
 
 import msgspec
 
-from tests.experiments.benchmarks.machine import Load, about, console, table
-from tests.support.zenoh_sessions import session
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
+from tests.support.zenoh_sessions import open_session
 
 ROOT = Path(__file__).parents[3]
 HOST, PORT = "127.0.0.1", 7450
@@ -35,10 +35,10 @@ PATIENCE_S = 900.0
 
 
 @contextlib.contextmanager
-def busy(processes: int, processors: set[int]) -> Iterator[None]:
-    """Keep processors busy by so many processes."""
+def run_busy_processes(processes: int, processors: set[int]) -> Iterator[None]:
+    """Keep processors busy with child processes."""
     before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, processors)  # inherited by what is started
+    os.sched_setaffinity(0, processors)  # child processes inherit this
     children = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
     try:
         yield
@@ -49,7 +49,7 @@ def busy(processes: int, processors: set[int]) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def times(cache: Path) -> dict[str, float]:
+def measure_start(cache: Path) -> dict[str, float]:
     """Start the program once; return the seconds until each result, and how many samples were lost."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     environment["NUMBA_CACHE_DIR"] = str(cache)
@@ -59,12 +59,12 @@ def times(cache: Path) -> dict[str, float]:
         began_s = time.monotonic()
         program = subprocess.Popen(command, env=environment, stdout=log, stderr=log, cwd=ROOT)
         try:
-            _wait_for(_listens, began_s)
-            with session(connect=[f"tcp/{HOST}:{PORT}"]) as opened:
+            _wait_for(_is_listening, began_s)
+            with open_session(connect=[f"tcp/{HOST}:{PORT}"]) as opened:
 
                 def take(sample: Any) -> None:
                     topic = str(sample.key_expr).rsplit("/", 1)[-1]
-                    _note(found, topic, sample.payload.to_bytes(), time.monotonic() - began_s)
+                    _record_time(found, topic, sample.payload.to_bytes(), time.monotonic() - began_s)
 
                 subscriber = opened.declare_subscriber("imu/**", take)
                 _wait_for(lambda: "everything" in found, began_s)
@@ -82,13 +82,13 @@ def _wait_for(condition: Callable[[], bool], began_s: float) -> None:
         time.sleep(0.02)
 
 
-def _listens() -> bool:
+def _is_listening() -> bool:
     with contextlib.suppress(OSError), socket.create_connection((HOST, PORT), 1.0):
         return True
     return False
 
 
-def _note(found: dict[str, float], topic: str, payload: bytes, now_s: float) -> None:
+def _record_time(found: dict[str, float], topic: str, payload: bytes, now_s: float) -> None:
     if topic == "allan":
         found.setdefault("curve", now_s)
     elif topic == "coefficients":
@@ -105,25 +105,25 @@ def _note(found: dict[str, float], topic: str, payload: bytes, now_s: float) -> 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--load", type=int, default=0, help="busy processes beside it")
+    parser.add_argument("--load", type=int, default=0, help="number of busy processes")
     parser.add_argument("--share", type=float, help="share of one processor, e.g. 0.25")
     parser.add_argument("--rounds", type=int, default=3)
-    chosen = parser.parse_args()
-    processors, load = os.sched_getaffinity(0), chosen.load
-    if chosen.share is not None:
-        processors, load = {min(processors)}, round(1.0 / chosen.share) - 1
-    console.print(about())
-    meanwhile, rows = Load(), list[tuple[str, ...]]()
-    for _ in range(chosen.rounds):
-        with tempfile.TemporaryDirectory() as folder, busy(load, processors):
+    arguments = parser.parse_args()
+    processors, load = os.sched_getaffinity(0), arguments.load
+    if arguments.share is not None:
+        processors, load = {min(processors)}, round(1.0 / arguments.share) - 1
+    console.print(describe_machine())
+    machine_load, rows = Load(), list[tuple[str, ...]]()
+    for _ in range(arguments.rounds):
+        with tempfile.TemporaryDirectory() as folder, run_busy_processes(load, processors):
             for kernels in ("cold", "warm"):
-                found = times(Path(folder))
+                found = measure_start(Path(folder))
                 rows.append((kernels, *(f"{found[name]:.1f}" for name in NAMES)))
-    shown = table("seconds after the start", "kernels", *NAMES)
+    table = create_table("seconds after the start", "kernels", *NAMES)
     for row in sorted(rows):
-        shown.add_row(*row)
-    console.print(shown)
-    console.print(meanwhile.said())
+        table.add_row(*row)
+    console.print(table)
+    console.print(machine_load.describe())
 
 
 NAMES = ("curve", "coefficients", "everything", "lost")

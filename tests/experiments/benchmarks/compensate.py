@@ -1,10 +1,10 @@
-"""Drift compensation before one judge: at rest, in motion, while noise changes, without learning, and its cost.
+"""Errors and cost of the drift compensation methods: at rest, in motion, with changing noise and without rest.
 
     python -m tests.experiments.benchmarks.compensate [PART …] [--seeds 5]
 
-Simulated gyros are those of the catalogue. Whatever learns from a whole recording learns from its first third, or from
-the rest before the motion; the daemon's filter learns as it goes, and is judged on the same stretch. "Before" has the
-mean of what was learned from taken out.
+The simulated gyros are models of the catalogue. Methods that learn from a whole recording get its first third, or the
+rest before the motion. The filter of the daemon learns continuously, and its errors are computed for the same part.
+"Before" means the rate less the mean of the part for learning.
 """
 
 import argparse
@@ -30,8 +30,8 @@ from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.thermal.interval_means import compute_interval_means
 from monitor.noise.model_loading import load_model
-from tests.experiments.benchmarks.joint import compiled_joint, joint
-from tests.experiments.benchmarks.machine import console, table
+from tests.experiments.benchmarks.joint_filter import compiled_filter, filter_drift_and_rate
+from tests.experiments.benchmarks.machine import console, create_table
 from tests.experiments.benchmarks.motion_score import MotionScore, score_in_motion
 
 RATE_HZ = 100.0
@@ -48,14 +48,14 @@ RECORDINGS = (
 )
 
 
-def noise(sensor: str, seed: int, seconds: float) -> Floats:
-    """[n, 6] at rest."""
+def simulate_rest(sensor: str, seed: int, seconds: float) -> Floats:
+    """Return samples [n, 6] of a sensor at rest."""
     model = load_model(sensor, Path.cwd())
     return model.start_stream(RATE_HZ, seed, None).draw_samples_with_temperature(round(seconds * RATE_HZ)).values.copy()
 
 
-def profiles(t: Floats) -> Iterator[tuple[str, Floats]]:
-    """Name and rate of a turntable, rad/s."""
+def motion_profiles(t: Floats) -> Iterator[tuple[str, Floats]]:
+    """Yield name and rate of each motion of a turntable, in rad/s."""
     for size in (1.0, 10.0, 50.0, 200.0):
         for hz in (0.1, 0.5, 1.0, 2.0):
             yield f"sine {size:g} °/s, {hz:g} Hz", size * DEGREE * np.sin(2.0 * np.pi * hz * t)
@@ -63,26 +63,26 @@ def profiles(t: Floats) -> Iterator[tuple[str, Floats]]:
         yield f"ramps ±{size:g} °/s", size * DEGREE * (2.0 * np.abs(t / 10.0 % 2.0 - 1.0) - 1.0)
 
 
-def live(values: Floats, rate_hz: float, adapts: bool = True) -> tuple[Floats, Compensator]:
-    """As the daemon does."""
-    one, out = Compensator(rate_hz, adapts), np.empty_like(values)
-    size = one.interval_samples
+def compensate_live(values: Floats, rate_hz: float, adapts: bool = True) -> tuple[Floats, Compensator]:
+    """Compensate values as the daemon does."""
+    compensator, out = Compensator(rate_hz, adapts), np.empty_like(values)
+    size = compensator.interval_samples
     for start in range(0, len(values), size):
-        out[start : start + size] = one.compensate(values[start : start + size])
-        one.identify_due_models()
-    return out, one
+        out[start : start + size] = compensator.compensate(values[start : start + size])
+        compensator.identify_due_models()
+    return out, compensator
 
 
-def by(method: str, values: Floats, rest: int, axis: int) -> Floats:
-    """One axis by a method that has learned from the first ``rest`` samples."""
+def compensate_axis(method: str, values: Floats, rest: int, axis: int) -> Floats:
+    """Compensate one axis with a method that learns from the first ``rest`` samples."""
     if method in REFERENCE_METHODS:
         return apply_reference_method(values[:, axis], values[:rest, axis], REFERENCE_METHODS[method])
-    return live(values, RATE_HZ, method != "fixed")[0][:, axis]
+    return compensate_live(values, RATE_HZ, method != "fixed")[0][:, axis]
 
 
 def rest(seeds: int) -> None:
-    """Simulated sensors at rest for three hours, every method."""
-    made = table(
+    """Print the errors of every method for simulated sensors at rest for three hours."""
+    table = create_table(
         "At rest, three hours, °/h: before → after",
         "sensor, method",
         "rms",
@@ -96,23 +96,25 @@ def rest(seeds: int) -> None:
         for method in METHODS:
             rows = []
             for seed in range(1 if method == "emd" else seeds):
-                place = folder / f"bench-compensate-{os.getpid()}.npz"
+                path = folder / f"bench-compensate-{os.getpid()}.npz"
                 np.savez(
-                    place, fs=RATE_HZ, **dict(zip(("gx", "gy", "gz"), noise(sensor, seed, 10_800.0).T, strict=False))
+                    path,
+                    fs=RATE_HZ,
+                    **dict(zip(("gx", "gy", "gz"), simulate_rest(sensor, seed, 10_800.0).T, strict=False)),
                 )
-                rows.append(_judged(place, method))
-                place.unlink()
-            made.add_row(f"{sensor} {method}", *_row(np.array(rows)))
-    console.print(made)
+                rows.append(_compute_errors(path, method))
+                path.unlink()
+            table.add_row(f"{sensor} {method}", *_format_errors(np.array(rows)))
+    console.print(table)
 
 
 def recordings(_seeds: int) -> None:
-    """Real recordings at rest, every method."""
+    """Print the errors of every method for real recordings at rest."""
     folder = os.environ.get("IMU_MONITOR_DATA")
     if not folder:
         console.print("IMU_MONITOR_DATA is not set: no recordings")
         return
-    made = table(
+    table = create_table(
         "At rest, °/h: before → after, mean of the axes",
         "recording, method",
         "rms",
@@ -123,58 +125,58 @@ def recordings(_seeds: int) -> None:
     )
     for name in RECORDINGS:
         for method in METHODS:
-            made.add_row(
+            table.add_row(
                 f"{name.partition('/')[0]} {name[-8:-4]} {method}",
-                *_row(np.array([_judged(Path(folder) / name, method)])),
+                *_format_errors(np.array([_compute_errors(Path(folder) / name, method)])),
             )
-    console.print(made)
+    console.print(table)
 
 
 def allan(_seeds: int) -> None:
-    """Allan deviations of recordings at rest, before and after: root mean square of the axes."""
+    """Print the Allan deviations of recordings at rest before and after compensation, as rms of the axes."""
     folder = os.environ.get("IMU_MONITOR_DATA")
     if not folder:
         console.print("IMU_MONITOR_DATA is not set: no recordings")
         return
     taus = (0.1, 1.0, 10.0, 100.0)
-    made = table("Allan deviation at rest, °/h: before → after", "recording", *(f"{tau:g} s" for tau in taus))
+    table = create_table("Allan deviation at rest, °/h: before → after", "recording", *(f"{tau:g} s" for tau in taus))
     for name in RECORDINGS:
         curves = [
             [
                 [np.interp(np.log(tau), np.log(one.tau_s), one.allan) for tau in taus]
                 for one in (axis.uncompensated, axis.compensated)
             ]
-            for axis in _axes(Path(folder) / name, "adaptive")
+            for axis in _compensate_recording(Path(folder) / name, "adaptive")
         ]
-        made.add_row(name, *_row(np.array(curves)))
-    console.print(made)
+        table.add_row(name, *_format_errors(np.array(curves)))
+    console.print(table)
 
 
-def _judged(recording: Path, method: str) -> Floats:
-    """[2, 5] before and after: root mean squares over the axes of rms, worst minute and drift over each span, rad/s."""
-    axes = _axes(recording, method)
+def _compute_errors(recording: Path, method: str) -> Floats:
+    """Return rms, worst minute and drift over each span, before and after [2, 5], as rms of the axes in rad/s."""
+    axes = _compensate_recording(recording, method)
     rows = [
         [[one.rms, one.worst_minute, *one.drift] for one in (axis.uncompensated, axis.compensated)] for axis in axes
     ]
     return np.asarray(np.sqrt(np.mean(np.square(rows), axis=0)))
 
 
-def _axes(recording: Path, method: str) -> list[AxisCompensation]:
-    """What compensation made of each axis; the recording that comes out is not kept."""
+def _compensate_recording(recording: Path, method: str) -> list[AxisCompensation]:
+    """Return the result of each axis, without the compensated recording."""
     with tempfile.TemporaryDirectory() as folder:
         return list(run_compensation(CompensationRequest(recording, Path(folder) / "out.npz", method)).axes.values())
 
 
-def _row(rows: Floats) -> list[str]:
+def _format_errors(rows: Floats) -> list[str]:
     before, after = np.sqrt(np.mean(np.square(rows), axis=0)) * PER_H
     return [f"{b:.3g} → {a:.3g}" if np.isfinite(b + a) else "—" for b, a in zip(before, after, strict=True)]
 
 
 def motion(seeds: int) -> None:
-    """A turntable after ten minutes at rest: error over that of the rate less its mean at rest."""
+    """Print the relative errors on a turntable after ten minutes at rest."""
     t = np.arange(round(MOTION_S * RATE_HZ)) / RATE_HZ
     for sensor in SENSORS:
-        made = table(
+        table = create_table(
             f"{sensor}: rms error over that before, delay, angle (°, before → after)",
             "profile",
             *METHODS,
@@ -182,10 +184,10 @@ def motion(seeds: int) -> None:
             "angle",
         )
         worst = dict.fromkeys(METHODS, 0.0)
-        for name, truth in profiles(t):
+        for name, truth in motion_profiles(t):
             cells, first = [], None
             for method in METHODS:
-                pairs = [_in_motion(sensor, seed, truth, method) for seed in range(1 if method == "emd" else seeds)]
+                pairs = [_score_motion(sensor, seed, truth, method) for seed in range(1 if method == "emd" else seeds)]
                 ratio = float(
                     np.sqrt(np.mean([a.rms_error**2 for _, a in pairs]) / np.mean([b.rms_error**2 for b, _ in pairs]))
                 )
@@ -195,20 +197,20 @@ def motion(seeds: int) -> None:
             assert first is not None
             angle = [np.sqrt(np.mean([one[k].angle_error_rad ** 2 for one in first])) / DEGREE for k in (0, 1)]
             delay = np.mean([after.delay_s for _, after in first])
-            made.add_row(name, *cells, f"{1e3 * delay:.1f} ms", f"{angle[0]:.2g} → {angle[1]:.2g}")
-        made.add_row("worst", *(f"{worst[method]:.3f}" for method in METHODS))
-        console.print(made)
+            table.add_row(name, *cells, f"{1e3 * delay:.1f} ms", f"{angle[0]:.2g} → {angle[1]:.2g}")
+        table.add_row("worst", *(f"{worst[method]:.3f}" for method in METHODS))
+        console.print(table)
 
 
 def one_filter(_seeds: int) -> None:
-    """A single filter of drift and rate, as the papers have it, of several intensities of motion."""
+    """Print the errors of a single filter of drift and rate, for several intensities of motion."""
     t = np.arange(round(MOTION_S * RATE_HZ)) / RATE_HZ
     shown = ("sine 1 °/s, 0.1 Hz", "sine 10 °/s, 1 Hz", "steps 10 °/s")
-    truths = {"rest": np.zeros(t.size), **{name: truth for name, truth in profiles(t) if name in shown}}
-    made = table("One filter of both: rms error over that before", "sensor, (°/s³)²/Hz", *truths)
+    truths = {"rest": np.zeros(t.size), **{name: truth for name, truth in motion_profiles(t) if name in shown}}
+    table = create_table("One filter of both: rms error over that before", "sensor, (°/s³)²/Hz", *truths)
     for sensor in SENSORS:
         still = round(REST_S * RATE_HZ)
-        measured = noise(sensor, 0, REST_S + MOTION_S)[:, 2]
+        measured = simulate_rest(sensor, 0, REST_S + MOTION_S)[:, 2]
         means = compute_interval_means(measured[:still], np.zeros(still), RATE_HZ, 1.0)
         model = fit_arma(means.bias, float(np.mean(means.error**2)), [(1, 0)])
         phi, white = max(model.phi[0], 0.5) ** (1.0 / RATE_HZ), float(measured[:still].var())
@@ -218,43 +220,43 @@ def one_filter(_seeds: int) -> None:
             for truth in truths.values():
                 z = measured - measured[:still].mean()
                 z[still:] += truth
-                out = compiled_joint(z, 1.0 / RATE_HZ, phi, 0.0, 0.0, variance, white, intensity)
+                out = compiled_filter(z, 1.0 / RATE_HZ, phi, 0.0, 0.0, variance, white, intensity)
                 before, after = score_in_motion(z[still:], truth, RATE_HZ), score_in_motion(out[still:], truth, RATE_HZ)
                 cells.append(f"{after.rms_error / before.rms_error:.3g}")
-            made.add_row(f"{sensor}, {intensity / DEGREE**2:.1e}", *cells)
-    console.print(made)
+            table.add_row(f"{sensor}, {intensity / DEGREE**2:.1e}", *cells)
+    console.print(table)
 
 
-def _in_motion(sensor: str, seed: int, truth: Floats, method: str) -> tuple[MotionScore, MotionScore]:
+def _score_motion(sensor: str, seed: int, truth: Floats, method: str) -> tuple[MotionScore, MotionScore]:
     still = round(REST_S * RATE_HZ)
-    values = noise(sensor, seed, REST_S + MOTION_S)
+    values = simulate_rest(sensor, seed, REST_S + MOTION_S)
     before = values[still:, 2] - values[:still, 2].mean() + truth
     values[still:, 2] += truth
-    after = by(method, values, still, 2)[still:]
+    after = compensate_axis(method, values, still, 2)[still:]
     return score_in_motion(before, truth, RATE_HZ), score_in_motion(after, truth, RATE_HZ)
 
 
 def slow(seeds: int) -> None:
-    """How slow a rotation may be before it is taken for drift: half an hour at rest, then a constant rate."""
-    made = table("Constant rotation for ten minutes: what is left of it", "°/s", *SENSORS)
+    """Print how much of a constant slow rotation remains, after half an hour at rest."""
+    table = create_table("Constant rotation for ten minutes: what is left of it", "°/s", *SENSORS)
     for rate in (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 5.0):
         cells = []
         for sensor in SENSORS:
             left = []
             for seed in range(seeds):
-                values = noise(sensor, seed, 2400.0)
+                values = simulate_rest(sensor, seed, 2400.0)
                 values[180_000:, 2] += rate * DEGREE
-                out = live(values, RATE_HZ)[0][180_000:, 2]
+                out = compensate_live(values, RATE_HZ)[0][180_000:, 2]
                 left.append([out[:6000].mean(), out[24_000:30_000].mean(), out[-6000:].mean()])
             cells.append(" ".join(f"{100.0 * x / DEGREE / rate:.0f}" for x in np.mean(left, axis=0)))
-        made.add_row(f"{rate:g}", *cells)
-    console.print(made)
+        table.add_row(f"{rate:g}", *cells)
+    console.print(table)
     console.print("percent of it in the first, the fifth and the tenth minute")
 
 
 def doubling(seeds: int) -> None:
-    """White noise of the means that doubles, or grows fourfold, half way: noise estimated, or as identified."""
-    made = table(
+    """Print the errors for white noise that increases by a factor of 2 or 4, with adaptive and fixed noise."""
+    table = create_table(
         "rms error of the drift, in units of its own deviation",
         "white noise",
         "before",
@@ -273,9 +275,9 @@ def doubling(seeds: int) -> None:
             z = drift + white * rng.standard_normal(n)
             scatter = white**2 * rng.chisquare(3, n) / 3.0
             model = fit_arma(z[:2048], float(scatter[:2048].mean()))
-            rows.append([_followed(model, z, scatter, drift, adapts) for adapts in (True, False)])
+            rows.append([_filter_errors(model, z, scatter, drift, adapts) for adapts in (True, False)])
         (before, adaptive, first), (_, fixed, second) = np.sqrt(np.mean(np.square(rows), axis=0))
-        made.add_row(
+        table.add_row(
             f"× {factor:g}",
             f"{before:.3f}",
             f"{adaptive:.3f}",
@@ -283,11 +285,11 @@ def doubling(seeds: int) -> None:
             f"{1 / first**2:.2f}",
             f"{1 / second**2:.2f}",
         )
-    console.print(made)
+    console.print(table)
 
 
-def _followed(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) -> list[float]:  # type: ignore[no-untyped-def]
-    """rms error before and after the change, and of ε/√S after it."""
+def _filter_errors(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) -> list[float]:  # type: ignore[no-untyped-def]
+    """Return the rms error before and after the change, and the rms of ε/√S after the change."""
     row = np.zeros(1, sage_husa.DRIFT_FILTER)[0]
     row["adaptive"] = adapts
     sage_husa.restart_with_model(row, model)
@@ -303,41 +305,43 @@ def _followed(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) ->
 
 
 def coast(seeds: int) -> None:
-    """As if the carrier moved: how far off the bias is when nothing was learned for so long, °/h."""
+    """Print the error of the bias after a time without rest, in °/h."""
     spans = (1.0, 10.0, 60.0)
-    made = table(
-        "Bias after so long without rest, °/h: last minute's mean | adaptive (and what it said)",
+    table = create_table(
+        "Bias after so long without rest, °/h: last minute's mean | adaptive (and its stated error)",
         "sensor",
         *(f"{s:g} min" for s in spans),
     )
     for sensor in SENSORS:
-        rows = [_coasted(noise(sensor, seed, 10_800.0), RATE_HZ, spans) for seed in range(seeds)]
-        made.add_row(sensor, *_coast_cells(np.array(rows)))
+        rows = [_errors_without_rest(simulate_rest(sensor, seed, 10_800.0), RATE_HZ, spans) for seed in range(seeds)]
+        table.add_row(sensor, *_format_errors_without_rest(np.array(rows)))
     folder = os.environ.get("IMU_MONITOR_DATA")
     for name in RECORDINGS if folder else ():
         found = load_samples(Path(str(folder)) / name)
         rate_hz = float(found.rate_hz or RATE_HZ)
         within = tuple(s for s in spans if 120.0 * s < len(found) / rate_hz)
-        made.add_row(name, *_coast_cells(np.array([_coasted(found.values, rate_hz, within)])))
-    console.print(made)
+        table.add_row(
+            name, *_format_errors_without_rest(np.array([_errors_without_rest(found.values, rate_hz, within)]))
+        )
+    console.print(table)
 
 
-def _coast_cells(rows: Floats) -> list[str]:
-    minute, own, said = np.sqrt(np.mean(np.square(rows), axis=0)) * PER_H
-    return [f"{a:.3g} | {b:.3g} ({c:.3g})" for a, b, c in zip(minute, own, said, strict=True)]
+def _format_errors_without_rest(rows: Floats) -> list[str]:
+    minute, own, stated = np.sqrt(np.mean(np.square(rows), axis=0)) * PER_H
+    return [f"{a:.3g} | {b:.3g} ({c:.3g})" for a, b, c in zip(minute, own, stated, strict=True)]
 
 
-def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats:
-    """[3, spans] rms over axes and places: of the last minute's mean, of the filter's, and what the filter said."""
+def _errors_without_rest(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats:
+    """Return rms errors of the last minute's mean and of the filter, and the stated error of the filter [3, spans]."""
     one = Compensator(rate_hz)
     size, kept = one.interval_samples, []
-    taught: list[Floats] = []
+    interval_means: list[Floats] = []
     for start in range(0, len(values) - size, size):
         one.compensate(values[start : start + size])
         one.identify_due_models()
-        kept.append((one._state.drift.copy(), len(taught)))
-        taught += [interval.mean for interval in one.take_finished_intervals()]
-    means, per_min = np.array(taught), round(60.0 / one.interval_s)
+        kept.append((one._state.drift.copy(), len(interval_means)))
+        interval_means += [interval.mean for interval in one.take_finished_intervals()]
+    means, per_min = np.array(interval_means), round(60.0 / one.interval_s)
     squares = np.zeros((3, len(spans)))
     for at, span in enumerate(spans):
         ahead, count = round(span * per_min), 0
@@ -359,62 +363,64 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
 
 
 def alarms(seeds: int) -> None:
-    """How often ``drift_unexplained`` is told of a sensor whose noise stays what it is."""
-    made = table("Events at rest", "sensor", "hours", "events", "of them steps")
+    """Print the number of events ``drift_unexplained`` for sensors with constant noise."""
+    table = create_table("Events at rest", "sensor", "hours", "events", "of them steps")
     sources: list[tuple[str, list[Floats], float]] = [
-        (sensor, [noise(sensor, 1000 + seed, 10_800.0) for seed in range(seeds)], RATE_HZ) for sensor in SENSORS
+        (sensor, [simulate_rest(sensor, 1000 + seed, 10_800.0) for seed in range(seeds)], RATE_HZ) for sensor in SENSORS
     ]
     folder = os.environ.get("IMU_MONITOR_DATA")
     for name in RECORDINGS if folder else ():
         found = load_samples(Path(str(folder)) / name)
         sources.append((name, [found.values], float(found.rate_hz or RATE_HZ)))
     for name, records, rate_hz in sources:
-        told: list[str] = []
+        event_texts: list[str] = []
         for values in records:
-            one, by_hand = LiveDriftCompensation(rate_hz), ArmaWorker("", synchronous=True)
+            one, worker = LiveDriftCompensation(rate_hz), ArmaWorker("", synchronous=True)
             t_ns = np.round(np.arange(len(values)) / rate_hz * 1e9).astype(np.int64)
             for start in range(0, len(values), 100):
                 one.compensate_block(make_block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))
-                by_hand.adopt_and_start_models(one)
-            told += [event.text for event in one.take_events()]
+                worker.adopt_and_start_models(one)
+            event_texts += [event.text for event in one.take_events()]
         hours = sum(len(values) for values in records) / rate_hz / 3600.0
-        made.add_row(name, f"{hours:.1f}", str(len(told)), str(sum("step of the bias" in text for text in told)))
-    console.print(made)
+        table.add_row(
+            name, f"{hours:.1f}", str(len(event_texts)), str(sum("step of the bias" in text for text in event_texts))
+        )
+    console.print(table)
 
 
 def consistency(_seeds: int) -> None:
-    """Recordings in motion beside another witness: the robot's attitude, the car's yaw, two other gyros."""
+    """Compare recordings in motion with a reference: attitude of a robot, yaw of a car, or other gyros."""
     folder = os.environ.get("IMU_MONITOR_DATA")
     if not folder:
         console.print("IMU_MONITOR_DATA is not set: no recordings")
         return
-    made = table("rms difference to the witness: before → after", "recording", "learned at rest", "°/s, or °")
+    table = create_table("rms difference to the reference: before → after", "recording", "learned at rest", "°/s, or °")
     for name in ("mpu9150", "mpu6500", "mpu6050"):
         with np.load(Path(folder) / f"robot-arm/{name}.npz") as found:
-            values, rate_hz, t = _six(found), float(found["fs"]), found["t"]
+            values, rate_hz, t = _stack_axes(found), float(found["fs"]), found["t"]
             attitude = Rotation.from_quat(found["ref_quat"][:, [1, 2, 3, 0]])
-        out, one = live(values, rate_hz)
-        made.add_row(
+        out, one = compensate_live(values, rate_hz)
+        table.add_row(
             f"robot-arm {name}, ° turned in 100 samples",
-            _known(one),
-            " → ".join(f"{_turned_apart(x[:, :3], t, attitude):.3g}" for x in (values, out)),
+            _has_learned(one),
+            " → ".join(f"{_angle_difference(x[:, :3], t, attitude):.3g}" for x in (values, out)),
         )
     with np.load(Path(folder) / "car-phone-can/minute.npz") as found:
-        values, rate_hz = _six(found), float(found["fs"])
+        values, rate_hz = _stack_axes(found), float(found["fs"])
         t = np.arange(len(values)) / rate_hz if "t" not in found else found["t"] - found["t"][0]
         yaw = np.interp(t, found["t_yaw"] - found["t_yaw"][0], found["yaw_counts"] * 0.24 * DEGREE)
-    out, one = live(values, rate_hz)
-    made.add_row(
+    out, one = compensate_live(values, rate_hz)
+    table.add_row(
         "car-phone-can, yaw",
-        _known(one),
+        _has_learned(one),
         _differences([x[:, 2] - x[:, 2].mean() for x in (values, out)], yaw.mean() - yaw),
     )
     each: list[tuple[Floats, Floats, str]] = []
     for imu in ("imu1", "imu2", "imu3"):
         found_one = load_samples(Path(folder) / f"autopilot-3imu/{imu}.npz")
-        out, one = live(found_one.values, 50.0)
-        still = found_one.values[1000:2500, :3].mean(axis=0)  # on the ground from 20 s on
-        each.append((found_one.values[:, :3] - still, out[:, :3], _known(one)))
+        out, one = compensate_live(found_one.values, 50.0)
+        still = found_one.values[1000:2500, :3].mean(axis=0)  # at rest on the ground from 20 s
+        each.append((found_one.values[:, :3] - still, out[:, :3], _has_learned(one)))
     for a, b in ((0, 1), (0, 2), (1, 2)):
         n = min(len(each[a][0]), len(each[b][0]))
         cells = []
@@ -423,16 +429,19 @@ def consistency(_seeds: int) -> None:
             means = apart[: len(apart) // 500 * 500].reshape(-1, 500, 3).mean(axis=1)
             cells.append((np.sqrt(np.mean(apart**2)), np.sqrt(np.mean(means**2))))
         text = ", ".join(f"{x / DEGREE:.3g} → {y / DEGREE:.3g}" for x, y in zip(*cells, strict=True))
-        made.add_row(f"autopilot-3imu {a + 1} and {b + 1} in flight; means of 10 s", each[a][2], text)
-    console.print(made)
+        table.add_row(f"autopilot-3imu {a + 1} and {b + 1} in flight; means of 10 s", each[a][2], text)
+    console.print(table)
 
 
-def _six(found) -> Floats:  # type: ignore[no-untyped-def]
+def _stack_axes(found) -> Floats:  # type: ignore[no-untyped-def]
     return np.stack([found[axis].astype(np.float64) for axis in AXES], axis=1)
 
 
-def _turned_apart(rates: Floats, t: Floats, attitude: Rotation) -> float:
-    """rms, °, of the angle turned within 100 samples by the gyros less that by the attitude, which comes 10 earlier."""
+def _angle_difference(rates: Floats, t: Floats, attitude: Rotation) -> float:
+    """Return the rms difference of the angles that gyros and attitude turn in 100 samples, in °.
+
+    The attitude is 10 samples early.
+    """
     apart = []
     for start in range(100, len(rates) - 200, 50):
         turned = Rotation.identity()
@@ -443,7 +452,7 @@ def _turned_apart(rates: Floats, t: Floats, attitude: Rotation) -> float:
     return float(np.sqrt(np.mean(np.square(apart))) / DEGREE)
 
 
-def _known(one: Compensator) -> str:
+def _has_learned(one: Compensator) -> str:
     return "yes" if np.isfinite(one.bias).all() else "no"
 
 
@@ -452,9 +461,9 @@ def _differences(both: list[Floats], truth: Floats) -> str:
 
 
 def arma(seeds: int) -> None:
-    """Intervals of the coefficients, 95 %: how many of 20 times ``seeds`` simulated drifts they hold."""
+    """Print the coverage of the 95 % intervals of the coefficients for 20 times ``seeds`` simulated drifts."""
     count = 20 * seeds
-    made = table(f"{count} drifts each, per cent inside 95 %", "φ1, φ2, θ1", "values", "φ1", "φ2", "θ1")
+    table = create_table(f"{count} drifts each, per cent inside 95 %", "φ1, φ2, θ1", "values", "φ1", "φ2", "θ1")
     for phi, theta in (
         ((1.2, -0.5), -0.4),
         ((0.9, 0.05), -0.5),
@@ -469,12 +478,12 @@ def arma(seeds: int) -> None:
                 z = lfilter([1.0, theta], [1.0, -phi[0], -phi[1]], a)[500:]
                 found = fit_arma(z, orders=[(2, 1)], with_confidence_intervals=True)
                 inside += (np.array(found.lo) <= [*phi, theta]) & (np.array(found.hi) >= [*phi, theta])
-            made.add_row(f"{phi[0]:g}, {phi[1]:g}, {theta:g}", str(n), *(f"{100 * x / count:.0f}" for x in inside))
-    console.print(made)
+            table.add_row(f"{phi[0]:g}, {phi[1]:g}, {theta:g}", str(n), *(f"{100 * x / count:.0f}" for x in inside))
+    console.print(table)
 
 
 def robust(_seeds: int) -> None:
-    """10⁸ samples with outliers, gaps, saturation, missing values, stuck values, motion, steps: all stays finite."""
+    """Check that results stay finite for 10⁸ samples with outliers, gaps, saturation, motion and steps."""
     rng, one = np.random.default_rng(0), Compensator(RATE_HZ)
     size, done, bias = 400_000, 0, np.zeros(6)
     least = np.inf
@@ -501,7 +510,7 @@ def robust(_seeds: int) -> None:
         assert np.array_equal(np.isfinite(out), np.isfinite(values))
         for row in one._state.drift:
             covariance = row["covariance"]
-            if np.trace(covariance) > 0.0:  # something is known
+            if np.trace(covariance) > 0.0:  # the filter has learned
                 least = min(least, float(np.linalg.eigvalsh(covariance)[0] / np.trace(covariance)))
         done += size
     seconds = time.perf_counter() - began
@@ -511,7 +520,7 @@ def robust(_seeds: int) -> None:
 
 
 def speed(_seeds: int) -> None:
-    """Processor time a sample and axis, beside a plain NumPy Kalman filter of a drift and a rate."""
+    """Print the processor time per sample and axis, compared with a NumPy Kalman filter of a drift and a rate."""
     values = 1e-3 * np.random.default_rng(0).standard_normal((400_000, 6))
     Compensator(RATE_HZ).compensate(values[:1000])
 
@@ -525,27 +534,41 @@ def speed(_seeds: int) -> None:
         return 1e9 * best
 
     began = time.process_time()
-    joint(values[:10_000, 0], 1.0 / RATE_HZ, 1.6, -0.61, -0.8, 1e-10, 1e-6, 1e-2)
+    filter_drift_and_rate(values[:10_000, 0], 1.0 / RATE_HZ, 1.6, -0.61, -0.8, 1e-10, 1e-6, 1e-2)
     plain = 1e9 * (time.process_time() - began) / 10_000.0
-    made = table("ns a sample and axis", "fed by", "ns", "plain NumPy filter over it")
+    table = create_table("ns a sample and axis", "fed by", "ns", "plain NumPy filter over it")
     for rows, count in ((4096, 400_000), (100, 400_000), (1, 40_000)):
         ns = cost(rows, count)
-        made.add_row(str(rows), f"{ns:.0f}", f"{plain / ns:.0f}")
-    console.print(made)
+        table.add_row(str(rows), f"{ns:.0f}", f"{plain / ns:.0f}")
+    console.print(table)
 
 
-EACH = (rest, recordings, allan, motion, one_filter, slow, doubling, coast, alarms, consistency, arma, robust, speed)
-PARTS = {one.__name__: one for one in EACH}
+PART_FUNCTIONS = (
+    rest,
+    recordings,
+    allan,
+    motion,
+    one_filter,
+    slow,
+    doubling,
+    coast,
+    alarms,
+    consistency,
+    arma,
+    robust,
+    speed,
+)
+PARTS = {function.__name__: function for function in PART_FUNCTIONS}
 
 
 def main() -> None:
-    """Print the tables that are wanted."""
+    """Print the requested tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=[])
     parser.add_argument("--seeds", type=int, default=5)
-    asked = parser.parse_args()
-    for part in asked.parts or PARTS:
-        PARTS[part](asked.seeds)
+    arguments = parser.parse_args()
+    for part in arguments.parts or PARTS:
+        PARTS[part](arguments.seeds)
 
 
 if __name__ == "__main__":

@@ -1,24 +1,22 @@
-"""Do the intervals hold what they promise? Simulates records of known noise and counts.
+"""Coverage of the intervals of deviations and coefficients for simulated records with known noise.
 
     python -m tests.experiments.benchmarks.coverage --json coverage.jsonl                # all cells, 20 minutes
     python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 120  # fewer
 
 With ``--records 0 --page docs/statistics-measurements.md``, the program only writes the tables into the page.
 
-Counted for each cell (a noise and a length of record at 100 Hz), in percent with the 95 % interval of Wilson:
+A cell is a noise and a length of record at 100 Hz. The tables contain these numbers for each cell, in percent with the
+95 % interval of Wilson:
 
-- how often the two-sided 95 % interval of a deviation holds the true one, at all τ up to an eighth of the record
-  together. Neighbouring τ of a record err together, so its interval is that of as many independent looks as the
-  scatter between records shows;
-- for each term that is there: how often what is said of it is true, be it a two-sided 95 % interval or a one-sided 95 %
-  bound; how often it is estimated; and the shares of true intervals and of true bounds by themselves. A term enters
-  when its estimate comes out large, so the few intervals of a term that is seldom in are those of lucky records,
-  and the few bounds of one that is nearly always in those of unlucky ones: where a kind of answer is given
-  in less than half of the records, its share is shown but not judged;
-- for each term that is absent: how often it is estimated all the same.
+- the coverage of the two-sided 95 % intervals of deviations, for all τ up to an eighth of the record. The errors at
+  neighbouring τ are correlated, so the number of independent intervals is estimated from the scatter between records.
+- for each present term: the share of true results, which are two-sided 95 % intervals or one-sided 95 % bounds, the
+  share of estimated terms, and the coverage of intervals and of bounds. A term is estimated if its estimate is large.
+  Therefore, rare intervals or rare bounds of a term are a biased sample. If a kind of result occurs in less than half
+  of the records, its coverage is not compared with a target.
+- for each absent term: the share of records in which it is estimated.
 
-Each record goes through ``analyze``, and is looked at once. One process, one thread; a run can be broken off and
-taken up again.
+Each record is analysed once by ``analyze``, in one process and one thread. An interrupted run can be continued.
 """
 
 from typing import Final
@@ -36,13 +34,13 @@ from tests.experiments.benchmarks.records import (
     RATE_HZ,
     Chunk,
     Noise,
-    length,
-    markdown,
-    merged,
-    program,
-    sixes,
+    format_length,
+    format_table,
+    group_chunks,
+    run_experiment,
+    simulate_chunk,
     true_avar,
-    wilson,
+    wilson_interval,
 )
 
 CELLS: Final = {
@@ -59,8 +57,8 @@ CELLS: Final = {
 }
 TWO_SIDED: Final = (0.93, 0.97)
 ONE_SIDED: Final = (0.94, 1.0)
-FALSE: Final = (0.0, 0.05)
-SAID: Final = (0.93, 1.0)
+ABSENT_TARGET: Final = (0.0, 0.05)
+RESULT_TARGET: Final = (0.93, 1.0)
 ANY: Final = (0.0, 1.0)
 COUNTED: Final = ("estimated", "held", "bounded", "bound_held")
 
@@ -69,13 +67,13 @@ BoolMatrix = NDArray[np.bool_]
 
 
 def count(cell: str, seconds: int, seed: int, chunk: int) -> Chunk:
-    """Simulate, analyze and count one chunk."""
+    """Simulate and analyse the records of one chunk, and return the counts."""
     noise = CELLS[cell]
     n = round(seconds * RATE_HZ)
     t_ns = np.arange(n) * round(1e9 / RATE_HZ)
     by_tau: list[BoolMatrix] = []
     letters = np.zeros((len(SYMBOLS), len(COUNTED)), np.int64)
-    for values in sixes(noise, cell, seconds, seed, chunk):
+    for values in simulate_chunk(noise, cell, seconds, seed, chunk):
         found = analyze([make_block(t_ns, values)], RATE_HZ).estimate
         truth = np.sqrt(true_avar(noise, found.curve.factors))[:, None]
         by_tau.append((found.curve.lo <= truth) & (truth <= found.curve.hi))
@@ -91,31 +89,33 @@ def count(cell: str, seconds: int, seed: int, chunk: int) -> Chunk:
 
 
 def _counted(given: Coefficients, noise: Noise) -> Ints:
-    """[5, 4] of COUNTED in six axes."""
+    """Return the counts [5, 4] of COUNTED in six axes."""
     truth = np.array([getattr(noise, letter) for letter in SYMBOLS])[:, None]
-    held = (given.lo <= truth) & (truth <= given.hi)
+    covered = (given.lo <= truth) & (truth <= given.hi)
     estimated, bounded = given.status == Status.ESTIMATED, given.status == Status.UPPER_BOUND
-    return np.stack([flags.sum(axis=1) for flags in (estimated, estimated & held, bounded, bounded & held)], axis=1)
+    return np.stack(
+        [flags.sum(axis=1) for flags in (estimated, estimated & covered, bounded, bounded & covered)], axis=1
+    )
 
 
 def tables(chunks: list[Chunk]) -> str:
-    """Markdown of all that was counted."""
-    groups = merged(chunks)
+    """Return the tables in Markdown."""
+    groups = group_chunks(chunks)
     parts = [
         "Two-sided 95 % intervals of deviations, for τ up to an eighth of the record:",
-        markdown(
+        format_table(
             ("record", "noise", "records", "holds, %", "worst and best τ, %"), [_deviations(*g) for g in groups.items()]
         ),
         "Terms that are present:",
-        markdown(
+        format_table(
             ("record", "noise", "term", "result holds, %", "estimated, %", "interval holds, %", "bound holds, %"),
             [row for group in groups.items() for row in _present(*group)],
         ),
         "Absent terms that are estimated, %:",
-        markdown(("record", "noise", *SYMBOLS), [_absent(*group) for group in groups.items()]),
+        format_table(("record", "noise", *SYMBOLS), [_absent(*group) for group in groups.items()]),
         "A figure is bold if its interval lies entirely outside the expected range. The expected range is "
-        f"{_percent(*TWO_SIDED)} % for intervals, {_percent(*ONE_SIDED)} % for bounds, {_percent(*SAID)} % for all "
-        f"results of a term together, and {_percent(*FALSE)} % for absent terms.",
+        f"{_percent(*TWO_SIDED)} % for intervals, {_percent(*ONE_SIDED)} % for bounds, {_percent(*RESULT_TARGET)} % "
+        f"for all results of a term together, and {_percent(*ABSENT_TARGET)} % for absent terms.",
     ]
     return "\n\n".join(parts)
 
@@ -126,29 +126,29 @@ def _deviations(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
     total, square = np.sum([chunk["shares"] for chunk in group], axis=0)
     share = total / records
     scatter = (square / records - share**2) / records  # variance of the mean share
-    looks = share * (1.0 - share) / scatter
+    total = share * (1.0 - share) / scatter
     m = np.array(group[0]["m"])
     by_tau = np.sum([chunk["deviations"] for chunk in group], axis=0)[m <= seconds * RATE_HZ / 8] / records
     worst = f"{100 * by_tau.min():.1f}, {100 * by_tau.max():.1f}"
-    return length(seconds), cell, str(records), _share(share * looks, looks, TWO_SIDED), worst
+    return format_length(seconds), cell, str(records), _share(share * total, total, TWO_SIDED), worst
 
 
 def _present(key: tuple[int, str], group: list[Chunk]) -> list[tuple[str, ...]]:
     seconds, cell = key
     records = sum(chunk["records"] for chunk in group)
     rows: list[tuple[str, ...]] = []
-    for letter in CELLS[cell].present():
+    for letter in CELLS[cell].present_terms():
         counts = [sum(chunk["letters"][letter][name] for chunk in group) for name in COUNTED]
-        estimated, held, bounded, bound_held = counts
+        estimated, covered, bounded, bound_covered = counts
         rows.append(
             (
-                length(seconds),
+                format_length(seconds),
                 cell,
                 letter,
-                _share(held + bound_held, estimated + bounded, SAID),
+                _share(covered + bound_covered, estimated + bounded, RESULT_TARGET),
                 _share(estimated, records),
-                _share(held, estimated, TWO_SIDED if 2 * estimated >= records else ANY),
-                _share(bound_held, bounded, ONE_SIDED if 2 * bounded >= records else ANY),
+                _share(covered, estimated, TWO_SIDED if 2 * estimated >= records else ANY),
+                _share(bound_covered, bounded, ONE_SIDED if 2 * bounded >= records else ANY),
             )
         )
     return rows
@@ -157,20 +157,22 @@ def _present(key: tuple[int, str], group: list[Chunk]) -> list[tuple[str, ...]]:
 def _absent(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
     seconds, cell = key
     records = sum(chunk["records"] for chunk in group)
-    there = CELLS[cell].present()
+    present = CELLS[cell].present_terms()
     entered = [
-        "–" if c in there else _share(sum(chunk["letters"][c]["estimated"] for chunk in group), records, FALSE)
+        "–"
+        if c in present
+        else _share(sum(chunk["letters"][c]["estimated"] for chunk in group), records, ABSENT_TARGET)
         for c in SYMBOLS
     ]
-    return length(seconds), cell, *entered
+    return format_length(seconds), cell, *entered
 
 
-def _share(held: float, looks: float, target: tuple[float, float] = ANY) -> str:
-    """A share with its interval, bold where the interval does not meet the target."""
-    if not looks:
+def _share(covered: float, total: float, target: tuple[float, float] = ANY) -> str:
+    """Return a share with its interval, in bold if the interval is outside the target."""
+    if not total:
         return "–"
-    lo, hi = wilson(held, looks)
-    text = f"{100 * held / looks:.1f} [{100 * lo:.1f}, {100 * hi:.1f}]"
+    lo, hi = wilson_interval(covered, total)
+    text = f"{100 * covered / total:.1f} [{100 * lo:.1f}, {100 * hi:.1f}]"
     return text if lo <= target[1] and hi >= target[0] else f"**{text}**"
 
 
@@ -179,4 +181,4 @@ def _percent(lo: float, hi: float) -> str:
 
 
 if __name__ == "__main__":
-    program("coverage", __doc__ or "", CELLS, (MIN_45, HOURS_3), count, tables)
+    run_experiment("coverage", __doc__ or "", CELLS, (MIN_45, HOURS_3), count, tables)

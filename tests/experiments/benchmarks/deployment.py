@@ -1,10 +1,10 @@
-"""What a daemon takes of memory and processor for 1, 4 and 16 sensors of 100 Hz and 1 kHz, recording and history on.
+"""Memory and processor time of a daemon with recording and history, for 1, 4 and 16 sensors at 100 Hz and 1 kHz.
 
     python -m tests.experiments.benchmarks.deployment --seconds 30
 
-The sensors are pseudo-terminals of this process that carry a real wire format at its pace; the daemon is a process of
-its own, whose processor time is the system's account of it, after the kernels are there. The window is an hour,
-refitted and published ten times a second; nobody subscribes and no viewer is open.
+The sensors are pseudo-terminals of this process with a real wire format at its rate. The daemon is a separate process.
+Its processor time is measured after the kernels have been compiled. The window is an hour, and results are published
+ten times per second. There is no subscriber and no viewer.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from drivers.decoders import vectornav_binary
 from monitor.common import shipped_config_paths
 from monitor.noise.model_loading import read_model
 
-WARM_S = 25.0
+WARM_UP_S = 25.0
 DEVICE = """
 [[device]]
 name = "imu-{i}"
@@ -49,7 +49,7 @@ folder = "{folder}"
 
 
 class Sensors:
-    """As many ports as wanted, the same frames on each."""
+    """Pseudo-terminals with the same frames on each."""
 
     def __init__(self, folder: Path, count: int, rate_hz: int, seconds: float) -> None:
         self.ports = [folder / f"tty{i}" for i in range(count)]
@@ -93,11 +93,11 @@ class Sensors:
                     continue
 
 
-def measured(count: int, rate_hz: int, seconds: float, wait_s: float = 0.01) -> str:
-    """One row of the table."""
+def measure_daemon(count: int, rate_hz: int, seconds: float, wait_s: float = 0.01) -> str:
+    """Measure a daemon and return one row of the table."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        sensors = Sensors(folder, count, rate_hz, WARM_S + seconds + 10.0)
+        sensors = Sensors(folder, count, rate_hz, WARM_UP_S + seconds + 10.0)
         text = "".join(
             DEVICE.format(i=i, rate=float(rate_hz), port=port, wait_s=wait_s) for i, port in enumerate(sensors.ports)
         )
@@ -106,7 +106,7 @@ def measured(count: int, rate_hz: int, seconds: float, wait_s: float = 0.01) -> 
         with (folder / "log").open("wb") as log:
             process = subprocess.Popen(command, stdout=log, stderr=log)
         try:
-            time.sleep(WARM_S)
+            time.sleep(WARM_UP_S)
             one = psutil.Process(process.pid)
             before, begun, stored = one.cpu_times(), time.monotonic(), _size(folder / "store")
             time.sleep(seconds)
@@ -132,15 +132,15 @@ def _size(folder: Path) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=30.0)
-    wanted = parser.parse_args()
+    arguments = parser.parse_args()
     print(
         "| sensors | Hz | read_timeout, ms | % of a core | memory MB | threads | MB a sensor and day, before packing |"
     )
     print("| --: | --: | --: | --: | --: | --: | --: |")
     for rate_hz in (100, 1000):
         for count in (1, 4, 16):
-            print(measured(count, rate_hz, wanted.seconds), flush=True)
-        print(measured(16, rate_hz, wanted.seconds, 0.1), flush=True)
+            print(measure_daemon(count, rate_hz, arguments.seconds), flush=True)
+        print(measure_daemon(16, rate_hz, arguments.seconds, 0.1), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""Faults, each injected for real beside a running service: what was lost, and what the status said, in one table.
+"""Table of the lost samples and the status of a running service for each injected fault.
 
     python -m tests.experiments.benchmarks.faults [NAME…] --times 1000
 
-Most have a sensor of their own: a board on a pseudo-terminal that prints 200 lines a second, each with a count and a
-checksum, so that every line is known as received, lost or bad. ``tests/system/test_unattended.py`` runs the same ones.
+For most faults, the sensor is a simulated board on a pseudo-terminal. It prints 200 lines per second with a counter and
+a checksum, so every line is counted as received, lost or bad. ``tests/system/test_unattended.py`` injects the same
+faults.
 """
 
 import argparse
@@ -83,29 +84,29 @@ with zenoh.open(config):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a fault cost."""
+    """Counts of samples and reported status for one fault."""
 
     injected: str
     sent: int
     received: int
     lost: int
     bad: int
-    said: str  # by the status, at its worst
+    reported: str  # text of the status
     note: str = ""
-    dropped: int = 0  # of those sent: found no port, or no room in it
+    dropped: int = 0  # sent samples for which there was no port or no room
 
     @property
     def accounted(self) -> bool:
-        """Whether every sample that was sent is known. Nobody sees those that are dropped at the end."""
+        """True if every sent sample is counted. Samples that are dropped at the end cannot be counted."""
         return self.received + max(self.lost + self.bad, self.dropped) >= self.sent
 
 
 @dataclass
-class Said(Output):
-    """What the status said."""
+class StatusOutput(Output):
+    """Output that stores all states and events."""
 
     healths: list[Health] = field(default_factory=list)
-    events: list[str] = field(default_factory=list)  # their sentences
+    events: list[str] = field(default_factory=list)  # texts of the events
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.healths.append(health)
@@ -114,12 +115,12 @@ class Said(Output):
         self.events.append(event.text)
 
     def texts(self) -> set[str]:
-        """Every sentence so far: of the device, of its outputs, of events."""
+        """Return all texts so far of the device, its outputs and its events."""
         found = {health.text for health in self.healths}
         return found | set(self.events) | {text for health in self.healths for text in health.outputs.values()}
 
-    def wait(self, words: str) -> str:
-        """The first sentence with these words."""
+    def wait_for_text(self, words: str) -> str:
+        """Wait for a text that contains ``words`` and return it."""
         return wait_for(lambda: next((text for text in self.texts() if words in text), ""), f'"{words}"')
 
     def newest(self) -> Health | None:
@@ -127,12 +128,12 @@ class Said(Output):
 
 
 class Board:
-    """Lines on a pseudo-terminal whose name stays the same; what goes wrong on the way is put between."""
+    """Simulated board that prints lines to a pseudo-terminal. ``corrupt`` changes the printed bytes."""
 
     def __init__(self, folder: Path) -> None:
         self.port = folder / "tty"
         self.sent = 0
-        self.spoil: Callable[[bytes], bytes] = lambda data: data
+        self.corrupt: Callable[[bytes], bytes] = lambda data: data
         self._terminal = LineTerminal(self.port)
         self._plugging = threading.Lock()
         self._closing = threading.Event()
@@ -154,8 +155,8 @@ class Board:
         with self._plugging:
             self._terminal.pull()
 
-    def rest(self) -> None:
-        """Print nothing any more."""
+    def stop(self) -> None:
+        """Stop printing."""
         self._closing.set()
         self._thread.join()
 
@@ -165,11 +166,11 @@ class Board:
             due = int((time.monotonic() - begun) * RATE)
             data = b"".join(_line(self.sent + i, rng.standard_normal(6) * 1e-3) for i in range(due - self.sent))
             self.sent = due
-            self._write(self.spoil(data))
+            self._write(self.corrupt(data))
 
     @property
     def dropped(self) -> int:
-        """Lines that found no port, or no room in it."""
+        """Number of lines for which there was no port or no room in its buffer."""
         return self._terminal.dropped
 
     def _write(self, data: bytes) -> None:
@@ -186,57 +187,57 @@ def _line(count: int, values: Any) -> bytes:
 
 
 @dataclass
-class Rig:
-    """A board, a service that reads it, and what it says."""
+class ServiceWithBoard:
+    """Board with a service that reads it and the output of the service."""
 
     folder: Path
     board: Board
     service: Service
-    said: Said
+    output: StatusOutput
 
     @property
-    def station(self) -> DeviceWorker:
+    def worker(self) -> DeviceWorker:
         return self.service.workers[0]
 
-    def flows(self, more: int = 50) -> None:
-        """Samples come now."""
-        before = self.station.driver.counts.received
-        wait_for(lambda: self.station.driver.counts.received >= before + more, "samples")
+    def wait_for_samples(self, more: int = 50) -> None:
+        """Wait for new samples."""
+        before = self.worker.driver.counts.received
+        wait_for(lambda: self.worker.driver.counts.received >= before + more, "samples")
 
-    def well(self) -> None:
-        """The status has nothing to say any more."""
+    def wait_for_clean_status(self) -> None:
+        """Wait until the status reports no problem."""
 
-        def quiet() -> bool:
-            newest = self.said.newest()
+        def is_clean() -> bool:
+            newest = self.output.newest()
             return newest is not None and newest.state == "running" and not newest.text
 
-        wait_for(quiet, "a clean status")
+        wait_for(is_clean, "a clean status")
 
-    def outcome(self, injected: str, said: str, note: str = "") -> Outcome:
-        """Once the board rests and all has come."""
-        self.flows()
-        self.board.rest()
-        counts, sent, dropped = self.station.driver.counts, self.board.sent, self.board.dropped
-        with contextlib.suppress(AssertionError):  # what never comes is in the outcome
+    def finish(self, injected: str, reported: str, note: str = "") -> Outcome:
+        """Stop the board, wait for its last line and return the counts."""
+        self.wait_for_samples()
+        self.board.stop()
+        counts, sent, dropped = self.worker.driver.counts, self.board.sent, self.board.dropped
+        with contextlib.suppress(AssertionError):  # the outcome contains the missing samples
             wait_for(lambda: counts.received + max(counts.lost + counts.bad, dropped) >= sent, "the last line")
-        return Outcome(injected, sent, counts.received, counts.lost, counts.bad, said, note, dropped)
+        return Outcome(injected, sent, counts.received, counts.lost, counts.bad, reported, note, dropped)
 
 
 @contextlib.contextmanager
-def running(folder: Path, more: str = NO_ZENOH + NO_VIEWER) -> Iterator[Rig]:
-    """The service beside the board, from before its first line on."""
-    board, said = Board(folder), Said()
+def run_service(folder: Path, more: str = NO_ZENOH + NO_VIEWER) -> Iterator[ServiceWithBoard]:
+    """Run a service with a board, which starts to print after the service has opened the port."""
+    board, output = Board(folder), StatusOutput()
     path = folder / "faults.toml"
     path.write_text(DEVICE.format(rate=RATE, port=board.port) + more)
-    service = Service(loading.load_config(path), [said])
+    service = Service(loading.load_config(path), [output])
     thread = threading.Thread(target=service.run)
     thread.start()
-    rig = Rig(folder, board, service, said)
+    rig = ServiceWithBoard(folder, board, service, output)
     try:
-        wait_for(lambda: getattr(rig.station.driver.link, "_port", None) is not None, "the port")
+        wait_for(lambda: getattr(rig.worker.driver.link, "_port", None) is not None, "the port")
         board.start()
-        rig.flows()
-        wait_for(lambda: said.healths and "compiling" not in said.healths[-1].text, "the kernels")
+        rig.wait_for_samples()
+        wait_for(lambda: output.healths and "compiling" not in output.healths[-1].text, "the kernels")
         yield rig
     finally:
         service.request_stop()
@@ -248,26 +249,26 @@ def running(folder: Path, more: str = NO_ZENOH + NO_VIEWER) -> Iterator[Rig]:
 
 
 def cable(folder: Path, times: int) -> Outcome:
-    """Out and in, again and again."""
+    """Unplug the cable and plug it in repeatedly."""
     pauses = mock.patch.multiple("drivers.driver", MIN_RETRY_PAUSE_S=0.01, MAX_RETRY_PAUSE_S=0.05)
-    with pauses, running(folder) as rig:
+    with pauses, run_service(folder) as rig:
         for _ in range(times):
             rig.board.pull()
-            wait_for(lambda: rig.station.driver.state == "lost", "the loss")
+            wait_for(lambda: rig.worker.driver.state == "lost", "the loss")
             rig.board.plug()
-            wait_for(lambda: rig.station.driver.state == "running", "samples after it")
-        said = rig.said.wait("the device is gone")
-        return rig.outcome(f"cable unplugged and plugged in, {times} times", said)
+            wait_for(lambda: rig.worker.driver.state == "running", "samples after it")
+        reported = rig.output.wait_for_text("the device is gone")
+        return rig.finish(f"cable unplugged and plugged in, {times} times", reported)
 
 
 def garbage(folder: Path, times: int) -> Outcome:
-    """Bursts of random bytes between and within the lines."""
+    """Send bursts of random bytes between and within the lines."""
     rng = random.Random(1)
     bursts = max(times // 5, 5)
-    with running(folder) as rig:
+    with run_service(folder) as rig:
         done = 0
 
-        def spoil(data: bytes) -> bytes:
+        def corrupt(data: bytes) -> bytes:
             nonlocal done
             if done < bursts and data and rng.random() < 0.3:
                 done += 1
@@ -275,24 +276,24 @@ def garbage(folder: Path, times: int) -> Outcome:
                 return data[:at] + rng.randbytes(rng.randrange(1, 400)) + data[at:]
             return data
 
-        rig.board.spoil = spoil
+        rig.board.corrupt = corrupt
         wait_for(lambda: done >= bursts, "the bursts", 10.0 * PATIENCE_S)
-        rig.board.spoil = lambda data: data
-        return rig.outcome(f"{bursts} bursts of random bytes", _at_worst(rig))
+        rig.board.corrupt = lambda data: data
+        return rig.finish(f"{bursts} bursts of random bytes", _longest_status(rig))
 
 
 def half_baud(folder: Path, times: int) -> Outcome:
-    """What a port at half the baud rate makes of the bits, for two seconds."""
-    with running(folder) as rig:
-        rig.board.spoil = at_half_the_baud_rate
-        said = rig.said.wait("bytes without a sample")
-        rig.board.spoil = lambda data: data
-        rig.well()
-        return rig.outcome("half the baud rate, until the message", said)
+    """Send the bytes that a port at half the baud rate receives."""
+    with run_service(folder) as rig:
+        rig.board.corrupt = read_at_half_baud_rate
+        reported = rig.output.wait_for_text("bytes without a sample")
+        rig.board.corrupt = lambda data: data
+        rig.wait_for_clean_status()
+        return rig.finish("half the baud rate, until the message", reported)
 
 
-def at_half_the_baud_rate(data: bytes) -> bytes:
-    """Frames of ten bits, read with bits twice as long: start, eight bits, stop."""
+def read_at_half_baud_rate(data: bytes) -> bytes:
+    """Return the bytes that result if the bits of the data are read with twice their length."""
     line: list[int] = []
     for byte in data:
         line += [0, *((byte >> i) & 1 for i in range(8)), 1]
@@ -309,57 +310,57 @@ def at_half_the_baud_rate(data: bytes) -> bytes:
 
 
 def two_daemons(folder: Path, times: int) -> Outcome:
-    """A second daemon on the same serial port and zenoh endpoint."""
+    """Start a second daemon on the same serial port and zenoh endpoint."""
     both = f'[zenoh]\nlisten = ["{free_endpoint()}"]\n' + NO_VIEWER
-    with running(folder, both) as rig:
+    with run_service(folder, both) as rig:
         wait_for(lambda: rig.service.output_states()["zenoh"] == "ok", "the session")
-        said = Said()
-        second = Service(loading.load_config(folder / "faults.toml"), [said])
+        output = StatusOutput()
+        second = Service(loading.load_config(folder / "faults.toml"), [output])
         thread = threading.Thread(target=second.run)
         thread.start()
         try:
-            held = said.wait("held by another program")
-            busy = said.wait("is busy")
-            rig.flows()
+            in_use = output.wait_for_text("held by another program")
+            busy = output.wait_for_text("is busy")
+            rig.wait_for_samples()
         finally:
             second.request_stop()
             thread.join(PATIENCE_S)
         assert second.workers[0].driver.counts.received == 0
-        return rig.outcome("two daemons on one port", f"the second: {held}; {busy}")
+        return rig.finish("two daemons on one port", f"the second: {in_use}; {busy}")
 
 
 def no_descriptors(folder: Path, times: int) -> Outcome:
-    """No file can be opened any more, while the cable is put back."""
-    with running(folder) as rig:
+    """Plug the cable in while no further file can be opened."""
+    with run_service(folder) as rig:
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         rig.board.pull()
-        wait_for(lambda: rig.station.driver.state == "lost", "the loss")
+        wait_for(lambda: rig.worker.driver.state == "lost", "the loss")
         rig.board.plug()
         free = os.open(os.devnull, os.O_RDONLY)
         os.close(free)
         try:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))  # the lowest that is free may not be taken
-            said = rig.said.wait(os.strerror(errno.EMFILE))
+            resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))  # forbids the lowest free descriptor
+            reported = rig.output.wait_for_text(os.strerror(errno.EMFILE))
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        rig.well()
-        return rig.outcome("out of file descriptors while the cable is put back", said)
+        rig.wait_for_clean_status()
+        return rig.finish("out of file descriptors while the cable is put back", reported)
 
 
 # --- CAN
 
 
 def can_bus(folder: Path, times: int) -> Outcome:
-    """Error frames between the frames of a virtual bus, then bus-off."""
+    """Send error frames between the frames of a virtual bus, then bus-off."""
     import can
 
     channel = f"faults-{os.getpid()}"
-    path, said = folder / "faults.toml", Said()
+    path, output = folder / "faults.toml", StatusOutput()
     path.write_text(CAN.format(rate=RATE, channel=channel) + NO_ZENOH + NO_VIEWER)
-    service = Service(loading.load_config(path), [said])
-    station = service.workers[0]
-    # python-can would sort a peer's error frames out by their identifier, as the kernel does not
-    station.driver.link.set_address_filter([])  # type: ignore[attr-defined]
+    service = Service(loading.load_config(path), [output])
+    worker = service.workers[0]
+    # python-can filters error frames by their identifier, which the kernel does not
+    worker.driver.link.set_address_filter([])  # type: ignore[attr-defined]
     thread = threading.Thread(target=service.run)
     thread.start()
     sent = 0
@@ -378,15 +379,15 @@ def can_bus(folder: Path, times: int) -> Outcome:
 
     try:
         with can.Bus(interface="virtual", channel=channel) as bus:
-            wait_for(lambda: getattr(station.driver.link, "_bus", None) is not None, "the bus")
+            wait_for(lambda: getattr(worker.driver.link, "_bus", None) is not None, "the bus")
             send(RATE)
             send(RATE, error=0x04)  # a controller's warning
             bus.send(can.Message(is_error_frame=True, arbitration_id=0x40))
-            text = said.wait("bus off")
-            while station.driver.state != "running":
+            text = output.wait_for_text("bus off")
+            while worker.driver.state != "running":
                 send(10)
             send(RATE)
-            counts = station.driver.counts
+            counts = worker.driver.counts
             wait_for(lambda: counts.received + counts.lost + counts.bad >= sent - 1, "the last sample")
             injected = f"{RATE // 10} CAN error frames, then bus-off"
             return Outcome(
@@ -401,21 +402,21 @@ def can_bus(folder: Path, times: int) -> Outcome:
 
 
 def full_disk(folder: Path, times: int) -> Outcome:
-    """The recording on a disk of half a megabyte."""
+    """Fill the disk of the recording, which has half a megabyte."""
     small = folder / "small"
     small.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", str(small)], check=True, capture_output=True)
     try:
         ballast = small / "ballast"
-        with running(folder, _storage(small / "store")) as rig:
-            rig.flows()
+        with run_service(folder, _storage(small / "store")) as rig:
+            rig.wait_for_samples()
             with contextlib.suppress(OSError):
                 ballast.write_bytes(bytes(1_000_000))
-            said = rig.said.wait("No space left")
-            rig.flows()
+            reported = rig.output.wait_for_text("No space left")
+            rig.wait_for_samples()
             ballast.unlink()
             wait_for(lambda: rig.service.output_states()["recording"] == "ok", "the recording")
-            outcome = rig.outcome("disk full, then free again", said)
+            outcome = rig.finish("disk full, then free again", reported)
         _check_recording(small / "store", outcome)
         return outcome
     finally:
@@ -423,23 +424,21 @@ def full_disk(folder: Path, times: int) -> Outcome:
 
 
 def slow_disk(folder: Path, times: int) -> Outcome:
-    """Every batch takes two seconds to write."""
+    """Delay every write of the recording by two seconds."""
     write = segment_file.SegmentFileWriter.write_samples
 
-    def slowly(writer: segment_file.SegmentFileWriter, *arguments: Any) -> None:
+    def write_slowly(writer: segment_file.SegmentFileWriter, *arguments: Any) -> None:
         time.sleep(2.0)
         write(writer, *arguments)
 
     with (
-        mock.patch("drivers.recordings.segment_file.SegmentFileWriter.write_samples", slowly),
-        running(folder, _storage(folder / "store")) as rig,
+        mock.patch("drivers.recordings.segment_file.SegmentFileWriter.write_samples", write_slowly),
+        run_service(folder, _storage(folder / "store")) as rig,
     ):
         for _ in range(4):
-            rig.flows(RATE)
+            rig.wait_for_samples(RATE)
         assert rig.service.recorder is not None
-        outcome = rig.outcome(
-            "every write takes 2 s", rig.service.recorder.state, "nothing is missing in the recording"
-        )
+        outcome = rig.finish("every write takes 2 s", rig.service.recorder.state, "nothing is missing in the recording")
     _check_recording(folder / "store", outcome)
     return outcome
 
@@ -449,7 +448,7 @@ def _storage(folder: Path) -> str:
 
 
 def _check_recording(store: Path, outcome: Outcome) -> None:
-    """All that was received is recorded, and what is missing in it is where it says."""
+    """Check that the recording contains all received samples."""
     ticks = [
         piece.samples
         for path in segment_file.list_segments(store / "board")
@@ -463,14 +462,14 @@ def _check_recording(store: Path, outcome: Outcome) -> None:
 
 
 def clock_back(folder: Path, times: int) -> Outcome:
-    """The host's clock is set back an hour."""
+    """Set the clock of the host back by an hour."""
     true = time.time_ns
-    with running(folder, _storage(folder / "store")) as rig:
-        rig.flows()
+    with run_service(folder, _storage(folder / "store")) as rig:
+        rig.wait_for_samples()
         with mock.patch("time.time_ns", side_effect=lambda: true() - 3600 * 10**9):
             for _ in range(5):
-                rig.flows(RATE)
-            outcome = rig.outcome("clock set back an hour", rig.said.wait("ahead of the host clock"))
+                rig.wait_for_samples(RATE)
+            outcome = rig.finish("clock set back an hour", rig.output.wait_for_text("ahead of the host clock"))
     times_s = np.concatenate(
         [
             piece.samples.t_ns / 1e9
@@ -486,7 +485,7 @@ def clock_back(folder: Path, times: int) -> Outcome:
 
 
 def router(folder: Path, times: int) -> Outcome:
-    """The router between daemon and subscriber is killed and started again."""
+    """Kill and restart the router between daemon and subscriber."""
     import json
 
     import zenoh
@@ -494,25 +493,25 @@ def router(folder: Path, times: int) -> Outcome:
     endpoint = free_endpoint()
     more = f'[zenoh]\nlisten = []\nconnect = ["{endpoint}"]\n' + NO_VIEWER
     process = _router(endpoint)
-    heard: list[float] = []
+    received_s: list[float] = []
     config = zenoh.Config()
     for key, value in {
         "mode": "client", "scouting/multicast/enabled": False, "connect/endpoints": [endpoint]
     }.items():  # fmt: skip
         config.insert_json5(key, json.dumps(value))
     try:
-        with running(folder, more) as rig, zenoh.open(config) as session:
-            session.declare_subscriber("imu/board/status", lambda _: heard.append(time.monotonic()))
-            wait_for(lambda: heard, "a status")
+        with run_service(folder, more) as rig, zenoh.open(config) as session:
+            session.declare_subscriber("imu/board/status", lambda _: received_s.append(time.monotonic()))
+            wait_for(lambda: received_s, "a status")
             process.kill()
             process.wait()
-            said = rig.said.wait("nobody at")
-            rig.flows()
+            reported = rig.output.wait_for_text("nobody at")
+            rig.wait_for_samples()
             process = _router(endpoint)
             back = time.monotonic()
-            wait_for(lambda: heard[-1] > back, "a status after it")
-            note = f"messages again {heard[-1] - back:.1f} s after the router's start"
-            return rig.outcome("router killed and started again", said, note)
+            wait_for(lambda: received_s[-1] > back, "a status after it")
+            note = f"messages again {received_s[-1] - back:.1f} s after the router's start"
+            return rig.finish("router killed and started again", reported, note)
     finally:
         process.kill()
         process.wait()
@@ -528,30 +527,30 @@ def _router(endpoint: str) -> subprocess.Popen[str]:
 
 
 def viewer(folder: Path, times: int) -> Outcome:
-    """The viewer is frozen (SIGSTOP) for some seconds."""
+    """Stop the process of the viewer (SIGSTOP) for some seconds."""
     more = NO_ZENOH + f'[viewer]\nmode = "web"\nport = {free_port()}\nweb_port = {free_port()}\n'
-    with running(folder, more) as rig:
+    with run_service(folder, more) as rig:
         assert rig.service.viewer is not None
         wait_for(lambda: rig.service.output_states()["viewer"] == "ok", "the viewer")
         child = rig.service.viewer._child
         assert child is not None
         os.kill(child.pid, signal.SIGSTOP)
-        said = rig.said.wait("stalled")
-        rig.flows(2 * RATE)
+        reported = rig.output.wait_for_text("stalled")
+        rig.wait_for_samples(2 * RATE)
         os.kill(child.pid, signal.SIGCONT)
         wait_for(lambda: rig.service.output_states()["viewer"] == "ok", "the viewer again")
-        return rig.outcome("viewer frozen", f"viewer: {said}")
+        return rig.finish("viewer frozen", f"viewer: {reported}")
 
 
-def _at_worst(rig: Rig) -> str:
-    """The longest sentence, as trouble has more to say."""
-    texts = {health.text for health in rig.said.healths}
+def _longest_status(rig: ServiceWithBoard) -> str:
+    """Return the longest text of the status, which reports the most problems."""
+    texts = {health.text for health in rig.output.healths}
     return max(texts, key=len, default="") or "nothing"
 
 
 FAULTS: Final = {
-    one.__name__: one
-    for one in (
+    fault.__name__: fault
+    for fault in (
         cable, garbage, half_baud, can_bus, two_daemons, no_descriptors, full_disk, slow_disk, clock_back, router,
         viewer,
     )
@@ -561,15 +560,17 @@ FAULTS: Final = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(FAULTS))
-    parser.add_argument("--times", type=int, default=1000, help="of what is done again and again")
-    wanted = parser.parse_args()
-    print("| fault | sent | received | lost | bad | the status said |\n| --- | --- | --- | --- | --- | --- |")
-    for name in wanted.names or FAULTS:
+    parser.add_argument("--times", type=int, default=1000, help="number of repetitions")
+    arguments = parser.parse_args()
+    print("| fault | sent | received | lost | bad | status |\n| --- | --- | --- | --- | --- | --- |")
+    for name in arguments.names or FAULTS:
         with tempfile.TemporaryDirectory() as folder:
-            one = FAULTS[name](Path(folder), wanted.times)
-        said = one.said.replace(folder, "…")
+            one = FAULTS[name](Path(folder), arguments.times)
+        reported = one.reported.replace(folder, "…")
         note = f" ({one.note})" if one.note else ""
-        print(f"| {one.injected}{note} | {one.sent} | {one.received} | {one.lost} | {one.bad} | {said} |", flush=True)
+        print(
+            f"| {one.injected}{note} | {one.sent} | {one.received} | {one.lost} | {one.bad} | {reported} |", flush=True
+        )
 
 
 if __name__ == "__main__":

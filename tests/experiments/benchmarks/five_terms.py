@@ -1,8 +1,8 @@
-"""Names that ``analyze`` gives by itself: the five-term fit and its notes, without a model to compare with.
+"""Names of effects from ``analyze``, which are its five-term fit and its notes, without a comparison with a model.
 
-A coefficient that is estimated where the model has no such term is a name; so are a line and a resonance that the
-model has not, outliers, a low-pass, values in coarse steps, a bias that stepped and white noise of another level: each
-is what one of the notes says. Notes of a misfit name nothing. Of one axis each name is given once.
+An estimated coefficient is a name if the model has no such term. The notes give further names: a line or a resonance
+that the model does not contain, outliers, a low-pass, a coarse resolution, a bias step, and a change of the white
+noise. Notes of a poor fit are no names. Each name occurs once for each axis.
 """
 
 from collections.abc import Iterator, Mapping
@@ -32,7 +32,7 @@ EFFECTS: Final = dict(
         strict=True,
     )
 )
-SAID: Final = frozenset(
+POSSIBLE_NAMES: Final = frozenset(
     {
         *EFFECTS.values(),
         "sinusoidal",
@@ -44,26 +44,30 @@ SAID: Final = frozenset(
         "noise_step",
     }
 )
-"""All names that it can give."""
+"""All names that ``analyze`` can give."""
 
 
-def names(columns: Mapping[str, Floats], rate_hz: float, model: NoiseModel) -> set[tuple[str, str]]:
-    """(axis, effect) of what ``analyze`` says of a recording beyond a model.
+def find_names(columns: Mapping[str, Floats], rate_hz: float, model: NoiseModel) -> set[tuple[str, str]]:
+    """Return (axis, effect) for each effect that ``analyze`` finds and a model does not contain.
 
-    Args:
-        columns: axis -> [n] SI; an axis that is not there is not judged
-        rate_hz: stated
-        model: whose terms and lines are no names
+    Parameters
+    ----------
+    columns
+        Samples [n] of each axis in SI units.
+    rate_hz
+        Stated sample rate in Hz.
+    model
+        Model with the known terms and lines.
     """
     n = next(iter(columns.values())).size
     values = np.stack([columns.get(axis, np.full(n, np.nan)) for axis in AXES], axis=1)
     t_ns = np.rint(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
     result = analyze([make_block(t_ns, values)], rate_hz)
-    said = (*_of_fit(result, model), *_of_events(result, model))
-    return {(axis, name) for axis, name in said if axis in columns}
+    pairs = (*_names_of_fit(result, model), *_names_of_disturbances(result, model))
+    return {(axis, name) for axis, name in pairs if axis in columns}
 
 
-def _of_fit(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
+def _names_of_fit(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
     has = {axis: {effect.name for effect in model.effects.get(axis, ())} for axis in AXES}
     status = result.estimate.coefficients.status
     for i, axis in enumerate(AXES):
@@ -72,12 +76,12 @@ def _of_fit(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str,
                 yield axis, effect
         if np.isfinite(result.bandwidth_hz[i]) and "bandwidth_limit" not in has[axis]:
             yield axis, "bandwidth_limit"
-    for one in find_coarsely_quantized_axes(result.values):
-        yield AXES[one.axis], "resolution"
+    for finding in find_coarsely_quantized_axes(result.values):
+        yield AXES[finding.axis], "resolution"
 
 
-def _of_events(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
-    """Of what ``detect_disturbances`` looks for, where it stands as numbers: each thing is sought once, as there."""
+def _names_of_disturbances(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
+    """Yield the names of lines, outliers and changes, which are detected as in ``detect_disturbances``."""
     values, rate_hz = result.values, result.estimate.rate_hz
     moving, _ = detect_motion(values, rate_hz)
     for line in detect_spectral_lines_per_axis(values, moving, rate_hz, result.estimate.curve):
@@ -90,20 +94,20 @@ def _of_events(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[s
         rows = slice(begin, begin + DETECTOR_CHUNK_ROWS)
         detector.process_samples(np.where(moving[rows, None], np.nan, values[rows]))
     for change in detector.take_changes():
-        name = _of_change(change)
+        name = _name_of_change(change)
         if name:
             yield AXES[change.axis], name
 
 
-def _of_change(change: Change) -> str | None:
-    """What a change is called; noise that changed elsewhere than in white noise has no name."""
+def _name_of_change(change: Change) -> str | None:
+    """Return the name of a change, or None for a change of noise without a change of white noise."""
     if change.kind == "noise_changed":
         return "noise_step" if "N" in change.what else None
     return {"bias_stepped": "bias_step", "outlier_burst": "outliers"}[change.kind]
 
 
 def _expected(line: SpectralLine, model: NoiseModel) -> bool:
-    """Whether the model has a line or a resonance there."""
+    """Return True if the model has a line or resonance at this frequency."""
     for effect in model.effects.get(AXES[line.axis], ()):
         if (
             isinstance(effect, Sinusoidal)

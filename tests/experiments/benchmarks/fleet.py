@@ -1,8 +1,8 @@
-"""Many daemons, three routers and one watcher on this machine: who is seen, who is missed, traffic and processor.
+"""Fleet of daemons with three routers and one watcher on this machine: states, detection of a kill, traffic and load.
 
-Each daemon is ``imu-monitor run`` in a process of its own, with a simulated sensor; two routers at the leaves, to which
-the daemons connect by turns, and one at the root, where the watcher is. Where it may, all of it runs in a network
-namespace of its own, so that the counters of ``lo`` are of nothing else.
+Each daemon is ``imu-monitor run`` in a separate process with a simulated sensor. The daemons connect alternately to two
+leaf routers, and the watcher connects to the root router. If possible, everything runs in a separate network namespace,
+so that the counters of the interface ``lo`` contain no other traffic.
 
     python -m tests.experiments.benchmarks.fleet [--daemons 50] [--seconds 30] [--rate 10] [--publish "1 Hz"]
     python -m tests.experiments.benchmarks.fleet --settings    bytes/s by topic, for several settings
@@ -32,9 +32,9 @@ from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from tests.support.ports import free_port
 
 PATIENCE_S: Final = 600.0
-TOGETHER: Final = 4
-"""Daemons that start at a time: importing is what they do most then."""
-INSIDE: Final = "IMU_MONITOR_BENCH_NAMESPACE"
+PARALLEL_STARTS: Final = 4
+"""Number of daemons that start at the same time."""
+NAMESPACE_VARIABLE: Final = "IMU_MONITOR_BENCH_NAMESPACE"
 DAEMON: Final = """
 [[device]]
 name = "imu{i}"
@@ -64,7 +64,7 @@ SETTINGS: Final = ((10, "1 Hz"), (100, "1 Hz"), (100, "10 Hz"), (1000, "10 Hz"),
 
 
 class Process:
-    """A child of the bench, and what it takes."""
+    """Child process with its processor time and memory."""
 
     def __init__(self, *arguments: str) -> None:
         self._child = subprocess.Popen(
@@ -73,16 +73,16 @@ class Process:
         self.seen = psutil.Process(self._child.pid)
 
     def cpu_s(self) -> float:
-        """Processor seconds so far."""
+        """Return the processor time so far in seconds."""
         t = self.seen.cpu_times()
         return float(t.user + t.system)
 
     def memory_bytes(self) -> int:
-        """Of its own: what it shares with others is not counted."""
+        """Return the memory that the process does not share with other processes."""
         return int(self.seen.memory_full_info().uss)
 
     def end(self, number: int = signal.SIGTERM) -> None:
-        """Send the signal, and wait."""
+        """Send a signal and wait for the end of the process."""
         if self._child.poll() is None:
             self._child.send_signal(number)
             try:
@@ -96,8 +96,8 @@ class Process:
 
 
 @contextlib.contextmanager
-def routers() -> Iterator[tuple[str, list[str], list[Process]]]:
-    """The root's endpoint, those of the two leaves, and their processes."""
+def start_routers() -> Iterator[tuple[str, list[str], list[Process]]]:
+    """Start three routers. Yield the endpoint of the root, the endpoints of the leaves, and the processes."""
     root, *leaves = (f"tcp/127.0.0.1:{free_port()}" for _ in range(3))
     processes = [Process("-m", "tests.experiments.benchmarks.fleet", "--router", root)]
     processes += [Process("-m", "tests.experiments.benchmarks.fleet", "--router", leaf, root) for leaf in leaves]
@@ -108,20 +108,20 @@ def routers() -> Iterator[tuple[str, list[str], list[Process]]]:
             process.end()
 
 
-def route(endpoint: str, *above: str) -> None:
-    """A router in this process, until its input ends."""
+def run_router(endpoint: str, *above: str) -> None:
+    """Run a router in this process until standard input ends."""
     own: dict[str, Any] = {"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(above)}
-    own["connect/timeout_ms"] = -1  # what is above may start later
-    own["transport/shared_memory/enabled"] = False  # on one machine longer messages would not pass the interface
+    own["connect/timeout_ms"] = -1  # the root may start later
+    own["transport/shared_memory/enabled"] = False  # with shared memory, long messages would not pass the interface
     with zenoh.open(build_session_config(own)):
         while sys.stdin.readline():
             pass
 
 
-def daemon(
+def start_daemon(
     folder: Path, router: str, i: int, rate: float, publish: str, window: str = "10min", more: str = ""
 ) -> Process:
-    """``imu-monitor run`` of one device."""
+    """Start ``imu-monitor run`` with one device."""
     path, model = folder / f"{i}.toml", folder / f"{i}.model.toml"
     model.write_text(MODEL.format(rate=float(rate)))
     path.write_text(DAEMON.format(i=i, rate=rate, publish=publish, router=router, model=model))
@@ -129,77 +129,87 @@ def daemon(
 
 
 class Watcher:
-    """What ``watch`` has, and when each token went."""
+    """Device states as in ``watch``, and the times at which liveliness tokens disappeared."""
 
     def __init__(self, endpoint: str) -> None:
-        self.arriving = ZenohSubscriber("imu/**", [endpoint])
-        self.board = RemoteDeviceRegistry()
+        self.subscriber = ZenohSubscriber("imu/**", [endpoint])
+        self.registry = RemoteDeviceRegistry()
         self.gone_s: dict[str, float] = {}
         self.messages: Counter[str] = Counter()
         self.bytes: Counter[str] = Counter()
-        self.arriving.start()
+        self.subscriber.start()
 
     def take(self, wait_s: float = 0.05) -> None:
-        """What came."""
-        for message in self.arriving.take(wait_s):
+        """Process the messages that have arrived."""
+        for message in self.subscriber.take(wait_s):
             topic = message.key.rpartition("/")[2]
             self.messages[topic] += 1
             self.bytes[topic] += len(message.payload or b"")
             if message.payload is None:
-                self.board.set_liveliness_token(message.key, message.token_exists)
+                self.registry.set_liveliness_token(message.key, message.token_exists)
                 if not message.token_exists:
                     self.gone_s[message.key] = time.monotonic()
             else:
-                self.board.process_message(message.key, message.payload)
+                self.registry.process_message(message.key, message.payload)
 
-    def until(self, true: Callable[[], bool], what: str) -> float:
-        """s until it is true."""
+    def until(self, condition: Callable[[], bool], what: str) -> float:
+        """Process messages until the condition is true, and return the elapsed time in seconds."""
         begun_s = time.monotonic()
-        while not true():
+        while not condition():
             if time.monotonic() - begun_s > PATIENCE_S:
                 raise SystemExit(f"waited {PATIENCE_S:.0f} s for {what}")
             self.take()
         return time.monotonic() - begun_s
 
     def states(self) -> Counter[str]:
-        """How many devices are in which state."""
+        """Return the number of devices in each state."""
         now_s = time.monotonic()
-        return Counter(one.state(now_s) for one in self.board.devices_with_problems_first(now_s))
+        return Counter(device.state(now_s) for device in self.registry.devices_with_problems_first(now_s))
 
 
-def fleet(daemons: int, rate: float, publish: str, seconds: float) -> dict[str, Any]:
-    """All of it, measured."""
-    with tempfile.TemporaryDirectory() as name, routers() as (root, leaves, routing), contextlib.ExitStack() as ending:
+def run_fleet(daemons: int, rate: float, publish: str, seconds: float) -> dict[str, Any]:
+    """Run a fleet and return all measurements."""
+    with (
+        tempfile.TemporaryDirectory() as name,
+        start_routers() as (root, leaves, router_processes),
+        contextlib.ExitStack() as stack,
+    ):
         watcher = Watcher(root)
-        ending.callback(watcher.arriving.close)
+        stack.callback(watcher.subscriber.close)
         running = []
         begun_s = time.monotonic()
         for i in range(daemons):
-            running.append(daemon(Path(name), leaves[i % 2], i, rate, publish))
-            ending.callback(running[-1].end)
-            if (i + 1) % TOGETHER == 0 or i + 1 == daemons:
+            running.append(start_daemon(Path(name), leaves[i % 2], i, rate, publish))
+            stack.callback(running[-1].end)
+            if (i + 1) % PARALLEL_STARTS == 0 or i + 1 == daemons:
                 watcher.until(lambda n=i + 1: watcher.states()["running"] == n, f"{i + 1} daemons")  # type: ignore[misc]
         started_s = time.monotonic() - begun_s
         found = {"daemons": daemons, "rate": rate, "publish": publish, "all running after s": round(started_s, 1)}
-        found |= _steady(watcher, running, routing, seconds)
-        found |= _killed(watcher, running[daemons // 2], f"imu/imu{daemons // 2}/alive")
+        found |= _measure_traffic(watcher, running, router_processes, seconds)
+        found |= _kill_daemon(watcher, running[daemons // 2], f"imu/imu{daemons // 2}/alive")
         return found
 
 
-def _steady(watcher: Watcher, running: list[Process], routing: list[Process], seconds: float) -> dict[str, Any]:
-    """Traffic and processor once all run; what a first minute takes to compile is over by then."""
+def _measure_traffic(
+    watcher: Watcher, running: list[Process], router_processes: list[Process], seconds: float
+) -> dict[str, Any]:
+    """Measure traffic and processor time after all daemons have started and compiled their kernels."""
     watcher.until(lambda: watcher.states()["running"] == len(running), "all to run")
     settle_s = time.monotonic() + 0.5 * seconds
     watcher.until(lambda: time.monotonic() > settle_s, "quiet")
     watcher.messages.clear()
     watcher.bytes.clear()
-    n, mine = len(running), psutil.Process()
-    before, begun_s, own_s = [p.cpu_s() for p in (*running, *routing)], time.monotonic(), sum(mine.cpu_times()[:2])
+    n, this_process = len(running), psutil.Process()
+    before, begun_s, own_s = (
+        [p.cpu_s() for p in (*running, *router_processes)],
+        time.monotonic(),
+        sum(this_process.cpu_times()[:2]),
+    )
     lo = _loopback_bytes()
     watcher.until(lambda: time.monotonic() - begun_s > seconds, "the measurement")
     took_s = time.monotonic() - begun_s
     lo = _loopback_bytes() - lo
-    cpu = [(after.cpu_s() - b) / took_s for after, b in zip((*running, *routing), before, strict=True)]
+    cpu = [(after.cpu_s() - b) / took_s for after, b in zip((*running, *router_processes), before, strict=True)]
     memory = sorted(p.memory_bytes() for p in running)
     # on a busy machine a daemon may have been silent for a moment
     watcher.until(lambda: watcher.states()["running"] == n, "all to run after the measurement")
@@ -209,41 +219,45 @@ def _steady(watcher: Watcher, running: list[Process], routing: list[Process], se
         "payload bytes/s of a device": {topic: round(size / took_s / n, 1) for topic, size in watcher.bytes.items()},
         "messages/s of a device": {topic: round(count / took_s / n, 2) for topic, count in watcher.messages.items()},
         "loopback bytes/s of a device, three hops": round(lo / took_s / n),
-        "loopback counts nothing else": bool(os.environ.get(INSIDE)),
+        "loopback counts nothing else": bool(os.environ.get(NAMESPACE_VARIABLE)),
         "processor of a daemon, % of a core": {
             "median": round(100 * sorted(cpu[:n])[n // 2], 2),
             "most": round(100 * max(cpu[:n]), 2),
         },
-        "processor of the routers, % of a core": [round(100 * one, 2) for one in cpu[n:]],
-        "processor of the watcher, % of a core": round(100 * (sum(mine.cpu_times()[:2]) - own_s) / took_s, 2),
+        "processor of the routers, % of a core": [round(100 * share, 2) for share in cpu[n:]],
+        "processor of the watcher, % of a core": round(100 * (sum(this_process.cpu_times()[:2]) - own_s) / took_s, 2),
         "memory of a daemon, MB": {"median": round(memory[n // 2] / 1e6), "most": round(memory[-1] / 1e6)},
-        "memory of a router, MB": [round(p.memory_bytes() / 1e6) for p in routing],
-        "dropped": watcher.arriving.dropped,
+        "memory of a router, MB": [round(p.memory_bytes() / 1e6) for p in router_processes],
+        "dropped": watcher.subscriber.dropped,
     }
 
 
-def _killed(watcher: Watcher, victim: Process, key: str) -> dict[str, Any]:
-    """SIGKILL to one: when its token goes, and when the table says so."""
+def _kill_daemon(watcher: Watcher, victim: Process, key: str) -> dict[str, Any]:
+    """Kill one daemon, and return the delays until its token disappears and the table shows it."""
     watcher.take(0.0)
     watcher.gone_s.clear()
     before = watcher.states()["gone"]
     killed_s = time.monotonic()
     victim.seen.kill()
-    told_s = watcher.until(lambda: watcher.states()["gone"] > before, "the killed one to be missed")
+    shown_s = watcher.until(lambda: watcher.states()["gone"] > before, "the killed one to be missed")
     return {
-        "killed": {"token gone after s": round(watcher.gone_s[key] - killed_s, 3), "shown after s": round(told_s, 3)}
+        "killed": {"token gone after s": round(watcher.gone_s[key] - killed_s, 3), "shown after s": round(shown_s, 3)}
     }
 
 
-def settings(seconds: float) -> list[dict[str, Any]]:
-    """Payload bytes a second of one device by topic, everything subscribed to."""
+def measure_settings(seconds: float) -> list[dict[str, Any]]:
+    """Print the payload bytes per second of one device by topic for several settings."""
     rows = []
     for rate, publish in SETTINGS:
-        with tempfile.TemporaryDirectory() as name, routers() as (root, leaves, _), contextlib.ExitStack() as ending:
-            process = daemon(Path(name), leaves[0], 0, rate, publish)
-            ending.callback(process.end)
+        with (
+            tempfile.TemporaryDirectory() as name,
+            start_routers() as (root, leaves, _),
+            contextlib.ExitStack() as stack,
+        ):
+            process = start_daemon(Path(name), leaves[0], 0, rate, publish)
+            stack.callback(process.end)
             own = {"mode": "client", "connect/endpoints": [root], "connect/timeout_ms": -1}
-            session: Any = ending.enter_context(zenoh.open(build_session_config(own)))
+            session: Any = stack.enter_context(zenoh.open(build_session_config(own)))
             subscriber: Any = session.declare_subscriber("imu/**", zenoh.handlers.RingChannel(100_000))
             channel = subscriber.handler
             _wait_for_coefficients(channel)
@@ -271,7 +285,7 @@ def settings(seconds: float) -> list[dict[str, Any]]:
 
 
 def _wait_for_coefficients(channel: Any) -> None:
-    """Until kernels are there and the first fit is out."""
+    """Wait for the first message with coefficients."""
     end_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < end_s:
         sample = channel.try_recv()
@@ -283,25 +297,30 @@ def _wait_for_coefficients(channel: Any) -> None:
 
 
 def _loopback_bytes() -> int:
-    """Sent over ``lo`` since it is up."""
+    """Return the number of bytes sent over ``lo``."""
     line = next(
         line for line in Path("/proc/net/dev").read_text("ascii").splitlines() if line.strip().startswith("lo:")
     )
     return int(line.split(":")[1].split()[8])
 
 
-def _alone() -> None:
-    """Go on in a network namespace of its own, where that may be made."""
-    if os.environ.get(INSIDE) is not None or os.geteuid() != 0 or not shutil.which("unshare") or not shutil.which("ip"):
+def _restart_in_namespace() -> None:
+    """Restart the program in a separate network namespace, if this is permitted."""
+    if (
+        os.environ.get(NAMESPACE_VARIABLE) is not None
+        or os.geteuid() != 0
+        or not shutil.which("unshare")
+        or not shutil.which("ip")
+    ):
         return
     again = [sys.executable, "-m", "tests.experiments.benchmarks.fleet", *sys.argv[1:]]
     line = 'ip link set lo up && exec "$@"'
-    os.environ[INSIDE] = "1"
+    os.environ[NAMESPACE_VARIABLE] = "1"
     os.execvp("unshare", ["unshare", "--net", "--", "sh", "-c", line, "sh", *again])
 
 
 def main() -> None:
-    """Measure, and print it as JSON."""
+    """Measure and print the results as JSON."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--daemons", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=30.0)
@@ -309,15 +328,15 @@ def main() -> None:
     parser.add_argument("--publish", default="1 Hz")
     parser.add_argument("--settings", action="store_true")
     parser.add_argument("--router", nargs="+", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.router:
-        route(*asked.router)
+    arguments = parser.parse_args()
+    if arguments.router:
+        run_router(*arguments.router)
         return
-    _alone()
-    if asked.settings:
-        settings(asked.seconds)
+    _restart_in_namespace()
+    if arguments.settings:
+        measure_settings(arguments.seconds)
     else:
-        print(json.dumps(fleet(asked.daemons, asked.rate, asked.publish, asked.seconds), indent=1))
+        print(json.dumps(run_fleet(arguments.daemons, arguments.rate, arguments.publish, arguments.seconds), indent=1))
 
 
 if __name__ == "__main__":

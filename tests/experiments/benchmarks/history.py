@@ -1,10 +1,10 @@
-"""History: what it costs an estimate, its size after years, how fast it is asked, what a hundred kills leave.
+"""Cost of the history per estimate, its size after years, duration of queries, and consistency after kills.
 
     python -m tests.experiments.benchmarks.history [--years 5] [--kills 100] [--keep FILE]
 
-The years are those of one device of six axes, written as the daemon writes: a row a minute, all numbers that a window
-of an hour at 100 Hz gives, thinned as they age, one event every three hours. Their values wander, step and jump like a
-sensor's that is replaced, heated and knocked.
+The simulated years belong to one device of six axes and are written as by the daemon. There is a row for each minute
+with all numbers of a window of an hour at 100 Hz, and an event every three hours. Old rows are merged. The values
+change slowly, with steps and single outliers.
 """
 
 import argparse
@@ -13,6 +13,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,14 +30,14 @@ from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.history import HistoryMessage
 from tests.experiments.benchmarks.machine import Load
-from tests.monitor.history.kills import kill
-from tests.monitor.publishing.made import estimate
+from tests.monitor.history.kill_writers import kill_writers
+from tests.monitor.publishing.example_results import make_estimate
 
 T0 = 1_609_459_200  # 2021-01-01
 DAY_S, MINUTES, YEAR_D = 86_400, 1440, 365.25
-LOOKS = 600  # estimates a minute at 10 Hz
+ESTIMATES_PER_MINUTE = 600  # at 10 Hz
 DEVICE = "bench-1"
-QUESTIONS = (
+QUERIES = (
     ("last hour", 3600.0, HistoryQuery()),
     ("last day", 86_400.0, HistoryQuery()),
     ("last month", 30 * 86_400.0, HistoryQuery()),
@@ -51,43 +52,43 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--years", type=float, default=5.0)
     parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--keep", type=Path, help="where to leave the file of the years")
-    asked = parser.parse_args()
+    parser.add_argument("--keep", type=Path, help="path for the file of the years")
+    arguments = parser.parse_args()
     load = Load()
-    cost()
+    print_cost()
     with tempfile.TemporaryDirectory() as folder:
-        path = asked.keep or Path(folder) / "years.sqlite"
-        if asked.years:
-            years(path, asked.years)
-            queries(path)
-        if asked.kills:
-            kills(Path(folder) / "kills.sqlite", asked.kills)
-    print(load.said())
+        path = arguments.keep or Path(folder) / "years.sqlite"
+        if arguments.years:
+            write_years(path, arguments.years)
+            print_queries(path)
+        if arguments.kills:
+            run_kills(Path(folder) / "kills.sqlite", arguments.kills)
+    print(load.describe())
 
 
-def cost() -> None:
-    """Of an estimate in the loop, and of a row in the writer's thread."""
-    looks = [estimate(seed=seed) for seed in range(50)]
+def print_cost() -> None:
+    """Print the time of an estimate in the main loop and of a row in the thread of the writer."""
+    estimates = [make_estimate(seed=seed) for seed in range(50)]
     minutes, rows = MinuteAggregator(), []
     begun = time.perf_counter()
     for i in range(20_000):
-        rows.append(minutes.add_estimate(T0 + 0.1 * i, looks[i % 50]))
+        rows.append(minutes.add_estimate(T0 + 0.1 * i, estimates[i % 50]))
     each = (time.perf_counter() - begun) / 20_000
     full = [row for row in rows if row is not None]
     print(f"an estimate: {each * 1e6:.1f} µs in the loop; {len(full[0].names)} numbers")
-    packed = _timed(lambda: [pack_count_min_max_last(row) for row in full]) / len(full)
+    packed = _measure_time(lambda: [pack_count_min_max_last(row) for row in full]) / len(full)
     size = np.mean([len(pack_count_min_max_last(row)) for row in full])
     print(f"a row: {packed * 1e6:.0f} µs to pack, {size:.0f} bytes")
 
 
-def years(path: Path, count: float) -> None:
-    """Write so many years, and say what they take."""
-    rng, course = np.random.default_rng(1), _Course(estimate())
+def write_years(path: Path, count: float) -> None:
+    """Write the years, and print size and time."""
+    rng, simulated_days = np.random.default_rng(1), _SimulatedDays(make_estimate())
     store, begun, written = HistoryFileWriter(path), time.perf_counter(), 0
     days = round(count * YEAR_D)
     largest = 0
     for day in range(days):
-        rows = course.day(day, rng)
+        rows = simulated_days.day(day, rng)
         store.write_rows_and_events([(DEVICE, row) for row in rows], [(DEVICE, one) for one in _events(day, rng)])
         written += len(rows)
         while store.merge_old_rows(math.inf, 1000):
@@ -106,35 +107,36 @@ def years(path: Path, count: float) -> None:
         print(f"  events: {reader.read_events(DEVICE, TimeRange(-math.inf, math.inf), 10**9)[1]:,}")
 
 
-def queries(path: Path) -> None:
-    """How long an answer takes, from the file to the message."""
+def print_queries(path: Path) -> None:
+    """Print the time of each query, from the file to the message."""
     with open_history(path) as reader:
-        held = reader.stored_range(DEVICE)
-    assert held is not None
-    for name, seconds, asked in QUESTIONS:
-        span = TimeRange(held[1] - seconds, held[1])
-        read_s = _timed(lambda span=span, asked=asked: _read(path, span, asked))  # type: ignore[misc]
-        found = _read(path, span, asked)
-        said_s = _timed(lambda found=found, asked=asked: HistoryMessage.build_reply(found, asked, 0.0, 0).encode())  # type: ignore[misc]
-        size = len(HistoryMessage.build_reply(found, asked, 0.0, 0).encode())
+        stored = reader.stored_range(DEVICE)
+    assert stored is not None
+    for name, seconds, query in QUERIES:
+        span = TimeRange(stored[1] - seconds, stored[1])
+        read_s = _measure_time(partial(_read, path, span, query))
+        found = _read(path, span, query)
+        encode = partial(_encode_reply, found, query)
+        write_s = _measure_time(encode)
+        size = len(encode())
         print(
             f"{name}: {len(found)} buckets of {found.step_s} s; {read_s * 1e3:.0f} ms to read, "
-            f"{said_s * 1e3:.0f} ms to write as {size / 1e3:.0f} kB"
+            f"{write_s * 1e3:.0f} ms to write as {size / 1e3:.0f} kB"
         )
 
 
-def kills(path: Path, count: int) -> None:
-    """Kill a writer at random moments; the check is in ``tests.monitor.history.kills``."""
-    left = kill(path, count, seed=1, within_s=0.2)
-    unsaid = sum(one.found > one.acknowledged for one in left)
+def run_kills(path: Path, count: int) -> None:
+    """Kill a writer at random moments; the check is in ``tests.monitor.history.kill_writers``."""
+    left = kill_writers(path, count, seed=1, within_s=0.2)
+    unacknowledged = sum(result.found > result.acknowledged for result in left)
     print(
         f"{count} kills: {left[-1].found:,} minutes, each in one row, sums and extremes exact; "
-        f"{unsaid} of the kills came after a commit and before it was said"
+        f"{unacknowledged} of the kills came after a commit and before its acknowledgement"
     )
 
 
-class _Course:
-    """Rows of days: each number wanders around what a sensor has."""
+class _SimulatedDays:
+    """Simulation of the rows of a day with slowly changing numbers."""
 
     def __init__(self, first: Estimate) -> None:
         numbers = EstimateToColumnsConverter(first)
@@ -145,7 +147,7 @@ class _Course:
         self._spread = np.array([_spread(name) for name in self.names])
 
     def day(self, day: int, rng: np.random.Generator) -> list[HistoryRow]:
-        """A day of minutes; now and then the device is away for some of them."""
+        """Return the rows of a day. On some days, rows are missing."""
         t = (day * MINUTES + np.arange(MINUTES)) / MINUTES  # d
         k = len(self.names)
         wander = np.cumsum(rng.standard_normal((MINUTES, k)), axis=0) * 0.02
@@ -155,13 +157,13 @@ class _Course:
             self._spread * (season + 0.03 * wander + 0.01 * rng.standard_normal((MINUTES, k)) + old)
         )
         half = np.abs(self._spread * rng.standard_normal((2, MINUTES, k)) * 0.004)
-        knocked = rng.random(MINUTES) < 0.5 / MINUTES
-        half[1][knocked] += 0.5 * self._spread
+        outliers = rng.random(MINUTES) < 0.5 / MINUTES
+        half[1][outliers] += 0.5 * self._spread
         low, high = (last * (1.0 - half[0])).astype(np.float32), (last * (1.0 + half[1])).astype(np.float32)
-        n = np.where(np.isfinite(self._centre), LOOKS, 0)
-        away = slice(700, 700 + int(rng.integers(0, 400))) if rng.random() < 0.02 else slice(0, 0)
+        n = np.where(np.isfinite(self._centre), ESTIMATES_PER_MINUTE, 0)
+        absent = slice(700, 700 + int(rng.integers(0, 400))) if rng.random() < 0.02 else slice(0, 0)
         there = np.ones(MINUTES, np.bool_)
-        there[away] = False
+        there[absent] = False
         singles, day_s = last.astype(np.float32), T0 + day * DAY_S
         rows = []
         for i in np.flatnonzero(there).tolist():
@@ -191,13 +193,17 @@ def _events(day: int, rng: np.random.Generator) -> list[StoredEvent]:
     return found
 
 
-def _read(path: Path, span: TimeRange, asked: HistoryQuery) -> HistoryTable:
+def _read(path: Path, span: TimeRange, query: HistoryQuery) -> HistoryTable:
     with open_history(path) as reader:
-        return past.read_history(reader, DEVICE, span, asked.selects_column, asked.step_s)
+        return past.read_history(reader, DEVICE, span, query.selects_column, query.step_s)
 
 
-def _timed(work: Callable[[], object]) -> float:
-    """The best of three, s."""
+def _encode_reply(table: HistoryTable, query: HistoryQuery) -> bytes:
+    return HistoryMessage.build_reply(table, query, 0.0, 0).encode()
+
+
+def _measure_time(work: Callable[[], object]) -> float:
+    """Return the least time of three runs in seconds."""
     taken: list[float] = []
     for _ in range(3):
         begun = time.perf_counter()
@@ -207,7 +213,7 @@ def _timed(work: Callable[[], object]) -> float:
 
 
 def _size(path: Path) -> int:
-    """With what stands beside it."""
+    """Return the size of a file and of the files with the same prefix."""
     return sum(os.stat(one).st_size for one in path.parent.glob(f"{path.name}*"))
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from tests.experiments.benchmarks.machine import console, table
+from tests.experiments.benchmarks.machine import console, create_table
 
 ROOT: Final = Path(__file__).parents[3]
 DEVELOPMENT: Final = ("test", "fuzz")
@@ -29,7 +29,7 @@ LARGEST: Final = 6
 MB: Final = 1e6
 
 
-def sizes(folder: Path) -> Counter[str]:
+def measure_packages(folder: Path) -> Counter[str]:
     """Return the bytes of each package in a site-packages folder, by the name of its folder or file."""
     found = Counter[str]()
     for place, _, names in os.walk(folder):
@@ -41,13 +41,13 @@ def sizes(folder: Path) -> Counter[str]:
     return found
 
 
-def fresh(folder: Path) -> Counter[str]:
+def create_environment(folder: Path) -> Counter[str]:
     """Make a virtual environment with pip, and return the bytes that it holds already."""
     venv.create(folder, with_pip=True)
-    return sizes(packages(folder))
+    return measure_packages(get_site_packages(folder))
 
 
-def packages(folder: Path) -> Path:
+def get_site_packages(folder: Path) -> Path:
     """Return the site-packages of an environment."""
     (found,) = folder.glob("lib/python*/site-packages")
     return found
@@ -58,19 +58,19 @@ def install(folder: Path, source: Path, extra: str) -> Counter[str]:
     what = f"{source}[{extra}]" if extra else str(source)
     command = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", what]
     subprocess.run(command, check=True, stdout=sys.stderr)
-    return sizes(packages(folder))
+    return measure_packages(get_site_packages(folder))
 
 
-def installed(source: Path, extras: Sequence[str]) -> Iterator[tuple[str, Counter[str]]]:
+def measure_installations(source: Path, extras: Sequence[str]) -> Iterator[tuple[str, Counter[str]]]:
     """Yield the bytes of an installation without extras, named "", and of one with each extra."""
     with TemporaryDirectory(prefix="imu-monitor-") as temporary:
-        base, beside = Path(temporary) / "base", Path(temporary) / "extra"
-        empty = fresh(base)
+        base, copy = Path(temporary) / "base", Path(temporary) / "extra"
+        empty = create_environment(base)
         yield "", install(base, source, "") - empty
         for extra in extras:
-            shutil.copytree(base, beside, symlinks=True)
-            yield extra, install(beside, source, extra) - empty
-            shutil.rmtree(beside)
+            shutil.copytree(base, copy, symlinks=True)
+            yield extra, install(copy, source, extra) - empty
+            shutil.rmtree(copy)
 
 
 def main() -> None:
@@ -78,19 +78,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--source", type=Path, default=ROOT, help="checkout to install")
     parser.add_argument("--extra", action="append", help="only these; else every extra of the project")
-    given = parser.parse_args()
-    project = tomllib.loads((given.source / "pyproject.toml").read_text("utf-8"))["project"]
-    extras = given.extra or [one for one in project["optional-dependencies"] if one not in DEVELOPMENT]
-    shown = table("installed size, MB", "extra", "whole", "it adds", "largest packages of what it adds")
+    arguments = parser.parse_args()
+    project = tomllib.loads((arguments.source / "pyproject.toml").read_text("utf-8"))["project"]
+    extras = arguments.extra or [one for one in project["optional-dependencies"] if one not in DEVELOPMENT]
+    table = create_table("installed size, MB", "extra", "whole", "it adds", "largest packages of what it adds")
     base = Counter[str]()
-    for extra, found in installed(given.source.resolve(), extras):
+    for extra, found in measure_installations(arguments.source.resolve(), extras):
         added = found - base
         largest = ", ".join(f"{name} {size / MB:.0f}" for name, size in added.most_common(LARGEST) if size > 0.5 * MB)
         more = f"{added.total() / MB:.1f}" if extra else ""
-        shown.add_row(extra or "(none)", f"{found.total() / MB:.1f}", more, largest)
+        table.add_row(extra or "(none)", f"{found.total() / MB:.1f}", more, largest)
         base = base or found
-    console.print(f"Python {sys.version.split()[0]}, {given.source.resolve().name}")
-    console.print(shown)
+    console.print(f"Python {sys.version.split()[0]}, {arguments.source.resolve().name}")
+    console.print(table)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""The daemon killed (SIGKILL) at random moments while a sensor sends a thousand samples a second: what is missing?
+"""Samples that are missing after a daemon was killed (SIGKILL) at random moments, with a sensor at 1 kHz.
 
     python -m tests.experiments.benchmarks.kill --kills 100 --seed 1
 
-The sensor is a pseudo-terminal in this process, whose lines carry a count. Each daemon records into the same folder,
-with segments of ten seconds, so that files are begun, ended and packed all the time. After each kill every file is
-read, and each row's count must follow from the one before by what it says was lost.
+The sensor is a pseudo-terminal in this process that prints lines with a counter. All daemons record into one folder,
+with segments of ten seconds, so that files are frequently started, ended and compressed. After each kill, every file is
+read. The counter of each row must agree with the previous row and the number of lost samples.
 """
 
 import argparse
@@ -54,14 +54,14 @@ raw = {raw}
 
 
 class Sensor:
-    """Lines with a count, a thousand a second; what nobody reads is gone, as on a wire."""
+    """Simulated sensor that prints a thousand lines per second with a counter. Unread lines are lost."""
 
     def __init__(self, folder: Path) -> None:
         self.port = folder / "tty"
         self._terminal = LineTerminal(self.port)
         self.device = os.readlink(self.port)
-        self.sent = 0  # counts that have been given to the wire
-        self.still = threading.Lock()  # nothing is sent while it is held
+        self.sent = 0  # number of lines that have been written
+        self.send_lock = threading.Lock()  # while it is locked, the sensor sends nothing
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -76,8 +76,8 @@ class Sensor:
         begun = time.monotonic()
         while not self._closing.wait(0.01):
             asked = time.monotonic()
-            with self.still:
-                begun += time.monotonic() - asked  # the sensor's clock stands still too
+            with self.send_lock:
+                begun += time.monotonic() - asked  # the clock of the sensor stops too
                 due = int((time.monotonic() - begun) * RATE)
                 values = 1e-3 * rng.standard_normal((due - self.sent, 6))
                 lines = [
@@ -90,16 +90,16 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Kill:
-    """One of them."""
+    """Result of one kill."""
 
     lived_s: float
-    rows: int  # that this daemon recorded
-    missing_s: float  # of what had come by then, not in the recording
-    batches_s: tuple[float, ...] = ()  # length of each batch of the newest segment, in s of samples
+    rows: int  # rows that this daemon recorded
+    missing_s: float  # duration of the sent samples that are not in the recording
+    batches_s: tuple[float, ...] = ()  # duration of each batch in the newest segment
 
 
 class Bench:
-    """Daemons one after the other on one folder."""
+    """Daemons that record one after the other into one folder."""
 
     def __init__(self, folder: Path, raw: bool = True) -> None:
         self.folder = folder / "store"
@@ -114,34 +114,34 @@ class Bench:
         self._log.close()
 
     def kill(self, after_s: float) -> Kill:
-        """Start, kill after so long, look at what there is."""
+        """Start a daemon, kill it after ``after_s`` seconds, and compare the recording with the sensor."""
         begun = time.monotonic()
         return self.kill_when(lambda _: time.monotonic() >= begun + after_s)
 
-    def kill_when(self, true: Callable[[int], bool]) -> Kill:
-        """Start a daemon, kill it once ``true`` of its process id holds, and compare the recording with the sensor.
+    def kill_when(self, condition: Callable[[int], bool]) -> Kill:
+        """Start a daemon, kill it once ``condition`` is true, and compare the recording with the sensor.
 
-        The sensor sends nothing between the moment at which ``true`` holds and the end of the process.
+        ``condition`` gets the process id. The sensor sends nothing between this moment and the end of the process.
         """
         before = self.ticks()
         process, begun = self._start(), time.monotonic()
         opened = None
 
-        def killed() -> bool:
+        def try_kill() -> bool:
             nonlocal opened
             if opened is None and self.has_port(process.pid):
                 opened = self.sensor.sent
-            if not true(process.pid):
+            if not condition(process.pid):
                 return False
-            with self.sensor.still:
-                if not true(process.pid):
+            with self.sensor.send_lock:
+                if not condition(process.pid):
                     return False
                 process.kill()
                 process.wait()
                 return True
 
         try:
-            wait_for(killed, "the moment of the kill")
+            wait_for(try_kill, "the moment of the kill")
             sent, lived_s = self.sensor.sent, time.monotonic() - begun
         finally:
             process.kill()
@@ -153,24 +153,24 @@ class Bench:
         return Kill(lived_s, rows, missing_s, self._batches_s() if rows else ())
 
     def after(self, condition: Callable[[int], bool], wait_s: float) -> Callable[[int], bool]:
-        """Return a condition: so many seconds have passed since another condition became true."""
+        """Return a condition that is true ``wait_s`` seconds after another condition became true."""
         since_s: float | None = None
 
-        def true(pid: int) -> bool:
+        def time_has_passed(pid: int) -> bool:
             nonlocal since_s
             if since_s is None and condition(pid):
                 since_s = time.monotonic()
             return since_s is not None and time.monotonic() >= since_s + wait_s
 
-        return true
+        return time_has_passed
 
     def recorded(self, rows: int) -> Callable[[int], bool]:
-        """Return a condition: so many more rows are recorded."""
+        """Return a condition that is true after ``rows`` more rows have been recorded."""
         before = len(self.ticks())
         return lambda _: len(self.ticks()) >= before + rows
 
-    def live(self, until: Callable[[], bool]) -> int:
-        """Start, stop in order (SIGTERM) once ``until`` holds; the exit status."""
+    def run_until(self, until: Callable[[], bool]) -> int:
+        """Start a daemon, stop it (SIGTERM) once ``until`` is true, and return its exit status."""
         process = self._start()
         try:
             wait_for(until, "the daemon to come up")
@@ -179,7 +179,7 @@ class Bench:
         return process.wait(PATIENCE_S)
 
     def ticks(self) -> Ints:
-        """The counts in all segments; AssertionError where a file cannot be read or a count does not follow."""
+        """Return the counters in all segments. Fail if a file is unreadable or a counter is wrong."""
         ticks, lost = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
         for path in segment_file.list_segments(self.folder / "bench"):
             for piece in segment_file.read_samples(path):
@@ -192,12 +192,12 @@ class Bench:
         return counts
 
     def _batches_s(self) -> tuple[float, ...]:
-        """Seconds of samples in each batch of the newest segment, which stands as it was written."""
+        """Return the duration of each batch in the newest, uncompressed segment, in seconds."""
         newest = segment_file.list_segments(self.folder / "bench")[-1]
         return tuple(len(piece.samples) / RATE for piece in segment_file.read_samples(newest))
 
     def check_files(self) -> None:
-        """Every file with the commands' own reader, and the raw ones."""
+        """Read every file with the reader of the commands, and every raw file."""
         if segment_file.list_segments(self.folder / "bench"):
             recording = load_samples(self.folder / "bench")
             left_out = [note for note in recording.notes if "left out" in note]
@@ -208,7 +208,7 @@ class Bench:
         self._check_history()
 
     def _check_history(self) -> None:
-        """The store is whole, and no minute stands in it twice."""
+        """Check that the history is intact and contains no minute twice."""
         path = self.folder / "history.sqlite"
         if not path.exists():
             return
@@ -226,7 +226,7 @@ class Bench:
         """Return True if the process has opened the sensor's port."""
         try:
             names = [os.readlink(f"/proc/{pid}/fd/{fd}") for fd in os.listdir(f"/proc/{pid}/fd")]
-        except OSError:  # between two of them
+        except OSError:  # the process ends or closes a file
             return False
         return self.sensor.device in names
 
@@ -235,26 +235,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--longest", type=float, default=8.0, help="s that a daemon lives at most")
-    wanted = parser.parse_args()
-    rng = np.random.default_rng(wanted.seed)
+    parser.add_argument("--longest", type=float, default=8.0, help="longest life of a daemon in seconds")
+    arguments = parser.parse_args()
+    rng = np.random.default_rng(arguments.seed)
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder))
         try:
             kills = []
-            for i in range(wanted.kills):
-                kills.append(bench.kill(float(rng.uniform(0.2, wanted.longest))))
+            for i in range(arguments.kills):
+                kills.append(bench.kill(float(rng.uniform(0.2, arguments.longest))))
                 bench.check_files()
                 one = kills[-1]
                 print(f"{i + 1:4d}  lived {one.lived_s:4.1f} s  {one.rows:6d} rows  {one.missing_s:.3f} s missing")
             rows = len(bench.ticks())
-            status = bench.live(lambda: len(bench.ticks()) > rows + RATE)
-            _tell(kills, bench, status)
+            status = bench.run_until(lambda: len(bench.ticks()) > rows + RATE)
+            _print_summary(kills, bench, status)
         finally:
             bench.close()
 
 
-def _tell(kills: list[Kill], bench: Bench, status: int) -> None:
+def _print_summary(kills: list[Kill], bench: Bench, status: int) -> None:
     missing: Floats = np.array([one.missing_s for one in kills])
     files = len(list(bench.folder.rglob(f"*{segment_file.SUFFIX}")))
     print(

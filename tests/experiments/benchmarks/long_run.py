@@ -1,11 +1,11 @@
-"""Does the window stay exact for ever? Feeds it samples without end and compares it with a batch computation.
+"""Numerical error of the sliding window after very many samples, compared with a batch computation.
 
     python -m tests.experiments.benchmarks.long_run --samples 1e9
 
-9.81 on every axis under noise of 1e-4, in a window of an hour at 100 Hz; a thousand samples in each million are
-missing, and once, a tenth of the way in, a transient of 10⁶ times the noise passes through. It prints the largest
-relative difference between the Allan variances of the window and of ``batch.overlapping_avar`` over the very samples
-that it holds, as often as the run passes a power of ten, and at its end.
+The window has an hour at 100 Hz. Every axis is 9.81 plus noise of 1e-4. A thousand samples in each million are missing.
+After a tenth of the run, there is a transient of 10⁶ times the noise. At each power of ten and at the end, the program
+prints the largest relative difference between the Allan variances of the window and of ``batch.overlapping_avar`` for
+the same samples.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar
 from monitor.estimation.allan.window import AllanWindow
-from tests.experiments.benchmarks.machine import about, console
+from tests.experiments.benchmarks.machine import console, describe_machine
 
 LENGTH = 360_000
 BLOCK = 1_000_000
@@ -25,8 +25,8 @@ NOISE = 1e-4
 TRANSIENT = 1e6 * NOISE
 
 
-def block_of(index: int) -> Floats:
-    """One block [BLOCK, 6], the same whenever it is asked for."""
+def simulate_block(index: int) -> Floats:
+    """Return the block [BLOCK, 6] with this index."""
     rng = np.random.default_rng(index)
     values = 9.81 + NOISE * rng.standard_normal((BLOCK, 6))
     gap = int(rng.integers(BLOCK - 1000))
@@ -34,36 +34,36 @@ def block_of(index: int) -> Floats:
     return values
 
 
-def difference(window: AllanWindow, newest: Floats) -> float:
-    """Largest relative difference to the batch computation."""
+def largest_difference(window: AllanWindow, newest: Floats) -> float:
+    """Return the largest relative difference to the batch computation."""
     avar, terms = overlapping_avar(newest[-LENGTH:], window.factors)
     if not np.array_equal(terms, window.term_counts()):
         raise SystemExit("the window counts other terms than the batch computation")
     return float(np.nanmax(np.abs(window.avar() / avar - 1.0)))
 
 
-def run(blocks: int, say: Callable[[str], None]) -> float:
-    """Largest relative difference on the way through so many blocks."""
+def run(blocks: int, report: Callable[[str], None]) -> float:
+    """Process the blocks and return the largest relative difference."""
     window = AllanWindow(LENGTH, cluster_sizes(LENGTH, 100.0))
     worst, begun = 0.0, time.perf_counter()
     for index in range(blocks):
-        values = block_of(index)
+        values = simulate_block(index)
         if index == blocks // 10:
             values[1000:1050] += TRANSIENT
         window.append_samples(values)
         done = (index + 1) * BLOCK
         if index == blocks // 10 or index + 1 == blocks or str(done).rstrip("0") == "1":
-            worst = max(worst, found := difference(window, values))
-            say(f"{done:.0e} samples: {found:.1e}, {time.perf_counter() - begun:.0f} s")
+            worst = max(worst, found := largest_difference(window, values))
+            report(f"{done:.0e} samples: {found:.1e}, {time.perf_counter() - begun:.0f} s")
     return worst
 
 
 def main() -> None:
-    """Run and print."""
+    """Run and print the differences."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--samples", type=float, default=1e8)
     blocks = max(1, round(parser.parse_args().samples / BLOCK))
-    console.print(about())
+    console.print(describe_machine())
     console.print(f"largest difference: {run(blocks, console.print):.1e}")
 
 

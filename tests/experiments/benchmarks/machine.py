@@ -1,7 +1,7 @@
-"""What the benchmarks share: who else is busy, what the machine is, medians of alternated runs, and their tables.
+"""Load of the machine, description of the machine, times of alternating runs, and tables for all benchmarks.
 
-Ratios are taken from one run, the competitors in turn, so that a busy neighbour harms them alike. The
-neighbours are measured: processor time of the whole machine less that of this process and its children.
+The methods of a comparison run alternately, so that a load by other processes affects them alike. The load is the
+processor time of the whole machine less that of this process and its children.
 """
 
 import os
@@ -23,7 +23,7 @@ console = Console(width=WIDTH)
 
 
 class Load:
-    """How busy others kept the machine while this process and its children measured."""
+    """Processor time that other processes used during a measurement."""
 
     def __init__(self) -> None:
         self._wall_s = time.monotonic()
@@ -31,13 +31,13 @@ class Load:
         self._own_s = _own_s()
 
     def others(self) -> float:
-        """Cores that others used since the start, on average."""
+        """Return the mean number of cores that other processes used since the start."""
         wall_s = time.monotonic() - self._wall_s
         return max(0.0, (_busy_s() - self._busy_s - (_own_s() - self._own_s)) / wall_s)
 
-    def said(self) -> str:
-        """For the foot of a table."""
-        return f"meanwhile others used {self.others():.2f} of {os.cpu_count()} cores"
+    def describe(self) -> str:
+        """Return a sentence for the end of a table."""
+        return f"other processes used {self.others():.2f} of {os.cpu_count()} cores during the measurement"
 
 
 def _busy_s() -> float:
@@ -46,7 +46,7 @@ def _busy_s() -> float:
 
 
 def _own_s() -> float:
-    # children that were waited for are in os.times; those that still run are asked
+    # os.times includes only children that have ended
     t = os.times()
     running = psutil.Process().children(recursive=True)
     return t.user + t.system + t.children_user + t.children_system + sum(_process_s(child) for child in running)
@@ -60,16 +60,16 @@ def _process_s(process: psutil.Process) -> float:
     return float(t.user + t.system)
 
 
-def about() -> str:
-    """Machine class and versions, one line."""
+def describe_machine() -> str:
+    """Return the machine type and the versions of libraries in one line."""
     libraries = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
     return f"{os.cpu_count()}-core {platform.machine()}, Python {platform.python_version()}, {libraries}"
 
 
-def alternate(works: Mapping[str, Callable[[], None]], rounds: int) -> dict[str, tuple[float, float]]:
-    """(median, best) processor seconds of each work over that many rounds, one after the other in each round.
+def time_alternately(works: Mapping[str, Callable[[], None]], rounds: int) -> dict[str, tuple[float, float]]:
+    """Run all works in each round, and return the median and least processor time of each work in seconds.
 
-    Processor time of this thread: where others wait for the same cores, the clock on the wall measures them.
+    The times are processor times of this thread, because the wall clock also measures other processes.
     """
     took: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(rounds):
@@ -80,10 +80,10 @@ def alternate(works: Mapping[str, Callable[[], None]], rounds: int) -> dict[str,
     return {name: (float(np.median(t)), min(t)) for name, t in took.items()}
 
 
-def table(title: str, first: str, *columns: str) -> Table:
-    """A table of figures: the first column words, the others numbers."""
-    made = Table(title=title, title_justify="left")
-    made.add_column(first)
+def create_table(title: str, first: str, *columns: str) -> Table:
+    """Return a table whose first column contains text and whose other columns contain numbers."""
+    new_table = Table(title=title, title_justify="left")
+    new_table.add_column(first)
     for heading in columns:
-        made.add_column(heading, justify="right")
-    return made
+        new_table.add_column(heading, justify="right")
+    return new_table

@@ -1,6 +1,6 @@
-"""What a scrape of ``[metrics]`` takes of a processor, and weighs: ``python -m tests.experiments.benchmarks.metrics``.
+"""Processor time and size of a scrape of ``[metrics]``: ``python -m tests.experiments.benchmarks.metrics``.
 
-Time of the processor, with that of the client that asks: it is the same on a loaded machine.
+The processor time includes the client and does not depend on the load of the machine.
 """
 
 import statistics
@@ -9,26 +9,26 @@ import urllib.request
 
 from monitor.daemon.operations.prometheus_metrics import MetricsOutput
 from monitor.settings.loading import MetricsAddress
-from tests.monitor.publishing import made
+from tests.monitor.publishing import example_results
 
 SCRAPES = 30
 
 
 def main() -> None:
-    """1, 16 and 100 devices."""
+    """Measure 1, 16 and 100 devices."""
     for devices in (1, 16, 100):
         output = MetricsOutput(MetricsAddress("127.0.0.1", 0))
         for i in range(devices):
-            output.publish_health(f"device-{i}", 0.0, made.health())
-            output.publish_result(f"device-{i}", 0.0, 0, made.estimate())
+            output.publish_health(f"device-{i}", 0.0, example_results.make_health())
+            output.publish_result(f"device-{i}", 0.0, 0, example_results.make_estimate())
         output.start()
         while not output.port:
             time.sleep(0.01)
         took_s, size = [], 0
         for _ in range(SCRAPES):
             begun_s = time.process_time()
-            with urllib.request.urlopen(f"http://127.0.0.1:{output.port}/metrics") as answer:
-                size = len(answer.read())
+            with urllib.request.urlopen(f"http://127.0.0.1:{output.port}/metrics") as response:
+                size = len(response.read())
             took_s.append(time.process_time() - begun_s)
         output.close()
         print(f"{devices:4d} devices: {1e3 * statistics.median(took_s):6.1f} ms, {size / 1e3:7.1f} kB")

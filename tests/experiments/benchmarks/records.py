@@ -1,18 +1,17 @@
-"""Simulated records for the statistical proofs, exact, and made without any code of ``monitor.noise``.
+"""Exact simulation of records for the statistical experiments, without code of ``monitor.noise``.
 
-A record is the sum, sampled at τ0, of the terms of IEEE Std 952: Q the differences of white angle noise, N white noise,
-B noise of spectrum B²/(2πf) up to half the sample rate and none above, K the running sum of white noise, R a straight
-line. These are also the definitions of ``monitor.noise``; there B comes out of a filter that follows 1/f within a
-tenth of a percent, here there is no filter.
+A record is the sum of the terms of IEEE Std 952, sampled at τ0. Q is the difference of white angle noise, N is white
+noise, B has the spectrum B²/(2πf) up to half the sample rate, K is the cumulative sum of white noise, and R is a
+straight line. ``monitor.noise`` uses the same definitions, but its filter for B follows 1/f only to 0.1 %.
 
-Q, N, B, K are not all stationary, but the steps of the rate from sample to sample are, and their autocovariance r is
-known in closed form. The circulant matrix whose first row is r, there and back, has the eigenvalues DCT-I(r); none is
-negative for these noises, so white noise through the root of them and a Fourier transform has exactly the wanted
-autocovariance (Davies & Harte, Biometrika 74, 1987; Dietrich & Newsam, SIAM J. Sci. Comput. 18, 1997), and twice:
-in its real and in its imaginary part. The running sum of the steps is the record, up to its mean, which no Allan
-variance sees.
+Not all terms are stationary, but the differences of successive samples are. Their autocovariance r is known in closed
+form. The circulant matrix whose first row is r followed by its mirror image has the eigenvalues DCT-I(r), which are not
+negative for these noises. White noise times the square roots of the eigenvalues is Fourier-transformed. The real and
+the imaginary part of the result then have exactly this autocovariance (Davies & Harte, Biometrika 74, 1987; Dietrich &
+Newsam, SIAM J. Sci. Comput. 18, 1997). The cumulative sum of the differences is the record, except for its mean, which
+does not change an Allan variance.
 
-Also here: the Cramér–Rao limit of such records, and the file of counts that makes long runs divisible.
+The module also contains the Cramér–Rao limit of such records, and the file of counts with which a run is continued.
 """
 
 import argparse
@@ -34,22 +33,22 @@ from monitor.estimation.fit.coefficient_values import SYMBOLS
 
 RATE_HZ: Final = 100.0
 AXES: Final = 6
-LONG: Final = 4096
-"""Samples; in clusters from here on the end of the spectrum changes flicker by less than a millionth."""
+LARGE_CLUSTER: Final = 4096
+"""Cluster size in samples from which the upper end of the spectrum changes flicker by less than 1e-6."""
 CHUNK: Final = 60
-"""Records of a chunk, the least that is stored."""
+"""Number of records in a chunk, the smallest unit in the file."""
 MIN_45: Final = 2700
 HOURS_3: Final = 10_800
 HOURS_24: Final = 86_400
 NAMES: Final = {MIN_45: "45 min", HOURS_3: "3 h", HOURS_24: "24 h"}
 
 Chunk = dict[str, Any]
-"""One line of the file: cell, seconds, seed, chunk, records, cpu_s, and what the program counted."""
+"""One line of the file: cell, seconds, seed, chunk, records, cpu_s, and the counts of the experiment."""
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """What a record is made of, SI; zero is absent."""
+    """Coefficients of a record in SI units. A term with 0 is absent."""
 
     Q: float = 0.0  # rad
     N: float = 0.0  # rad/√s
@@ -58,23 +57,23 @@ class Noise:
     R: float = 0.0  # rad/s²
 
     def at_unit_step(self) -> Floats:
-        """Q² N² B² K² R² at τ0 = 1: [5] in (rad/s)²."""
+        """Return Q² N² B² K² R² [5] for τ0 = 1 in (rad/s)²."""
         return np.array(astuple(self)) ** 2 * RATE_HZ ** np.array([2.0, 1.0, 0.0, -1.0, -2.0])
 
-    def present(self) -> tuple[str, ...]:
-        """Letters of the terms that are there."""
+    def present_terms(self) -> tuple[str, ...]:
+        """Return the letters of the present terms."""
         return tuple(letter for letter in SYMBOLS if getattr(self, letter) > 0.0)
 
 
 MIX: Final = Noise(Q=2e-6, N=1.5e-4, B=4e-5, K=1.5e-6)
-"""A MEMS gyro."""
+"""Noise of a MEMS gyro."""
 
 
 class Records:
-    """Draws six independent records of one noise at a time.
+    """Simulation of six independent records of one noise at a time.
 
     >>> draw = Records(Noise(N=1e-3), 1000)
-    >>> draw.six(np.random.default_rng(0)).shape
+    >>> draw.simulate_six(np.random.default_rng(0)).shape
     (1000, 6)
     """
 
@@ -82,14 +81,14 @@ class Records:
         self._n = n
         self._ramp = noise.R / RATE_HZ
         half = next_fast_len(n)
-        eigenvalues = dct(_steps_autocovariance(noise, half), type=1)
+        eigenvalues = dct(_difference_autocovariance(noise, half), type=1)
         if eigenvalues.min() < -1e-12 * eigenvalues.max():
             raise ValueError(f"no circulant for {noise}: eigenvalue {eigenvalues.min()}")
         whole = np.concatenate([eigenvalues, eigenvalues[-2:0:-1]])
         self._amplitudes = np.sqrt(np.maximum(whole, 0.0) / whole.size)
 
-    def six(self, rng: np.random.Generator) -> Floats:
-        """Rates [n, 6], rad/s."""
+    def simulate_six(self, rng: np.random.Generator) -> Floats:
+        """Return six records [n, 6] in rad/s."""
         values = np.empty((self._n, AXES))
         for pair in range(0, AXES, 2):
             white = rng.standard_normal(2 * self._amplitudes.size).view(np.complex128)
@@ -102,8 +101,8 @@ class Records:
         return values
 
 
-def _steps_autocovariance(noise: Noise, lags: int) -> Floats:
-    """Autocovariance of the rate's steps at lags 0 … ``lags``, τ0 = 1.
+def _difference_autocovariance(noise: Noise, lags: int) -> Floats:
+    """Return the autocovariance of the differences of successive samples at lags 0 … ``lags`` for τ0 = 1.
 
     White noise differenced once is N, twice Q. For 1/f, E|y_{k+t} − y_k|² = (2/π) Cin(πt), Cin(z) = ∫ (1 − cos u)/u du
     from 0 to z, and steps have half the second difference of that. It is the transform of the steps' spectrum:
@@ -112,7 +111,7 @@ def _steps_autocovariance(noise: Noise, lags: int) -> Floats:
     >>> spectrum = 4.0 * np.sin(np.pi * f) ** 2 / (2.0 * np.pi * f)
     >>> [round(float(np.mean(spectrum * np.cos(2.0 * np.pi * f * lag))), 6) for lag in range(4)]
     [1.049326, -0.273397, -0.132764, -0.021602]
-    >>> _steps_autocovariance(Noise(B=1.0), 3).round(6).tolist()
+    >>> _difference_autocovariance(Noise(B=1.0), 3).round(6).tolist()
     [1.049326, -0.273397, -0.132764, -0.021602]
     """
     q, n, b, k, _ = noise.at_unit_step()
@@ -127,13 +126,13 @@ def _steps_autocovariance(noise: Noise, lags: int) -> Floats:
 
 
 def _cin(lags: Ints) -> Floats:
-    """Cin(πt) at whole t ≥ 0."""
+    """Return Cin(πt) for integers t ≥ 0."""
     z = np.pi * np.maximum(lags, 1)
     return np.where(lags > 0, np.euler_gamma + np.log(z) - sici(z)[1], 0.0)
 
 
 def true_avar(noise: Noise, factors: Ints) -> Floats:
-    """Allan variance [m] of such records without end (IEEE Std 952, as sampled), (rad/s)².
+    """Return the true Allan variance [m] of sampled records in (rad/s)² (IEEE Std 952).
 
     >>> m = np.array([1, 2, 1000])
     >>> (true_avar(Noise(B=1.0), m) / (2.0 * np.log(2.0) / np.pi)).round(4).tolist()
@@ -146,15 +145,15 @@ def true_avar(noise: Noise, factors: Ints) -> Floats:
 
 
 def _flicker_avar(m: int) -> float:
-    """1/m² Σ (m − |j|) (c(j) − c(j + m)) over |j| < m, c(t) = −Cin(πt)/π; over 4096 samples and more 2 ln 2/π."""
-    if m >= LONG:
+    """Return 1/m² Σ (m − |j|) (c(j) − c(j + m)) over |j| < m with c(t) = −Cin(πt)/π, or 2 ln 2/π for large m."""
+    if m >= LARGE_CLUSTER:
         return float(2.0 * np.log(2.0) / np.pi)
     j = np.arange(1 - m, m)
     return float((m - np.abs(j)) @ (_cin(j + m) - _cin(np.abs(j))) / (np.pi * m * m))
 
 
 def cramer_rao(noise: Noise, n: int) -> dict[str, float]:
-    """Least relative standard deviation of each random term that is there, from Whittle's information.
+    """Return the least relative standard deviation of each present random term, from Whittle's information.
 
     I_ab = ½ Σ_k S_a S_b / S² in the variances, at f_k = k/2n, k = 1 … n − 1, where the DCT-II makes the coefficients of
     white noise and random walk independent exactly; the root of its inverse's diagonal, halved, in deviations. The
@@ -165,7 +164,7 @@ def cramer_rao(noise: Noise, n: int) -> dict[str, float]:
     >>> print(f"{cramer_rao(Noise(N=1.0), 5001)['N']:.3f}")
     0.010
     """
-    letters = [letter for letter in noise.present() if letter != "R"]
+    letters = [letter for letter in noise.present_terms() if letter != "R"]
     k = np.arange(1, n)
     sine = np.sin(np.pi * k / (2.0 * n))
     shapes = {"Q": 4.0 * sine**2, "N": np.ones(n - 1), "B": n / (np.pi * k), "K": 0.25 / sine**2}
@@ -177,31 +176,31 @@ def cramer_rao(noise: Noise, n: int) -> dict[str, float]:
 
 
 def generator(cell: str, seconds: int, seed: int, chunk: int) -> np.random.Generator:
-    """Each chunk of each cell draws from its own: any chunk can be made again alone."""
+    """Return the random generator of a chunk, so that each chunk can be simulated separately."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(crc32(cell.encode()), seconds, chunk)))
 
 
-def sixes(noise: Noise, cell: str, seconds: int, seed: int, chunk: int) -> Iterator[Floats]:
-    """The records [n, 6] of a chunk."""
+def simulate_chunk(noise: Noise, cell: str, seconds: int, seed: int, chunk: int) -> Iterator[Floats]:
+    """Yield the records [n, 6] of a chunk."""
     rng, records = generator(cell, seconds, seed, chunk), Records(noise, round(seconds * RATE_HZ))
     for _ in range(CHUNK // AXES):
-        yield records.six(rng)
+        yield records.simulate_six(rng)
 
 
-def wilson(held: float, looks: float) -> tuple[float, float]:
-    """Ends of the 95 % interval of a share (Wilson 1927).
+def wilson_interval(covered: float, total: float) -> tuple[float, float]:
+    """Return the 95 % interval of a share (Wilson 1927).
 
-    >>> lo, hi = wilson(950, 1000)
+    >>> lo, hi = wilson_interval(950, 1000)
     >>> print(f"{lo:.3f} {hi:.3f}")
     0.935 0.962
     """
     z2 = float(ndtri(0.975)) ** 2
-    centre = (held + 0.5 * z2) / (looks + z2)
-    reach = np.sqrt(z2 * (held * (looks - held) / looks + 0.25 * z2)) / (looks + z2)
+    centre = (covered + 0.5 * z2) / (total + z2)
+    reach = np.sqrt(z2 * (covered * (total - covered) / total + 0.25 * z2)) / (total + z2)
     return float(centre - reach), float(centre + reach)
 
 
-def program(
+def run_experiment(
     name: str,
     description: str,
     cells: Mapping[str, Noise],
@@ -209,42 +208,42 @@ def program(
     count: Callable[[str, int, int, int], Chunk],
     tables: Callable[[list[Chunk]], str],
 ) -> None:
-    """The command line of both proofs: count what is missing in the file, chunk by chunk, then print the tables.
+    """Run the command line of an experiment: compute the missing chunks of the file, then print the tables.
 
-    ``count(cell, seconds, seed, chunk)`` gives what to store of a chunk; ``tables`` turns all chunks into Markdown,
-    which ``--page`` puts between the comments ``<!-- name -->`` and ``<!-- end of name -->``.
+    ``count(cell, seconds, seed, chunk)`` returns the counts of a chunk. ``tables`` returns the tables of all chunks in
+    Markdown. ``--page`` writes them between the comments ``<!-- name -->`` and ``<!-- end of name -->``.
     """
-    given = _arguments(description, cells, lengths)
-    lines = given.json.read_text("utf-8").splitlines() if given.json and given.json.exists() else []
+    arguments = _arguments(description, cells, lengths)
+    lines = arguments.json.read_text("utf-8").splitlines() if arguments.json and arguments.json.exists() else []
     chunks: list[Chunk] = [json.loads(line) for line in lines]
     done = {(c["cell"], c["seconds"], c["seed"], c["chunk"]) for c in chunks}
     wanted = [
-        (cell, seconds, given.seed, chunk)
-        for chunk in range(-(-given.records // CHUNK))  # a run that is broken off has as many of every cell
-        for seconds in given.seconds
-        for cell in given.cells
+        (cell, seconds, arguments.seed, chunk)
+        for chunk in range(-(-arguments.records // CHUNK))  # an interrupted run has equally many of each cell
+        for seconds in arguments.seconds
+        for cell in arguments.cells
     ]
     for key in wanted:
         if key in done:
             continue
         start = time.process_time()
-        made = dict(zip(("cell", "seconds", "seed", "chunk"), key, strict=True)) | {"records": CHUNK} | count(*key)
-        made["cpu_s"] = round(time.process_time() - start, 2)
-        chunks.append(made)
-        print(f"{key[0]}, {key[1]} s, chunk {key[3]}: {made['cpu_s']} s", file=sys.stderr, flush=True)
-        if given.json:
-            with given.json.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(made) + "\n")
+        result = dict(zip(("cell", "seconds", "seed", "chunk"), key, strict=True)) | {"records": CHUNK} | count(*key)
+        result["cpu_s"] = round(time.process_time() - start, 2)
+        chunks.append(result)
+        print(f"{key[0]}, {key[1]} s, chunk {key[3]}: {result['cpu_s']} s", file=sys.stderr, flush=True)
+        if arguments.json:
+            with arguments.json.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(result) + "\n")
     text = tables(chunks)
     print(text)
-    if given.page:
-        given.page.write_text(_between(given.page.read_text("utf-8"), name, text), "utf-8")
+    if arguments.page:
+        arguments.page.write_text(_replace_section(arguments.page.read_text("utf-8"), name, text), "utf-8")
 
 
-def _between(page: str, name: str, text: str) -> str:
-    """A page with what stands between the two comments of that name replaced.
+def _replace_section(page: str, name: str, text: str) -> str:
+    """Replace the text between the two comments of this name in a page.
 
-    >>> _between("a <!-- x -->old<!-- end of x --> b", "x", "new")
+    >>> _replace_section("a <!-- x -->old<!-- end of x --> b", "x", "new")
     'a <!-- x -->\\n\\nnew\\n\\n<!-- end of x --> b'
     """
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
@@ -254,31 +253,33 @@ def _between(page: str, name: str, text: str) -> str:
 
 def _arguments(description: str, cells: Mapping[str, Noise], lengths: Sequence[int]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--records", type=int, default=1000, help="of each cell; 0 = print the tables of --json only")
+    parser.add_argument(
+        "--records", type=int, default=1000, help="records of each cell; 0 = print the tables of --json only"
+    )
     parser.add_argument("--cells", nargs="+", default=list(cells), choices=list(cells), metavar="CELL")
     parser.add_argument("--seconds", nargs="+", type=int, default=list(lengths), help="lengths of the records")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--json", type=Path, help="keep what was counted here, a line a chunk; what is there is not redone"
+        "--json", type=Path, help="file of the counts, with a line for each chunk, which a later run continues"
     )
     parser.add_argument("--page", type=Path, help="a Markdown file to put the tables into")
     return parser.parse_args()
 
 
-def merged(chunks: list[Chunk]) -> dict[tuple[int, str], list[Chunk]]:
-    """Chunks by (seconds, cell), lengths ascending, cells as they came."""
+def group_chunks(chunks: list[Chunk]) -> dict[tuple[int, str], list[Chunk]]:
+    """Group chunks by (seconds, cell), in ascending order of the lengths."""
     groups: dict[tuple[int, str], list[Chunk]] = {}
     for chunk in sorted(chunks, key=lambda c: int(c["seconds"])):
         groups.setdefault((chunk["seconds"], chunk["cell"]), []).append(chunk)
     return groups
 
 
-def length(seconds: int) -> str:
-    """A length in words."""
+def format_length(seconds: int) -> str:
+    """Return a length of time as text."""
     return NAMES.get(seconds, f"{seconds} s")
 
 
-def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table."""
+def format_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
     lines = [headings, ["---"] * len(headings), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

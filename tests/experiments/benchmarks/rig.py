@@ -1,10 +1,10 @@
-"""What the benchmarks of the whole service share: sensors in one process, the daemon in another, a subscriber here.
+"""Sensors in one process, the daemon in another process, and a subscriber in this process, for service benchmarks.
 
 ``python -m tests.experiments.benchmarks.rig FOLDER DEVICES RATE SECONDS`` is the process of the sensors. It opens a
-pseudo-terminal for each, linked as FOLDER/tty<i>, encodes all frames beforehand, waits for a line on standard input,
-writes a frame to each device every 1/RATE s, and leaves in FOLDER how many it wrote to each and when (monotonic ns,
-as seen by every process of the machine). A pseudo-terminal that is full is waited for and counted: a port would have
-lost bytes.
+pseudo-terminal FOLDER/tty<i> for each device, encodes all frames, and waits for a line on standard input. It then
+writes a frame to each device every 1/RATE s. The numbers and times of the frames are stored in FOLDER, with times in
+monotonic nanoseconds. If a pseudo-terminal is full, the process waits and counts the event. A real port would lose
+bytes.
 """
 
 import contextlib
@@ -53,7 +53,7 @@ level = "error"
 
 
 class Sensors:
-    """The process that writes."""
+    """Process of the simulated sensors."""
 
     def __init__(self, folder: Path, devices: int, rate_hz: int, seconds: float) -> None:
         self.folder = folder
@@ -71,49 +71,49 @@ class Sensors:
         if self._process.stdout.readline() != "ready\n":
             raise SystemExit("the process of the sensors did not start")
 
-    def go(self) -> None:
-        """Begin to write."""
+    def start(self) -> None:
+        """Start writing."""
         assert self._process.stdin is not None
         self._process.stdin.write("go\n")
         self._process.stdin.flush()
 
     def wait(self, timeout_s: float) -> dict[str, Any]:
-        """Counts of the whole run, once all is written; the pseudo-terminals stay open."""
+        """Wait for the last frame and return the counts. The pseudo-terminals stay open."""
         wait_for((self.folder / "sent.json").exists, "the last frame", timeout_s)
         sent: dict[str, Any] = json.loads((self.folder / "sent.json").read_text())
         return sent
 
     def written_ns(self) -> Ints:
-        """When frame i was written, monotonic ns."""
+        """Return the time of each frame in monotonic nanoseconds."""
         times: Ints = np.load(self.folder / "written.npy")
         return times
 
     def close(self) -> None:
-        """Hang up."""
+        """End the process."""
         self._process.communicate("stop\n", timeout=PATIENCE_S)
 
 
 class Daemon:
-    """The service in a process of its own, as ``imu-monitor run`` starts it."""
+    """``imu-monitor run`` in a separate process."""
 
     def __init__(
         self, folder: Path, devices: int, rate_hz: int, window: str, more: str = "", read_timeout: float = 0.01
     ) -> None:
         self.port = free_port()
         path = folder / "config.toml"
-        same = {"rate": rate_hz, "window": window, "folder": folder, "more": more, "read_timeout": read_timeout}
-        path.write_text("".join(DEVICE.format(i=i, **same) for i in range(devices)) + REST.format(port=self.port))
+        values = {"rate": rate_hz, "window": window, "folder": folder, "more": more, "read_timeout": read_timeout}
+        path.write_text("".join(DEVICE.format(i=i, **values) for i in range(devices)) + REST.format(port=self.port))
         self._process = subprocess.Popen([sys.executable, "-c", DAEMON, "run", str(path)])
         self.process = psutil.Process(self._process.pid)
         wait_for(lambda: self._open_ports() >= devices, "the daemon to open its ports")
 
     def cpu_s(self) -> float:
-        """Processor seconds so far."""
+        """Return the processor time so far in seconds."""
         t = self.process.cpu_times()
         return float(t.user + t.system)
 
     def close(self) -> None:
-        """SIGTERM, and its exit."""
+        """Stop the daemon (SIGTERM) and check its exit status."""
         self._process.terminate()
         if self._process.wait(PATIENCE_S) != 0:
             raise SystemExit(f"the daemon ended with status {self._process.returncode}")
@@ -129,8 +129,8 @@ class Daemon:
 
 
 @contextlib.contextmanager
-def subscriber(port: int) -> Iterator[zenoh.Session]:
-    """A client of the daemon, in this process."""
+def open_session(port: int) -> Iterator[zenoh.Session]:
+    """Open a zenoh session with the daemon."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -139,8 +139,8 @@ def subscriber(port: int) -> Iterator[zenoh.Session]:
         yield session
 
 
-def frames_of(rate_hz: int, seconds: float) -> list[bytes]:
-    """Distinct frames of a resting sensor with noise; TimeStartup goes on by one period each."""
+def encode_frames(rate_hz: int, seconds: float) -> list[bytes]:
+    """Return frames of a resting sensor with noise. TimeStartup increases by one period in each frame."""
     n = round(rate_hz * seconds)
     values = 1e-3 * np.random.default_rng(1).standard_normal((n, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
     at = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
@@ -148,8 +148,8 @@ def frames_of(rate_hz: int, seconds: float) -> list[bytes]:
     return [chunk.data for chunk in decoder.encode(make_block(at, values, np.full(n, np.nan), at + 1_000_000))]
 
 
-def cables(folder: Path, devices: int) -> list[int]:
-    """Pseudo-terminals; the sensors' ends, which do not wait."""
+def open_terminals(folder: Path, devices: int) -> list[int]:
+    """Open pseudo-terminals and return their non-blocking ends for the sensors."""
     masters = []
     for i in range(devices):
         master, slave = os.openpty()
@@ -157,12 +157,12 @@ def cables(folder: Path, devices: int) -> list[int]:
         tty.setraw(slave)
         (folder / f"tty{i}").symlink_to(os.ttyname(slave))
         os.set_blocking(master, False)
-        masters.append(master)  # the slave stays open too: opening and closing it must not hang up
+        masters.append(master)  # the slave stays open, so that the reader can close and open it without a hang-up
     return masters
 
 
 def write_all(masters: list[int], frames: list[bytes], rate_hz: int) -> tuple[Ints, int]:
-    """Each frame to each device at its time; when each was written to the last one, and how often one was full."""
+    """Write each frame to each device at its time. Return the write times and how often a terminal was full."""
     written_ns, full = np.zeros(len(frames), np.int64), 0
     begun_ns = time.monotonic_ns()
     for i, frame in enumerate(frames):
@@ -176,7 +176,7 @@ def write_all(masters: list[int], frames: list[bytes], rate_hz: int) -> tuple[In
 
 
 def _write(master: int, data: bytes) -> int:
-    """Write all; 1 when the terminal was full meanwhile."""
+    """Write all data and return 1 if the terminal was full, or else 0."""
     full = 0
     while data:
         try:
@@ -188,10 +188,10 @@ def _write(master: int, data: bytes) -> int:
 
 
 def main() -> None:
-    """The process of the sensors."""
+    """Run the process of the sensors."""
     folder, devices, rate_hz, seconds = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
-    frames = frames_of(rate_hz, seconds)
-    masters = cables(folder, devices)
+    frames = encode_frames(rate_hz, seconds)
+    masters = open_terminals(folder, devices)
     print("ready", flush=True)
     if sys.stdin.readline() != "go\n":
         return

@@ -1,10 +1,10 @@
-"""A simulated month through the whole service, as fast as it goes: decoder, clock, window, watch, outputs, store.
+"""Run a simulated month through the whole service as fast as possible: decoder, clock, window, outputs and storage.
 
     python -m tests.experiments.benchmarks.soak --days 30 --rate 50 --plot docs/pictures/soak.png
 
-The sensor's frames are made and decoded as on a wire; one in 20 000 is lost, one in 20 000 has a flipped byte, and
-there is rubbish between two of 50 000. Memory, descriptors, threads and the store's size are taken every second of the
-run. At the end all sums must be exact: sent = received + lost + flipped, and the recording holds what was received.
+The frames of the sensor are encoded and decoded. One frame in 20 000 is lost, one in 20 000 has a flipped bit, and
+random bytes follow one in 50 000. Memory, descriptors, threads and the size of the storage are recorded every second.
+At the end, sent = received + lost + flipped must hold exactly, and the recording must contain all received samples.
 """
 
 import argparse
@@ -57,7 +57,7 @@ keep = "{keep}"
 
 @dataclass
 class Truth:
-    """What was put on the wire."""
+    """Numbers of sent, lost and damaged frames."""
 
     sent: int = 0
     lost: int = 0
@@ -65,12 +65,12 @@ class Truth:
     rubbish: int = 0
 
 
-class Wire:
-    """A link that brings a month of frames as fast as they are taken."""
+class SimulatedLink:
+    """Link that delivers the frames of a simulated sensor as fast as they are read."""
 
     carrier: Carrier = "bytes"
     epoch: Literal["monotonic", "unix"] = "unix"
-    name = "a simulated wire"
+    name = "a simulated link"
 
     def __init__(self, rate_hz: float, samples: int) -> None:
         self.truth = Truth()
@@ -104,21 +104,21 @@ class Wire:
             t_ns, drawn.values, 24.0 + 6.0 * np.sin(index * (2 * np.pi / 86400 / self._rate_hz)), ticks
         )
         frames = [chunk.data for chunk in self._encoder.encode(samples)]
-        return [Chunk(self._hurt(frames, n), int(t_ns[-1]))]
+        return [Chunk(self._damage(frames, n), int(t_ns[-1]))]
 
-    def _hurt(self, frames: list[bytes], n: int) -> bytes:
-        """The frames with what goes wrong on the way; the first and the last stay, so that all can be counted."""
-        places = self._rng.random(n)
-        places[[0, -1]] = 1.0
-        for at in np.flatnonzero(places < LOST):
+    def _damage(self, frames: list[bytes], n: int) -> bytes:
+        """Return the frames with random faults, except in the first and last frame, so that all can be counted."""
+        draws = self._rng.random(n)
+        draws[[0, -1]] = 1.0
+        for at in np.flatnonzero(draws < LOST):
             frames[at] = b""
             self.truth.lost += 1
-        for at in np.flatnonzero((places >= LOST) & (places < LOST + FLIPPED)):
-            hurt = bytearray(frames[at])
-            hurt[12] ^= 0x10
-            frames[at] = bytes(hurt)
+        for at in np.flatnonzero((draws >= LOST) & (draws < LOST + FLIPPED)):
+            damaged = bytearray(frames[at])
+            damaged[12] ^= 0x10
+            frames[at] = bytes(damaged)
             self.truth.flipped += 1
-        for at in np.flatnonzero((places >= LOST + FLIPPED) & (places < LOST + FLIPPED + RUBBISH)):
+        for at in np.flatnonzero((draws >= LOST + FLIPPED) & (draws < LOST + FLIPPED + RUBBISH)):
             frames[at] += self._rng.bytes(40).replace(b"\xfa", b"\x00")
             self.truth.rubbish += 1
         self.truth.sent += n
@@ -126,8 +126,8 @@ class Wire:
 
 
 @dataclass
-class Course:
-    """What the process took, once a second."""
+class ResourceHistory:
+    """Resources of the process, recorded once per second."""
 
     days: list[float] = field(default_factory=list)
     rows: list[tuple[float, ...]] = field(default_factory=list)  # MB, descriptors, threads, MB of the store
@@ -139,33 +139,33 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=50.0)
     parser.add_argument("--keep", default="30d", help="of the recording")
     parser.add_argument("--plot", type=Path)
-    wanted = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "soak.toml"
-        path.write_text(CONFIG.format(rate=wanted.rate, folder=Path(folder) / "store", keep=wanted.keep))
-        wire = Wire(wanted.rate, round(wanted.days * 86400 * wanted.rate))
+        path.write_text(CONFIG.format(rate=arguments.rate, folder=Path(folder) / "store", keep=arguments.keep))
+        link = SimulatedLink(arguments.rate, round(arguments.days * 86400 * arguments.rate))
         config = loading.load_config(path)
         (one,) = config.devices
-        device = one.model_copy(update={"driver": dataclasses.replace(one.driver, link=wire)})
+        device = one.model_copy(update={"driver": dataclasses.replace(one.driver, link=link)})
         service = Service(dataclasses.replace(config, devices=(device,)))
-        course, begun = Course(), time.monotonic()
+        history, begun = ResourceHistory(), time.monotonic()
         done = threading.Event()
-        watcher = threading.Thread(target=_watch, args=(service, wanted.rate, Path(folder) / "store", course, done))
+        watcher = threading.Thread(target=_watch, args=(service, arguments.rate, Path(folder) / "store", history, done))
         watcher.start()
         service.run()
         done.set()
         watcher.join()
         took_s = time.monotonic() - begun
-        _tell(service, wire, course, took_s, Path(folder) / "store")
-        if wanted.plot is not None:
-            _draw(course, wanted.plot)
+        _print_results(service, link, history, took_s, Path(folder) / "store")
+        if arguments.plot is not None:
+            _draw(history, arguments.plot)
 
 
-def _watch(service: Service, rate_hz: float, store: Path, course: Course, done: threading.Event) -> None:
+def _watch(service: Service, rate_hz: float, store: Path, history: ResourceHistory, done: threading.Event) -> None:
     process = psutil.Process()
     while not done.wait(1.0):
-        course.days.append(service.workers[0].driver.counts.received / rate_hz / 86400)
-        course.rows.append(
+        history.days.append(service.workers[0].driver.counts.received / rate_hz / 86400)
+        history.rows.append(
             (process.memory_info().rss / 1e6, process.num_fds(), process.num_threads(), _size(store) / 1e6)
         )
 
@@ -180,12 +180,12 @@ def _size(folder: Path) -> int:
     return total
 
 
-def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Path) -> None:
-    counts, truth = service.workers[0].driver.counts, wire.truth
+def _print_results(service: Service, link: SimulatedLink, history: ResourceHistory, took_s: float, store: Path) -> None:
+    counts, truth = service.workers[0].driver.counts, link.truth
     print(f"{truth.sent} samples in {took_s:.0f} s, {truth.sent / took_s:.0f} a second")
     print(f"received {counts.received}, lost {counts.lost}, bad {counts.bad}; lost on the way {truth.lost},", end=" ")
-    print(f"flipped {truth.flipped}, rubbish {truth.rubbish}: {_sum(counts, truth)} of {truth.sent} sent")
-    assert _sum(counts, truth) == truth.sent
+    print(f"flipped {truth.flipped}, rubbish {truth.rubbish}: {_count_samples(counts, truth)} of {truth.sent} sent")
+    assert _count_samples(counts, truth) == truth.sent
     recorded = missing = 0
     for path in segment_file.list_segments(store / "soak"):
         for piece in segment_file.read_samples(path):
@@ -200,7 +200,7 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
     print(f"received, lost and bad of all its rows: {sums}")
     assert sums == [counts.received, counts.lost, counts.bad]
     assert recorded == counts.received
-    early, late = _half(course, 0.1, 0.5), _half(course, 0.5, 1.0)
+    early, late = _max_in_part(history, 0.1, 0.5), _max_in_part(history, 0.5, 1.0)
     names = ("memory MB", "descriptors", "threads", "store MB")
     for at, name in enumerate(names):
         print(f"{name}: most before the half {early[at]:.1f}, after it {late[at]:.1f}")
@@ -208,18 +208,18 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
     print(f"the window holds {estimator.samples_in_window if estimator is not None else 0} samples")
 
 
-def _sum(counts: SampleCounts, truth: Truth) -> int:
-    """A stretch of rubbish counts as a bad frame, too: nobody can tell that it never was one."""
+def _count_samples(counts: SampleCounts, truth: Truth) -> int:
+    """Return the number of counted samples. Random bytes may also count as a bad frame."""
     assert truth.flipped <= counts.bad <= truth.flipped + truth.rubbish
     return counts.received + counts.lost + truth.flipped
 
 
-def _half(course: Course, begin: float, end: float) -> tuple[float, ...]:
-    rows = course.rows[int(begin * len(course.rows)) : int(end * len(course.rows))]
+def _max_in_part(history: ResourceHistory, begin: float, end: float) -> tuple[float, ...]:
+    rows = history.rows[int(begin * len(history.rows)) : int(end * len(history.rows))]
     return tuple(np.max(np.array(rows or [(np.nan,) * 4]), axis=0).tolist())
 
 
-def _draw(course: Course, path: Path) -> None:
+def _draw(history: ResourceHistory, path: Path) -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -228,7 +228,7 @@ def _draw(course: Course, path: Path) -> None:
     figure, axes = pyplot.subplots(4, 1, sharex=True, figsize=(9, 8), constrained_layout=True)
     titles = ("resident memory, MB", "open descriptors", "threads", "store on disk, MB")
     for at, (axis, title) in enumerate(zip(axes, titles, strict=True)):
-        axis.plot(course.days, [row[at] for row in course.rows], color="#2a6f97", linewidth=1.2)
+        axis.plot(history.days, [row[at] for row in history.rows], color="#2a6f97", linewidth=1.2)
         axis.set_ylim(bottom=0)
         axis.set_ylabel(title)
         axis.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""The score of a compensated rate in motion."""
+"""Tests of the score of a compensated rate in motion."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,12 @@ import pytest
 from tests.experiments.benchmarks.motion_score import score_in_motion
 
 
-def test_delay_error_and_angle_of_a_rate_that_comes_late() -> None:
+def test_score_of_a_delayed_rate() -> None:
     t = np.arange(10_000) / 100.0
     truth = np.sin(2.0 * np.pi * 0.5 * t)
     late = np.sin(2.0 * np.pi * 0.5 * (t - 0.03)) + 0.01
-    one = score_in_motion(late, truth, 100.0)
-    assert one.delay_s == pytest.approx(0.03, rel=0.01)
-    assert one.rms_error == pytest.approx(np.sqrt(np.mean((late - truth) ** 2)))
-    assert one.angle_error_rad == pytest.approx(0.01 * 100.0 / np.sqrt(3.0), rel=0.05)
+    score = score_in_motion(late, truth, 100.0)
+    assert score.delay_s == pytest.approx(0.03, rel=0.01)
+    assert score.rms_error == pytest.approx(np.sqrt(np.mean((late - truth) ** 2)))
+    assert score.angle_error_rad == pytest.approx(0.01 * 100.0 / np.sqrt(3.0), rel=0.05)
     assert np.isnan(score_in_motion(late, np.zeros_like(t), 100.0).delay_s)

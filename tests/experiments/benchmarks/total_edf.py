@@ -1,12 +1,12 @@
-"""Do bias, degrees of freedom and intervals of total and Hadamard variance hold? Simulates records and counts.
+"""Bias, degrees of freedom and interval coverage of total and Hadamard variance for simulated records.
 
     python -m tests.experiments.benchmarks.total_edf --records 2000 --samples 4096
 
-For white noise, flicker, random walk, quantization and two mixtures it prints, at τ = T/8, T/4, T/2, 3T/4 and T, the
-mean of the corrected total variance over the Allan variance, its degrees of freedom as counted and as stated, and how
-often the 95 % interval holds the true deviation: with the noise known, and with the noise fitted to the same record
-(beyond T/2 that is why a curve has none). Then the same for the Hadamard variance up to T/3. Counting errors of a
-share p over n records are √(p(1 − p)/n), 0.5 % for 2000.
+The noises are white noise, flicker, random walk, quantization and two mixtures. For each noise and τ = T/8, T/4, T/2,
+3T/4 and T, the table contains the mean of the corrected total variance over the Allan variance, its measured and stated
+degrees of freedom, and the coverage of the 95 % interval. The coverage is given for known noise and for noise that is
+fitted to the same record. A second table contains the Hadamard variance up to T/3. The standard error of a share p over
+n records is √(p(1 − p)/n), which is 0.5 % for 2000 records.
 """
 
 import argparse
@@ -39,11 +39,11 @@ NOISES: Final[dict[str, tuple[float, float, float, float]]] = {  # Q N B K, τ0 
     "Q and N": (10.0, 1.0, 0.0, 0.0),
     "N, B and K": (0.0, 1.0, 0.05, 0.001),
 }
-"""The last: flicker meets white noise at 900 samples, random walk flicker at 1700."""
+"""In the last mixture, flicker equals white noise at 900 samples, and random walk equals flicker at 1700 samples."""
 
 
-def records(coefficients: tuple[float, ...], n: int, count: int, rng: np.random.Generator) -> Floats:
-    """Simulated rates [n, count]."""
+def simulate_records(coefficients: tuple[float, ...], n: int, count: int, rng: np.random.Generator) -> Floats:
+    """Return simulated rates [n, count]."""
     kinds: tuple[type[Source], ...] = (QuantizationNoise, AngleRandomWalk, BiasInstability, RateRandomWalk)
     values = np.zeros((n, count))
     for kind, letter, size in zip(kinds, "QNBK", coefficients, strict=True):
@@ -52,8 +52,8 @@ def records(coefficients: tuple[float, ...], n: int, count: int, rng: np.random.
     return values
 
 
-def fitted(values: Floats) -> Floats:
-    """θ [5, k] of the records themselves."""
+def fit_noise(values: Floats) -> Floats:
+    """Return θ [5, k] that is fitted to the records."""
     factors = cluster_sizes(len(values), 1.0)
     avar, terms = overlapping_avar(values, factors)
     measured = MeasuredVariancesAndSlopes(avar, terms, rate_slope_from_thirds(values))
@@ -63,22 +63,22 @@ def fitted(values: Floats) -> Floats:
 Spread = tuple[Floats, Floats, Floats, Floats]
 
 
-def line(name: str, curves: tuple[Spread, Spread], truth: Floats) -> None:
-    """One noise: mean over truth, counted and stated edf, coverage with the noise known and fitted."""
+def print_row(name: str, curves: tuple[Spread, Spread], truth: Floats) -> None:
+    """Print the row of one noise: mean over truth, measured and stated edf, and coverage."""
     variance, edf, _, _ = curves[0]
-    counted = 2.0 * variance.mean(axis=1) ** 2 / variance.var(axis=1)
+    measured_edf = 2.0 * variance.mean(axis=1) ** 2 / variance.var(axis=1)
     cells = [
         f"{mean / true:.3f}; {found:.3g} / {stated:.3g}"
-        for mean, true, found, stated in zip(variance.mean(axis=1), truth, counted, edf[:, 0], strict=True)
+        for mean, true, found, stated in zip(variance.mean(axis=1), truth, measured_edf, edf[:, 0], strict=True)
     ]
     for _, _, lo, hi in curves:
-        held = (lo <= np.sqrt(truth)[:, None]) & (np.sqrt(truth)[:, None] <= hi)
-        cells = [f"{cell}; {100 * share:.1f}" for cell, share in zip(cells, held.mean(axis=1), strict=True)]
+        covered = (lo <= np.sqrt(truth)[:, None]) & (np.sqrt(truth)[:, None] <= hi)
+        cells = [f"{cell}; {100 * share:.1f}" for cell, share in zip(cells, covered.mean(axis=1), strict=True)]
     print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
 
 def main() -> None:
-    """Simulate, count, print two tables."""
+    """Simulate the records and print both tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--records", type=int, default=2000)
     parser.add_argument("--samples", type=int, default=4096)
@@ -89,23 +89,24 @@ def main() -> None:
     thirds = np.array([n // 24, n // 12, n // 6, n // 4, n // 3])
     own = [total_estimator_moments(n, int(m)) for m in factors]
     other = [hadamard_estimator_moments(n, int(m)) for m in thirds]
-    print(
-        f"{arguments.records} records of {n} samples. Cells: mean over truth; edf counted / stated; % of intervals that"
-    )
-    print("hold the truth with the noise known; with the noise fitted.\n")
+    print(f"{arguments.records} records of {n} samples. Cells: mean over truth; edf measured / stated; % of intervals")
+    print("that contain the truth with the noise known; with the noise fitted.\n")
     rows = []
     print("| total variance | " + " | ".join(f"{share:g} T" for share in SHARES) + " |")
     print("| --- " * (1 + len(SHARES)) + "|")
     for name, coefficients in NOISES.items():
-        values = records(coefficients, n, arguments.records, rng)
+        values = simulate_records(coefficients, n, arguments.records, rng)
         theta = np.append(np.square(coefficients), 0.0)
-        known, found = np.repeat(theta[:, None], arguments.records, axis=1), theta_in_sample_units(fitted(values), 1.0)
+        known, found = (
+            np.repeat(theta[:, None], arguments.records, axis=1),
+            theta_in_sample_units(fit_noise(values), 1.0),
+        )
         tvar, terms = total_variance(values, factors)
         totals = (
             correct_bias_and_compute_intervals(own, known, tvar, terms),
             correct_bias_and_compute_intervals(own, found, tvar, terms),
         )
-        line(name, totals, np.stack([one.allan for one in own]) @ theta)
+        print_row(name, totals, np.stack([one.allan for one in own]) @ theta)
         hvar, terms = hadamard_variance(values, thirds)
         hadamards = (
             correct_bias_and_compute_intervals(other, known, hvar, terms),
@@ -115,7 +116,7 @@ def main() -> None:
     print("\n| Hadamard variance | " + " | ".join(f"{m / n:.3f} T" for m in thirds) + " |")
     print("| --- " * (1 + len(thirds)) + "|")
     for row in rows:
-        line(*row)
+        print_row(*row)
 
 
 if __name__ == "__main__":

@@ -2,10 +2,10 @@
 
     python -m tests.experiments.benchmarks.windows [--records 240] [--seed 1]
 
-All at equal effective length: the variance of σ² under white noise, at τ short beside the window, is that of
-the rectangle. Prints how fast each follows a step of N and forgets a burst, how much each scatters under white noise,
-flicker and random walk, what each costs, and what the five-term fit says of the curve while N is changing. The Hann
-window is computed plainly from the whole record; it has no cheap recursion, and stands here for comparison.
+All windows have the same effective length: at short τ and for white noise, the variance of σ² is that of the rectangle.
+The tables contain the response to a step of N and to a burst, the scatter for white noise, flicker and random walk, the
+cost, and the five-term fit while N is changing. The Hann window is computed from the whole record, because it has no
+fast recursion.
 """
 
 import argparse
@@ -26,213 +26,234 @@ from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.model import NoiseModel
-from tests.experiments.benchmarks.machine import about, alternate, console, table
+from tests.experiments.benchmarks.machine import console, create_table, describe_machine, time_alternately
 
 RATE_HZ: Final = 20.0
 WINDOW_S: Final = 3600.0
 LENGTH: Final = round(WINDOW_S * RATE_HZ)
 HANN: Final = 1.5
-"""Length of the Hann window over that of the rectangle of equal variance: (Σw)²/Σw² = 2/3 of its length."""
+"""Length of the Hann window over that of a rectangle with equal variance: (Σw)²/Σw² is 2/3 of its length."""
 N_TRUE, N_STEP, B_TRUE = 1.5e-4, 1.5, 4e-5
-LOOKS_S: Final = (-1.0, 30.0, 120.0, 600.0, 1800.0, 3600.0, 7200.0, 14_400.0)
-"""Fits, by the time since N changed."""
+FIT_TIMES_S: Final = (-1.0, 30.0, 120.0, 600.0, 1800.0, 3600.0, 7200.0, 14_400.0)
+"""Times of the fits since the change of N."""
 KINDS: Final = ("rectangle", "Hann", "a window per τ")
 RESTARTED: Final = "rectangle, restarted"
 TAUS: Final = 17
-"""Of the table of costs."""
+"""Number of τ in the table of costs."""
 
-Courses = dict[str, Floats]  # name: σ² [looks, m, 6]
+Variances = dict[str, Floats]  # name: σ² [times, m, 6]
 
 
-def windows(factors: Ints, length: int, rate_hz: float) -> dict[str, AllanWindow]:
-    """The recursive ones."""
+def make_windows(factors: Ints, length: int, rate_hz: float) -> dict[str, AllanWindow]:
+    """Return the recursive windows."""
     return {
         "rectangle": AllanWindow(length, factors),
         "a window per τ": AllanWindow(length, factors, newest_samples_per_displayed_tau(factors, rate_hz, length)),
     }
 
 
-def course(window: AllanWindow, values: Floats, ends: Sequence[int]) -> Floats:
-    """σ² [looks, m, 6] after so many samples each."""
-    looks = []
+def append_and_read(window: AllanWindow, values: Floats, ends: Sequence[int]) -> Floats:
+    """Return σ² [times, m, 6] after each number of samples."""
+    variances = []
     for start, end in zip([0, *ends], ends, strict=False):
         window.append_samples(values[start:end])
-        looks.append(window.avar())
-    return np.array(looks)
+        variances.append(window.avar())
+    return np.array(variances)
 
 
-def hann(values: Floats, factors: Ints, length: int, ends: Sequence[int]) -> Floats:
-    """The same under Hann weights over the last 1.5 · length terms, by their definition."""
+def hann_variances(values: Floats, factors: Ints, length: int, ends: Sequence[int]) -> Floats:
+    """Return σ² [times, m, 6] with Hann weights over the last 1.5 · length terms, by definition."""
     phase = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     weights = np.sin(np.pi * (np.arange(round(HANN * length)) + 0.5) / round(HANN * length)) ** 2
-    looks = np.empty((len(ends), factors.size, values.shape[1]))
+    variances = np.empty((len(ends), factors.size, values.shape[1]))
     for i, m in enumerate(factors):
-        squares = (phase[2 * m :] - 2 * phase[m:-m] + phase[: -2 * m]) ** 2  # the last ends at sample 2m + its place
+        squares = (phase[2 * m :] - 2 * phase[m:-m] + phase[: -2 * m]) ** 2  # term k ends at sample 2m + k
         for k, end in enumerate(ends):
             there = squares[max(0, end + 1 - 2 * m - weights.size) : end + 1 - 2 * m]
             own = weights[weights.size - len(there) :]
-            looks[k, i] = own @ there / own.sum() / (2.0 * m * m)
-    return looks
+            variances[k, i] = own @ there / own.sum() / (2.0 * m * m)
+    return variances
 
 
-def courses(values: Floats, factors: Ints, length: int, rate_hz: float, ends: Sequence[int]) -> Courses:
-    """Every window's course over one record of six axes."""
-    found = {name: course(window, values, ends) for name, window in windows(factors, length, rate_hz).items()}
-    found["Hann"] = hann(values, factors, length, ends)
+def compare_windows(values: Floats, factors: Ints, length: int, rate_hz: float, ends: Sequence[int]) -> Variances:
+    """Return σ² of every window for one record of six axes."""
+    found = {
+        name: append_and_read(window, values, ends) for name, window in make_windows(factors, length, rate_hz).items()
+    }
+    found["Hann"] = hann_variances(values, factors, length, ends)
     return {name: found[name] for name in KINDS}
 
 
-def changed(gain: Floats, rng: np.random.Generator) -> Floats:
-    """White noise twice: three axes as it is, and the same three times ``gain`` [n]."""
+def simulate_change(gain: Floats, rng: np.random.Generator) -> Floats:
+    """Return white noise of three axes, and the same noise times ``gain`` [n]."""
     calm = rng.standard_normal((gain.size, 3))
     return np.concatenate([calm, gain[:, None] * calm], axis=1) * N_TRUE
 
 
-def pairs(gain: Floats, factors: Ints, ends: Sequence[int], records: int, seed: int) -> tuple[Courses, Courses]:
-    """Courses of σ² without and with the change, [looks, m], averaged over records."""
+def average_change(
+    gain: Floats, factors: Ints, ends: Sequence[int], records: int, seed: int
+) -> tuple[Variances, Variances]:
+    """Return σ² [times, m] without and with the change, averaged over records."""
     sums: dict[str, Floats] = {}
     rng = np.random.default_rng(seed)
     for _ in range(-(-records // 3)):
-        for name, found in courses(changed(gain, rng), factors, LENGTH, RATE_HZ, ends).items():
+        for name, found in compare_windows(simulate_change(gain, rng), factors, LENGTH, RATE_HZ, ends).items():
             sums[name] = sums.get(name, 0.0) + np.stack([found[..., :3].mean(2), found[..., 3:].mean(2)])
     return {k: v[0] for k, v in sums.items()}, {k: v[1] for k, v in sums.items()}
 
 
 def step_table(records: int, seed: int) -> None:
-    """Seconds until a step of N shows to 50, 90 and 99 % in σ²."""
+    """Print the time until σ² shows 50, 90 and 99 % of a step of N."""
     factors, since = np.array([1, 64, 512]), np.unique(np.round(np.geomspace(1.0, 4.0 * WINDOW_S, 160) * RATE_HZ))
     before = 4 * LENGTH
     ends = [before + int(s) for s in since]
     gain = np.where(np.arange(ends[-1]) < before, 1.0, N_STEP)
-    calm, step = pairs(gain, factors, ends, records, seed)
-    shown = table(f"a step of N × {N_STEP}: seconds until so much of it shows in σ² (mean of {records} records)",
-                  "share, τ", *KINDS)  # fmt: skip
+    calm, step = average_change(gain, factors, ends, records, seed)
+    table = create_table(
+        f"a step of N × {N_STEP}: seconds until σ² shows a share of it (mean of {records} records)",
+        "share, τ",
+        *KINDS,
+    )
     for i, m in enumerate(factors):
         for wanted in (0.5, 0.9, 0.99):
-            reached = [crossing(since / RATE_HZ, step[name][:, i] / calm[name][:, i], wanted) for name in KINDS]
-            shown.add_row(f"{wanted:.0%} at {m / RATE_HZ:g} s", *(f"{t:.0f}" for t in reached))
-    console.print(shown)
+            reached = [find_crossing(since / RATE_HZ, step[name][:, i] / calm[name][:, i], wanted) for name in KINDS]
+            table.add_row(f"{wanted:.0%} at {m / RATE_HZ:g} s", *(f"{t:.0f}" for t in reached))
+    console.print(table)
 
 
-def crossing(t: Floats, ratio: Floats, wanted: float) -> float:
-    """When that share of the step in σ² is reached first, between looks by a straight line."""
+def find_crossing(t: Floats, ratio: Floats, wanted: float) -> float:
+    """Return the interpolated time at which σ² first reaches a share of the step."""
     share = (ratio - 1.0) / (N_STEP**2 - 1.0)
     k = int(np.argmax(share >= wanted))
     return float(t[0] if k == 0 else np.interp(wanted, share[k - 1 : k + 1], t[k - 1 : k + 1]))
 
 
 def burst_table(records: int, seed: int) -> None:
-    """Windows until one second of larger noise is less than 1 % of σ²."""
+    """Print the time until a burst of one second is less than 1 % of σ²."""
     factors, since = np.array([1, 64]), np.arange(0.02, 10.0, 0.02)
     before = 4 * LENGTH
     ends = [before + round(RATE_HZ) + round(s * LENGTH) for s in since]
-    shown = table(f"a burst of 1 s: windows until it is within 1 % of σ² for good (mean of {records} records)",
-                  "burst, τ", *KINDS)  # fmt: skip
+    table = create_table(
+        f"a burst of 1 s: windows until it stays below 1 % of σ² (mean of {records} records)", "burst, τ", *KINDS
+    )
     for height in (10.0, 100.0, 10_000.0):
         gain = np.ones(ends[-1])
         gain[before : before + round(RATE_HZ)] = height
-        calm, burst = pairs(gain, factors, ends, records, seed)
+        calm, burst = average_change(gain, factors, ends, records, seed)
         for i, m in enumerate(factors):
-            left = [since[_looks_until(burst[name][:, i] <= 1.01 * calm[name][:, i])] for name in KINDS]
-            shown.add_row(f"{height:,g} × the noise, {m / RATE_HZ:g} s", *(f"{t:.2f}" for t in left))
-    console.print(shown)
+            left = [since[_first_index_of_final_true(burst[name][:, i] <= 1.01 * calm[name][:, i])] for name in KINDS]
+            table.add_row(f"{height:,g} × the noise, {m / RATE_HZ:g} s", *(f"{t:.2f}" for t in left))
+    console.print(table)
 
 
-def _looks_until(held: NDArray[np.bool_]) -> int:
-    """The first look from which on it holds; the last one must."""
-    return 0 if held.all() else int(np.flatnonzero(~held)[-1]) + 1
+def _first_index_of_final_true(flags: NDArray[np.bool_]) -> int:
+    """Return the first index from which on all values are True. The last value must be True."""
+    return 0 if flags.all() else int(np.flatnonzero(~flags)[-1]) + 1
 
 
-def noises(n: int, records: int, seed: int, source: Source, rate_hz: float) -> Iterator[Floats]:
-    """Six records at a time of one kind of noise."""
+def simulate_records(n: int, records: int, seed: int, source: Source, rate_hz: float) -> Iterator[Floats]:
+    """Yield records of one noise, six at a time."""
     for k in range(-(-records // len(AXES))):
         yield NoiseModel(dict.fromkeys(AXES, (source,))).simulate(n, rate_hz, seed + k)
 
 
 def scatter_table(records: int, seed: int) -> None:
-    """Standard deviation of the Allan deviation at rest, in percent of it."""
+    """Print the relative standard deviation of the Allan deviation for constant noise."""
     length, factors = 4096, np.array([1, 16, 128, 512])
     rate_hz = length / WINDOW_S
     kinds = {"white": AngleRandomWalk(N=1e-4), "flicker": BiasInstability(B=1e-4), "walk": RateRandomWalk(K=1e-4)}
-    shown = table(f"standard deviation of the deviation at rest, % ({records} records; "
-                  f"itself known to {70.0 / np.sqrt(records):.1f} % of it)", "noise, τ", *KINDS)  # fmt: skip
+    table = create_table(
+        f"standard deviation of the deviation at rest, % ({records} records; "
+        f"itself known to {70.0 / np.sqrt(records):.1f} % of it)",
+        "noise, τ",
+        *KINDS,
+    )
     for kind, source in kinds.items():
         every: dict[str, list[Floats]] = {name: [] for name in KINDS}
-        for values in noises(6 * length, records, seed, source, rate_hz):
-            for name, found in courses(values, factors, length, rate_hz, [6 * length]).items():
+        for values in simulate_records(6 * length, records, seed, source, rate_hz):
+            for name, found in compare_windows(values, factors, length, rate_hz, [6 * length]).items():
                 every[name].append(np.sqrt(found[0]))
         deviations = [np.concatenate(every[name], axis=1) for name in KINDS]
         for i, m in enumerate(factors):
-            shown.add_row(f"{kind}, T/{length // m}", *(f"{100 * d[i].std() / d[i].mean():.1f}" for d in deviations))
-    console.print(shown)
+            table.add_row(f"{kind}, T/{length // m}", *(f"{100 * d[i].std() / d[i].mean():.1f}" for d in deviations))
+    console.print(table)
 
 
 def cost_table(rounds: int, seed: int) -> None:
-    """Processor time a sample and bytes held, an hour at 100 Hz."""
+    """Print the processor time per sample and the memory for an hour at 100 Hz."""
     length, factors = 360_000, 2 ** np.arange(TAUS)
     values = N_TRUE * np.random.default_rng(seed).standard_normal((20_000, 6)) + 9.81
     works: dict[str, Callable[[], None]] = {}
-    held = {}
-    for name, window in windows(factors, length, 100.0).items():
+    sizes = {}
+    for name, window in make_windows(factors, length, 100.0).items():
         for _ in range(-(-(length + 1000) // len(values))):
             window.append_samples(values)
-        held[name] = bytes_of(window)
-        works[f"{name} blocks"] = advancing(window, values, 100)
-        works[f"{name} singles"] = advancing(window, values[:2000], 1)
-    took = alternate(works, rounds)
-    shown = table(f"cost: {TAUS} τ, six axes, window of {length:,} samples; median (best) of {rounds} rounds",
-                  "window", "ns a sample, 100 a call", "ns a sample, 1 a call", "kB held")  # fmt: skip
-    for name, size in held.items():
+        sizes[name] = memory_of(window)
+        works[f"{name} blocks"] = make_append_loop(window, values, 100)
+        works[f"{name} singles"] = make_append_loop(window, values[:2000], 1)
+    took = time_alternately(works, rounds)
+    table = create_table(
+        f"cost: {TAUS} τ, six axes, window of {length:,} samples; median (best) of {rounds} rounds",
+        "window",
+        "ns a sample, 100 a call",
+        "ns a sample, 1 a call",
+        "memory in kB",
+    )
+    for name, size in sizes.items():
         each = [[t * 1e9 / n for t in took[f"{name} {how}"]] for how, n in (("blocks", 20_000), ("singles", 2_000))]
-        shown.add_row(name, *(f"{median:.0f} ({best:.0f})" for median, best in each), f"{size / 1e3:,.0f}")
-    console.print(shown)
+        table.add_row(name, *(f"{median:.0f} ({best:.0f})" for median, best in each), f"{size / 1e3:,.0f}")
+    console.print(table)
 
 
-def bytes_of(window: AllanWindow) -> int:
+def memory_of(window: AllanWindow) -> int:
     """Return the memory of the arrays of a window in bytes."""
     return window._ints.nbytes + window._floats.nbytes + window._missing.nbytes
 
 
-def advancing(window: AllanWindow, values: Floats, size: int) -> Callable[[], None]:
-    """Advance by all values, ``size`` samples a call."""
+def make_append_loop(window: AllanWindow, values: Floats, size: int) -> Callable[[], None]:
+    """Return a function that appends all values, with ``size`` samples in each call."""
     blocks = [values[i : i + size] for i in range(0, len(values), size)]
 
     def work() -> None:
-        for one in blocks:
-            window.append_samples(one)
+        for block in blocks:
+            window.append_samples(block)
 
     return work
 
 
 def fit_table(records: int, seed: int) -> None:
-    """What the five-term fit says over each kind of curve while N changes; truth: N and B, nothing else."""
+    """Print the five-term fit of each window while N changes. The true noise consists of N and B."""
     factors = cluster_sizes(LENGTH, RATE_HZ)
     before = 4 * LENGTH
-    ends = [before + round(s * RATE_HZ) for s in LOOKS_S]
+    ends = [before + round(s * RATE_HZ) for s in FIT_TIMES_S]
     model = NoiseModel(dict.fromkeys(AXES, (BiasInstability(B=B_TRUE),)))
     fits: dict[tuple[str, int], list[Fit]] = {}
     for k in range(-(-records // len(AXES))):
         white = np.random.default_rng([seed, k]).standard_normal((ends[-1], 6)) * N_TRUE * np.sqrt(RATE_HZ)
         white[before:] *= N_STEP
         values = white + model.simulate(ends[-1], RATE_HZ, seed + k)
-        for name, found in courses(values, factors, LENGTH, RATE_HZ, ends).items():
-            for look, avar in enumerate(found):
-                fits.setdefault((name, look), []).append(fitted(name, factors, avar))
-        for look, one in enumerate(restarted(values, factors, before, ends)):
-            fits.setdefault((RESTARTED, look), []).append(one)
+        for name, found in compare_windows(values, factors, LENGTH, RATE_HZ, ends).items():
+            for index, avar in enumerate(found):
+                fits.setdefault((name, index), []).append(fit_curve(name, factors, avar))
+        for index, one in enumerate(fit_restarted_window(values, factors, before, ends)):
+            fits.setdefault((RESTARTED, index), []).append(one)
     names = (*KINDS, RESTARTED)
-    shown = table(f"the fit while N changes: N over its value now / % of axes with Q or K in / % whose B the interval "
-                  f"misses ({records} records)", f"since N × {N_STEP}", *names)  # fmt: skip
-    for look, since_s in enumerate(LOOKS_S):
+    table = create_table(
+        f"the fit while N changes: N over its value now / % of axes with Q or K in / % whose B the interval "
+        f"misses ({records} records)",
+        f"since N × {N_STEP}",
+        *names,
+    )
+    for index, since_s in enumerate(FIT_TIMES_S):
         truth = N_TRUE * (N_STEP if since_s > 0.0 else 1.0)
-        shown.add_row(
-            "at rest" if since_s < 0.0 else f"{since_s:g} s", *(said(fits[name, look], truth) for name in names)
+        table.add_row(
+            "at rest" if since_s < 0.0 else f"{since_s:g} s", *(format_fit(fits[name, index], truth) for name in names)
         )
-    console.print(shown)
+    console.print(table)
 
 
-def fitted(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
-    """The fit as if the curve were a rectangle's, each row of its own number of terms."""
+def fit_curve(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
+    """Fit a curve as that of a rectangle, with the number of terms of each τ."""
     whole = covariances(length, factors)
     spans = (
         newest_samples_per_displayed_tau(factors, RATE_HZ, length)
@@ -243,19 +264,19 @@ def fitted(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
     return fit_coefficients(make_design_matrix(factors, RATE_HZ), whole, MeasuredVariancesAndSlopes(avar, terms))
 
 
-def restarted(values: Floats, factors: Ints, before: int, ends: Sequence[int]) -> Iterator[Fit]:
-    """The rectangle, all before the change forgotten at the first look after it."""
+def fit_restarted_window(values: Floats, factors: Ints, before: int, ends: Sequence[int]) -> Iterator[Fit]:
+    """Yield the fits of a rectangle that discards all samples before the change."""
     window = AllanWindow(LENGTH, factors)
-    for look, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
-        if look == 1:
+    for index, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
+        if index == 1:
             window.discard_samples()
             start = before
         window.append_samples(values[start:end])
-        yield fitted(RESTARTED, factors, window.avar(), window.samples_in_window)
+        yield fit_curve(RESTARTED, factors, window.avar(), window.samples_in_window)
 
 
-def said(fits: Sequence[Fit], truth: float) -> str:
-    """One cell: N's ratio, false terms, B outside its interval."""
+def format_fit(fits: Sequence[Fit], truth: float) -> str:
+    """Return a cell with the ratio of N, false terms, and B outside its interval."""
     status = np.concatenate([f.coefficients.status for f in fits], axis=1)
     theta = np.concatenate([f.theta for f in fits], axis=1)
     lo, hi = (np.concatenate([getattr(f.coefficients, end) for f in fits], axis=1)[2] for end in ("lo", "hi"))
@@ -272,13 +293,13 @@ def main() -> None:
     )
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    console.print(about())
-    step_table(max(given.records // 8, 3), given.seed)
-    burst_table(max(given.records // 40, 3), given.seed)
-    scatter_table(10 * given.records, given.seed)
-    cost_table(given.rounds, given.seed)
-    fit_table(given.records, given.seed)
+    arguments = parser.parse_args()
+    console.print(describe_machine())
+    step_table(max(arguments.records // 8, 3), arguments.seed)
+    burst_table(max(arguments.records // 40, 3), arguments.seed)
+    scatter_table(10 * arguments.records, arguments.seed)
+    cost_table(arguments.rounds, arguments.seed)
+    fit_table(arguments.records, arguments.seed)
 
 
 if __name__ == "__main__":

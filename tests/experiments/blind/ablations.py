@@ -20,39 +20,39 @@ from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
-from tests.experiments.blind.run import Job, run
+from tests.experiments.blind.run import Job, run_job
 
 NULLS = 10
 HIDDEN = (
     *("sinusoidal", "narrowband", "exponentially_correlated", "rate_ramp", "bias_step", "temperature_bias"),
     *("outliers", "cross_axis"),
 )
-FOREIGN = ("foreign:chirp", "foreign:amplitude_modulated_line", "foreign:wandering_line", "foreign:pulse_train")
+FOREIGN = ("foreign:chirp", "foreign:amplitude_modulated_line", "foreign:sawtooth")
 
 
 @contextmanager
-def as_it_is() -> Iterator[None]:
-    """Nothing switched off."""
+def unchanged() -> Iterator[None]:
+    """Switch nothing off."""
     yield
 
 
 @contextmanager
-def without_null() -> Iterator[None]:
-    """Thresholds from a table instead of from simulated recordings."""
+def without_null_distribution() -> Iterator[None]:
+    """Use thresholds of the χ² distribution instead of simulated recordings."""
     from monitor.reconcile import reconcile
     from monitor.reconcile.diagnostics.null_distribution import AxisNull, NullDistribution
     from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 
-    def table(simulated: Mapping[str, Sequence[Any]]) -> dict[str, AxisNull]:
+    def fixed_distributions(simulated: Mapping[str, Sequence[Any]]) -> dict[str, AxisNull]:
         return {axis: dict.fromkeys(DIAGNOSTICS, NullDistribution(1.92, 3.32)) for axis in simulated}
 
-    with patch.object(reconcile, "estimate_null_distributions", table):
+    with patch.object(reconcile, "estimate_null_distributions", fixed_distributions):
         yield
 
 
 @contextmanager
-def without_proof() -> Iterator[None]:
-    """Nothing held out."""
+def without_cross_validation() -> Iterator[None]:
+    """Accept every effect without cross-validation."""
     from monitor.reconcile.search import search
 
     with patch.object(search, "cross_validate", lambda *_arguments: search.accept_without_validation("switched off")):
@@ -60,22 +60,22 @@ def without_proof() -> Iterator[None]:
 
 
 @contextmanager
-def without_refit() -> Iterator[None]:
-    """The model's own sizes stay whatever is added."""
-    from monitor.reconcile.likelihood import hypothesis
+def without_joint_fit() -> Iterator[None]:
+    """Keep all sizes of the model fixed when an effect is added."""
+    from monitor.reconcile.likelihood import hypothesis_fit
     from monitor.reconcile.search import search
 
-    def stiff(axis: Any, added: Sequence[Any], model: tuple[Any, ...]) -> Any:
-        return hypothesis.Hypothesis(model, axis.fit((*model, *added), hypothesis.noise_effect_indices(model)))
+    def fit_with_fixed_sizes(axis: Any, added: Sequence[Any], model: tuple[Any, ...]) -> Any:
+        return hypothesis_fit.Hypothesis(model, axis.fit((*model, *added), hypothesis_fit.noise_effect_indices(model)))
 
     name = "fit_with_fewest_changes"
-    with patch.object(search, name, stiff), patch.object(hypothesis, name, stiff):
+    with patch.object(search, name, fit_with_fixed_sizes), patch.object(hypothesis_fit, name, fit_with_fixed_sizes):
         yield
 
 
 @contextmanager
 def without_withdrawal() -> Iterator[None]:
-    """Names stay, whatever is left at their place."""
+    """Do not withdraw contradicted effects."""
     from monitor.reconcile.search import search
 
     with patch.object(search, "keep_uncontradicted_effects", lambda found, *_others: found):
@@ -83,11 +83,11 @@ def without_withdrawal() -> Iterator[None]:
 
 
 VARIANTS: dict[str, Callable[[], Any]] = {
-    "as it is": as_it_is,
-    "without the simulated null": without_null,
-    "without held-out halves": without_proof,
-    "without the joint refit": without_refit,
-    "without withdrawn names": without_withdrawal,
+    "unchanged": unchanged,
+    "without simulated null distribution": without_null_distribution,
+    "without cross-validation": without_cross_validation,
+    "without joint fit": without_joint_fit,
+    "without withdrawal": without_withdrawal,
 }
 
 
@@ -98,7 +98,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1200.0)
     parser.add_argument("--only", nargs="*", choices=VARIANTS, default=list(VARIANTS))
     asked = parser.parse_args()
-    heads = ("", "true models accused", "given a name", "hidden and named", "5 % off", "false names", "foreign named")
+    heads = (
+        "",
+        "true models rejected",
+        "true models with a name",
+        "effects named",
+        "effects named, baseline 5 % off",
+        "false names",
+        "foreign effects named",
+    )
     print("| " + " | ".join(heads) + " |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in asked.only:
@@ -110,20 +118,22 @@ def _counts(variant: Callable[[], Any], seeds: int, seconds: float) -> list[str]
         return Job(name, "plain", seed, seconds, axes=2)
 
     with variant():
-        nulls = [run(job("null", seed), in_process=True) for seed in range(NULLS)]
-        hidden = [run(job(name, seed), in_process=True) for name in HIDDEN for seed in range(seeds)]
+        nulls = [run_job(job("null", seed), in_process=True) for seed in range(NULLS)]
+        hidden = [run_job(job(name, seed), in_process=True) for name in HIDDEN for seed in range(seeds)]
         off = [
-            run(replace(job(name, seed), baseline="off"), in_process=True) for name in HIDDEN for seed in range(seeds)
+            run_job(replace(job(name, seed), baseline="off"), in_process=True)
+            for name in HIDDEN
+            for seed in range(seeds)
         ]
-        foreign = [run(job(name, seed), in_process=True) for name in FOREIGN for seed in range(seeds)]
-    named = [sum(not one.missed for one in group) for group in (hidden, off)]
+        foreign = [run_job(job(name, seed), in_process=True) for name in FOREIGN for seed in range(seeds)]
+    named = [sum(not outcome.missed for outcome in group) for group in (hidden, off)]
     return [
-        f"{sum(one.verdict != 'agrees' for one in nulls)} of {len(nulls)}",
-        f"{sum(bool(one.names) for one in nulls)} of {len(nulls)}",
+        f"{sum(outcome.verdict != 'agrees' for outcome in nulls)} of {len(nulls)}",
+        f"{sum(bool(outcome.names) for outcome in nulls)} of {len(nulls)}",
         f"{named[0]} of {len(hidden)}",
         f"{named[1]} of {len(off)}",
-        f"{sum(len(one.false) for one in [*hidden, *off])}",
-        f"{sum(bool(one.false) for one in foreign)} of {len(foreign)}",
+        f"{sum(len(outcome.false) for outcome in [*hidden, *off])}",
+        f"{sum(bool(outcome.false) for outcome in foreign)} of {len(foreign)}",
     ]
 
 

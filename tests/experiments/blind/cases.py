@@ -1,7 +1,8 @@
-"""Recordings with something hidden in them, baseline models, and truths.
+"""Cases of the blind trials: recordings with hidden effects, baseline models and truths.
 
-A case is named by what is hidden: an effect (``sinusoidal``), a pair (``bias_step@same+outliers``: on one axis; with
-``+`` alone on two), ``null``, or ``foreign:chirp``. The same name, level, seed and length give the same case.
+The name of a case says what is hidden. Examples are a single effect (``sinusoidal``), two effects on one axis
+(``bias_step@same+outliers``), two effects on two axes (``sinusoidal+bias_step``), no effect (``null``) and an effect
+without a name (``foreign:chirp``). The same name, level, seed and length give the same case.
 """
 
 import json
@@ -14,12 +15,25 @@ from zlib import crc32
 import numpy as np
 
 from tests.experiments.blind import foreign
-from tests.experiments.blind.levels import NotIdentifiable, aim, at_level, at_multiple, size_lines
+from tests.experiments.blind.levels import (
+    NotIdentifiable,
+    draw_size_target,
+    scale_size,
+    set_line_amplitudes,
+    set_size_for_level,
+)
 from tests.experiments.blind.oracle import Gains
 from tests.experiments.blind.processes import Floats
 from tests.experiments.blind.recipes import RECIPES, log_uniform
-from tests.experiments.blind.sensors import off, sensor, with_lines, with_shaking, with_temperature, without_term
-from tests.experiments.blind.world import AXES, Effect, Foreign, World, model_text
+from tests.experiments.blind.sensors import (
+    draw_sensor,
+    perturb_baseline,
+    with_lines,
+    with_temperature,
+    with_vibration,
+    without_term,
+)
+from tests.experiments.blind.world import AXES, Effect, ForeignEffect, World, model_text
 
 SINGLES: Final = tuple(RECIPES)
 FOREIGN: Final = tuple(f"foreign:{name}" for name in foreign.NAMES)
@@ -52,21 +66,21 @@ PAIRS: Final = (
     "sample_rate_error+bias_step",
     "cross_axis+quantization_noise",
 )
-REDRAWS: Final = 6  # sensors and shapes tried before a case is given up; how many were needed stands in the truth
+MAX_DRAWS: Final = 6  # draws of a sensor and an effect before a case is given up
 
 
 @dataclass(frozen=True)
 class Case:
-    """A recording, its baseline model, and what only the scorer may know."""
+    """Recording with its baseline model and the truth for the scorer."""
 
     name: str
-    columns: Mapping[str, Floats]  # SI, and °C
+    columns: Mapping[str, Floats]  # in SI units and °C
     rate_hz: float
     model: str  # TOML
     truth: Mapping[str, Any]
 
     def write(self, folder: Path) -> tuple[Path, Path]:
-        """``recording.npz`` and ``model.toml`` in a folder; the truth is not among them."""
+        """Write ``recording.npz`` and ``model.toml``, but not the truth, to a folder and return their paths."""
         folder.mkdir(parents=True, exist_ok=True)
         recording, model = folder / "recording.npz", folder / "model.toml"
         np.savez(recording, fs=np.float64(self.rate_hz), **dict(self.columns))  # type: ignore[arg-type]
@@ -74,23 +88,23 @@ class Case:
         return recording, model
 
     def truth_json(self) -> str:
-        """For a file kept elsewhere."""
+        """Return the truth as JSON."""
         return json.dumps(self.truth)
 
 
 @dataclass
 class _Plan:
-    """A case in the making."""
+    """Sensor and hidden effects of a case that is being built."""
 
     world: World
     rng: np.random.Generator
     level: str
     sizes: tuple[float, float] | None
     factor: float = 1.0
-    told: list[dict[str, Any]] = field(default_factory=list)
+    truths: list[dict[str, Any]] = field(default_factory=list)
 
 
-def case(
+def make_case(
     name: str,
     level: str = "plain",
     seed: int = 0,
@@ -103,27 +117,35 @@ def case(
 ) -> Case:
     """Make one case.
 
-    Args:
-        name: what is hidden
-        level: plain or faint
-        seed: another sensor, other draws
-        seconds, rate: length and stated sample rate (Hz) of the recording
-        axes: 6, or fewer counted from gx
-        baseline: exact, or off: N, B and K 5 % too large or too small
-        sizes: range of the multiple of the level's size, drawn evenly on a logarithmic scale; None for the level itself
+    Parameters
+    ----------
+    name
+        Name of the case.
+    level
+        "plain" or "faint".
+    seed
+        Seed of the sensor and of all random numbers.
+    seconds, rate
+        Length in seconds and stated sample rate in Hz.
+    axes
+        Number of axes, counted from gx.
+    baseline
+        "exact", or "off" for N, B and K that are 5 % too large or too small.
+    sizes
+        Range of the factor on the size, which is drawn evenly on a logarithmic scale. None is the size of the level.
     """
     entropy = [crc32(name.encode()), crc32(level.encode()), seed]
     rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(entropy)))
-    for redrawn in range(REDRAWS):
-        plan = _Plan(sensor(rng, seconds, rate, AXES[:axes]), rng, level, sizes)
+    for redrawn in range(MAX_DRAWS):
+        plan = _Plan(draw_sensor(rng, seconds, rate, AXES[:axes]), rng, level, sizes)
         try:
-            _fill(plan, name)
+            _add_effects(plan, name)
             break
         except NotIdentifiable:
-            if redrawn == REDRAWS - 1:
+            if redrawn == MAX_DRAWS - 1:
                 raise
     world = plan.world
-    told_baseline = world.baseline if baseline == "exact" else off(world.baseline, rng)
+    known_baseline = world.baseline if baseline == "exact" else perturb_baseline(world.baseline, rng)
     truth = {
         "case": name,
         "level": level,
@@ -134,56 +156,57 @@ def case(
         "axes": list(world.axes),
         "baseline": baseline,
         "redrawn": redrawn,
-        "hidden": plan.told,
-        "foreign": [asdict(one) for one in world.strangers],
+        "hidden": plan.truths,
+        "foreign": [asdict(effect) for effect in world.foreign_effects],
     }
-    return Case(name, world.recording(), rate, model_text(told_baseline, rate), truth)
+    return Case(name, world.recording(), rate, model_text(known_baseline, rate), truth)
 
 
-def _fill(plan: _Plan, name: str) -> None:
+def _add_effects(plan: _Plan, name: str) -> None:
     if name.startswith("foreign:"):
-        _add_stranger(plan, name.removeprefix("foreign:"))
+        _add_foreign_effect(plan, name.removeprefix("foreign:"))
     elif name != "null":
         _hide(plan, name)
 
 
-def _add_stranger(plan: _Plan, name: str) -> None:
+def _add_foreign_effect(plan: _Plan, name: str) -> None:
     if name in foreign.NEEDS_TEMPERATURE:
         plan.world = with_temperature(plan.world, plan.rng)
-    stranger = Foreign(str(plan.rng.choice(plan.world.axes)), name)
-    plan.world = replace(plan.world, strangers=(stranger,))
+    effect = ForeignEffect(str(plan.rng.choice(plan.world.axes)), name)
+    plan.world = replace(plan.world, foreign_effects=(effect,))
 
 
 def _hide(plan: _Plan, name: str) -> None:
-    """Draw effects of a name, give them sizes, put them in.
+    """Draw the effects of a case, search their sizes, and add them to the sensor.
 
-    Of a pair each is as large as its level asks for where the model has the other already; so the first is sized twice.
+    The size of each effect of a pair holds for a model that contains the other effect, so the first size is searched
+    twice.
     """
     drawn: list[Effect] = []
-    for each in name.replace("@same", "").split("+"):
-        drawn.append(_draw(plan, each, drawn, same="@same" in name))
-    aims = [aim(plan.world, plan.rng, effect, plan.level) for effect in drawn]
+    for effect_name in name.replace("@same", "").split("+"):
+        drawn.append(_draw(plan, effect_name, drawn, same="@same" in name))
+    targets = [draw_size_target(plan.world, plan.rng, effect, plan.level) for effect in drawn]
     hidden: dict[int, tuple[Effect, Gains]] = {}
     for _ in drawn:
         for k, effect in enumerate(drawn):
             others = tuple(other for j, (other, _) in hidden.items() if j != k)
             known = replace(plan.world, baseline=(*plan.world.baseline, *others))
-            if aims[k].lines:
-                plan.world, gains = size_lines(plan.world, aims[k].target)
-                hidden[k] = effect.sized(ratio=aims[k].size), gains
+            if targets[k].lines:
+                plan.world, gains = set_line_amplitudes(plan.world, targets[k].gain)
+                hidden[k] = effect.sized(ratio=targets[k].size), gains
             else:
-                hidden[k] = at_level(known, effect, aims[k])
+                hidden[k] = set_size_for_level(known, effect, targets[k])
     if plan.sizes is not None:
         plan.factor = log_uniform(plan.rng, *plan.sizes)
         for k in hidden:
             others = tuple(other for j, (other, _) in hidden.items() if j != k)
             known = replace(plan.world, baseline=(*plan.world.baseline, *others))
-            if aims[k].lines:
-                plan.world, gains = size_lines(plan.world, aims[k].target * plan.factor**2)
+            if targets[k].lines:
+                plan.world, gains = set_line_amplitudes(plan.world, targets[k].gain * plan.factor**2)
                 hidden[k] = hidden[k][0], gains
             else:
-                hidden[k] = at_multiple(known, hidden[k][0], plan.factor)
-    plan.told = [_told(*hidden[k]) for k in range(len(drawn))]
+                hidden[k] = scale_size(known, hidden[k][0], plan.factor)
+    plan.truths = [_describe_truth(*hidden[k]) for k in range(len(drawn))]
     plan.world = plan.world.with_hidden(*(effect for effect, _ in hidden.values()))
 
 
@@ -201,12 +224,12 @@ def _draw(plan: _Plan, name: str, before: list[Effect], same: bool) -> Effect:
         plan.world = without_term(plan.world, axis, recipe.needs)
     effect = Effect(axis, name, recipe.draw(rng, plan.world, axis))
     if recipe.needs == "shaking source":
-        plan.world = with_shaking(plan.world, rng, effect.parameters["source"])
+        plan.world = with_vibration(plan.world, rng, effect.parameters["source"])
     return effect
 
 
-def _told(effect: Effect, gains: Gains) -> dict[str, Any]:
-    """For the truth."""
+def _describe_truth(effect: Effect, gains: Gains) -> dict[str, Any]:
+    """Return the entry of a hidden effect in the truth."""
     return {
         "axis": effect.axis,
         "effect": effect.name,

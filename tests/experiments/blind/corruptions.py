@@ -22,7 +22,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: threads of two programs fight for the cores
+# set before NumPy is imported, so that programs do not compete for the cores
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numpy as np  # noqa: E402
@@ -118,21 +119,21 @@ class Answer:
         )
 
 
-def load(data: Path, place: tuple[str, int, int]) -> Recording:
+def load_part(data: Path, place: tuple[str, int, int]) -> Recording:
     """Return one part of a recording."""
     file, begin, end = place
-    with np.load(data / file) as held:
-        values = {axis: held[axis][begin:end].astype(np.float64) for axis in AXES}
-        temperature_c = held["temp"][begin:end].astype(np.float64) if "temp" in held else None
-        return Recording(values, float(held["fs"]), temperature_c)
+    with np.load(data / file) as columns:
+        values = {axis: columns[axis][begin:end].astype(np.float64) for axis in AXES}
+        temperature_c = columns["temp"][begin:end].astype(np.float64) if "temp" in columns else None
+        return Recording(values, float(columns["fs"]), temperature_c)
 
 
-def changed(recording: Recording, values: dict[str, Floats]) -> Recording:
+def replace_values(recording: Recording, values: dict[str, Floats]) -> Recording:
     """Return the recording with other values on some axes."""
     return Recording({**recording.values, **values}, recording.rate_hz, recording.temperature_c)
 
 
-def noise_of(y: Floats) -> float:
+def noise_deviation(y: Floats) -> float:
     """Return the standard deviation from sample to sample."""
     return float(np.std(np.diff(y))) / 2.0**0.5
 
@@ -144,7 +145,13 @@ def with_unit(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
     values = {axis: factor * second.values[axis] for axis in triad}
     detail = f"{triad[0][0]}* times {factor:.5g}"
     return Case(
-        sensor, "unit", detail, changed(second, values), ("unit_error",), triad, {"nearest_factor": (factor, 1e-6)}
+        sensor,
+        "unit",
+        detail,
+        replace_values(second, values),
+        ("unit_error",),
+        triad,
+        {"nearest_factor": (factor, 1e-6)},
     )
 
 
@@ -155,16 +162,16 @@ def with_swap(sensor: str, first: Recording, second: Recording, rng: np.random.G
         for triad in TRIADS
         for k, one in enumerate(triad)
         for other in triad[k + 1 :]
-        if _differ_clearly(first, second, one, other)
+        if _have_different_spectra(first, second, one, other)
     ]
     if not pairs:
         return None
     one, other = pairs[int(rng.integers(len(pairs)))]
     values = {one: second.values[other], other: second.values[one]}
-    return Case(sensor, "swap", f"{one} and {other}", changed(second, values), ("axes_permuted",), (one, other))
+    return Case(sensor, "swap", f"{one} and {other}", replace_values(second, values), ("axes_permuted",), (one, other))
 
 
-def _differ_clearly(first: Recording, second: Recording, one: str, other: str) -> bool:
+def _have_different_spectra(first: Recording, second: Recording, one: str, other: str) -> bool:
     """Return True if a swap of two axes changes the spectra far more than the spectra differ between the parts."""
     spectra = {
         (part, axis): np.log(welch(recording.values[axis], nperseg=256)[1][2:])
@@ -198,8 +205,8 @@ def with_knocks(sensor: str, second: Recording, rng: np.random.Generator) -> Cas
         t = np.arange(length) / rate_hz
         shape = np.exp(-t / max(0.15, 3.0 / rate_hz)) * np.sin(2.0 * np.pi * rng.uniform(0.1, 0.3) * np.arange(length))
         for axis, y in values.items():
-            y[begin : begin + length] += rng.uniform(20.0, 100.0) * noise_of(second.values[axis]) * shape
-    return Case(sensor, "knocks", f"{count}", changed(second, values), ("motion",))
+            y[begin : begin + length] += rng.uniform(20.0, 100.0) * noise_deviation(second.values[axis]) * shape
+    return Case(sensor, "knocks", f"{count}", replace_values(second, values), ("motion",))
 
 
 def with_hole(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
@@ -212,7 +219,7 @@ def with_hole(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
         y[begin : begin + length] = y[begin - 1] if frozen else np.nan
     at = {"time": (begin / second.rate_hz, 0.01)}
     kind = "frozen_rows" if frozen else "missing_rows"
-    return Case(sensor, "drop-out", f"{length} rows {kind}", changed(second, values), (kind,), (), at)
+    return Case(sensor, "drop-out", f"{length} rows {kind}", replace_values(second, values), (kind,), (), at)
 
 
 def with_spike(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
@@ -229,7 +236,7 @@ def with_first_row(sensor: str, second: Recording, rng: np.random.Generator) -> 
         values = {axis: y.copy() for axis, y in second.values.items()}
         for y in values.values():
             y[0] = 0.0
-        return Case(sensor, "first row", "row 0 is zero", changed(second, values), ("corrupt_rows",))
+        return Case(sensor, "first row", "row 0 is zero", replace_values(second, values), ("corrupt_rows",))
     return _corrupt_row(sensor, "first row", second, at, AXES, rng)
 
 
@@ -240,10 +247,10 @@ def _corrupt_row(
     values = {axis: y.copy() for axis, y in second.values.items()}
     size = float(np.exp(rng.uniform(np.log(30.0), np.log(1000.0))))
     for axis in axes:
-        values[axis][at] += size * noise_of(values[axis]) * float(rng.choice([-1.0, 1.0]))
+        values[axis][at] += size * noise_deviation(values[axis]) * float(rng.choice([-1.0, 1.0]))
     expected = {"time": (at / second.rate_hz, 1e-9)} if at else {}
     detail = f"row {at}, {size:.0f} s on {' '.join(axes)}"
-    return Case(sensor, fault, detail, changed(second, values), ("corrupt_rows",), (), expected)
+    return Case(sensor, fault, detail, replace_values(second, values), ("corrupt_rows",), (), expected)
 
 
 def with_stuck_axis(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
@@ -254,12 +261,12 @@ def with_stuck_axis(sensor: str, second: Recording, rng: np.random.Generator) ->
     y = second.values[axis].copy()
     y[begin:end] = y[begin - 1]
     detail = f"{axis} for {end - begin} of {n} rows"
-    return Case(sensor, "stuck axis", detail, changed(second, {axis: y}), ("stuck_axis",), (axis,))
+    return Case(sensor, "stuck axis", detail, replace_values(second, {axis: y}), ("stuck_axis",), (axis,))
 
 
 def draw_case(data: Path, sensor: Sensor, fault: str, rng: np.random.Generator) -> Case | None:
     """Draw one case, or return None if the fault cannot be identified with the sensor."""
-    first, second = load(data, sensor.first), load(data, sensor.second)
+    first, second = load_part(data, sensor.first), load_part(data, sensor.second)
     if fault == "swap":
         return with_swap(sensor.name, first, second, rng)
     draw = {
@@ -293,26 +300,26 @@ def draw_cases(data: Path, seed: int, count: int) -> list[Case]:
     return cases
 
 
-def model_of(data: Path, sensor: Sensor, folder: Path) -> NoiseModel:
+def load_or_fit_model(data: Path, sensor: Sensor, folder: Path) -> NoiseModel:
     """Return the model of the first part, which is stored in a folder."""
     file, begin, end = sensor.first
-    kept = folder / f"{file.replace('/', '-')}-{begin}-{end}.toml"
-    if not kept.exists():
+    file_of_model = folder / f"{file.replace('/', '-')}-{begin}-{end}.toml"
+    if not file_of_model.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        kept.write_text(reconcile(load(data, sensor.first), None, 1).model.to_toml())
-    return NoiseModel.from_toml(kept.read_text())
+        file_of_model.write_text(reconcile(load_part(data, sensor.first), None, 1).model.to_toml())
+    return NoiseModel.from_toml(file_of_model.read_text())
 
 
-def answer(case: Case, model: NoiseModel, whole: bool) -> Answer:
+def run_case(case: Case, model: NoiseModel, with_search: bool) -> Answer:
     """Run ``reconcile`` on a case, or only the checks of the recording if ``whole`` is False."""
     begin = time.perf_counter()
-    if whole:
+    if with_search:
         result = reconcile(case.recording, model, 1)
         return Answer(case, result.recording_findings, result.verdict, time.perf_counter() - begin)
-    return Answer(case, checks_before_search(case.recording, model), "", time.perf_counter() - begin)
+    return Answer(case, run_checks_before_search(case.recording, model), "", time.perf_counter() - begin)
 
 
-def checks_before_search(recording: Recording, model: NoiseModel) -> tuple[RecordingFinding, ...]:
+def run_checks_before_search(recording: Recording, model: NoiseModel) -> tuple[RecordingFinding, ...]:
     """Return the findings of ``reconcile`` without the search for effects."""
     checked = check_recording(recording, model, 1)
     usable, _ = select_axes_and_smooth_temperature(checked.recording, model)
@@ -347,24 +354,24 @@ def main() -> None:
     if "IMU_MONITOR_DATA" not in os.environ:
         parser.error("IMU_MONITOR_DATA does not point to the recordings")
     data = Path(os.environ["IMU_MONITOR_DATA"])
-    models = {sensor.name: model_of(data, sensor, options.models) for sensor in SENSORS}
+    models = {sensor.name: load_or_fit_model(data, sensor, options.models) for sensor in SENSORS}
     print("| sensor | fault | case | first finding | all findings | s |\n|---|---|---|---|---|---|")
     for sensor in SENSORS:
-        clean = Case(sensor.name, "none", "", load(data, sensor.second), ())
-        _print(answer(clean, models[sensor.name], not options.checks_only))
+        clean = Case(sensor.name, "none", "", load_part(data, sensor.second), ())
+        _print_answer(run_case(clean, models[sensor.name], not options.checks_only))
     answers = []
     for case in draw_cases(data, options.seed, options.cases):
         if case.fault in options.only:
-            answers.append(answer(case, models[case.sensor], not options.checks_only))
-            _print(answers[-1])
+            answers.append(run_case(case, models[case.sensor], not options.checks_only))
+            _print_answer(answers[-1])
     print("\n| fault | named first | cases |\n|---|---|---|")
     for fault in options.only:
-        of = [one for one in answers if one.case.fault == fault]
-        print(f"| {fault} | {sum(one.right for one in of)} | {len(of)} |")
+        group = [answer for answer in answers if answer.case.fault == fault]
+        print(f"| {fault} | {sum(answer.right for answer in group)} | {len(group)} |")
     print(f"| all | {sum(one.right for one in answers)} | {len(answers)} |")
 
 
-def _print(one: Answer) -> None:
+def _print_answer(one: Answer) -> None:
     """Print one answer as a table row."""
     case = one.case
     mark = "" if case.fault == "none" else "right: " if one.right else "WRONG: "

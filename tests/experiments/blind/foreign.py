@@ -32,13 +32,6 @@ def amplitude_modulated_line(clock: Clock, rng: np.random.Generator, size: float
     return 0.15 * size * swell * np.sin(2.0 * np.pi * 11.7 * clock.t_s + rng.uniform(0.0, 2.0 * np.pi))
 
 
-def wandering_line(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
-    """A line of constant amplitude whose frequency wanders by 0.3 Hz about 13 Hz, over minutes: a motor."""
-    away_hz = exponentially_correlated(clock, rng, 0.3, 200.0)
-    phase = 2.0 * np.pi * np.cumsum(13.0 + away_hz) / clock.rate_hz
-    return 0.2 * size * np.sin(phase)
-
-
 def quadratic_temperature(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
     """A bias that follows (T − mean)² and not T."""
     if clock.temperature_c is None:
@@ -66,7 +59,6 @@ SERIES: Final[dict[str, Callable[[Clock, np.random.Generator, float], Floats]]] 
         chirp,
         plateau,
         amplitude_modulated_line,
-        wandering_line,
         quadratic_temperature,
         sawtooth,
         two_correlated,

@@ -13,7 +13,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: threads of two programs fight for the cores
+# set before NumPy is imported, so that programs do not compete for the cores
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numpy as np  # noqa: E402
@@ -41,7 +42,7 @@ from monitor.reconcile.likelihood.whitening import whiten_axis  # noqa: E402
 from monitor.reconcile.preparation.reconcile_input import Recording  # noqa: E402
 from monitor.reconcile.reconcile import SIMULATED_RECORDINGS  # noqa: E402
 from monitor.reconcile.search.sample_repair import build_repaired_axes  # noqa: E402
-from tests.experiments.blind.tables import markdown, share  # noqa: E402
+from tests.experiments.blind.tables import format_share, format_table  # noqa: E402
 
 RATE_HZ: Final = 100.0
 TERMS: Final = {
@@ -73,7 +74,7 @@ def diagnose(model: NoiseModel, n: int, seeds: Sequence[int]) -> Round:
     return found
 
 
-def report(model: NoiseModel, n: int, recordings: int) -> str:
+def compare_with_thresholds(model: NoiseModel, n: int, recordings: int) -> str:
     """Compare the thresholds of each six recordings with the gains of the following six recordings."""
     rounds = [
         diagnose(model, n, range(first, first + SIMULATED_RECORDINGS))
@@ -85,10 +86,10 @@ def report(model: NoiseModel, n: int, recordings: int) -> str:
     for before, after in pairwise(rounds):
         null = estimate_null_distributions(before)
         for at in range(SIMULATED_RECORDINGS):
-            looks = [(null[axis][name], after[axis][at][name].gain, name) for axis in after for name in DIAGNOSTICS]
-            above.append(any(gain > limits.threshold for limits, gain, _ in looks))
-            searched.append(any(gain > limits.search_threshold for limits, gain, _ in looks))
-            for limits, gain, name in looks:
+            results = [(null[axis][name], after[axis][at][name].gain, name) for axis in after for name in DIAGNOSTICS]
+            above.append(any(gain > limits.threshold for limits, gain, _ in results))
+            searched.append(any(gain > limits.search_threshold for limits, gain, _ in results))
+            for limits, gain, name in results:
                 gains[name].append(gain)
                 thresholds[name].append(limits.threshold)
     rows = [
@@ -97,14 +98,14 @@ def report(model: NoiseModel, n: int, recordings: int) -> str:
             *(f"{np.quantile(gains[name], q):.1f}" for q in (0.5, 0.95, 0.99)),
             f"{max(gains[name]):.1f}",
             f"{np.mean(thresholds[name]):.1f} ± {np.std(thresholds[name]):.1f}",
-            share(sum(g > t for g, t in zip(gains[name], thresholds[name], strict=True)), len(gains[name])),
+            format_share(sum(g > t for g, t in zip(gains[name], thresholds[name], strict=True)), len(gains[name])),
         )
         for name in DIAGNOSTICS
     ]
     lines = [
-        markdown(("diagnostic", "median", "95 %", "99 %", "largest", "threshold", "above, of axes"), rows),
-        f"Recordings above a threshold: {share(sum(above), len(above))}.",
-        f"Recordings that are searched: {share(sum(searched), len(searched))}.",
+        format_table(("diagnostic", "median", "95 %", "99 %", "largest", "threshold", "above, of axes"), rows),
+        f"Recordings above a threshold: {format_share(sum(above), len(above))}.",
+        f"Recordings that are searched: {format_share(sum(searched), len(searched))}.",
     ]
     return "\n\n".join(lines)
 
@@ -118,7 +119,8 @@ def main() -> None:
     options = parser.parse_args()
     for name in options.model:
         model = NoiseModel(dict.fromkeys(AXES[:3], TERMS[name])) if name in TERMS else load_model(name, Path.cwd())
-        print(f"{name}\n\n{report(model, round(3600.0 * options.hours * RATE_HZ), options.recordings)}\n", flush=True)
+        tables = compare_with_thresholds(model, round(3600.0 * options.hours * RATE_HZ), options.recordings)
+        print(f"{name}\n\n{tables}\n", flush=True)
 
 
 if __name__ == "__main__":

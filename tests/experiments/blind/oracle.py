@@ -8,6 +8,8 @@ What the gain is of,
   times the room that the data leave: a jump of height h in white noise N is timed to ∫exp(−v|t|/2 + √v W)dt, v =
   h²/N², of which the mean logarithm is ln(10/v) (Laplace's method; both-sided Dufresne integral, simulated). A jump
   that is timed no better than jumps are spaced gains nothing and costs nothing;
+- a wandering line: the path of its phase is unknown too. It is worth the gain of the true line, less two nats for each
+  stretch over which the phase can be extrapolated: κ^(−2/3) for a frequency that walks by κ = s√(2/T) in Hz/√s;
 - outliers, noise steps and heavy tails: the samples whitened by 1/√S, then a two-Gaussian mixture, two variances, or
   Student's t;
 - what is exact (a grid, repeats, clipping) gains without bound: ``inf``;
@@ -16,7 +18,7 @@ What the gain is of,
 Wrong names are fitted, the truth is not, so margins err on the low side. They are: the baseline's terms retuned, Q,
 N, B, K, correlated noise of up to T/30, and ramp, transient, step, temperature and lag as regressors beside retuned
 terms; for a leak any Gaussian noise of that spectrum; for a line a resonance of 10/T and for a resonance the best
-line; for popcorn correlated noise, and for jumps random walk.
+line; for popcorn correlated noise, for jumps random walk, and for a wandering line a resonance of its spectrum.
 """
 
 from collections.abc import Iterable
@@ -46,6 +48,7 @@ KNOWN: Final = (
     *LEAKS,
 )
 TIMING: Final = 10.0
+PHASE: Final = 2.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,8 @@ class Observer:
             return self._known(coefficients(self._signal(self.effect)))
         if name in ("random_telegraph", "poisson_steps"):
             return self._path()
+        if name == "wandering_line":
+            return self._wandering()
         if name in ("outliers", "noise_step", "heavy_tails", "variance_modulation"):
             return self._samples()
         return self._gaussian([*self.baseline, self.effect])
@@ -104,7 +109,7 @@ class Observer:
             found["narrowband"] = self._resonance()
         elif name == "narrowband":
             found["sinusoidal"] = self._best_line()
-        elif name in ("random_telegraph", "poisson_steps"):
+        elif name in ("random_telegraph", "poisson_steps", "wandering_line"):
             found["its spectrum"] = self._gaussian([*self.baseline, self.effect])
         elif name == "exponentially_correlated":
             found["random_telegraph"] = self._gaussian([*self.baseline, self.effect]) - self._as_popcorn()
@@ -152,6 +157,13 @@ class Observer:
             spread = parameters["height"]
             prior += np.minimum(0.0, np.log(noise / spread)) - 0.5 * (heights / spread) ** 2 + 0.5
         return gain + float(np.sum(prior))
+
+    def _wandering(self) -> float:
+        """Of the line with its true phase, less what it takes to learn the phase: see the module."""
+        parameters = self.effect.parameters
+        walk = parameters["frequency_deviation"] * np.sqrt(2.0 / parameters["correlation_time"])
+        stretches = self.world.seconds * walk ** (2.0 / 3.0)
+        return self._known(coefficients(self.world.series(self.effect))) - PHASE * float(stretches)
 
     def _samples(self) -> float:
         """Of whitened samples."""

@@ -115,6 +115,21 @@ def narrowband(clock: Clock, rng: np.random.Generator, sigma: float, frequency: 
     return cosine * np.cos(angle) + sine * np.sin(angle)
 
 
+def wandering_line(
+    clock: Clock,
+    rng: np.random.Generator,
+    amplitude: float,
+    frequency: float,
+    frequency_deviation: float,
+    correlation_time: float,
+    phase: float,
+) -> Floats:
+    """A line of constant amplitude: its frequency is correlated noise about the centre, summed up sample by sample."""
+    hz = frequency + exponentially_correlated(clock, rng, frequency_deviation, correlation_time)
+    turns = np.concatenate([[0.0], np.cumsum(0.5 * (hz[1:] + hz[:-1]))]) / clock.rate_hz
+    return amplitude * np.sin(2.0 * np.pi * turns + phase)
+
+
 def power_law(clock: Clock, rng: np.random.Generator, density: float, exponent: float) -> Floats:
     """S = D² (sin(πfτ0)/(πτ0))^−α; what wraps at the ends of a steep one is far away."""
     tau0 = 1.0 / clock.rate_hz
@@ -226,6 +241,7 @@ SOURCES: Final[dict[str, Callable[..., Floats]]] = {
         exponentially_correlated,
         sinusoidal,
         narrowband,
+        wandering_line,
         power_law,
         temperature_bias,
         temperature_lag,

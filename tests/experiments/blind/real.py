@@ -1,14 +1,16 @@
 """Effects hidden in real noise: ``python -m tests.experiments.blind.real``, with IMU_MONITOR_DATA.
 
-Two stretches of one sensor. The program explains the first one as far as it goes; the model that it writes is the one
-under test for the second. Real noise differs from stretch to stretch, so the second has names of its own: it is
-compared as it is at first, and once more for every effect that is put into it. A name is right where the effect is
-told on its axis; of the others those count as false which the stretch without the effect has not.
+Each sensor has two parts of its recordings. ``reconcile`` explains the first part and writes a model. The second part
+is compared with this model, first without a hidden effect and then with each effect. A name is right if it is the
+hidden effect on its axis. Other names count as false if they do not occur without the hidden effect.
 
-An effect acts before the converter, and values that were rounded once cannot be rounded again: the recorded values are
-spread evenly over their step, the effect is added, the sum is rounded to the step. Sizes are plain beside the white
-noise (gain in ln L above 100, though less over the best wrong name), and stand in the table in units of its standard
-deviation a sample, s.
+An effect acts before the converter of the sensor, and recorded values are already rounded. The recorded values are
+therefore spread evenly over their step, the effect is applied, and the result is rounded to the step. Effects that
+need a temperature are left out, because these recordings have none. Terms that the model of the sensor contains anyway
+are left out too, as well as effects that real noise cannot be given afterwards (``heavy_tails``, ``resolution``,
+``sample_rate_error``). A noise step and a modulation act on the deviations from a running mean. The effects are large
+compared with the white noise: the gain in ln L is above 100, and less over the best wrong name. The table contains the
+sizes in units of the standard deviation s of a sample.
 """
 
 import argparse
@@ -23,23 +25,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: threads of two programs fight for the cores
+# set before NumPy is imported, so that programs do not compete for the cores
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numpy as np  # noqa: E402
 
-from tests.experiments.blind.processes import SOURCES, Clock, Floats, generator  # noqa: E402
+from tests.experiments.blind.processes import SOURCES, TRANSFORMS, Clock, Floats, generator, modulated  # noqa: E402
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """Two stretches of recordings of one sensor."""
+    """Two parts of recordings of one sensor."""
 
     name: str
-    first: tuple[str, int, int]  # file, samples from and to: explained first
-    second: tuple[str, int, int]  # the same: where effects are hidden
+    first: tuple[str, int, int]  # file, first and last sample: part for the fit of the model
+    second: tuple[str, int, int]  # file, first and last sample: part with hidden effects
     axes: tuple[str, ...]
-    hidden_in: str  # axis
+    hidden_axis: str
 
 
 SENSORS: Final = (
@@ -67,11 +70,11 @@ SENSORS: Final = (
 )
 
 TIME_LIMIT_S: Final = 600.0
-FINE: Final = 0.01
-"""Of the deviation: steps below that are decimals of a text, no converter's."""
+MIN_STEP_SHARE: Final = 0.01
+"""Smaller steps, relative to the standard deviation, come from decimals of a text and not from a converter."""
 Parameters = dict[str, Any]
 Sizes = Callable[[float, int, float], Parameters]
-"""Of standard deviation a sample, samples and rate to the parameters of an effect."""
+"""Function from standard deviation, number of samples and rate in Hz to the parameters of an effect."""
 
 
 def _line(s: float, n: int, rate_hz: float) -> Parameters:
@@ -90,7 +93,7 @@ def _telegraph(s: float, n: int, rate_hz: float) -> Parameters:
     return {"amplitude": s, "dwell_time": 300.0 / rate_hz}
 
 
-def _far(s: float, n: int, rate_hz: float) -> Parameters:
+def _outliers(s: float, n: int, rate_hz: float) -> Parameters:
     return {"fraction": 1.5e-3, "scale": 8.0 * s}
 
 
@@ -106,28 +109,78 @@ def _transient(s: float, n: int, rate_hz: float) -> Parameters:
     return {"amplitude": 1.0 * s, "time_constant": 0.07 * n / rate_hz}
 
 
+def _wandering_line(s: float, n: int, rate_hz: float) -> Parameters:
+    return {
+        "amplitude": 0.5 * s,
+        "frequency": 0.0931 * rate_hz,
+        "frequency_deviation": 2e-3 * rate_hz,
+        "correlation_time": 2000.0 / rate_hz,
+        "phase": 1.0,
+    }
+
+
+def _power_law(s: float, n: int, rate_hz: float) -> Parameters:
+    """Return noise with the density of the white noise at one hundredth of the sample rate."""
+    return {"density": s / rate_hz**0.5 * (0.01 * rate_hz) ** 0.75, "exponent": 1.5}
+
+
+def _poisson_steps(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"rate": 20.0 * rate_hz / n, "height": 0.6 * s}
+
+
+def _pulses(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"height": 0.6 * s, "period": 100.0 / rate_hz, "width": 10.0 / rate_hz, "delay": 33.0 / rate_hz}
+
+
+def _curve(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"slope": 0.0, "curvature": 1.5 * s * (rate_hz / n) ** 2}
+
+
+def _noise_step(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"time": 0.6 * n / rate_hz, "ratio": 1.3}
+
+
+def _modulation(s: float, n: int, rate_hz: float) -> Parameters:
+    return {"depth": 0.5, "period": 0.07 * n / rate_hz, "phase": 1.0}
+
+
 HIDDEN: Final[dict[str, Sizes]] = {
     "sinusoidal": _line,
     "narrowband": _resonance,
     "exponentially_correlated": _correlated,
     "random_telegraph": _telegraph,
-    "outliers": _far,
+    "outliers": _outliers,
     "bias_step": _step,
     "rate_ramp": _slope,
     "turn_on_transient": _transient,
+    "wandering_line": _wandering_line,
+    "power_law": _power_law,
+    "poisson_steps": _poisson_steps,
+    "pulse_train": _pulses,
+    "bias_curve": _curve,
+    "noise_step": _noise_step,
+    "variance_modulation": _modulation,
+    "bandwidth_limit": lambda s, n, rate_hz: {"cutoff": 0.15 * rate_hz, "order": 2},
+    "sample_hold": lambda s, n, rate_hz: {"fraction": 0.03},
+    "scale_factor": lambda s, n, rate_hz: {"factor": 1.3},
+    "leak": lambda s, n, rate_hz: {"coefficient": 0.25},
 }
+LEAK_NAMES: Final = ("cross_axis", "g_sensitivity")
+"""Names of a leak from an axis of the same kind, and from an axis of the other kind."""
+MEAN_SAMPLES: Final = 65
+"""Number of samples of the running mean whose deviations a noise step or a modulation changes."""
 
 
 @dataclass(frozen=True)
-class Told:
-    """What the program said of one recording."""
+class ReconcileAnswer:
+    """Answer of the program to one recording."""
 
     verdict: str
-    names: tuple[tuple[str, str, float], ...]  # axis, effect, confidence, of what was added
+    names: tuple[tuple[str, str, float], ...]  # axis, effect and confidence of the added effects
     seconds: float
 
-    def beyond(self, other: "Told") -> list[tuple[str, str, float]]:
-        """Names that ``other`` has not."""
+    def names_not_in(self, other: "ReconcileAnswer") -> list[tuple[str, str, float]]:
+        """Return the names that another answer does not contain."""
         known = [(axis, effect) for axis, effect, _ in other.names]
         found = []
         for axis, effect, confidence in self.names:
@@ -138,36 +191,61 @@ class Told:
         return found
 
 
-def columns(data: Path, place: tuple[str, int, int], axes: Sequence[str]) -> tuple[dict[str, Floats], float]:
-    """Axes of a stretch, and its sample rate."""
+def load_columns(data: Path, place: tuple[str, int, int], axes: Sequence[str]) -> tuple[dict[str, Floats], float]:
+    """Return the axes of a part of a recording, and its sample rate in Hz."""
     file, begin, end = place
-    with np.load(data / file) as held:
-        return {axis: held[axis][begin:end].astype(np.float64) for axis in axes}, float(held["fs"])
+    with np.load(data / file) as columns:
+        return {axis: columns[axis][begin:end].astype(np.float64) for axis in axes}, float(columns["fs"])
 
 
-def with_effect(values: Floats, rate_hz: float, name: str, seed: int) -> tuple[Floats, Parameters]:
-    """Values [n] with an effect, on the grid that they were on, and its parameters."""
+def add_effect(values: Floats, other_axis: Floats, rate_hz: float, name: str, seed: int) -> tuple[Floats, Parameters]:
+    """Return values [n] with an effect, rounded to their original step, and the parameters of the effect."""
     rng = generator(seed, "hidden in real noise", name)
     step = float(np.median(np.diff(np.unique(values))))
-    s = float(np.std(np.diff(values))) / 2.0**0.5
+    s = white_deviation(values)
     parameters = HIDDEN[name](s, values.size, rate_hz)
-    effect = SOURCES[name](Clock(values.size, rate_hz), rng, **parameters)
-    if step < FINE * s:
-        return values + effect, {**parameters, "s": s}
+    if name == "leak":  # the coefficient is relative to the noise of both axes
+        parameters["coefficient"] *= s / white_deviation(other_axis)
+    if step < MIN_STEP_SHARE * s:
+        return apply_effect(values, other_axis, rate_hz, name, rng, parameters), {**parameters, "s": s}
     spread = values + step * (rng.random(values.size) - 0.5)
-    origin = values[0]
-    return origin + step * np.rint((spread + effect - origin) / step), {**parameters, "s": s}
+    changed, origin = apply_effect(spread, other_axis, rate_hz, name, rng, parameters), values[0]
+    return origin + step * np.rint((changed - origin) / step), {**parameters, "s": s}
 
 
-def compare(folder: Path, held: dict[str, Floats], rate_hz: float, model: Path | None) -> Told:
-    """The program on a recording, as a user runs it."""
+def white_deviation(values: Floats) -> float:
+    """Return the standard deviation of a sample of the white noise."""
+    return float(np.std(np.diff(values))) / 2.0**0.5
+
+
+def apply_effect(
+    values: Floats, other_axis: Floats, rate_hz: float, name: str, rng: np.random.Generator, parameters: Parameters
+) -> Floats:
+    """Return values [n] with an effect."""
+    clock = Clock(values.size, rate_hz)
+    if name in SOURCES:
+        return values + SOURCES[name](clock, rng, **parameters)
+    if name in TRANSFORMS:
+        return TRANSFORMS[name](values, rate_hz, rng, **parameters)
+    if name == "leak":
+        return values + parameters["coefficient"] * (other_axis - other_axis.mean())
+    mean = np.convolve(np.pad(values, MEAN_SAMPLES // 2, "reflect"), np.full(MEAN_SAMPLES, 1.0 / MEAN_SAMPLES), "valid")
+    if name == "noise_step":
+        level = np.where(clock.t_s >= parameters["time"], parameters["ratio"], 1.0)
+    else:
+        level = np.sqrt(modulated(clock, **parameters))
+    return mean + level * (values - mean)
+
+
+def run_reconcile(folder: Path, columns: dict[str, Floats], rate_hz: float, model: Path | None) -> ReconcileAnswer:
+    """Run the command on a recording and return its answer."""
     folder.mkdir(parents=True)
     recording, out = folder / "recording.npz", folder / "out"
-    np.savez(recording, fs=np.float64(rate_hz), **held)  # type: ignore[arg-type]
-    under_test = ["--model", str(model)] if model else []
+    np.savez(recording, fs=np.float64(rate_hz), **columns)  # type: ignore[arg-type]
+    options = ["--model", str(model)] if model else []
     begin = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-m", "monitor.cli", "reconcile", str(recording), *under_test, "--out", str(out)],
+        [sys.executable, "-m", "monitor.cli", "reconcile", str(recording), *options, "--out", str(out)],
         capture_output=True,
         text=True,
         timeout=TIME_LIMIT_S,
@@ -183,46 +261,55 @@ def compare(folder: Path, held: dict[str, Floats], rate_hz: float, model: Path |
         for step in result["steps"]
         if step["kind"] == "added"
     ]
-    return Told(report["verdict"], tuple(names), seconds)
+    return ReconcileAnswer(report["verdict"], tuple(names), seconds)
 
 
-def rows(data: Path, sensor: Sensor, seed: int, only: Sequence[str]) -> list[tuple[str, bool, int]]:
-    """One row of the table for each effect: its text, whether the name is right, and how many names are false."""
+def run_sensor(data: Path, sensor: Sensor, seed: int, only: Sequence[str]) -> list[tuple[str, bool, int]]:
+    """Return a row for each effect: its text, True if the name is right, and the number of false names."""
     found = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        first, rate_hz = columns(data, sensor.first, sensor.axes)
-        compare(folder / "first", first, rate_hz, None)
+        first, rate_hz = load_columns(data, sensor.first, sensor.axes)
+        run_reconcile(folder / "first", first, rate_hz, None)
         model = folder / "first" / "out" / "model.toml"
-        second, rate_hz = columns(data, sensor.second, sensor.axes)
-        bare = compare(folder / "second", second, rate_hz, model)
-        print(_row(sensor.name, "nothing", "", bare.verdict, bare.names, bare.seconds), flush=True)
+        second, rate_hz = load_columns(data, sensor.second, sensor.axes)
+        without_effect = run_reconcile(folder / "second", second, rate_hz, model)
+        print(
+            _format_row(
+                sensor.name, "nothing", "", without_effect.verdict, without_effect.names, without_effect.seconds
+            ),
+            flush=True,
+        )
         for name in only or HIDDEN:
-            changed, parameters = with_effect(second[sensor.hidden_in], rate_hz, name, seed)
-            told = compare(folder / name, {**second, sensor.hidden_in: changed}, rate_hz, model)
-            new = told.beyond(bare)
-            right = any((axis, effect) == (sensor.hidden_in, name) for axis, effect, _ in new)
-            text = _row(sensor.name, name, _sizes(parameters), told.verdict, new, told.seconds)
+            (other_axis,) = (axis for axis in sensor.axes if axis != sensor.hidden_axis)
+            changed, parameters = add_effect(second[sensor.hidden_axis], second[other_axis], rate_hz, name, seed)
+            answer = run_reconcile(folder / name, {**second, sensor.hidden_axis: changed}, rate_hz, model)
+            added = answer.names_not_in(without_effect)
+            expected = LEAK_NAMES[other_axis[0] != sensor.hidden_axis[0]] if name == "leak" else name
+            right = any((axis, effect) == (sensor.hidden_axis, expected) for axis, effect, _ in added)
+            text = _format_row(sensor.name, name, _format_sizes(parameters), answer.verdict, added, answer.seconds)
             print(text, flush=True)
-            found.append((text, right, len(new) - right))
+            found.append((text, right, len(added) - right))
     return found
 
 
-def _sizes(parameters: Parameters) -> str:
-    """In s, s.d. of a sample; Hz and s."""
+def _format_sizes(parameters: Parameters) -> str:
+    """Return the parameters as text, with amplitudes in units of s."""
     s = parameters["s"]
     sized = {"amplitude", "sigma", "scale", "height"}
     parts = [f"{k} {v / s:.2g} s" if k in sized else f"{k} {v:.3g}" for k, v in parameters.items() if k != "s"]
     return ", ".join(parts)
 
 
-def _row(sensor: str, effect: str, sizes: str, verdict: str, new: Sequence[tuple[str, str, float]], took: float) -> str:
-    said = ", ".join(f"{axis} {name} ({confidence:.3f})" for axis, name, confidence in new) or "no name"
-    return f"| {sensor} | {effect} | {sizes} | {said} | {verdict} | {took:.1f} |"
+def _format_row(
+    sensor: str, effect: str, sizes: str, verdict: str, added: Sequence[tuple[str, str, float]], took: float
+) -> str:
+    names = ", ".join(f"{axis} {name} ({confidence:.3f})" for axis, name, confidence in added) or "no name"
+    return f"| {sensor} | {effect} | {sizes} | {names} | {verdict} | {took:.1f} |"
 
 
 def main() -> None:
-    """Run and print."""
+    """Run all sensors and print the table."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.experiments.blind.real", description="Effects hidden in real noise."
     )
@@ -233,12 +320,12 @@ def main() -> None:
     if "IMU_MONITOR_DATA" not in os.environ:
         parser.error("IMU_MONITOR_DATA does not point to the recordings")
     data = Path(os.environ["IMU_MONITOR_DATA"])
-    print("| recording | hidden | size | names beyond those without it | verdict | s |\n|---|---|---|---|---|---|")
+    print("| recording | hidden | size | additional names | verdict | s |\n|---|---|---|---|---|---|")
     found = [
         one
         for sensor in SENSORS
         if not options.sensor or sensor.name in options.sensor
-        for one in rows(data, sensor, options.seed, options.only)
+        for one in run_sensor(data, sensor, options.seed, options.only)
     ]
     right, false = sum(one[1] for one in found), sum(one[2] for one in found)
     print(f"\n{right} of {len(found)} named right; {false} false names.")

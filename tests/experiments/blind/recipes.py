@@ -78,6 +78,15 @@ def _resonance(rng: np.random.Generator, world: World, axis: str) -> dict[str, A
     return {"frequency": uniform(rng, 0.03, 0.42) * world.rate_hz, "bandwidth": log_uniform(rng, 0.2, 3.0)}
 
 
+def _wandering(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
+    return {
+        "frequency": uniform(rng, 0.03, 0.42) * world.rate_hz,
+        "frequency_deviation": log_uniform(rng, 0.05, 0.5),
+        "correlation_time": log_uniform(rng, 20.0, world.seconds / 10.0),
+        "phase": uniform(rng, 0.0, 2.0 * np.pi),
+    }
+
+
 def _warmth(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
     return {"reference": 25.0}
 
@@ -99,7 +108,8 @@ def _pulses(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]
 
 
 def _curve(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
-    return {"slope": sign(rng) * world.noise(axis) / world.seconds}
+    # the slope alone must stay below the target, or no curvature is the smallest one that reaches the target
+    return {"slope": 0.02 * uniform(rng, -1.0, 1.0) * world.noise(axis) / world.seconds}
 
 
 def _breath(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
@@ -184,6 +194,7 @@ RECIPES: Final[Mapping[str, Recipe]] = {
     "exponentially_correlated": Recipe(_correlated, "sigma", _noise(0.05)),
     "sinusoidal": Recipe(_line, "amplitude", _noise(0.03)),
     "narrowband": Recipe(_resonance, "sigma", _noise(0.05)),
+    "wandering_line": Recipe(_wandering, "amplitude", _noise(0.1)),
     "temperature_bias": Recipe(_warmth, "coefficient", _noise(0.05), "temperature"),
     "temperature_lag": Recipe(_late, "coefficient", _noise(0.05), "temperature"),
     "temperature_hysteresis": Recipe(_loop, "height", _noise(0.1), "temperature"),
@@ -213,7 +224,7 @@ RECIPES: Final[Mapping[str, Recipe]] = {
 }
 
 SIGNED: Final = ("coefficient", "amplitude", "height", "curvature")
-UNSIGNED_AMPLITUDES: Final = ("sinusoidal", "random_telegraph", "poisson_steps")
+UNSIGNED_AMPLITUDES: Final = ("sinusoidal", "wandering_line", "random_telegraph", "poisson_steps")
 
 
 def sized(effect: Effect, size: float, sense: float) -> Effect:

@@ -1,8 +1,7 @@
-"""Cases through the program, as a user would: files in, ``report.json`` out. What came of it is a line of a result
-file.
+"""Run the program on the files of cases and write the scored reports to a result file, one line for each case.
 
-The truth never goes where the program could read it: the folder that it sees holds a recording and a model. A result
-file can be continued: cases that stand in it are not run again.
+The program gets a folder with a recording and a model, and never the truth. A run can be continued: cases that the
+result file already contains are not run again.
 """
 
 import contextlib
@@ -23,12 +22,12 @@ from tests.experiments.blind import cases
 from tests.experiments.blind.score import Outcome, score
 
 TIME_LIMIT_S: Final = 900.0
-STOPPED: Final = 128
+MIN_SIGNAL_STATUS: Final = 128
 
 
 @dataclass(frozen=True)
 class Job:
-    """One case to run."""
+    """Parameters of one case to run."""
 
     name: str
     level: str
@@ -41,7 +40,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """What tells it from others in a result file."""
+        """Unique name of the case in a result file."""
         sizes = "" if self.sizes is None else f" x{self.sizes[0]:g}-{self.sizes[1]:g}"
         return (
             f"{self.name} {self.level} {self.seed} {self.seconds:g}s {self.rate:g}Hz {self.axes} {self.baseline}{sizes}"
@@ -49,12 +48,12 @@ class Job:
 
     @property
     def folder(self) -> str:
-        """Its name on disk."""
+        """Name of the folder of the case."""
         return self.key.replace(" ", "_").replace(":", "_")
 
     def case(self) -> cases.Case:
-        """Made from it."""
-        return cases.case(
+        """Make the case."""
+        return cases.make_case(
             self.name,
             self.level,
             self.seed,
@@ -66,7 +65,7 @@ class Job:
         )
 
 
-def jobs(
+def make_jobs(
     which: str,
     level: str,
     seeds: Sequence[int],
@@ -75,18 +74,21 @@ def jobs(
     baseline: str = "exact",
     sizes: tuple[float, float] | None = None,
 ) -> list[Job]:
-    """The cases of a set; ``off`` is short for singles with a baseline that is off, ``all`` for the other four sets.
+    """Return the cases of a set.
 
-    ``nulls`` are of two sorts: six axes of a sixth of the length, and one axis of the whole.
+    The set ``off`` contains the single effects with the baseline "off", and ``all`` contains the other four sets. The
+    set ``nulls`` contains recordings of six axes with a sixth of the length, and of one axis with the whole length.
 
-    Raises:
-        ValueError: no such set
+    Raises
+    ------
+    ValueError
+        If there is no such set.
     """
     if which == "all":
         return [
             job
-            for each in ("singles", "pairs", "nulls", "foreign")
-            for job in jobs(each, level, seeds, seconds, only, baseline, sizes)
+            for name in ("singles", "pairs", "nulls", "foreign")
+            for job in make_jobs(name, level, seeds, seconds, only, baseline, sizes)
         ]
     if which == "off":
         which, baseline = "singles", "off"
@@ -94,25 +96,29 @@ def jobs(
     if which not in names:
         raise ValueError(f"no set {which!r}: {', '.join(names)}, off or all")
     if which in ("foreign", "nulls"):
-        level, sizes = "plain", None  # they have but one
-    made = [
+        level, sizes = "plain", None  # these sets have a single level
+    jobs = [
         Job(name, level, seed, seconds, baseline=baseline, sizes=sizes)
         for seed in seeds
         for name in names[which]
         if not only or name in only
     ]
     if which == "nulls":
-        return [null for job in made for null in (replace(job, seconds=seconds / 6.0), replace(job, axes=1))]
-    return made
+        return [null for job in jobs for null in (replace(job, seconds=seconds / 6.0), replace(job, axes=1))]
+    return jobs
 
 
-def run(job: Job, in_process: bool = False, keep: Path | None = None) -> Outcome:
-    """Make the case, run the program on it, score what it says.
+def run_job(job: Job, in_process: bool = False, keep: Path | None = None) -> Outcome:
+    """Make a case, run the program on its files, and score the report.
 
-    Args:
-        job: which
-        in_process: call the command here instead of in a process of its own
-        keep: a folder where recording, model and report stay, each case in a folder of its own, truths beside them
+    Parameters
+    ----------
+    job
+        Parameters of the case.
+    in_process
+        True to call the command in this process, False to start a separate process.
+    keep
+        Folder in which recording, model, report and truth are kept, with a folder for each case.
     """
     case = job.case()
     with tempfile.TemporaryDirectory() as scratch:
@@ -121,23 +127,23 @@ def run(job: Job, in_process: bool = False, keep: Path | None = None) -> Outcome
         out = folder / "out"
         arguments = ["reconcile", str(recording), "--model", str(model), "--out", str(out), "--seed", str(job.seed)]
         begin = time.perf_counter()
-        status, said = (_here if in_process else _apart)(arguments)
+        status, output = (_run_in_process if in_process else _run_in_subprocess)(arguments)
         seconds = time.perf_counter() - begin
         report = out / "report.json"
         parsed = json.loads(report.read_text()) if report.exists() else None
         if keep is not None:
             (keep / f"{job.folder}.truth.json").write_text(case.truth_json())
-            (folder / "said.txt").write_text(said)
-    if status >= STOPPED:  # by a signal: no result of the program, and a wish to stop
+            (folder / "output.txt").write_text(output)
+    if status >= MIN_SIGNAL_STATUS:  # ended by a signal, so the program has no result and the run shall stop
         raise KeyboardInterrupt(f"{job.key}: exit status {status}")
     if parsed is None and status == 0:
-        raise RuntimeError(f"{job.key}: exit status 0 without a report: {said}")
+        raise RuntimeError(f"{job.key}: exit status 0 without a report: {output}")
     if status in (1, 2):
-        print(f"{job.key}: exit status {status}: {said.strip()[-500:]}", file=sys.stderr)
+        print(f"{job.key}: exit status {status}: {output.strip()[-500:]}", file=sys.stderr)
     return score(case.truth, parsed, status, seconds)
 
 
-def _apart(arguments: list[str]) -> tuple[int, str]:
+def _run_in_subprocess(arguments: list[str]) -> tuple[int, str]:
     done = subprocess.run(
         [sys.executable, "-m", "monitor.cli", *arguments],
         capture_output=True,
@@ -148,53 +154,53 @@ def _apart(arguments: list[str]) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-def _here(arguments: list[str]) -> tuple[int, str]:
-    """The program's own ``main``, with what it prints kept: the start of Python and its libraries is saved."""
+def _run_in_process(arguments: list[str]) -> tuple[int, str]:
+    """Call ``main`` of the program in this process, which saves the start of Python, and return status and output."""
     from monitor.cli import main
 
-    said, before = io.StringIO(), sys.argv
+    output, before = io.StringIO(), sys.argv
     sys.argv = ["imu-monitor", *arguments]
     try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             main()
     except SystemExit as stop:
-        return int(stop.code or 0), said.getvalue()
+        return int(stop.code or 0), output.getvalue()
     finally:
         sys.argv = before
-    return 0, said.getvalue()
+    return 0, output.getvalue()
 
 
 def run_all(
     todo: Sequence[Job], file: Path, processes: int, in_process: bool = False, keep: Path | None = None
 ) -> Iterator[Outcome]:
-    """Run what does not stand in ``file`` yet, and append a line for each as it is done."""
-    known = {line["key"] for line in lines(file)}
-    left = [job for job in todo if job.key not in known]
+    """Run the cases that ``file`` does not contain yet, and append a line for each result."""
+    known = {line["key"] for line in read_lines(file)}
+    remaining = [job for job in todo if job.key not in known]
     with file.open("a") as results:
-        for job, outcome in _outcomes(left, processes, in_process, keep):
+        for job, outcome in _outcomes(remaining, processes, in_process, keep):
             results.write(json.dumps({"key": job.key, **outcome.json()}) + "\n")
             results.flush()
             yield outcome
 
 
 def _outcomes(
-    left: Sequence[Job], processes: int, in_process: bool, keep: Path | None
+    remaining: Sequence[Job], processes: int, in_process: bool, keep: Path | None
 ) -> Iterator[tuple[Job, Outcome]]:
     if processes == 1:
-        for job in left:
-            yield job, run(job, in_process, keep)
+        for job in remaining:
+            yield job, run_job(job, in_process, keep)
         return
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        running = {pool.submit(run, job, in_process, keep): job for job in left}
+        running = {pool.submit(run_job, job, in_process, keep): job for job in remaining}
         for done in as_completed(running):
             yield running[done], done.result()
 
 
-def lines(file: Path) -> list[dict[str, Any]]:
-    """Of a result file; none where there is no file."""
+def read_lines(file: Path) -> list[dict[str, Any]]:
+    """Return the lines of a result file, or no lines if the file does not exist."""
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
-def outcomes(file: Path) -> list[Outcome]:
-    """Scored cases of a result file."""
-    return [Outcome.from_json({k: v for k, v in line.items() if k != "key"}) for line in lines(file)]
+def read_outcomes(file: Path) -> list[Outcome]:
+    """Return the scored cases of a result file."""
+    return [Outcome.from_json({k: v for k, v in line.items() if k != "key"}) for line in read_lines(file)]

@@ -1,13 +1,13 @@
-"""A report beside the truth: which names are right, which are missing, which are wrong, and what was said of them.
+"""Comparison of a report with the truth: right names, missing names, false names and intervals.
 
-A name is right when an ``added`` step gives the very effect on the very axis, with the very source where it leaks
-in; there are no near misses, not even for names of equal spectrum. Two exceptions: a clock error is one fact about
-the recording, so any axis may tell it and several may; and ``foreign.HONEST`` lists names that are right for effects
-outside the vocabulary. A retuned term is no name. Everything else that is added is a false name, and so is a name
-given twice where it was hidden once.
+A name is right if an ``added`` step has the hidden effect, on the same axis, and with the same source if it leaks from
+another axis. There are no near misses, not even for names with equal spectra. There are two exceptions. A clock error
+concerns the whole recording, so any axis and several axes may name it. ``foreign.HONEST`` lists names that are right
+for foreign effects, which have no name of their own. A term with a changed size is no name. All other added effects are
+false names. A name that is given twice and hidden once is false once.
 
-An *honest* answer to a foreign effect is ``unexplained`` or ``partly_explained`` (or all names are in ``HONEST``);
-*unnamed* says that besides no false name was given.
+An *honest* answer to a foreign effect has the verdict ``unexplained`` or ``partly_explained``, or all its names are in
+``foreign.HONEST``.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,15 +20,17 @@ from tests.experiments.blind import foreign
 
 Json = Mapping[str, Any]
 
-NOT_JUDGED: Final = ("reference", "order", "source")  # the mean is free; whole numbers and names have no interval
-ANYWHERE: Final = ("sample_rate_error",)
-FAINT: Final = (15.0, 5.0)  # gains of the oracle: see the package
-OPEN: Final = ("unexplained", "partly_explained")
+PARAMETERS_WITHOUT_INTERVAL: Final = ("reference", "order", "source")
+"""The reference is arbitrary, and integers and names have no interval."""
+RECORDING_WIDE_EFFECTS: Final = ("sample_rate_error",)
+MIN_IDENTIFIABLE_GAINS: Final = (15.0, 5.0)
+"""Gains of the oracle over the baseline and over the best wrong name, as for faint effects."""
+OPEN_VERDICTS: Final = ("unexplained", "partly_explained")
 
 
 @dataclass(frozen=True)
-class Name:
-    """One name that was given, or should have been."""
+class NamedEffect:
+    """Effect that the report names or misses."""
 
     axis: str
     effect: str
@@ -38,7 +40,7 @@ class Name:
 
 @dataclass(frozen=True)
 class Outcome:
-    """One case, scored."""
+    """Score of one case."""
 
     case: str
     level: str
@@ -46,50 +48,52 @@ class Outcome:
     baseline: str
     exit_status: int
     verdict: str  # empty without a report
-    names: tuple[Name, ...]  # that were given
-    missed: tuple[Name, ...]
-    confused: tuple[tuple[str, str], ...]  # hidden effect -> what was said of its axis
-    coverage: tuple[tuple[str, str, bool], ...]  # effect, parameter, whether its interval holds the truth
+    names: tuple[NamedEffect, ...]  # names in the report
+    missed: tuple[NamedEffect, ...]
+    confused: tuple[tuple[str, str], ...]  # hidden effect, and the name or verdict of its axis in the report
+    coverage: tuple[tuple[str, str, bool], ...]  # effect, parameter, True if the interval contains the truth
     retuned: int
-    closed: bool  # nothing was left over
+    closed: bool  # True if nothing is left unexplained
     seconds: float
     foreign: tuple[str, ...] = field(default=())
-    gain: float | None = None  # the smallest of the oracle's
-    size: float = 1.0  # multiple of the level's size
-    margin: float | None = None  # the smallest of the oracle's, over the best wrong name
+    gain: float | None = None  # smallest gain of the oracle over the baseline
+    size: float = 1.0  # factor on the size of the level
+    margin: float | None = None  # smallest gain of the oracle over the best wrong name
 
     @property
-    def false(self) -> tuple[Name, ...]:
+    def false(self) -> tuple[NamedEffect, ...]:
         """Names that are wrong."""
         return tuple(name for name in self.names if not name.right)
 
     @property
     def right(self) -> bool:
-        """All that was hidden was named, and nothing else; of what is foreign, that an honest answer was given."""
+        """True if exactly the hidden effects are named, or the answer to a foreign effect is honest."""
         if self.foreign:
             return self.honest
         return bool(self.verdict) and not self.missed and not self.false
 
     @property
     def is_identifiable(self) -> bool:
-        """Whether the oracle gains what a faint effect gains, over the baseline and over the best wrong name."""
-        return (self.gain is None or self.gain >= FAINT[0]) and (self.margin is None or self.margin >= FAINT[1])
+        """True if the gains of the oracle are at least those of a faint effect."""
+        return (self.gain is None or self.gain >= MIN_IDENTIFIABLE_GAINS[0]) and (
+            self.margin is None or self.margin >= MIN_IDENTIFIABLE_GAINS[1]
+        )
 
     @property
     def honest(self) -> bool:
-        """That something is there which no name explains was said, or its parts were named."""
-        return self.verdict in OPEN or (bool(self.names) and not self.false)
+        """True if the report states an unexplained part, or all its names are right."""
+        return self.verdict in OPEN_VERDICTS or (bool(self.names) and not self.false)
 
     def json(self) -> dict[str, Any]:
-        """A line of a result file."""
+        """Return the score as a line of a result file."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, line: Json) -> "Outcome":
-        """Of such a line."""
+        """Return the score of a line of a result file."""
         values = dict(line)
         for key in ("names", "missed"):
-            values[key] = tuple(Name(**one) for one in values[key])
+            values[key] = tuple(NamedEffect(**one) for one in values[key])
         for key in ("confused", "coverage"):
             values[key] = tuple(tuple(one) for one in values[key])
         values["foreign"] = tuple(values["foreign"])
@@ -97,29 +101,35 @@ class Outcome:
 
 
 def score(truth: Json, report: Json | None, exit_status: int, seconds: float) -> Outcome:
-    """Compare.
+    """Compare a report with the truth.
 
-    Args:
-        truth: of ``cases.Case``
-        report: the parsed ``report.json``; None where none was written
-        exit_status, seconds: of the program's run
+    Parameters
+    ----------
+    truth
+        Truth of a ``cases.Case``.
+    report
+        Content of ``report.json``, or None if the program wrote none.
+    exit_status, seconds
+        Exit status and duration of the program.
     """
     added = [] if report is None else list(_steps(report, "added"))
     open_truths = list(truth["hidden"])
     names, coverage = [], []
-    told_anywhere: set[str] = set()
+    named_effects: set[str] = set()
     for axis, step in added:
-        match = next((one for one in open_truths if _is(one, axis, step)), None)
-        again = step["effect"] in told_anywhere
-        welcome = any(
+        match = next((one for one in open_truths if _is_match(one, axis, step)), None)
+        is_repeated = step["effect"] in named_effects
+        is_allowed = any(
             one["axis"] == axis and step["effect"] in foreign.HONEST.get(one["name"], ()) for one in truth["foreign"]
         )
-        names.append(Name(axis, step["effect"], step["confidence"], match is not None or again or welcome))
+        names.append(
+            NamedEffect(axis, step["effect"], step["confidence"], match is not None or is_repeated or is_allowed)
+        )
         if match is not None:
             open_truths.remove(match)
             coverage += _coverage(match, step)
-            if step["effect"] in ANYWHERE:
-                told_anywhere.add(step["effect"])
+            if step["effect"] in RECORDING_WIDE_EFFECTS:
+                named_effects.add(step["effect"])
     gains = [one["gain"] for one in truth["hidden"] if np.isfinite(one["gain"])]
     margins = [one["margin"] for one in truth["hidden"] if np.isfinite(one["margin"])]
     return Outcome(
@@ -130,7 +140,7 @@ def score(truth: Json, report: Json | None, exit_status: int, seconds: float) ->
         exit_status=exit_status,
         verdict="" if report is None else report["verdict"],
         names=tuple(names),
-        missed=tuple(Name(one["axis"], one["effect"]) for one in open_truths),
+        missed=tuple(NamedEffect(one["axis"], one["effect"]) for one in open_truths),
         confused=tuple(_confusions(truth, names, report)),
         coverage=tuple(coverage),
         retuned=0 if report is None else sum(1 for _ in _steps(report, "retuned")),
@@ -150,27 +160,29 @@ def _steps(report: Json, kind: str) -> Iterable[tuple[str, Json]]:
                 yield axis, step
 
 
-def _is(hidden: Json, axis: str, step: Json) -> bool:
+def _is_match(hidden: Json, axis: str, step: Json) -> bool:
     if hidden["effect"] != step["effect"]:
         return False
-    if hidden["effect"] in ANYWHERE:
+    if hidden["effect"] in RECORDING_WIDE_EFFECTS:
         return True
     source = step["parameters"].get("source", {}).get("value")
     return bool(hidden["axis"] == axis and hidden["parameters"].get("source") == source)
 
 
-def _confusions(truth: Json, names: list[Name], report: Json | None) -> Iterable[tuple[str, str]]:
-    """For each hidden effect: its own name, else a false name on its axis, else the verdict about the axis."""
-    free = [name for name in names if not name.right]
-    told = [(name.axis, name.effect) for name in names if name.right]
+def _confusions(truth: Json, names: list[NamedEffect], report: Json | None) -> Iterable[tuple[str, str]]:
+    """Yield each hidden effect with its name, a false name on its axis, or the verdict of the axis."""
+    false_names = [name for name in names if not name.right]
+    right_names = [(name.axis, name.effect) for name in names if name.right]
     for one in truth["hidden"]:
         effect, axis = one["effect"], one["axis"]
-        if (axis, effect) in told or (effect in ANYWHERE and effect in [name for _, name in told]):
+        if (axis, effect) in right_names or (
+            effect in RECORDING_WIDE_EFFECTS and effect in [name for _, name in right_names]
+        ):
             yield effect, effect
             continue
-        wrong = next((name for name in free if name.axis == axis or effect in ANYWHERE), None)
+        wrong = next((name for name in false_names if name.axis == axis or effect in RECORDING_WIDE_EFFECTS), None)
         if wrong is not None:
-            free.remove(wrong)
+            false_names.remove(wrong)
             yield effect, wrong.effect
         elif report is None:
             yield effect, "(no report)"
@@ -181,15 +193,20 @@ def _confusions(truth: Json, names: list[Name], report: Json | None) -> Iterable
 
 
 def _coverage(hidden: Json, step: Json) -> list[tuple[str, str, bool]]:
-    """Of every parameter that has an interval."""
+    """Return for every parameter with an interval whether the interval contains the truth."""
     found = []
     for name, truth in hidden["parameters"].items():
         bounds = step["parameters"].get(name)
-        if name in NOT_JUDGED or bounds is None or bounds.get("lo") is None or bounds.get("hi") is None:
+        if (
+            name in PARAMETERS_WITHOUT_INTERVAL
+            or bounds is None
+            or bounds.get("lo") is None
+            or bounds.get("hi") is None
+        ):
             continue
         lo, hi = float(bounds["lo"]), float(bounds["hi"])
-        if name == "phase":  # a full turn changes nothing
+        if name == "phase":  # a phase is periodic
             truth += 2.0 * np.pi * np.round((0.5 * (lo + hi) - truth) / (2.0 * np.pi))
-        slack = 1e-9 * abs(truth)  # an exact answer: a step of a grid
+        slack = 1e-9 * abs(truth)  # for exact results, such as the step of a grid
         found.append((hidden["effect"], name, bool(lo - slack <= truth <= hi + slack)))
     return found

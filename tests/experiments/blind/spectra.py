@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import numpy as np
-from scipy.fft import dct
+from scipy.fft import dct, rfft
 
 from tests.experiments.blind.processes import Floats
 from tests.experiments.blind.world import Effect
@@ -43,6 +43,24 @@ def _decaying(f_hz: Floats, tau0: float, variance: float, phi: complex) -> Float
     return np.asarray(variance * tau0 * (rotations[0] + rotations[1]).real)
 
 
+def _wandering(
+    f_hz: Floats,
+    tau0: float,
+    amplitude: float,
+    frequency: float,
+    frequency_deviation: float,
+    correlation_time: float,
+    phase: float = 0.0,
+) -> Floats:
+    """Kubo's autocovariance of an oscillation whose phase is the integral of correlated noise, summed at all lags."""
+    n = round(0.5 / (tau0 * float(f_hz[1] - f_hz[0])))
+    lag = np.arange(n) * tau0
+    x, index = lag / correlation_time, (2.0 * np.pi * frequency_deviation * correlation_time) ** 2
+    r = 0.5 * amplitude**2 * np.cos(2.0 * np.pi * frequency * lag) * np.exp(-index * (np.expm1(-x) + x))
+    summed = tau0 * (2.0 * rfft(r, 2 * n).real - r[0])
+    return np.asarray(np.interp(f_hz, np.arange(summed.size) / (2.0 * n * tau0), np.maximum(summed, 0.0)))
+
+
 SHAPES: Final[dict[str, Callable[..., Any]]] = {
     "quantization_noise": lambda f, tau0, Q: 4.0 * Q**2 / tau0 * np.sin(np.pi * f * tau0) ** 2,
     "angle_random_walk": lambda f, tau0, N: N**2 * np.ones_like(f),
@@ -54,6 +72,7 @@ SHAPES: Final[dict[str, Callable[..., Any]]] = {
     "narrowband": lambda f, tau0, sigma, frequency, bandwidth: _decaying(
         f, tau0, sigma**2, np.exp((-bandwidth + 2j * frequency) * np.pi * tau0)
     ),
+    "wandering_line": _wandering,
     "power_law": lambda f, tau0, density, exponent: (
         density**2 * (np.sin(np.pi * f * tau0) / (np.pi * tau0)) ** -exponent
     ),

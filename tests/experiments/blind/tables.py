@@ -1,4 +1,4 @@
-"""Tables of scored cases: how often the name was right, what was said instead, what intervals hold."""
+"""Tables of scored cases: shares of right names, confusions, false names and coverage of intervals."""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -10,47 +10,47 @@ from scipy.special import ndtri
 
 from tests.experiments.blind.score import Outcome
 
-SURE: Final = 0.95
-SIZES: Final = (0.0, 0.21, 0.3, 0.42, 0.6, 0.85, np.inf)  # edges of the columns of a power curve: 0.25, 0.35, 0.5, …
-CONFIDENCES: Final = (0.0, 0.5, 0.8, 0.9, 0.99, np.inf)
+HIGH_CONFIDENCE: Final = 0.95
+SIZE_EDGES: Final = (0.0, 0.21, 0.3, 0.42, 0.6, 0.85, np.inf)  # edges of the columns of a power curve
+CONFIDENCE_EDGES: Final = (0.0, 0.5, 0.8, 0.9, 0.99, np.inf)
 
 
-def wilson(held: int, looks: int) -> tuple[float, float]:
-    """Ends of the 95 % interval of a share (Wilson, J. Am. Stat. Assoc. 22 (1927) 209).
+def wilson_interval(count: int, total: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share (Wilson, J. Am. Stat. Assoc. 22 (1927) 209).
 
-    >>> lo, hi = wilson(0, 300)
+    >>> lo, hi = wilson_interval(0, 300)
     >>> print(f"{lo:.4f} {hi:.4f}")
     0.0000 0.0126
     """
     z2 = float(ndtri(0.975)) ** 2
-    centre = (held + 0.5 * z2) / (looks + z2)
-    reach = np.sqrt(z2 * (held * (looks - held) / looks + 0.25 * z2)) / (looks + z2)
+    centre = (count + 0.5 * z2) / (total + z2)
+    reach = np.sqrt(z2 * (count * (total - count) / total + 0.25 * z2)) / (total + z2)
     return max(0.0, float(centre - reach)), min(1.0, float(centre + reach))
 
 
-def share(held: int, looks: int) -> str:
-    """``97.5 % (93.1–99.2) 117 of 120``."""
-    if looks == 0:
+def format_share(count: int, total: int) -> str:
+    """Return a share with its interval, such as ``97.5 % (93.1–99.2) 117 of 120``."""
+    if total == 0:
         return "—"
-    lo, hi = wilson(held, looks)
-    return f"{100 * held / looks:.1f} % ({100 * lo:.1f}–{100 * hi:.1f}) {held} of {looks}"
+    lo, hi = wilson_interval(count, total)
+    return f"{100 * count / total:.1f} % ({100 * lo:.1f}–{100 * hi:.1f}) {count} of {total}"
 
 
-def report(outcomes: Sequence[Outcome]) -> str:
-    """Markdown of everything."""
-    tables = (_summary, _power, _reliability, _by_case, _matrix, _coverage, _false_names)
+def format_report(outcomes: Sequence[Outcome]) -> str:
+    """Return all tables in Markdown."""
+    tables = (_summary, _power, _reliability, _by_case, _confusions, _coverage, _false_names)
     parts = [table(outcomes) for table in tables]
     return "\n\n".join(part for part in parts if part)
 
 
-def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """One table."""
+def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
-def kind(outcome: Outcome) -> str:
-    """What sort of case it is."""
+def get_case_kind(outcome: Outcome) -> str:
+    """Return "foreign", "null", "pair" or "single"."""
     if outcome.foreign:
         return "foreign"
     if outcome.case == "null":
@@ -58,7 +58,7 @@ def kind(outcome: Outcome) -> str:
     return "pair" if "+" in outcome.case else "single"
 
 
-def _groups(outcomes: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[str, list[Outcome]]:
+def _group_outcomes(outcomes: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[str, list[Outcome]]:
     groups: dict[str, list[Outcome]] = defaultdict(list)
     for outcome in outcomes:
         groups[key(outcome)].append(outcome)
@@ -66,138 +66,147 @@ def _groups(outcomes: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[
 
 
 def _summary(outcomes: Sequence[Outcome]) -> str:
-    def key(one: Outcome) -> str:
-        level = "" if kind(one) in ("null", "foreign") else f" {one.level}"
-        return f"{kind(one)}{level}, {one.baseline} baseline"
+    def key(outcome: Outcome) -> str:
+        level = "" if get_case_kind(outcome) in ("null", "foreign") else f" {outcome.level}"
+        return f"{get_case_kind(outcome)}{level}, {outcome.baseline} baseline"
 
     rows = []
-    for name, group in sorted(_groups(outcomes, key).items()):
-        times = np.array([one.seconds for one in group])
+    for name, group in sorted(_group_outcomes(outcomes, key).items()):
+        times = np.array([outcome.seconds for outcome in group])
         rows.append(
             (
                 name,
-                share(sum(one.right for one in group), len(group)),
-                share(sum(bool(one.false) for one in group), len(group)),
-                share(sum(one.closed for one in group), len(group)),
-                share(sum(one.exit_status == 0 for one in group), len(group)),
+                format_share(sum(outcome.right for outcome in group), len(group)),
+                format_share(sum(bool(outcome.false) for outcome in group), len(group)),
+                format_share(sum(outcome.closed for outcome in group), len(group)),
+                format_share(sum(outcome.exit_status == 0 for outcome in group), len(group)),
                 f"{np.median(times):.1f} / {times.max():.1f}",
             )
         )
-    head = ("set", "right", "a false name", "nothing left over", "exit status 0", "seconds, median / most")
-    table = markdown(head, rows)
-    given = [name for one in outcomes for name in one.names]
-    sure = [name for name in given if (name.confidence or 0.0) >= SURE]
+    head = ("set", "right", "a false name", "nothing unexplained", "exit status 0", "seconds, median / maximum")
+    table = format_table(head, rows)
+    given = [name for outcome in outcomes for name in outcome.names]
+    confident = [name for name in given if (name.confidence or 0.0) >= HIGH_CONFIDENCE]
+    covered, intervals = _count_covered([item for outcome in outcomes for item in outcome.coverage])
     lines = [
         table,
-        f"Names given with a confidence of {SURE} or more that are wrong, of all names: "
-        f"{share(sum(not name.right for name in sure), len(given))}.",
-        f"Truth within the 95 % interval: {share(*_held([c for one in outcomes for c in one.coverage]))}.",
+        f"Names given with a confidence of {HIGH_CONFIDENCE} or more that are wrong, of all names: "
+        f"{format_share(sum(not name.right for name in confident), len(given))}.",
+        f"Truth within the 95 % interval: {format_share(covered, intervals)}.",
     ]
     return "\n\n".join(lines)
 
 
 def _power(outcomes: Sequence[Outcome]) -> str:
-    """The share of right answers against the size of what is hidden.
+    """Return the share of right answers against the size of the hidden effects.
 
-    An effect is identifiable at its size if the oracle gains what a faint effect gains.
+    An effect is identifiable if the gains of the oracle are at least those of a faint effect.
     """
-    drawn = [one for one in outcomes if one.size != 1.0]
+    drawn = [outcome for outcome in outcomes if outcome.size != 1.0]
     if not drawn:
         return ""
-    columns = [(lo, hi) for lo, hi in pairwise(SIZES) if any(lo <= one.size < hi for one in drawn)]
+    columns = [(lo, hi) for lo, hi in pairwise(SIZE_EDGES) if any(lo <= outcome.size < hi for outcome in drawn)]
 
-    def row(name: str, group: Sequence[Outcome], said: Callable[[int, int], str]) -> tuple[str, ...]:
-        within = [[one.right for one in group if lo <= one.size < hi] for lo, hi in columns]
-        return (name, *(said(sum(flags), len(flags)) for flags in within))
+    def row(name: str, group: Sequence[Outcome], format_cell: Callable[[int, int], str]) -> tuple[str, ...]:
+        within = [[outcome.right for outcome in group if lo <= outcome.size < hi] for lo, hi in columns]
+        return (name, *(format_cell(sum(flags), len(flags)) for flags in within))
 
-    kinds = sorted(_groups(drawn, kind).items())
-    rows = [row(f"all {name}s", group, share) for name, group in kinds]
+    kinds = sorted(_group_outcomes(drawn, get_case_kind).items())
+    rows = [row(f"all {name}s", group, format_share) for name, group in kinds]
     rows += [
-        row(f"identifiable {name}s", [one for one in group if one.is_identifiable], share) for name, group in kinds
+        row(f"identifiable {name}s", [outcome for outcome in group if outcome.is_identifiable], format_share)
+        for name, group in kinds
     ]
     rows += [
-        row(name, group, lambda held, looks: f"{held} of {looks}")
-        for name, group in sorted(_groups(drawn, lambda one: one.case).items())
+        row(name, group, lambda count, total: f"{count} of {total}")
+        for name, group in sorted(_group_outcomes(drawn, lambda outcome: outcome.case).items())
     ]
     head = ("hidden", *(f"{lo:g}–{hi:g}" for lo, hi in columns))
-    return "Right answers against the multiple of the level's size:\n\n" + markdown(head, rows)
+    return "Right answers against the multiple of the level's size:\n\n" + format_table(head, rows)
 
 
 def _reliability(outcomes: Sequence[Outcome]) -> str:
-    """Whether names are right as often as their confidence says."""
-    given = [name for one in outcomes for name in one.names]
+    """Return the share of right names against their confidence."""
+    given = [name for outcome in outcomes for name in outcome.names]
     rows = []
-    for lo, hi in pairwise(CONFIDENCES):
+    for lo, hi in pairwise(CONFIDENCE_EDGES):
         group = [name for name in given if lo <= (name.confidence or 0.0) < hi]
         mean = f"{np.mean([name.confidence for name in group]):.3f}" if group else "—"
-        held = share(sum(name.right for name in group), len(group))
-        rows.append((f"{lo:g}–{min(hi, 1.0):g}", mean, held))
-    return "Names against their confidence:\n\n" + markdown(("confidence", "mean", "right"), rows) if given else ""
+        count = format_share(sum(name.right for name in group), len(group))
+        rows.append((f"{lo:g}–{min(hi, 1.0):g}", mean, count))
+    return "Names against their confidence:\n\n" + format_table(("confidence", "mean", "right"), rows) if given else ""
 
 
 def _by_case(outcomes: Sequence[Outcome]) -> str:
-    """Each case by itself, worst first."""
+    """Return a row for each case, the worst case first."""
     rows = []
-    for name, group in _groups(outcomes, lambda one: f"{one.case} {one.level} {one.baseline}").items():
-        right = sum(one.right for one in group)
-        said = Counter(_said(one) for one in group if not one.right)
-        verdicts = Counter(one.verdict or f"exit {one.exit_status}" for one in group)
-        rows.append((right / len(group), name, group, right, verdicts, said))
+    for name, group in _group_outcomes(
+        outcomes, lambda outcome: f"{outcome.case} {outcome.level} {outcome.baseline}"
+    ).items():
+        right = sum(outcome.right for outcome in group)
+        wrong = Counter(_describe_wrong_answer(outcome) for outcome in group if not outcome.right)
+        verdicts = Counter(outcome.verdict or f"exit {outcome.exit_status}" for outcome in group)
+        rows.append((right / len(group), name, group, right, verdicts, wrong))
     rows.sort(key=lambda row: row[:2])
-    return markdown(
-        ("case", "right", "verdicts", "said instead"),
+    return format_table(
+        ("case", "right", "verdicts", "wrong answers"),
         [
-            (name, share(right, len(group)), _counted(verdicts), _counted(said))
-            for _, name, group, right, verdicts, said in rows
+            (name, format_share(right, len(group)), _format_counts(verdicts), _format_counts(wrong))
+            for _, name, group, right, verdicts, wrong in rows
         ],
     )
 
 
-def _said(one: Outcome) -> str:
-    false = sorted(f"{name.effect}" for name in one.false)
-    missed = sorted(f"no {name.effect}" for name in one.missed)
-    return ", ".join([*missed, *false]) or one.verdict or f"exit {one.exit_status}"
+def _describe_wrong_answer(outcome: Outcome) -> str:
+    false = sorted(f"{name.effect}" for name in outcome.false)
+    missed = sorted(f"no {name.effect}" for name in outcome.missed)
+    return ", ".join([*missed, *false]) or outcome.verdict or f"exit {outcome.exit_status}"
 
 
-def _counted(counter: Counter[str]) -> str:
+def _format_counts(counter: Counter[str]) -> str:
     return "; ".join(f"{count} × {name}" for name, count in counter.most_common())
 
 
-def _matrix(outcomes: Sequence[Outcome]) -> str:
-    """Hidden effect against what was said, levels and pairs together."""
-    cells = Counter(pair for one in outcomes for pair in one.confused)
+def _confusions(outcomes: Sequence[Outcome]) -> str:
+    """Return the names that hidden effects were given, for all levels together."""
+    cells = Counter(pair for outcome in outcomes for pair in outcome.confused)
     if not cells:
         return ""
     hidden = sorted({truth for truth, _ in cells})
-    said = sorted({name for _, name in cells}, key=lambda name: (name.startswith("("), name))
+    answers = sorted({name for _, name in cells}, key=lambda name: (name.startswith("("), name))
     rows = []
     for truth in hidden:
-        others = [f"{cells[truth, name]} {name}" for name in said if name != truth and cells[truth, name]]
+        others = [f"{cells[truth, name]} {name}" for name in answers if name != truth and cells[truth, name]]
         rows.append((truth, str(cells[truth, truth]), "; ".join(others)))
-    return "Confusion matrix, rows without their zeros:\n\n" + markdown(("hidden", "named so", "named otherwise"), rows)
+    return "Confusion matrix without zeros:\n\n" + format_table(("hidden", "right name", "other answers"), rows)
 
 
-def _held(coverage: Iterable[tuple[str, str, bool]]) -> tuple[int, int]:
-    flags = [held for _, _, held in coverage]
+def _count_covered(coverage: Iterable[tuple[str, str, bool]]) -> tuple[int, int]:
+    flags = [count for _, _, count in coverage]
     return sum(flags), len(flags)
 
 
 def _coverage(outcomes: Sequence[Outcome]) -> str:
     found: dict[tuple[str, str], list[bool]] = defaultdict(list)
-    for one in outcomes:
-        for effect, parameter, held in one.coverage:
-            found[effect, parameter].append(held)
+    for outcome in outcomes:
+        for effect, parameter, count in outcome.coverage:
+            found[effect, parameter].append(count)
     if not found:
         return ""
-    rows = [(*key, share(sum(flags), len(flags))) for key, flags in sorted(found.items())]
-    return "Truth within the 95 % interval:\n\n" + markdown(("effect", "parameter", "holds"), rows)
+    rows = [(*key, format_share(sum(flags), len(flags))) for key, flags in sorted(found.items())]
+    return "Truth within the 95 % interval:\n\n" + format_table(("effect", "parameter", "coverage"), rows)
 
 
 def _false_names(outcomes: Sequence[Outcome]) -> str:
-    """Each by itself: to be looked at."""
+    """Return a row for each false name."""
     rows = [
-        (f"{one.case} {one.level} {one.baseline}", str(one.seed), f"{name.axis} {name.effect}", f"{name.confidence}")
-        for one in outcomes
-        for name in one.false
+        (
+            f"{outcome.case} {outcome.level} {outcome.baseline}",
+            str(outcome.seed),
+            f"{name.axis} {name.effect}",
+            f"{name.confidence}",
+        )
+        for outcome in outcomes
+        for name in outcome.false
     ]
-    return "False names:\n\n" + markdown(("case", "seed", "name", "confidence"), rows) if rows else ""
+    return "False names:\n\n" + format_table(("case", "seed", "name", "confidence"), rows) if rows else ""

@@ -1,9 +1,9 @@
 """Fuzz every reader of external bytes or text: ``python -m tests.experiments.fuzz``. See ``docs/fuzzing.md``.
 
-A target is one function of bytes in ``tests/experiments/fuzz/targets``, marked with ``@target``. It hands them to one
-reader and raises where the reader broke its word: an exception that its docstring does not name, a value that is no
-measurement, another result for another cut of the same bytes. ``limits`` adds what holds for all of them: processor
-time, memory, no warning. Inputs come from atheris, guided by coverage, where it is installed (extra ``fuzz``), else
-from ``mutations``. What was found is kept as a file in ``tests/experiments/cases/fuzz/<target>/`` and tried in every
-run of the tests.
+A target is a function of bytes in ``tests/experiments/fuzz/targets``, marked with ``@target``. It passes the bytes to
+one reader and raises an exception if the reader violates a condition. Examples are an exception that the docstring of
+the reader does not name, an impossible value, or a result that depends on how the bytes are divided. ``limits`` adds
+the limits of processor time, memory and warnings. atheris generates inputs guided by coverage if the extra ``fuzz`` is
+installed. Otherwise ``mutations`` generates random inputs. Inputs that caused a fault are stored in
+``tests/experiments/cases/fuzz/<target>/`` and repeated in every run of the tests.
 """

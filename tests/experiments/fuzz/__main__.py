@@ -1,7 +1,8 @@
 """Run each fuzz target in its own process: ``python -m tests.experiments.fuzz [TARGET …] --inputs N --seed S``.
 
-One line a target: inputs, inputs a second, coverage (edges between branches of drivers and monitor that were reached),
-findings. Each finding's input is left in ``--out``. Exit status 1 where there is one.
+The program prints a line for each target with the number of inputs, the inputs per second, the reached edges between
+branches of drivers and monitor, and the findings. The inputs of findings are written to ``--out``. The exit status is 1
+if there is a finding.
 """
 
 import argparse
@@ -15,15 +16,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from tests.experiments.fuzz.target import targets
+from tests.experiments.fuzz.target import load_targets
 
 COVERED = re.compile(r"cov: (\d+) ft: (\d+)")
 
 
 def main() -> int:
-    """Run what the arguments say."""
+    """Run the requested targets."""
     arguments = _arguments()
-    known = targets()
+    known = load_targets()
     unknown = [name for name in arguments.targets if name not in known]
     if unknown:
         print(f"no target {', '.join(unknown)}; there are {', '.join(known)}", file=sys.stderr)
@@ -45,12 +46,14 @@ def main() -> int:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.experiments.fuzz")
-    parser.add_argument("targets", nargs="*", metavar="TARGET", help="all without any")
-    parser.add_argument("--inputs", type=int, default=100_000, help="of each target")
-    parser.add_argument("--seconds", type=float, default=3600.0, help="of each target at the most")
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help="targets to run (default: all)")
+    parser.add_argument("--inputs", type=int, default=100_000, help="inputs of each target")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="time limit of each target")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=1, help="processes at once")
-    parser.add_argument("--out", help="folder for findings and what reached new code; a new one otherwise")
+    parser.add_argument("--jobs", type=int, default=1, help="number of parallel processes")
+    parser.add_argument(
+        "--out", help="folder for findings and inputs that reach new code (default: a temporary folder)"
+    )
     parser.add_argument("--list", action="store_true", help="print the targets")
     guided = importlib.util.find_spec("atheris") is not None
     parser.add_argument("--engine", choices=("guided", "random"), default="guided" if guided else "random")
@@ -64,19 +67,19 @@ def _run(name: str, arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
     with (folder / "log").open("w") as log:
         command = [sys.executable, "-m", "tests.experiments.fuzz.run", *map(str, words)]
         ended = subprocess.run(command, stdout=log, stderr=log, check=False)
-    said = (folder / "log").read_text(errors="replace")
+    log_text = (folder / "log").read_text(errors="replace")
     file = folder / "run.json"
     run: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"target": name, "inputs": 0, "seconds": 1}
     run.setdefault("findings", [])
-    covered = COVERED.findall(said)
+    covered = COVERED.findall(log_text)
     run["edges"] = int(covered[-1][0]) if covered else None
     if ended.returncode:
-        run["findings"].append({"what": f"the process ended with {ended.returncode}", "where": str(folder / "log")})
+        run["findings"].append({"error": f"the process ended with {ended.returncode}", "location": str(folder / "log")})
     rate = run["inputs"] / max(run["seconds"], 1e-9)
     found = len(run["findings"])
     print(f"{name:28} {run['inputs']:10,} {rate:9,.0f} {run['edges'] or '':>6}  {found or ''}", flush=True)
-    for one in run["findings"]:
-        print(f"    {one['where']}: {one['what']}", flush=True)
+    for finding in run["findings"]:
+        print(f"    {finding['location']}: {finding['error']}", flush=True)
     return run
 
 

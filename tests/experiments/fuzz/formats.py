@@ -1,9 +1,9 @@
-"""Wire formats written a second time, slowly and plainly: what the fuzzed decoders are held against.
+"""Simple second implementation of the wire formats, with which the fuzzed decoders are compared.
 
-Shares no code with ``drivers.decoders`` but tables of identifiers and field sizes. ``wrap`` puts a frame around any
-bytes, with a check that holds; ``readings`` finds, at every offset of a stream, the frames whose check holds and
-gives the six numbers of each: gx gy gz rad/s, ax ay az m/s², None where the frame does not hold the axis. What a
-decoder passes on must be some of them, in their order.
+It shares only the tables of identifiers and field sizes with ``drivers.decoders``. ``wrap`` builds a frame with a valid
+checksum from any bytes. ``find_readings`` finds the frames with a valid checksum at every offset of a stream. It
+returns the six values of each frame: gx, gy and gz in rad/s, and ax, ay and az in m/s². The value is None if the frame
+does not contain the axis. The samples of a decoder must be a subsequence of these readings.
 """
 
 import math
@@ -26,45 +26,45 @@ Settings = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Format:
-    """One stream format; None where a frame carries no check."""
+    """Stream format. ``find_readings`` is None if the frames have no checksum."""
 
     wrap: Callable[[bytes, Settings], bytes]
-    readings: Callable[[bytes, Settings], Iterator[Reading]] | None
+    find_readings: Callable[[bytes, Settings], Iterator[Reading]] | None
 
 
 @cache
-def _bit_by_bit(bits: int, polynomial: int) -> tuple[int, ...]:
-    """What each byte leaves in a register that was 0."""
-    left = []
+def _build_crc_table(bits: int, polynomial: int) -> tuple[int, ...]:
+    """Return the remainder of each byte, from a register that is 0."""
+    table = []
     for byte in range(256):
         register = byte << (bits - 8)
         for _ in range(8):
             register = register << 1 ^ (polynomial if register >> (bits - 1) & 1 else 0)
-        left.append(register & ((1 << bits) - 1))
-    return tuple(left)
+        table.append(register & ((1 << bits) - 1))
+    return tuple(table)
 
 
-def crc(data: bytes, bits: int, polynomial: int, register: int) -> int:
-    """Cyclic redundancy check, most significant bit first."""
-    table, top, mask = _bit_by_bit(bits, polynomial), bits - 8, (1 << bits) - 1
+def compute_crc(data: bytes, bits: int, polynomial: int, register: int) -> int:
+    """Return the cyclic redundancy check of the data, with the most significant bit first."""
+    table, top, mask = _build_crc_table(bits, polynomial), bits - 8, (1 << bits) - 1
     for byte in data:
         register = (register << 8 ^ table[register >> top ^ byte]) & mask
     return register
 
 
-def exclusive_or(data: bytes) -> int:
+def compute_xor(data: bytes) -> int:
     return reduce(xor, data, 0)
 
 
-def places(stream: bytes, start: bytes) -> Iterator[int]:
+def find_offsets(stream: bytes, start: bytes) -> Iterator[int]:
     at = stream.find(start)
     while at >= 0:
         yield at
         at = stream.find(start, at + 1)
 
 
-def measured(row: list[float | None]) -> bool:
-    """Whether it holds a number, and no impossible one."""
+def has_finite_values(row: list[float | None]) -> bool:
+    """Return True if a row contains a number and all its numbers are finite."""
     numbers = [x for x in row if x is not None]
     return bool(numbers) and all(math.isfinite(x) for x in numbers)
 
@@ -79,7 +79,7 @@ def _stim300_size(identifier: int) -> int:
 
 
 def _stim300_check(body: bytes) -> bytes:
-    return crc(body + bytes(-len(body) % 4), 32, 0x04C11DB7, 0xFFFFFFFF).to_bytes(4, "big")
+    return compute_crc(body + bytes(-len(body) % 4), 32, 0x04C11DB7, 0xFFFFFFFF).to_bytes(4, "big")
 
 
 def _stim300_wrap(data: bytes, settings: Settings) -> bytes:
@@ -118,7 +118,7 @@ def _i24(frame: bytes, at: int) -> int:
 
 
 def _vectornav_fields(header: bytes) -> tuple[dict[tuple[int, int], int], int] | None:
-    """Offset of each field in the message, and the message's length; None for a header that is none."""
+    """Return the offset of each field and the length of the message, or None if the header is invalid."""
     if not header or header[0] in (0,) or header[0] & 0x80:
         return None
     groups = [g for g in range(1, 8) if header[0] >> (g - 1) & 1]
@@ -142,26 +142,26 @@ def _vectornav_wrap(data: bytes, settings: Settings) -> bytes:
     found = _vectornav_fields(data)
     size = found[1] - 3 if found else len(data)
     inner = data[:size].ljust(size, b"\0")
-    return b"\xfa" + inner + crc(inner, 16, 0x1021, 0).to_bytes(2, "big")
+    return b"\xfa" + inner + compute_crc(inner, 16, 0x1021, 0).to_bytes(2, "big")
 
 
 def _vectornav_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
-    ways = ((1, 9, 12), (3, 3, 0)), ((1, 5, 0), (3, 10, 0))
-    accel_ways = ((1, 9, 0), (3, 2, 0)), ((1, 8, 0), (3, 9, 0))
-    turn = -1 if settings.get("compensated") else 1
-    for at in places(stream, b"\xfa"):
+    gyro_fields = ((1, 9, 12), (3, 3, 0)), ((1, 5, 0), (3, 10, 0))
+    accel_fields = ((1, 9, 0), (3, 2, 0)), ((1, 8, 0), (3, 9, 0))
+    step = -1 if settings.get("compensated") else 1
+    for at in find_offsets(stream, b"\xfa"):
         found = _vectornav_fields(stream[at + 1 : at + 20])
         if found is None or len(stream) < at + found[1]:
             continue
         fields, length = found
         inner = stream[at + 1 : at + length - 2]
-        if crc(inner, 16, 0x1021, 0).to_bytes(2, "big") != stream[at + length - 2 : at + length]:
+        if compute_crc(inner, 16, 0x1021, 0).to_bytes(2, "big") != stream[at + length - 2 : at + length]:
             continue
         row: list[float | None] = []
-        for kind in (ways, accel_ways):
-            places_of = [fields[g, b] + inside for g, b, inside in sum(kind[::turn], ()) if (g, b) in fields]
-            row += struct.unpack_from("<3f", stream, at + places_of[0]) if places_of else [None] * 3
-        if measured(row):
+        for kind in (gyro_fields, accel_fields):
+            offsets = [fields[g, b] + inside for g, b, inside in sum(kind[::step], ()) if (g, b) in fields]
+            row += struct.unpack_from("<3f", stream, at + offsets[0]) if offsets else [None] * 3
+        if has_finite_values(row):
             yield tuple(row)
 
 
@@ -170,16 +170,16 @@ def _ascii_wrap(data: bytes, settings: Settings) -> bytes:
     if data[:1] < b"\x40":
         body = (b"VNIMU," if data[:1] < b"\x20" else b"VNYMR,") + body[1:]
     if data[-1:] > b"\xd0":
-        return b"$%b*%04X\r\n" % (body, crc(body, 16, 0x1021, 0))
-    return b"$%b*%02X\r\n" % (body, exclusive_or(body))
+        return b"$%b*%04X\r\n" % (body, compute_crc(body, 16, 0x1021, 0))
+    return b"$%b*%02X\r\n" % (body, compute_xor(body))
 
 
 def _ascii_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
     order = {b"VNIMU": (6, 7, 8, 3, 4, 5, 11), b"VNYMR": (9, 10, 11, 6, 7, 8, 12)}
-    for at in places(stream, b"$VN"):
+    for at in find_offsets(stream, b"$VN"):
         line = stream[at + 1 :].partition(b"\n")[0].removesuffix(b"\r")
         body, star, stated = line.rpartition(b"*")
-        if not star or stated not in (b"%02X" % exclusive_or(body), b"%04X" % crc(body, 16, 0x1021, 0)):
+        if not star or stated not in (b"%02X" % compute_xor(body), b"%04X" % compute_crc(body, 16, 0x1021, 0)):
             continue
         name, *words = body.split(b",")
         if name not in order:
@@ -189,7 +189,7 @@ def _ascii_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
             numbers = [float(word) for word in words[:width]]
         except ValueError:
             continue
-        if len(numbers) == width and measured([numbers[i] for i in columns]):
+        if len(numbers) == width and has_finite_values([numbers[i] for i in columns]):
             yield tuple(numbers[i] for i in columns)
 
 
@@ -204,7 +204,7 @@ def _xsens_wrap(data: bytes, settings: Settings) -> bytes:
 
 def _xsens_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
     wanted = (0x8040, 0x4040) if settings.get("high_rate") else (0x8020, 0x4020)
-    for at in places(stream, b"\xfa\xff\x36"):
+    for at in find_offsets(stream, b"\xfa\xff\x36"):
         head = stream[at + 3 : at + 6]
         if len(head) < 3:
             continue
@@ -219,7 +219,7 @@ def _xsens_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
         for kind in wanted:
             triples = [t for did, data in items if did & 0xFFF0 == kind and (t := _xsens_triple(did, data))]
             row += triples[0] if triples else [None] * 3
-        if measured(row):
+        if has_finite_values(row):
             yield tuple(row)
 
 
@@ -252,7 +252,7 @@ def _xsens_triple(did: int, data: bytes) -> list[float] | None:
 
 
 def _witmotion_wrap(data: bytes, settings: Settings) -> bytes:
-    """A pair of packets, or one of another type."""
+    """Build a pair of packets, or one packet of another type."""
     if settings.get("packet") == "bluetooth":
         return b"\x55" + (b"\x71" if data[:1] > b"\xf0" else b"\x61") + data[1:19].ljust(18, b"\0")
     data = data.ljust(17, b"\0")
@@ -264,15 +264,15 @@ def _witmotion_wrap(data: bytes, settings: Settings) -> bytes:
 def _witmotion_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
     gyro, accel = 2000 * DEGREE / 32768, 16 * G / 32768
     bluetooth = settings.get("packet") == "bluetooth"
-    for at in places(stream, b"\x55\x61" if bluetooth else b"\x55\x51"):
+    for at in find_offsets(stream, b"\x55\x61" if bluetooth else b"\x55\x51"):
         if bluetooth:
             if stream[at + 20 : at + 22] not in (b"\x55\x61", b"\x55\x71"):
                 continue
             words = struct.unpack_from("<6h", stream, at + 2)
         else:
             first, second = stream[at : at + 11], stream[at + 11 : at + 22]
-            holds = all(len(p) == 11 and sum(p[:10]) % 256 == p[10] for p in (first, second))
-            if not holds or second[:2] != b"\x55\x52":
+            is_valid = all(len(p) == 11 and sum(p[:10]) % 256 == p[10] for p in (first, second))
+            if not is_valid or second[:2] != b"\x55\x52":
                 continue
             words = struct.unpack_from("<3h", first, 2) + struct.unpack_from("<3h", second, 2)
         yield tuple([gyro * w for w in words[3:]] + [accel * w for w in words[:3]])
@@ -285,24 +285,24 @@ def _text_wrap(data: bytes, settings: Settings) -> bytes:
     if not settings.get("nmea"):
         return data + b"\r\n"
     body = data.replace(b"\n", b",").replace(b"\r", b",").replace(b"$", b",").replace(b"*", b",")
-    return b"$%b*%02X\r\n" % (body, exclusive_or(body))
+    return b"$%b*%02X\r\n" % (body, compute_xor(body))
 
 
 def _text_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
-    """Of sentences alone, in SI."""
+    """Return the readings of sentences with a checksum, in SI units."""
     axes = ("gx", "gy", "gz", "ax", "ay", "az")
     columns = settings["columns"]
     for line in stream.replace(b"\r", b"\n").split(b"\n"):
         body, star, stated = line.strip().rpartition(b"*")
         body = body.rpartition(b"$")[2]
         try:
-            holds = star and len(stated) == 2 and int(stated, 16) == exclusive_or(body)
+            is_valid = star and len(stated) == 2 and int(stated, 16) == compute_xor(body)
             words = [word.strip() for word in body.replace(b";", b",").replace(b"\t", b",").split(b",")]
             numbers = dict(zip(columns, [float(word) if word else math.nan for word in words], strict=True))
         except ValueError:
             continue
         row = [None if math.isnan(numbers[axis]) else numbers[axis] for axis in axes]
-        if holds and measured(row):
+        if is_valid and has_finite_values(row):
             yield tuple(row)
 
 
@@ -317,13 +317,13 @@ FORMATS: Final = {
 }
 
 
-def some_of(rows: list[Reading], known: Iterator[Reading]) -> bool:
-    """Whether the rows are among the known readings, in their order."""
-    return all(any(_equal(row, one) for one in known) for row in rows)
+def is_subsequence(rows: list[Reading], known: Iterator[Reading]) -> bool:
+    """Return True if the rows are a subsequence of the known readings."""
+    return all(any(_equal(row, reading) for reading in known) for row in rows)
 
 
-def _equal(one: Reading, other: Reading) -> bool:
+def _equal(first: Reading, second: Reading) -> bool:
     return all(
         (a is None) == (b is None) and (a is None or b is None or math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-15))
-        for a, b in zip(one, other, strict=True)
+        for a, b in zip(first, second, strict=True)
     )

@@ -1,4 +1,4 @@
-"""All that fuzzing found, tried again; a moment of fuzzing of every target; and that the harness sees what is wrong."""
+"""Tests with all inputs that have caused faults, with new random inputs, and tests of the fuzzing code itself."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,20 +12,20 @@ from drivers.data_types import Chunk
 from drivers.decoders.base import FrameBuffer, Frames
 from drivers.recordings import FORMATS
 from tests.experiments.fuzz import limits
-from tests.experiments.fuzz.limits import limited, tried
-from tests.experiments.fuzz.mutations import inputs
-from tests.experiments.fuzz.target import Target, targets
+from tests.experiments.fuzz.limits import enforce_limits, try_input
+from tests.experiments.fuzz.mutations import generate_inputs
+from tests.experiments.fuzz.target import Target, load_targets
 
 CASES = Path(__file__).resolve().parents[1] / "cases" / "fuzz"
-TARGETS = targets()
-FOUND = sorted(file for file in CASES.rglob("*") if file.is_file())
-A_MOMENT = 60
-"""Inputs of each target."""
+TARGETS = load_targets()
+STORED_INPUTS = sorted(file for file in CASES.rglob("*") if file.is_file())
+INPUTS_PER_TARGET = 60
+"""Number of new inputs for each target."""
 
 
 @pytest.fixture(autouse=True)
-def _within_limits() -> Iterator[None]:
-    with limited():
+def _apply_limits() -> Iterator[None]:
+    with enforce_limits():
         yield
 
 
@@ -37,27 +37,31 @@ def test_every_reader_has_a_target() -> None:
     assert decoders | formats <= TARGETS.keys()
 
 
-@pytest.mark.parametrize("case", FOUND, ids=lambda case: f"{case.parent.name}-{case.name}")
-def test_what_was_found_is_mended(case: Path) -> None:
-    assert tried(TARGETS[case.parent.name], case.read_bytes()) is None
+@pytest.mark.parametrize("case", STORED_INPUTS, ids=lambda case: f"{case.parent.name}-{case.name}")
+def test_stored_input_causes_no_fault(case: Path) -> None:
+    assert try_input(TARGETS[case.parent.name], case.read_bytes()) is None
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_a_moment_of_each_target(name: str) -> None:
-    found = [one for data in inputs(TARGETS[name], A_MOMENT, seed=1) if (one := tried(TARGETS[name], data)) is not None]
+def test_random_inputs_cause_no_fault(name: str) -> None:
+    found = [
+        finding
+        for data in generate_inputs(TARGETS[name], INPUTS_PER_TARGET, seed=1)
+        if (finding := try_input(TARGETS[name], data)) is not None
+    ]
     assert not found, found[0]
 
 
-# --- the harness itself
+# --- the fuzzing code itself
 
 
-def finding(check: object) -> str:
-    found = tried(Target("made", check, tuple, 100), b"some")  # type: ignore[arg-type]
+def find_error_type(check: object) -> str:
+    found = try_input(Target("test", check, tuple, 100), b"some")  # type: ignore[arg-type]
     assert found is not None
-    return found.what.partition(":")[0]
+    return found.error.partition(":")[0]
 
 
-def test_an_exception_a_warning_and_an_assertion_are_findings() -> None:
+def test_exception_warning_and_failed_assertion_are_findings() -> None:
     import numpy as np
 
     def warns(data: bytes) -> None:
@@ -66,58 +70,58 @@ def test_an_exception_a_warning_and_an_assertion_are_findings() -> None:
     def asserts(data: bytes) -> None:
         assert not data
 
-    assert finding(lambda data: data[4]) == "IndexError"
-    assert finding(warns) == "RuntimeWarning"
-    assert finding(asserts) == "AssertionError"
+    assert find_error_type(lambda data: data[4]) == "IndexError"
+    assert find_error_type(warns) == "RuntimeWarning"
+    assert find_error_type(asserts) == "AssertionError"
 
 
-def test_what_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "SECONDS", 0.2)
+def test_endless_check_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "MAX_CPU_S", 0.2)
 
-    def for_ever(data: bytes) -> None:
+    def loop_forever(data: bytes) -> None:
         while True:
             pass
 
-    assert finding(for_ever) == "TooSlow"
+    assert find_error_type(loop_forever) == "TooSlow"
 
 
-def test_memory_that_is_only_claimed_and_memory_that_is_used() -> None:
-    kept = []
+def test_large_allocation_and_large_growth_are_findings() -> None:
+    buffers = []
 
     def claims(data: bytes) -> None:
-        kept.append(bytearray(40_000_000_000))
+        buffers.append(bytearray(40_000_000_000))
 
-    # what counts is the largest size so far, and earlier tests may have been large
-    spare = limits._resident() - psutil.Process().memory_info().rss
+    # the limit uses the largest memory so far, which earlier tests may have increased
+    spare = limits._peak_resident_bytes() - psutil.Process().memory_info().rss
 
     def uses(data: bytes) -> None:
-        kept.append(b"x" * (max(spare, 0) + limits.RESIDENT_BYTES + 50_000_000))
+        buffers.append(b"x" * (max(spare, 0) + limits.MAX_GROWTH_BYTES + 50_000_000))
 
-    assert finding(claims) == "MemoryError"
-    assert finding(uses) == "TooLarge"
-    kept.clear()
+    assert find_error_type(claims) == "MemoryError"
+    assert find_error_type(uses) == "TooLarge"
+    buffers.clear()
 
 
-def test_a_sample_of_a_frame_whose_check_fails_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sample_of_a_frame_with_wrong_checksum_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     from drivers.decoders import stim300, xsens_mtdata2
 
     monkeypatch.setattr(stim300, "has_valid_crc", lambda frame: True)
     monkeypatch.setattr(xsens_mtdata2, "sum", lambda data: 0, raising=False)
     for name in ("wire-stim300", "wire-xsens_mtdata2"):
-        found = [tried(TARGETS[name], data) for data in inputs(TARGETS[name], 300, seed=1)]
-        assert any(one is not None and "no valid frame" in one.what for one in found), name
+        found = [try_input(TARGETS[name], data) for data in generate_inputs(TARGETS[name], 300, seed=1)]
+        assert any(finding is not None and "no valid frame" in finding.error for finding in found), name
 
 
-def test_another_cut_that_gives_other_samples_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_that_depend_on_the_chunks_are_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     feed = FrameBuffer.feed
 
-    def forgetful(self: FrameBuffer, chunks: Sequence[Chunk]) -> Frames:
+    def feed_and_drop_buffer(self: FrameBuffer, chunks: Sequence[Chunk]) -> Frames:
         frames = feed(self, chunks)
         self._buffer_offset += len(self._buffer)
         self._buffer = b""
         return frames
 
-    monkeypatch.setattr(FrameBuffer, "feed", forgetful)
+    monkeypatch.setattr(FrameBuffer, "feed", feed_and_drop_buffer)
     name = "decoder-witmotion"
-    found = [tried(TARGETS[name], data) for data in inputs(TARGETS[name], 100, seed=1)]
-    assert any(one is not None and "cut" in one.what for one in found)
+    found = [try_input(TARGETS[name], data) for data in generate_inputs(TARGETS[name], 100, seed=1)]
+    assert any(finding is not None and "how the bytes are divided" in finding.error for finding in found)

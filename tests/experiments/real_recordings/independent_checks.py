@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from scipy import signal, stats
 
 Floats = NDArray[np.float64]
+MAX_KNOCK_DEVIATIONS: Final = 6.0
+"""Largest deviation of a sample in the check of a leak, in robust standard deviations."""
+MIN_SEGMENTS: Final = 16
+"""Smallest number of segments of a coherence."""
 MIN_Z: Final = 4.5
 """Smallest number of standard deviations of a confirmed finding."""
 
@@ -257,8 +261,21 @@ def _check_temperature(recording: CheckedRecording, axis: str, p: Parameters) ->
 
 
 def _check_leak(recording: CheckedRecording, axis: str, source: str, coefficient: float) -> Check:
-    """Compare the regression coefficients of eight frequency bands."""
-    x, y = (np.fft.rfft(signal.detrend(recording.values[name])) for name in (source, axis))
+    """Compare the regression coefficients of eight frequency bands.
+
+    Knocks move both axes in any direction and can outweigh all other samples of a regression. Samples beyond
+    ``MAX_KNOCK_DEVIATIONS`` robust standard deviations on one of the axes are therefore interpolated on both axes.
+    """
+    both = [signal.detrend(recording.values[name]) for name in (source, axis)]
+    spreads = [max(1.4826 * float(np.median(np.abs(one - np.median(one)))), 0.1 * float(one.std())) for one in both]
+    quiet = np.logical_and(
+        *(
+            np.abs(one - np.median(one)) <= MAX_KNOCK_DEVIATIONS * spread
+            for one, spread in zip(both, spreads, strict=True)
+        )
+    )
+    at = np.arange(quiet.size)
+    x, y = (np.fft.rfft(np.interp(at, at[quiet], one[quiet])) for one in both)
     edges = np.linspace(1, x.size, 9).astype(int)
     bands, errors = [], []
     for first, last in pairwise(edges.tolist()):
@@ -280,18 +297,35 @@ def _check_leak(recording: CheckedRecording, axis: str, source: str, coefficient
 
 
 def _check_common_vibration(recording: CheckedRecording, axis: str, p: Parameters) -> Check:
-    """Test the coherence with the other axes, which does not depend on the sign and the phase of a vibration."""
-    if "frequency" in p:
-        return _check_peak(recording, axis, p)
-    best, size = 0.0, int(min(recording.values[axis].size // 64, 4096))
-    for other in recording.values:
-        if other != axis:
-            f_hz, coherence = signal.coherence(
-                recording.values[axis], recording.values[other], recording.rate_hz, nperseg=size
-            )
-            best = max(best, float(coherence[(f_hz > 0.0) & (f_hz <= p["bandwidth"])].mean()))
-    chance = size / recording.values[axis].size
-    return Check(best > 5.0 * chance, f"coherence {best:.3f} with another axis, {chance:.3f} by chance")
+    """Test the coherence with the other axes, which does not depend on the sign and the phase of a vibration.
+
+    The strength of the peak on one axis is no evidence that several axes share a vibration: a strong vibration of one
+    axis can be a small part of the noise of another axis. For K independent segments without a common source, the
+    coherence C of one frequency has the probability P(C > c) = (1 − c)^(K − 1) (Carter, Knapp & Nuttall, "Estimation of
+    the magnitude-squared coherence function via overlapped fast Fourier transform processing", IEEE Trans. Audio
+    Electroacoust. 21, 1973). The sum of −(K − 1) ln(1 − C) over m independent frequencies then has a gamma
+    distribution. A Hann window makes neighbouring frequencies dependent, so only every second frequency is used. The
+    band of the vibration is compared with all other axes, and the probability is multiplied by the number of axes.
+    """
+    x, rate_hz = recording.values[axis], recording.rate_hz
+    middle_hz, width_hz = p.get("frequency", 0.0), p["bandwidth"]
+    reach_hz = 0.5 * width_hz if "frequency" in p else width_hz
+    size = int(np.clip(4.0 * rate_hz / width_hz, 128, x.size // MIN_SEGMENTS))
+    segments = x.size // size
+    best_sum, best_mean, count = 0.0, 0.0, 1
+    others = [other for other in recording.values if other != axis]
+    for other in others:
+        f_hz, coherence = signal.coherence(x, recording.values[other], rate_hz, nperseg=size, noverlap=0)
+        inside = np.abs(f_hz - middle_hz) <= max(reach_hz, f_hz[1])
+        used = np.minimum(coherence[1:-1][inside[1:-1]][::2], 1.0 - 1e-12)
+        total = float(-(segments - 1.0) * np.log1p(-used).sum())
+        if total > best_sum:
+            best_sum, best_mean, count = total, float(used.mean()), used.size
+    probability = min(1.0, len(others) * float(stats.gamma.sf(best_sum, count)))
+    return Check(
+        probability < 1e-5,
+        f"coherence {best_mean:.3f} with another axis in {segments} segments, probability {probability:.1g} by chance",
+    )
 
 
 def _check_transient(recording: CheckedRecording, axis: str, p: Parameters) -> Check:

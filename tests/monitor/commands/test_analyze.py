@@ -1,4 +1,4 @@
-"""A recording through all that ``analyze`` can make of it, and what is made only on demand."""
+"""Tests of the analysis behind ``analyze``: which results are computed by default and which on request."""
 
 import json
 from pathlib import Path
@@ -15,14 +15,18 @@ from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing import exporters
 from monitor.publishing.messages.analysis_json import AnalysisMessage
 from monitor.publishing.terminal.thermal_output import notes_on_hysteresis
-from tests.monitor.drift.cycles import cycle, loop, opening
+from tests.monitor.drift.temperature_cycles import (
+    compute_hysteresis_bias,
+    compute_hysteresis_width,
+    make_temperature_cycle,
+)
 
 RATE_HZ = 100.0
 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """Two minutes of white noise; gx becomes noisier in the middle."""
+    """Write two minutes of white noise in which gx becomes noisier in the middle."""
     path = tmp_path / "x.npz"
     values = 1e-3 * np.random.default_rng(2).standard_normal((24_000, 6))
     values[15_000:, 0] *= 2.0
@@ -30,20 +34,20 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
-def test_only_what_is_wanted_is_made(recording: Path) -> None:
+def test_optional_results_are_computed_only_on_request(recording: Path) -> None:
     results = run_analysis(AnalysisRequest(recording))
     assert results.total is results.hadamard is results.dynamic is results.without_temperature is None
     assert results.lacking == ""
-    [change] = results.analysis.changes  # told in the notes, so always looked for
+    [change] = results.analysis.changes  # always detected because the notes mention it
     assert (change.axis, change.since) == (0, pytest.approx(15_000, abs=50))
 
 
 @pytest.mark.long
-def test_all_of_it(recording: Path) -> None:
-    told: list[tuple[str, float | None]] = []
+def test_requested_results_are_all_computed(recording: Path) -> None:
+    progress: list[tuple[str, float | None]] = []
     results = run_analysis(
         AnalysisRequest(recording, window_s=30.0, total_and_hadamard=True),
-        lambda what, share: told.append((what, share)),
+        lambda what, share: progress.append((what, share)),
     )
     assert results.total is not None
     assert results.hadamard is not None
@@ -52,24 +56,24 @@ def test_all_of_it(recording: Path) -> None:
     assert results.hadamard.tau_s[-1] == 40.96
     n = results.dynamic.value[:, 1, 0]
     assert n[-1] / n[0] == pytest.approx(2.0, rel=0.05)
-    assert [what for what, share in told if share is None] == [
+    assert [what for what, share in progress if share is None] == [
         "reading", "curve and fit", "motion and changes, total and Hadamard deviations"
     ]  # fmt: skip
-    shares = [share for what, share in told if what == "dynamic curves"]
+    shares = [share for what, share in progress if what == "dynamic curves"]
     assert shares == sorted(shares)  # type: ignore[type-var]
     assert shares[-1] == 1.0
 
 
 @pytest.mark.long
-def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
+def test_temperature_dependent_drift_is_reported(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     t = np.arange(43_200) / 2.0
-    warmth = 25.0 + 2.0 * np.sin(2.0 * np.pi * t / 7200.0) + 1.5 * np.sin(2.0 * np.pi * t / 3100.0)
+    temperature_c = 25.0 + 2.0 * np.sin(2.0 * np.pi * t / 7200.0) + 1.5 * np.sin(2.0 * np.pi * t / 3100.0)
     values = 1e-4 * rng.standard_normal((t.size, 6))
-    values[:, 2] += 3e-5 * (warmth - 25.0)
-    save_samples(tmp_path / "warm.npz", t, values, warmth)
+    values[:, 2] += 3e-5 * (temperature_c - 25.0)
+    save_samples(tmp_path / "warm.npz", t, values, temperature_c)
     results = run_analysis(AnalysisRequest(tmp_path / "warm.npz"))
-    (note,) = (one for one in results.analysis.notes if "follows its temperature" in one)
+    (note,) = (note for note in results.analysis.notes if "follows its temperature" in note)
     assert note.startswith("gz follows its temperature")
     written = json.loads(
         AnalysisMessage.from_analysis(results.analysis, temperature=results.without_temperature).encode()
@@ -84,12 +88,12 @@ def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", ["ramp", "sine", "steps", "heating"])
-def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k(tmp_path: Path, shape: str) -> None:
-    """gy is a cubic in temperature over 3 °/s, gz linear, gx and ax walk by themselves, az has a loop."""
+def test_temperature_dependent_axes_are_named_whatever_the_status_of_k(tmp_path: Path, shape: str) -> None:
+    """gy is cubic and gz linear in temperature, gx and ax have a random walk, and az has hysteresis."""
     rate_hz, seconds = 5.0, 9000.0
     n = round(rate_hz * seconds)
     rng = np.random.default_rng(6)
-    temperature_c = cycle(shape, n)
+    temperature_c = make_temperature_cycle(shape, n)
     x = (temperature_c + 18.0) / 92.0
     values = np.array([2e-4, 2e-4, 2e-4, 2e-3, 2e-3, 2e-3]) * rng.standard_normal((n, 6))
     values[:, 0] += 3e-6 / rate_hz**0.5 * rng.standard_normal(n).cumsum()
@@ -99,23 +103,28 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
     values[:, 2] += np.radians(0.5) * x
     values[:, 5] += 9.8 + 0.05 * x
     if shape != "heating":
-        values[:, 5] += 12.0 * MILLI_G * loop("loop", x) / opening(loop("loop", x), x)
+        values[:, 5] += (
+            12.0
+            * MILLI_G
+            * compute_hysteresis_bias("loop", x)
+            / compute_hysteresis_width(compute_hysteresis_bias("loop", x), x)
+        )
     path = tmp_path / "chamber.npz"
     save_samples(path, np.arange(n) / rate_hz, values, temperature_c)
     results = run_analysis(AnalysisRequest(path))
     assert results.analysis.axes_of_temperature == ("gy", "gz", "az")
-    named = [one.split()[0] for one in results.analysis.notes if "follows its temperature" in one]
+    named = [note.split()[0] for note in results.analysis.notes if "follows its temperature" in note]
     assert named == ["gy", "gz", "az"]
-    if shape == "ramp":  # the case in which nothing was said of gy
+    if shape == "ramp":  # K of gy is not estimated, but the note is still needed
         assert results.analysis.estimate.coefficients.status[SYMBOLS.index("K"), 1] != Status.ESTIMATED
     written = AnalysisMessage.from_analysis(results.analysis, temperature=results.without_temperature).encode()
-    marks = {axis: one.get("temperature") for axis, one in json.loads(written)["axes"].items()}
-    assert [axis for axis, one in marks.items() if one] == ["gy", "gz", "az"]
+    marks = {axis: entry.get("temperature") for axis, entry in json.loads(written)["axes"].items()}
+    assert [axis for axis, entry in marks.items() if entry] == ["gy", "gz", "az"]
     assert set(marks["gy"]) == {"share", "p_value", "form", "one_way", "interval"}
     assert marks["gy"]["share"] > 0.95
     assert marks["gy"]["one_way"] == (shape == "heating")
     warnings = exporters.from_analysis_json(written).warnings
-    assert [one.split()[0] for one in warnings] == ["gy", "gz", "az"]
+    assert [warning.split()[0] for warning in warnings] == ["gy", "gz", "az"]
     study = thermal.fit_thermal_models(path)
     if shape != "heating":
         assert study.fits["az"].hysteresis == pytest.approx(12.0 * MILLI_G, rel=0.15)
@@ -136,7 +145,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
 
 
 @pytest.mark.long
-def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recording: Path) -> None:
+def test_listed_tau_are_used_for_every_curve_that_supports_them(recording: Path) -> None:
     listed = (0.1, 0.2, 0.5, 1.0, 2.0, 100.0)
     results = run_analysis(AnalysisRequest(recording, tau=listed, total_and_hadamard=True))
     assert results.total is not None
@@ -146,21 +155,21 @@ def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recordi
     assert run_analysis(AnalysisRequest(recording, tau=(100.0,), total_and_hadamard=True)).hadamard is None
 
 
-def test_a_window_longer_than_the_recording_leaves_the_rest(recording: Path) -> None:
+def test_window_longer_than_the_recording_omits_only_dynamic_curves(recording: Path) -> None:
     results = run_analysis(AnalysisRequest(recording, window_s=1000.0))
     assert results.dynamic is None
     assert results.lacking == "no dynamic curves: 240 s are recorded, less than the window of 1000 s"
     assert results.analysis.notes[-1] == results.lacking
 
 
-def test_too_short_says_how_short(tmp_path: Path) -> None:
+def test_too_short_recording_reports_its_number_of_samples(tmp_path: Path) -> None:
     save_samples(tmp_path / "x.npz", np.arange(20) / RATE_HZ, np.zeros((20, 6)))
     with pytest.raises(TooFewSamples, match="20 samples; at least 50") as raised:
         run_analysis(AnalysisRequest(tmp_path / "x.npz"))
     assert raised.value.samples == 20
 
 
-def test_what_is_wrong_is_said(tmp_path: Path, recording: Path) -> None:
+def test_invalid_requests_raise_an_error(tmp_path: Path, recording: Path) -> None:
     with pytest.raises(RecordingError):
         run_analysis(AnalysisRequest(tmp_path / "nowhere.csv"))
     with pytest.raises(ConfigError, match="window of 0"):
@@ -169,7 +178,7 @@ def test_what_is_wrong_is_said(tmp_path: Path, recording: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "start"), [("x.png", b"\x89PNG"), ("x.html", b"<!DOCTYPE html>")])
-def test_a_drawing_has_the_changes_marked(recording: Path, name: str, start: bytes) -> None:
+def test_plot_marks_the_changes(recording: Path, name: str, start: bytes) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
     results = run_analysis(AnalysisRequest(recording, window_s=30.0, total_and_hadamard=True))
@@ -182,7 +191,7 @@ def test_a_drawing_has_the_changes_marked(recording: Path, name: str, start: byt
         assert ">change</text>" in page  # the mark in the drawing
 
 
-def test_an_analysis_beyond_the_memory_is_one_line(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_analysis_is_a_config_error(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_args: object) -> None:
         raise MemoryError
 

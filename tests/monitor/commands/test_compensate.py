@@ -1,4 +1,4 @@
-"""``compensate`` as a user runs it: files in; a recording, a table, JSON, a picture or one clear line out."""
+"""Tests of the command ``compensate``, from the input file to the recording, the JSON, the plot or the error."""
 
 import json
 from pathlib import Path
@@ -13,8 +13,8 @@ RATE_HZ = 100.0
 SIGMA = 1e-3
 
 
-def write(path: Path, seconds: float = 300.0, turn: float = 0.0, **more: np.ndarray) -> Path:
-    """Two gyro axes and an accelerometer; gz turns in the middle."""
+def write_recording(path: Path, seconds: float = 300.0, turn: float = 0.0, **more: np.ndarray) -> Path:
+    """Write two gyro axes and an accelerometer axis; gz turns in the middle."""
     rng = np.random.default_rng(0)
     n = round(seconds * RATE_HZ)
     gz = 0.01 + SIGMA * rng.standard_normal(n)
@@ -26,10 +26,10 @@ def write(path: Path, seconds: float = 300.0, turn: float = 0.0, **more: np.ndar
 
 
 @pytest.mark.long
-def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
-    recording, out = write(tmp_path / "a.npz", turn=0.5), tmp_path / "out.csv"
-    plot, told = tmp_path / "a.png", tmp_path / "a.json"
-    assert exit_status("compensate", recording, "--out", out, "--json", told, "--plot", plot) == 0
+def test_compensated_recording_has_no_drift(tmp_path, capsys):
+    recording, out = write_recording(tmp_path / "a.npz", turn=0.5), tmp_path / "out.csv"
+    plot, summary = tmp_path / "a.png", tmp_path / "a.json"
+    assert exit_status("compensate", recording, "--out", out, "--json", summary, "--plot", plot) == 0
     text = capsys.readouterr().out
     assert "adaptive; evaluated on" in text
     assert "→" in text
@@ -37,10 +37,10 @@ def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
     assert after.axes == ("gx", "gz", "az")
     np.testing.assert_allclose(after.t_s, before.t_s, atol=1e-9)
     np.testing.assert_array_equal(after.values[:, 5], before.values[:, 5])
-    still = after.values[4000:14_000, 2]
-    assert np.sqrt(np.mean(still**2)) < 0.3 * SIGMA
+    at_rest = after.values[4000:14_000, 2]
+    assert np.sqrt(np.mean(at_rest**2)) < 0.3 * SIGMA
     assert after.values[15_010:15_490, 2].mean() == pytest.approx(0.5, abs=2e-4)
-    found = json.loads(told.read_bytes())
+    found = json.loads(summary.read_bytes())
     assert found["schema"] == "imu-monitor/compensate/1"
     assert found["method"] == "adaptive"
     gz = found["axes"]["gz"]
@@ -53,18 +53,18 @@ def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["fixed", "ar", "emd", "wavelet"])
-def test_every_method_is_judged_on_the_same_stretch(tmp_path, capsys, method):
-    recording, out = write(tmp_path / "a.npz"), tmp_path / "out.npz"
+def test_methods_are_evaluated_on_the_same_part(tmp_path, capsys, method):
+    recording, out = write_recording(tmp_path / "a.npz"), tmp_path / "out.npz"
     assert exit_status("compensate", recording, "--out", out, "--method", method, "--json", "-") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["judged"] == pytest.approx(2.0 * found["learned"], rel=0.05)
-    for one in found["axes"].values():
-        assert one["after"]["deviation"] < 0.8 * one["before"]["deviation"]
+    for axis in found["axes"].values():
+        assert axis["after"]["deviation"] < 0.8 * axis["before"]["deviation"]
 
 
 @pytest.mark.long
-def test_the_order_can_be_given(tmp_path, capsys):
-    recording = write(tmp_path / "a.npz")
+def test_order_option_sets_the_order_of_the_model(tmp_path, capsys):
+    recording = write_recording(tmp_path / "a.npz")
     assert exit_status("compensate", recording, "--out", tmp_path / "out.npz", "--order", "2,1", "--json", "-") == 0
     model = json.loads(capsys.readouterr().out)["axes"]["gz"]["model"]
     assert model["order"] == [2, 1]
@@ -72,8 +72,8 @@ def test_the_order_can_be_given(tmp_path, capsys):
         assert model[name]["lo"] <= model[name]["value"] <= model[name]["hi"]
 
 
-def test_missing_samples_stay_missing_and_temperature_stays(tmp_path):
-    recording = write(tmp_path / "a.npz", temp=np.full(30_000, 25.0))
+def test_missing_samples_and_temperature_are_preserved(tmp_path):
+    recording = write_recording(tmp_path / "a.npz", temp=np.full(30_000, 25.0))
     with np.load(recording) as whole:
         kept = {name: np.delete(whole[name], np.s_[20_000:20_050]) for name in whole}
     np.savez(recording, **kept)
@@ -84,12 +84,12 @@ def test_missing_samples_stay_missing_and_temperature_stays(tmp_path):
     assert (found.temperature_c == 25.0).all()
 
 
-def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys):
-    recording, out = write(tmp_path / "a.npz", seconds=60.0), tmp_path / "out.npz"
+def test_invalid_request_is_reported_in_one_line_and_nothing_is_written(tmp_path, capsys):
+    recording, out = write_recording(tmp_path / "a.npz", seconds=60.0), tmp_path / "out.npz"
     np.savez(tmp_path / "b.npz", fs=RATE_HZ, az=np.random.default_rng(0).standard_normal(1000))
     moving = 0.5 * np.sin(np.arange(6000) / 20.0)
     np.savez(tmp_path / "c.npz", fs=RATE_HZ, gz=moving)
-    for arguments, status, said in (
+    for arguments, status, message in (
         ([recording, "--method", "adaptve"], 2, 'did you mean "adaptive"?'),
         ([recording, "--order", "3,1"], 2, "possible are 0,0 1,0 1,1 2,0 2,1"),
         ([tmp_path / "none.npz"], 2, "none.npz"),
@@ -101,7 +101,7 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys):
     ):
         assert exit_status("compensate", *arguments, "--out", out) == status
         err = capsys.readouterr().err
-        assert said in err
+        assert message in err
         assert err.count("\n") == 1
         assert not out.exists()
     assert exit_status("compensate", recording, "--out", recording) == 2

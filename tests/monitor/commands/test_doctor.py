@@ -1,4 +1,4 @@
-"""What is wrong with a machine or a configuration is found before the service is left alone with them."""
+"""Tests of the command ``doctor``, which examines the machine and the configuration."""
 
 import json
 import os
@@ -42,77 +42,79 @@ DEVICE = '[[device]]\nname = "a"\nrate = 100.0\ndriver = {{ {} }}\n'
 VIRTUAL = DEVICE.format('link = "virtual"')
 
 
-def examined(folder: Path, text: str, mode: int = 0o600) -> list[Finding]:
+def examine_config(folder: Path, text: str, mode: int = 0o600) -> list[Finding]:
     path = folder / "c.toml"
     path.write_text(text)
     path.chmod(mode)
     return examine_machine(path)
 
 
-def of(findings: list[Finding], about: str) -> list[Finding]:
-    return [one for one in findings if one.about == about]
+def select_findings(findings: list[Finding], about: str) -> list[Finding]:
+    return [finding for finding in findings if finding.about == about]
 
 
-def one_of(findings: list[Finding], about: str) -> Finding:
-    (found,) = of(findings, about)
+def require_one_finding(findings: list[Finding], about: str) -> Finding:
+    (found,) = select_findings(findings, about)
     return found
 
 
 # --- the configuration
 
 
-def test_all_that_is_wrong_with_the_file_is_found(tmp_path: Path) -> None:
-    found = of(examined(tmp_path, VIRTUAL + "windw = 1.0\n" + '[log]\nlevel = "loud"\n'), "configuration")
-    assert [one.mark for one in found] == ["wrong", "wrong"]
+def test_every_mistake_in_the_configuration_is_found(tmp_path: Path) -> None:
+    found = select_findings(
+        examine_config(tmp_path, VIRTUAL + "windw = 1.0\n" + '[log]\nlevel = "loud"\n'), "configuration"
+    )
+    assert [finding.mark for finding in found] == ["wrong", "wrong"]
     assert "windw" in found[0].text
     assert "log.level" in found[1].text
 
 
-def test_a_limit_that_its_model_cannot_bear_is_found(tmp_path: Path) -> None:
+def test_limit_without_the_term_in_the_model_is_found(tmp_path: Path) -> None:
     limit = '[[device.limit]]\naxes = "gz"\nletter = "R"\ntimes_model = 2.0\n'
     text = '[[device]]\nname = "a"\nmodel = "consumer-mems"\n' + limit + '[device.driver]\nlink = "virtual"\n' + QUIET
-    found = one_of(examined(tmp_path, text), "configuration")
+    found = require_one_finding(examine_config(tmp_path, text), "configuration")
     assert found.mark == "wrong"
     assert "has no R on gz" in found.text
 
 
-def test_a_file_that_is_not_there_is_wrong_and_the_machine_is_looked_at_still(tmp_path: Path) -> None:
+def test_machine_is_examined_even_if_the_configuration_is_missing(tmp_path: Path) -> None:
     found = examine_machine(tmp_path / "none.toml")
-    assert "no such file" in one_of(found, "configuration").text
-    assert of(found, "clock")
+    assert "no such file" in require_one_finding(found, "configuration").text
+    assert select_findings(found, "clock")
     assert worst_mark(found) == "wrong"
 
 
 @pytest.mark.parametrize(
-    ("mode", "mark", "words"),
+    ("mode", "mark", "text"),
     [(0o600, "well", "0600"), (0o644, "well", "0644"), (0o664, "doubt", "chmod g-w"), (0o666, "wrong", "chmod o-w")],
 )
-def test_who_may_write_the_file_may_do_as_the_service(tmp_path: Path, mode: int, mark: str, words: str) -> None:
-    found = one_of(examined(tmp_path, VIRTUAL + QUIET, mode), "permissions")
+def test_permissions_of_the_configuration_are_examined(tmp_path: Path, mode: int, mark: str, text: str) -> None:
+    found = require_one_finding(examine_config(tmp_path, VIRTUAL + QUIET, mode), "permissions")
     assert found.mark == mark
-    assert words in found.text + found.do
+    assert text in found.text + found.do
 
 
-def test_a_password_that_everyone_may_read_is_found_and_not_said(tmp_path: Path) -> None:
+def test_password_readable_by_everyone_is_found_and_not_printed(tmp_path: Path) -> None:
     secrets = tmp_path / "zenoh.json5"
     secrets.write_text('{transport: {auth: {usrpwd: {user: "imu", password: "hunter2"}}}}')
     text = VIRTUAL + f'[zenoh]\nconfig = "{secrets}"\n[viewer]\nmode = "none"\n'
     secrets.chmod(0o644)
-    found = one_of(examined(tmp_path, text), "zenoh file")
+    found = require_one_finding(examine_config(tmp_path, text), "zenoh file")
     assert found.mark == "wrong"
     assert "hunter2" not in found.text + found.do
     secrets.chmod(0o640)
-    assert one_of(examined(tmp_path, text), "zenoh file").mark == "well"
+    assert require_one_finding(examine_config(tmp_path, text), "zenoh file").mark == "well"
 
 
-def test_a_hook_that_everyone_may_write_is_found(tmp_path: Path) -> None:
-    tell = tmp_path / "tell"
-    tell.write_text("#!/bin/sh\n")
+def test_hook_writable_by_everyone_is_found(tmp_path: Path) -> None:
+    hook = tmp_path / "tell"
+    hook.write_text("#!/bin/sh\n")
     text = VIRTUAL + QUIET + '[[hook]]\non = ["*"]\ncommand = ["./tell"]\n'
-    tell.chmod(0o755)
-    assert one_of(examined(tmp_path, text), "hook tell").mark == "well"
-    tell.chmod(0o777)
-    assert one_of(examined(tmp_path, text), "hook tell").mark == "wrong"
+    hook.chmod(0o755)
+    assert require_one_finding(examine_config(tmp_path, text), "hook tell").mark == "well"
+    hook.chmod(0o777)
+    assert require_one_finding(examine_config(tmp_path, text), "hook tell").mark == "wrong"
 
 
 # --- devices
@@ -128,13 +130,13 @@ def port() -> Iterator[str]:
     os.close(master)
 
 
-def serial(folder: Path, port: str) -> Finding:
+def examine_serial_port(folder: Path, port: str) -> Finding:
     driver = f'link = "serial", port = "{port}", decoder = "stim300"'
-    return one_of(examined(folder, DEVICE.format(driver) + QUIET), "device a")
+    return require_one_finding(examine_config(folder, DEVICE.format(driver) + QUIET), "device a")
 
 
-def test_a_port_that_is_there_and_free_is_well_and_one_that_is_held_is_told(tmp_path: Path, port: str) -> None:
-    assert serial(tmp_path, port).mark == "well"
+def test_free_port_is_fine_and_used_port_names_the_process(tmp_path: Path, port: str) -> None:
+    assert examine_serial_port(tmp_path, port).mark == "well"
     if not Path("/proc/self/fd").is_dir():
         pytest.skip("needs /proc")
     wait = "import sys; f = open(sys.argv[1], 'rb', 0); print('open', flush=True); sys.stdin.read()"
@@ -142,51 +144,51 @@ def test_a_port_that_is_there_and_free_is_well_and_one_that_is_held_is_told(tmp_
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         holder.stdout.readline()
-        found = serial(tmp_path, port)
+        found = examine_serial_port(tmp_path, port)
         holder.communicate()
     assert found.mark == "doubt"
     assert f"(pid {holder.pid})" in found.text
 
 
-def test_a_port_that_is_missing_or_none_is_wrong(tmp_path: Path) -> None:
-    missing = serial(tmp_path, "/dev/ttyUSB987")
+def test_missing_port_or_other_file_is_wrong(tmp_path: Path) -> None:
+    missing = examine_serial_port(tmp_path, "/dev/ttyUSB987")
     assert (missing.mark, "no such port" in missing.text) == ("wrong", True)
     (tmp_path / "file").touch()
-    assert serial(tmp_path, str(tmp_path / "file")).text.endswith("not a serial port")
-    assert serial(tmp_path, "socket://127.0.0.1:1").mark == "well"
+    assert examine_serial_port(tmp_path, str(tmp_path / "file")).text.endswith("not a serial port")
+    assert examine_serial_port(tmp_path, "socket://127.0.0.1:1").mark == "well"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="nothing is forbidden to root")
-def test_a_port_that_may_not_be_read_says_which_group_may(tmp_path: Path, port: str) -> None:
+def test_unreadable_port_names_the_group_to_join(tmp_path: Path, port: str) -> None:
     os.chmod(port, 0)
-    found = serial(tmp_path, port)
+    found = examine_serial_port(tmp_path, port)
     assert found.mark == "wrong"
     assert found.do.startswith("sudo usermod -aG ")
     assert pwd.getpwuid(os.geteuid()).pw_name in found.do
 
 
 @pytest.mark.skipif(not hasattr(socket, "AF_CAN"), reason="no socketcan here")
-def test_a_bus_is_there_and_up_or_what_to_do_is_said(tmp_path: Path) -> None:
-    def interface(name: str, kind: str, flags: str) -> None:
+def test_can_interface_must_exist_and_be_up(tmp_path: Path) -> None:
+    def write_interface(name: str, kind: str, flags: str) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(f"{kind}\n")
         (tmp_path / name / "flags").write_text(f"{flags}\n")
 
-    interface("can0", "280", "0x40081")
-    interface("can1", "280", "0x40080")
-    interface("eth0", "1", "0x1003")
+    write_interface("can0", "280", "0x40081")
+    write_interface("can1", "280", "0x40080")
+    write_interface("eth0", "1", "0x1003")
 
-    def said(name: str) -> tuple[str, str]:
+    def check_interface(name: str) -> tuple[str, str]:
         found = doctor.check_can_interface("device a", "socketcan", name, tmp_path)
         return found.mark, found.text
 
-    assert said("can0") == ("well", "can0: is up")
-    assert said("can1") == ("wrong", "can1: is down")
-    assert said("eth0") == ("wrong", "eth0: not a CAN interface")
-    assert said("can7") == ("wrong", "can7: no such interface; existing CAN interfaces: can0, can1")
+    assert check_interface("can0") == ("well", "can0: is up")
+    assert check_interface("can1") == ("wrong", "can1: is down")
+    assert check_interface("eth0") == ("wrong", "eth0: not a CAN interface")
+    assert check_interface("can7") == ("wrong", "can7: no such interface; existing CAN interfaces: can0, can1")
 
 
-def test_a_package_that_the_interface_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_of_a_can_interface_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "msgpack", None)  # as if it were not installed
     found = doctor.check_can_interface("device a", "udp_multicast", "239.74.163.2")
     assert (found.mark, found.text) == ("wrong", "CAN interface udp_multicast needs the package msgpack")
@@ -196,7 +198,7 @@ def test_a_package_that_the_interface_lacks_is_named(monkeypatch: pytest.MonkeyP
 # --- outputs
 
 
-def test_ports_that_are_taken_and_routers_that_do_not_answer_are_told(tmp_path: Path) -> None:
+def test_used_ports_and_silent_routers_are_found(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken, socket.create_server(("127.0.0.1", 0)) as free:
         busy, idle = taken.getsockname()[1], free.getsockname()[1]
         free.close()
@@ -206,61 +208,69 @@ def test_ports_that_are_taken_and_routers_that_do_not_answer_are_told(tmp_path: 
             + f'connect = ["tcp/127.0.0.1:{busy}", "tcp/127.0.0.1:{idle}"]\n'
             + f'[viewer]\nmode = "none"\n[metrics]\nlisten = "127.0.0.1:{busy}"\n'
         )
-        found = examined(tmp_path, text)
-    assert [(one.mark, one.text.partition(": ")[2].partition(":")[0]) for one in of(found, "zenoh")] == [
+        found = examine_config(tmp_path, text)
+    assert [
+        (finding.mark, finding.text.partition(": ")[2].partition(":")[0]) for finding in select_findings(found, "zenoh")
+    ] == [
         ("doubt", "another program listens there"),
         ("well", "answers"),
         ("doubt", "no answer"),
     ]
-    assert one_of(found, "metrics").mark == "doubt"
+    assert require_one_finding(found, "metrics").mark == "doubt"
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:99999", f"tcp/{'a' * 70}.example:1", "tcp/192.0.2.1:7447"])
-def test_an_address_that_cannot_be_listened_on_is_wrong(endpoint: str) -> None:
+def test_address_that_cannot_be_bound_is_wrong(endpoint: str) -> None:
     found = doctor.check_port_free("zenoh", endpoint)
     assert found.mark == "wrong"
     assert found.text.startswith(f"{endpoint}: cannot listen: ")
 
 
-def test_what_listens_beyond_this_machine_without_protection_is_told(tmp_path: Path) -> None:
+def test_unprotected_listening_beyond_this_machine_is_found(tmp_path: Path) -> None:
     text = (
         VIRTUAL + '[zenoh]\nlisten = ["tcp/0.0.0.0:0"]\n[viewer]\nmode = "none"\n[metrics]\nlisten = "0.0.0.0:9464"\n'
     )
-    found = examined(tmp_path, text)
-    assert "everyone who reaches this machine can read all data and send commands" in str(of(found, "zenoh"))
-    assert "everyone who reaches this machine can read the metrics" in str(of(found, "metrics"))
+    found = examine_config(tmp_path, text)
+    assert "everyone who reaches this machine can read all data and send commands" in str(
+        select_findings(found, "zenoh")
+    )
+    assert "everyone who reaches this machine can read the metrics" in str(select_findings(found, "metrics"))
 
 
-def test_the_folder_of_recordings_is_tried_and_left_as_it_was(tmp_path: Path) -> None:
+def test_storage_folder_is_tested_and_left_unchanged(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
-    found = one_of(examined(tmp_path, VIRTUAL + QUIET + '[storage]\nfolder = "kept/here"\n'), "storage")
+    found = require_one_finding(
+        examine_config(tmp_path, VIRTUAL + QUIET + '[storage]\nfolder = "kept/here"\n'), "storage"
+    )
     assert found.mark in ("well", "doubt")
     assert "about 0.302 GB per day" in found.text
     assert not (tmp_path / "kept").exists()
     (tmp_path / "file").touch()
-    found = one_of(examined(tmp_path, VIRTUAL + QUIET + '[storage]\nfolder = "file/here"\n'), "storage")
+    found = require_one_finding(
+        examine_config(tmp_path, VIRTUAL + QUIET + '[storage]\nfolder = "file/here"\n'), "storage"
+    )
     assert (found.mark, "cannot be written" in found.text) == ("wrong", True)
 
 
-def test_a_rate_that_is_not_configured_leaves_the_disk_unjudged(tmp_path: Path) -> None:
+def test_unknown_rate_gives_unknown_disk_use(tmp_path: Path) -> None:
     text = VIRTUAL.replace("rate = 100.0\n", "") + QUIET + '[storage]\nfolder = "kept"\n'
-    found = examined(tmp_path, text)
-    assert "disk use per day unknown" in str(of(found, "storage"))
+    found = examine_config(tmp_path, text)
+    assert "disk use per day unknown" in str(select_findings(found, "storage"))
     config = loading.load_config(tmp_path / "c.toml")
     assert recorded_bytes_per_day(config) is None
 
 
-def test_room_is_judged_by_days(tmp_path: Path) -> None:
+def test_disk_space_is_rated_by_the_days_it_lasts(tmp_path: Path) -> None:
     own = Storage(folder=tmp_path, keep_s=30 * 86400.0, disk_share=0.9)
     marks = [
         check_disk_space(own, 1e9, 100_000_000_000, free) for free in (90_000_000_000, 25_000_000_000, 10_500_000_000)
     ]
-    assert [one.mark for one in marks] == ["well", "doubt", "wrong"]
+    assert [finding.mark for finding in marks] == ["well", "doubt", "wrong"]
     assert "the oldest data will be deleted after about 15 days" in marks[1].text
 
 
-def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
-    """Ten minutes of noise that fills a 32-bit float, packed as the daemon does it."""
+def test_sample_size_estimate_agrees_with_a_packed_segment(tmp_path: Path) -> None:
+    """Pack ten minutes of noise that uses all bits of a 32-bit float, as the daemon does."""
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     values = (
         read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(100.0, 1).draw_next_samples(60_000)
@@ -285,9 +295,9 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
 # --- the machine
 
 
-def test_the_libraries_here_are_those_that_are_required() -> None:
+def test_installed_libraries_satisfy_the_requirements() -> None:
     found = doctor.check_library_versions()
-    assert [one.mark for one in found] == ["well"], found
+    assert [finding.mark for finding in found] == ["well"], found
     required = {name: optional for name, _, optional in doctor.library_requirements()}
     assert required["numpy"] is False
     assert required["rerun-sdk"] is True
@@ -304,24 +314,24 @@ def test_the_libraries_here_are_those_that_are_required() -> None:
         ("1", "", True),
     ],
 )
-def test_versions_are_compared_by_their_numbers(version: str, wanted: str, fits: bool) -> None:
+def test_versions_are_compared_numerically(version: str, wanted: str, fits: bool) -> None:
     assert version_satisfies(version, wanted) is fits
 
 
 @pytest.mark.long
-def test_kernels_that_cannot_be_kept_are_told(tmp_path: Path) -> None:
+def test_kernel_cache_folder_is_none_only_if_nothing_is_writable(tmp_path: Path) -> None:
     assert kernel_cache_folder() is not None
-    say = "from monitor.common.compiled import kernel_cache_folder; print(kernel_cache_folder())"
+    program = "from monitor.common.compiled import kernel_cache_folder; print(kernel_cache_folder())"
     copy = tmp_path / "copy"
     shutil.copytree(Path(doctor.__file__).parents[1], copy / "monitor", ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "monitor" / "common" / "__pycache__").touch()  # no folder can be made there
+    (copy / "monitor" / "common" / "__pycache__").touch()  # no folder can be created at this path
     (tmp_path / "file").touch()
     environment = {**os.environ, "PYTHONPATH": str(copy), "HOME": str(tmp_path / "file")}
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         environment.pop(name, None)
     for more, wanted in (({}, "None"), ({"NUMBA_CACHE_DIR": str(tmp_path / "cache")}, str(tmp_path / "cache"))):
         done = subprocess.run(
-            [sys.executable, "-c", say],
+            [sys.executable, "-c", program],
             cwd=tmp_path,
             env={**environment, **more},
             capture_output=True,
@@ -331,14 +341,14 @@ def test_kernels_that_cannot_be_kept_are_told(tmp_path: Path) -> None:
         assert done.stdout.strip().startswith(wanted)
 
 
-def test_the_clock_is_asked_and_an_answer_given() -> None:
+def test_clock_check_advises_only_if_not_synchronised() -> None:
     found = doctor.check_clock()
     assert found.mark in ("well", "doubt")
     assert bool(found.do) == ("not synchronised" in found.text)
 
 
 @pytest.mark.parametrize(
-    ("seen", "mark"),
+    ("properties", "mark"),
     [
         ({"ActiveState": "active", "NRestarts": "0", "UnitFileState": "enabled"}, "well"),
         ({"ActiveState": "active", "NRestarts": "7", "UnitFileState": "enabled"}, "doubt"),
@@ -347,14 +357,16 @@ def test_the_clock_is_asked_and_an_answer_given() -> None:
         ({"ActiveState": "failed", "NRestarts": "0"}, "wrong"),
     ],
 )
-def test_the_unit_is_judged_by_what_systemd_says(seen: dict[str, str], mark: str) -> None:
-    assert [one.mark for one in doctor.check_systemd_unit_state({"LoadState": "loaded", **seen})] == [mark]
+def test_systemd_unit_state_is_rated(properties: dict[str, str], mark: str) -> None:
+    assert [finding.mark for finding in doctor.check_systemd_unit_state({"LoadState": "loaded", **properties})] == [
+        mark
+    ]
 
 
 # --- the command
 
 
-def run(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
+def run_doctor(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
     command = [sys.executable, "-m", "monitor.cli", "doctor", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(CONFIG_FOLDER.parent), "COLUMNS": "200"}
     return subprocess.run(
@@ -363,48 +375,58 @@ def run(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
 
 
 @pytest.mark.long
-def test_the_command_prints_a_sign_a_line_and_ends_with_1_if_anything_is_wrong(tmp_path: Path) -> None:
+def test_command_prints_one_sign_per_line_and_returns_1_on_errors(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
     (tmp_path / "c.toml").chmod(0o600)
-    well = run(tmp_path, "c.toml", "--json", "found.json")
+    well = run_doctor(tmp_path, "c.toml", "--json", "found.json")
     assert (well.returncode, well.stderr) == (0, "")
     assert all(line.lstrip()[0] in "✓!→" for line in well.stdout.splitlines())
     found = json.loads((tmp_path / "found.json").read_text())
     assert found["schema"] == "imu-monitor/doctor/1"
-    assert {one["mark"] for one in found["findings"]} <= {"well", "doubt"}
+    assert {finding["mark"] for finding in found["findings"]} <= {"well", "doubt"}
     assert {"mark", "about", "text", "do"} == set(found["findings"][0])
     (tmp_path / "c.toml").chmod(0o666)
-    wrong = run(tmp_path, "c.toml")
+    wrong = run_doctor(tmp_path, "c.toml")
     assert (wrong.returncode, wrong.stderr) == (1, "")
     assert "✗  permissions" in wrong.stdout
     assert "→ chmod o-w c.toml" in wrong.stdout
 
 
 @pytest.mark.long
-def test_json_alone_goes_to_standard_output(tmp_path: Path) -> None:
-    done = run(tmp_path, "none.toml", "--json", "-")
+def test_json_on_standard_output_is_not_mixed_with_text(tmp_path: Path) -> None:
+    done = run_doctor(tmp_path, "none.toml", "--json", "-")
     assert done.returncode == 1
-    assert {one["about"] for one in json.loads(done.stdout)["findings"]} >= {"configuration", "libraries", "clock"}
-    refused = run(tmp_path, "--json", "nowhere/x.json")
+    assert {finding["about"] for finding in json.loads(done.stdout)["findings"]} >= {
+        "configuration",
+        "libraries",
+        "clock",
+    }
+    refused = run_doctor(tmp_path, "--json", "nowhere/x.json")
     assert (refused.returncode, refused.stdout) == (2, "")
     assert refused.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("name", [RECORDING_LOCK, HISTORY_LOCK])
-def test_a_folder_that_another_process_uses_is_found(name: str, tmp_path: Path) -> None:
+def test_folder_used_by_another_process_is_found(name: str, tmp_path: Path) -> None:
     text = VIRTUAL + QUIET + f'[storage]\nfolder = "{tmp_path / "kept"}"\n'
-    assert not [one for one in of(examined(tmp_path, text), "storage") if "in use" in one.text]
+    assert not [
+        finding for finding in select_findings(examine_config(tmp_path, text), "storage") if "in use" in finding.text
+    ]
     lock = FolderLock(tmp_path / "kept", name)
     assert lock.ensure_held() == ""
-    (found,) = [one for one in of(examined(tmp_path, text), "storage") if "in use" in one.text]
+    (found,) = [
+        finding for finding in select_findings(examine_config(tmp_path, text), "storage") if "in use" in finding.text
+    ]
     assert found.mark == "doubt"
     assert found.text == f"{tmp_path / 'kept'}: in use by process {os.getpid()}"
     assert "choose another folder" in found.do
     lock.release()
 
 
-def test_a_fifo_in_place_of_the_folder_is_found(tmp_path: Path) -> None:
+def test_fifo_in_place_of_the_folder_is_found(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "kept")
     text = VIRTUAL + QUIET + f'[storage]\nfolder = "{tmp_path / "kept"}"\n'
-    found = [one for one in of(examined(tmp_path, text), "storage") if one.mark == "wrong"]
+    found = [
+        finding for finding in select_findings(examine_config(tmp_path, text), "storage") if finding.mark == "wrong"
+    ]
     assert "is a FIFO, not a folder" in found[-1].text

@@ -1,4 +1,4 @@
-"""A recording from a model: every format, what is in it and what is not, the truth beside it, runs broken off."""
+"""Tests of the command ``simulate``: file formats, samples, temperature, truth file and interruption."""
 
 import json
 import tomllib
@@ -16,7 +16,7 @@ from monitor.commands.simulate import CHUNK_ROWS, SimulationRequest, run_simulat
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 
-FIVE = {"Q": 2e-5, "N": 1.5e-4, "B": 3e-4, "K": 2e-4, "R": 3e-5}
+COEFFICIENTS = {"Q": 2e-5, "N": 1.5e-4, "B": 3e-4, "K": 2e-4, "R": 3e-5}
 MODEL = NoiseModel.from_toml(
     """sample_rate = 50.0
 [gz.quantization_noise]
@@ -31,7 +31,7 @@ K = 2e-4
 R = 3e-5
 """
 )
-WARM = NoiseModel.from_toml(
+TEMPERATURE_MODEL = NoiseModel.from_toml(
     """sample_rate = 50.0
 [temperature]
 mean = 30.0
@@ -50,100 +50,112 @@ height = 1.0
 
 
 @pytest.fixture(params=WRITABLE)
-def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    return tmp_path / f"made{request.param}"
+def output_path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return tmp_path / f"simulated{request.param}"
 
 
-def test_the_five_terms_come_back_from_every_format(path: Path) -> None:
-    """At 95 % about one interval in twenty misses: this seed's do not, and are the same in each format."""
-    made = run_simulation(SimulationRequest(MODEL, path, 1200.0, seed=2))
-    assert (made.samples, made.rate_hz, made.axes, made.temperature, made.truth) == (60_000, 50.0, ("gz",), False, None)
-    found = analyze.run_analysis(analyze.AnalysisRequest(path)).analysis.estimate.coefficients
+def test_five_terms_are_recovered_from_every_format(output_path: Path) -> None:
+    """About one 95 % interval in twenty misses its value; with this seed, none does."""
+    summary = run_simulation(SimulationRequest(MODEL, output_path, 1200.0, seed=2))
+    assert (summary.samples, summary.rate_hz, summary.axes, summary.temperature, summary.truth) == (
+        60_000,
+        50.0,
+        ("gz",),
+        False,
+        None,
+    )
+    found = analyze.run_analysis(analyze.AnalysisRequest(output_path)).analysis.estimate.coefficients
     assert found.value.shape == (5, 6)
     assert found.status[1, 2] == Status.ESTIMATED
     for row, letter in enumerate(SYMBOLS):
-        assert found.lo[row, 2] <= FIVE[letter] <= found.hi[row, 2], letter
+        assert found.lo[row, 2] <= COEFFICIENTS[letter] <= found.hi[row, 2], letter
 
 
-def test_it_is_the_models_own_series_to_the_last_bit(path: Path) -> None:
+def test_recording_has_exactly_the_samples_of_the_model(output_path: Path) -> None:
     n = CHUNK_ROWS + 1000  # more than one block
-    run_simulation(SimulationRequest(WARM, path, n / 50.0, seed=4))
-    recording = load_samples(path)
-    drawn = WARM.start_stream(50.0, 4).draw_samples_with_temperature(n)
-    assert recording.axes == ("gy", "ax", "az")  # what the model does not name is absent, not zero
+    run_simulation(SimulationRequest(TEMPERATURE_MODEL, output_path, n / 50.0, seed=4))
+    recording = load_samples(output_path)
+    drawn = TEMPERATURE_MODEL.start_stream(50.0, 4).draw_samples_with_temperature(n)
+    assert recording.axes == ("gy", "ax", "az")  # axes without effects are absent, not zero
     for axis in recording.axes:
         assert np.array_equal(recording.values[:, AXES.index(axis)], drawn.values[:, AXES.index(axis)])
     assert np.array_equal(recording.temperature_c, drawn.temperature_c)
     assert recording.t_s is not None
     assert np.array_equal(recording.t_s, np.arange(n) / 50.0)
     assert recording.notes == ()
-    assert list(path.parent.iterdir()) == [path]
+    assert list(output_path.parent.iterdir()) == [output_path]
 
 
-def test_the_rate_goes_before_the_models_and_one_must_be_known(tmp_path: Path) -> None:
+def test_rate_option_overrides_the_model_and_one_rate_is_required(tmp_path: Path) -> None:
     assert run_simulation(SimulationRequest(MODEL, tmp_path / "a.npz", 2.0, seed=1, rate_hz=200.0)).samples == 400
     with pytest.raises(ConfigError, match="no sample_rate; set the rate with --rate HZ"):
         run_simulation(SimulationRequest(NoiseModel(MODEL.effects), tmp_path / "b.npz", 2.0, seed=1))
     assert not (tmp_path / "b.npz").exists()
 
 
-def test_the_temperature_of_a_recording_is_taken(tmp_path: Path) -> None:
+def test_temperature_is_taken_from_a_recording(tmp_path: Path) -> None:
     t_s = np.arange(0.0, 20.0, 0.5) + 1e6  # at another rate, from another origin
-    warmth = 20.0 + (t_s - t_s[0])
-    warmth[7] = np.nan
-    save_samples(tmp_path / "oven.csv", t_s, np.zeros((t_s.size, 6)), warmth)
-    made = run_simulation(
-        SimulationRequest(WARM, tmp_path / "x.npz", 30.0, seed=1, temperature_from=tmp_path / "oven.csv")
+    temperature_c = 20.0 + (t_s - t_s[0])
+    temperature_c[7] = np.nan
+    save_samples(tmp_path / "oven.csv", t_s, np.zeros((t_s.size, 6)), temperature_c)
+    summary = run_simulation(
+        SimulationRequest(TEMPERATURE_MODEL, tmp_path / "x.npz", 30.0, seed=1, temperature_from=tmp_path / "oven.csv")
     )
     recording = load_samples(tmp_path / "x.npz")
-    assert made.temperature
+    assert summary.temperature
     since_s = np.arange(1500) / 50.0
-    assert recording.temperature_c == pytest.approx(20.0 + np.minimum(since_s, 19.5))  # then held
+    assert recording.temperature_c == pytest.approx(20.0 + np.minimum(since_s, 19.5))  # the last temperature continues
     assert recording.values[:, 3] == pytest.approx(1e-2 * (recording.temperature_c - 25.0))
 
 
-def test_the_recording_keeps_its_own_rate(tmp_path: Path) -> None:
+def test_temperature_recording_keeps_its_own_rate(tmp_path: Path) -> None:
     np.savez(tmp_path / "oven.npz", fs=1.0, gx=np.zeros(11), temperature=np.arange(11.0))
     run_simulation(
-        SimulationRequest(WARM, tmp_path / "x.npz", 8.0, seed=1, rate_hz=20.0, temperature_from=tmp_path / "oven.npz")
+        SimulationRequest(
+            TEMPERATURE_MODEL, tmp_path / "x.npz", 8.0, seed=1, rate_hz=20.0, temperature_from=tmp_path / "oven.npz"
+        )
     )
     assert load_samples(tmp_path / "x.npz").temperature_c == pytest.approx(np.arange(160) / 20.0)
 
 
-def test_a_recording_without_times_has_the_rate_asked_for(tmp_path: Path) -> None:
+def test_temperature_recording_without_times_uses_the_rate_option(tmp_path: Path) -> None:
     (tmp_path / "oven.csv").write_text("gx,temperature\n" + "".join(f"0,{i}\n" for i in range(200)))
-    wanted = SimulationRequest(WARM, tmp_path / "x.npz", 8.0, seed=1, temperature_from=tmp_path / "oven.csv")
+    wanted = SimulationRequest(
+        TEMPERATURE_MODEL, tmp_path / "x.npz", 8.0, seed=1, temperature_from=tmp_path / "oven.csv"
+    )
     with pytest.raises(ConfigError, match="give it with --rate HZ"):
         run_simulation(wanted)
     run_simulation(replace(wanted, rate_hz=20.0))
     assert load_samples(tmp_path / "x.npz").temperature_c == pytest.approx(np.arange(160.0))
 
 
-def test_a_recording_without_temperature_is_said(tmp_path: Path) -> None:
+def test_temperature_recording_without_temperature_is_refused(tmp_path: Path) -> None:
     save_samples(tmp_path / "cold.csv", np.arange(10.0), np.zeros((10, 6)))
     with pytest.raises(ConfigError, match=r"cold\.csv: has no temperature"):
         run_simulation(
-            SimulationRequest(WARM, tmp_path / "x.npz", 30.0, seed=1, temperature_from=tmp_path / "cold.csv")
+            SimulationRequest(
+                TEMPERATURE_MODEL, tmp_path / "x.npz", 30.0, seed=1, temperature_from=tmp_path / "cold.csv"
+            )
         )
     assert not (tmp_path / "x.npz").exists()
 
 
-def test_the_truth_says_what_the_file_does_not(tmp_path: Path) -> None:
-    made = run_simulation(SimulationRequest(WARM, tmp_path / "x.csv", 60.0, seed=9, truth=True))
-    assert made.truth == tmp_path / "x.csv.truth.json"
-    truth = json.loads(made.truth.read_bytes())
+def test_truth_file_has_the_model_and_the_drawn_events(tmp_path: Path) -> None:
+    summary = run_simulation(SimulationRequest(TEMPERATURE_MODEL, tmp_path / "x.csv", 60.0, seed=9, truth=True))
+    assert summary.truth == tmp_path / "x.csv.truth.json"
+    truth = json.loads(summary.truth.read_bytes())
     assert truth["schema"] == "imu-monitor/truth/1"
     assert (truth["seed"], truth["rate"], truth["seconds"], truth["samples"]) == (9, 50.0, 60.0, 3000)
     assert truth["axes"] == ["gy", "ax", "az"]
-    assert truth["model"] == tomllib.loads(WARM.to_toml())
+    assert truth["model"] == tomllib.loads(TEMPERATURE_MODEL.to_toml())
     (steps,) = truth["drawn"]["az"]["poisson_steps"]
     values = load_samples(tmp_path / "x.csv").values[:, 5]
     jumps = np.flatnonzero(np.abs(np.diff(values, prepend=0.0)) > 1e-9)
     assert steps["count"] == len(steps["times"]) >= 10
-    at = np.ceil(np.array(steps["times"]) * 50.0).astype(int)  # two of them may fall on one sample
+    at = np.ceil(np.array(steps["times"]) * 50.0).astype(int)  # two steps may fall on the same sample
     assert np.array_equal(np.unique(at), jumps)
     assert values == pytest.approx([sum(np.array(steps["heights"])[at <= i]) for i in range(3000)])
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["x.csv", "x.csv.truth.json"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["x.csv", "x.csv.truth.json"]
 
 
 class Cancelled(BaseException):
@@ -151,30 +163,30 @@ class Cancelled(BaseException):
 
 
 @pytest.mark.parametrize("truth", [False, True])
-def test_a_run_that_is_broken_off_leaves_nothing(path: Path, truth: bool) -> None:
-    def tell(what: str, share: float | None) -> None:
+def test_cancelled_simulation_leaves_no_file(output_path: Path, truth: bool) -> None:
+    def cancel(what: str, share: float | None) -> None:
         if share:
-            begun = any(one.name.endswith(".part") for one in path.parent.iterdir())
-            assert begun or path.suffix == ".npz"  # whose columns gather in files without a name
+            partial_file = any(file.name.endswith(".part") for file in output_path.parent.iterdir())
+            assert partial_file or output_path.suffix == ".npz"  # .npz columns are collected in unnamed files
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        run_simulation(SimulationRequest(MODEL, path, 2.0 * CHUNK_ROWS / 50.0, seed=1, truth=truth), tell)
-    assert list(path.parent.iterdir()) == []
+        run_simulation(SimulationRequest(MODEL, output_path, 2.0 * CHUNK_ROWS / 50.0, seed=1, truth=truth), cancel)
+    assert list(output_path.parent.iterdir()) == []
 
 
-def test_progress_rises_to_the_whole(tmp_path: Path) -> None:
-    told: list[float | None] = []
+def test_progress_rises_to_one(tmp_path: Path) -> None:
+    shares: list[float | None] = []
     run_simulation(
         SimulationRequest(MODEL, tmp_path / "x.npz", 2.5 * CHUNK_ROWS / 50.0, seed=1),
-        lambda _what, share: told.append(share),
+        lambda _what, share: shares.append(share),
     )
-    assert told[0] is None
-    assert told[1:4] == pytest.approx([0.4, 0.8, 1.0])
+    assert shares[0] is None
+    assert shares[1:4] == pytest.approx([0.4, 0.8, 1.0])
 
 
 @pytest.mark.parametrize(
-    ("model", "seconds", "words"),
+    ("model", "seconds", "message"),
     [
         (NoiseModel(sample_rate_hz=100.0), 1.0, "m: the model has no axis"),
         (MODEL, 1e-9, "1e-09 s at 50 Hz: 0 samples is outside the supported range"),
@@ -186,10 +198,10 @@ def test_progress_rises_to_the_whole(tmp_path: Path) -> None:
         (NoiseModel.from_toml("[gz.temperature_bias]\ncoefficient = 1.0\nreference = 2.0\n"), 1.0, "m: .*temperature"),
     ],
 )
-def test_what_cannot_be_is_said_and_nothing_written(
-    model: NoiseModel, seconds: float, words: str, tmp_path: Path
+def test_invalid_simulation_is_refused_and_nothing_is_written(
+    model: NoiseModel, seconds: float, message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises(ConfigError, match=message):
         run_simulation(
             SimulationRequest(model, tmp_path / "x.npz", seconds, seed=1, rate_hz=50.0, truth=True, name="m")
         )

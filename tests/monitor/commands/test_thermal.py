@@ -1,4 +1,4 @@
-"""``thermal fit`` and ``thermal predict`` as a user runs them: files in; tables, JSON, models or one clear line out."""
+"""Tests of the commands ``thermal fit`` and ``thermal predict``: tables, JSON, model files and errors."""
 
 import json
 from pathlib import Path
@@ -7,58 +7,58 @@ import numpy as np
 import pytest
 
 from monitor.commands import thermal
-from tests.monitor.drift.made import COEFFICIENT, late, weather
+from tests.monitor.drift.thermal_biases import BIAS_SLOPE, apply_lag, simulate_temperature
 from tests.support.program import exit_status
 
 HOURS = 36
 
 
-def write(path: Path, seed: int, lag_h: float = 2.0, offset: float = 0.0) -> Path:
-    """A recording of one axis by the minute."""
+def write_recording(path: Path, seed: int, lag_h: float = 2.0, offset: float = 0.0) -> Path:
+    """Write a recording of gz with one sample per minute."""
     rng = np.random.default_rng(seed)
-    warmth = weather(HOURS, rng)
-    bias = COEFFICIENT * late(warmth, lag_h) + offset + 2e-6 * rng.standard_normal(warmth.size)
+    temperature_c = simulate_temperature(HOURS, rng)
+    bias = BIAS_SLOPE * apply_lag(temperature_c, lag_h) + offset + 2e-6 * rng.standard_normal(temperature_c.size)
     t = 60.0 * np.arange(60 * HOURS)
-    np.savez(path, t=t, gz=bias[-t.size :], temp=warmth[-t.size :])
+    np.savez(path, t=t, gz=bias[-t.size :], temp=temperature_c[-t.size :])
     return path
 
 
 @pytest.mark.long
-def test_fit_then_predict_another_start(tmp_path, capsys):
-    first, second = write(tmp_path / "a.npz", 1), write(tmp_path / "b.npz", 2, offset=1e-4)
+def test_model_of_one_recording_predicts_another(tmp_path, capsys):
+    first, second = write_recording(tmp_path / "a.npz", 1), write_recording(tmp_path / "b.npz", 2, offset=1e-4)
     model, plot, out = tmp_path / "m.json", tmp_path / "a.png", tmp_path / "out.json"
     assert exit_status("thermal", "fit", first, "--interval", "1h", "--out", model, "--plot", plot, "--json", out) == 0
     assert "difference 1" in capsys.readouterr().out
     found = json.loads(out.read_bytes())
     assert found["schema"] == "imu-monitor/thermal-fit/1"
     gz = found["axes"]["gz"]
-    assert gz["slope"] == pytest.approx(COEFFICIENT, rel=0.1)
+    assert gz["slope"] == pytest.approx(BIAS_SLOPE, rel=0.1)
     assert gz["time_constants"][0] == pytest.approx(7200.0, rel=0.3)
     assert gz["equation"]["a"][0] == pytest.approx(-np.exp(-found["interval"] / gz["time_constants"][0]))
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert exit_status("thermal", "predict", second, "--model", model, "--json", out, "--plot", plot) == 0
     found = json.loads(out.read_bytes())
     assert found["schema"] == "imu-monitor/thermal-predict/1"
-    judged = found["axes"]["gz"]
-    assert judged["offset"] == pytest.approx(1e-4, rel=0.05)
-    assert judged["rms_offset_out"] < 0.2 * judged["rms_alone"]
+    prediction = found["axes"]["gz"]
+    assert prediction["offset"] == pytest.approx(1e-4, rel=0.05)
+    assert prediction["rms_offset_out"] < 0.2 * prediction["rms_alone"]
 
 
-def test_the_model_file_comes_back_as_it_went(tmp_path):
-    study = thermal.fit_thermal_models(write(tmp_path / "a.npz", 3), 3600.0)
+def test_model_file_preserves_all_parameters(tmp_path):
+    study = thermal.fit_thermal_models(write_recording(tmp_path / "a.npz", 3), 3600.0)
     path = tmp_path / "m.json"
     path.write_bytes(thermal.encode_model_file(study))
-    one, other = study.fits["gz"].model, thermal.read_model_file(path)["gz"]
+    saved, loaded = study.fits["gz"].model, thermal.read_model_file(path)["gz"]
     written = json.loads(path.read_bytes())
     assert written["schema"] == "imu-monitor/thermal-model/1"
-    assert written["axes"]["gz"]["equation"] == one.equation == other.equation
-    assert one.shape == other.shape
+    assert written["axes"]["gz"]["equation"] == saved.equation == loaded.equation
+    assert saved.shape == loaded.shape
     for name in ("coefficients", "initial_state", "covariance"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    assert (one.phi, one.sigma, one.reference_c) == (other.phi, other.sigma, other.reference_c)
+        np.testing.assert_array_equal(getattr(saved, name), getattr(loaded, name))
+    assert (saved.phi, saved.sigma, saved.reference_c) == (loaded.phi, loaded.sigma, loaded.reference_c)
 
 
-def test_hardly_moved_is_no_answer_and_says_so(tmp_path, capsys):
+def test_almost_constant_temperature_is_refused(tmp_path, capsys):
     path = tmp_path / "cold.npz"
     n = 4000
     rng = np.random.default_rng(4)
@@ -69,19 +69,21 @@ def test_hardly_moved_is_no_answer_and_says_so(tmp_path, capsys):
     assert "temperature hardly changed" in json.loads(out.read_bytes())["refused"]["gz"]
 
 
-def test_no_temperature_is_said(tmp_path, capsys):
+def test_recording_without_temperature_is_refused(tmp_path, capsys):
     path = tmp_path / "none.npz"
     np.savez(path, fs=1.0, gz=np.arange(100.0))
     assert exit_status("thermal", "fit", path) == 2
     assert "there is no temperature" in capsys.readouterr().err
 
 
-def good(tmp_path):
-    return json.loads(thermal.encode_model_file(thermal.fit_thermal_models(write(tmp_path / "a.npz", 3), 3600.0)))
+def make_model_file_content(tmp_path):
+    return json.loads(
+        thermal.encode_model_file(thermal.fit_thermal_models(write_recording(tmp_path / "a.npz", 3), 3600.0))
+    )
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda m: m.update(schema="imu-monitor/thermal-model/9"), 'schema "imu-monitor/thermal-model/9"'),
         (lambda m: m.update(interval=0.0), "interval: 0 s"),
@@ -95,17 +97,20 @@ def good(tmp_path):
         (lambda m: m["axes"]["gz"].pop("sigma"), "sigma"),
     ],
 )
-def test_a_model_file_that_is_wrong_says_where(tmp_path, capsys, change, says):
-    model = good(tmp_path)
+def test_invalid_model_file_is_refused_with_the_key(tmp_path, capsys, change, message):
+    model = make_model_file_content(tmp_path)
     change(model)
     path = tmp_path / "wrong.json"
     path.write_text(json.dumps(model))
     assert exit_status("thermal", "predict", tmp_path / "a.npz", "--model", path) == 2
     err = capsys.readouterr().err
-    assert says in err
+    assert message in err
     assert err.count("\n") == 1
 
 
-def test_no_model_file(tmp_path, capsys):
-    assert exit_status("thermal", "predict", write(tmp_path / "a.npz", 3), "--model", tmp_path / "nowhere.json") == 2
+def test_missing_model_file_is_refused(tmp_path, capsys):
+    assert (
+        exit_status("thermal", "predict", write_recording(tmp_path / "a.npz", 3), "--model", tmp_path / "nowhere.json")
+        == 2
+    )
     assert "nowhere.json: cannot be read" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Kernels are compiled where nothing can be kept on disk, too; what is kept is not taken when it is stale."""
+"""Tests of the compilation of kernels and of their cache on disk."""
 
 import gc
 import inspect
@@ -18,10 +18,10 @@ from tests.support.waiting import PATIENCE_S
 
 
 @pytest.mark.long
-def test_without_a_place_for_the_cache() -> None:
+def test_kernel_is_compiled_without_a_cache_folder() -> None:
     program = """
         from numba.core import caching
-        caching.CompileResultCacheImpl._locator_classes = []  # as of a read-only system and a user without a home
+        caching.CompileResultCacheImpl._locator_classes = []  # as on a read-only system without a home folder
         from monitor.common.compiled import compiled
 
         @compiled
@@ -35,7 +35,7 @@ def test_without_a_place_for_the_cache() -> None:
     subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=root, timeout=PATIENCE_S, check=True)
 
 
-def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
+def test_cache_is_invalid_after_a_change_of_an_imported_module(tmp_path):
     files = {name: tmp_path / "monitor" / f"{name}.py" for name in "abcdef"}
     files["a"].parent.mkdir()
     files["a"].write_text("from monitor.b import called\n")
@@ -45,20 +45,20 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
     files["f"].write_text("x = 1\n")
     files["d"].write_text("x = 1\n")
 
-    def now():
+    def compute_hash():
         hash_module_with_imports.cache_clear()
         return hash_module_with_imports(files["a"], tmp_path)
 
-    before = now()
+    before = compute_hash()
     files["d"].write_text("x = 2\n")
-    assert now() == before
+    assert compute_hash() == before
     for name in "fec":  # modules that are imported by name, too
         files[name].write_text("LIMIT = 2.0\n")
-        assert now() != before
-        before = now()
+        assert compute_hash() != before
+        before = compute_hash()
 
 
-def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
+def test_cache_version_of_a_kernel_covers_its_imported_files():
     imported = [package for package, *_ in IMPORT_STATEMENT.findall(Path(inspect.getfile(fit_kernel)).read_text())]
     assert imported.count("monitor.estimation.fit.term_selection") == 1
     assert fit_kernel.fit_axes._cache._cache_file._version.endswith(
@@ -66,7 +66,7 @@ def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
     )
 
 
-def test_a_cache_that_names_a_type_of_an_earlier_revision_is_replaced(tmp_path):
+def test_cache_with_a_type_of_an_earlier_revision_is_replaced(tmp_path):
     root = Path(monitor.common.compiled.__file__).parents[2]
     revision = """
         from typing import NamedTuple
@@ -103,7 +103,7 @@ def test_machine_code_is_generated_only_for_the_kernel_that_python_calls():
             total += value
         return total
 
-    add = Kernel(sum_from, inline=False)  # without the cache on disk, from which only the outer kernel would be loaded
+    add = Kernel(sum_from, inline=False)  # the disk cache would provide only the outer kernel
 
     def sum_twice(values):
         return add(values, add(values, 0.0))
@@ -117,7 +117,7 @@ def test_machine_code_is_generated_only_for_the_kernel_that_python_calls():
     engine = whole.library.codegen._engine
     assert engine.is_symbol_defined(whole.fndesc.llvm_cpython_wrapper_name)
     assert not engine.is_symbol_defined(part.fndesc.llvm_cpython_wrapper_name)
-    assert add(values, 1.0) == 11.0  # from Python it is compiled as a kernel of its own
+    assert add(values, 1.0) == 11.0  # called from Python, it is compiled as a separate kernel
     assert len(add.signatures) == 1
 
 

@@ -1,4 +1,4 @@
-"""One process at a time holds a folder, whatever becomes of the process, of the lock file and of the folder."""
+"""Tests of the lock that gives one process at a time the use of a folder."""
 
 import errno
 import fcntl
@@ -13,7 +13,7 @@ import pytest
 
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock, describe_lock_holder
 
-HOLDER = """
+HOLDER_PROGRAM = """
 import subprocess, sys
 from pathlib import Path
 from monitor.common.folder_lock import FolderLock
@@ -25,7 +25,7 @@ sys.stdin.read()
 """
 
 
-def test_the_second_is_told_who_holds_it_and_takes_it_after_the_first(tmp_path: Path) -> None:
+def test_second_lock_names_the_holder_and_succeeds_after_release(tmp_path: Path) -> None:
     first, second = FolderLock(tmp_path / "store", "a.lock"), FolderLock(tmp_path / "store", "a.lock")
     assert first.ensure_held() == ""
     assert second.ensure_held() == f"{tmp_path / 'store'}: in use by process {os.getpid()}"
@@ -37,16 +37,16 @@ def test_the_second_is_told_who_holds_it_and_takes_it_after_the_first(tmp_path: 
     second.release()
 
 
-def test_each_kind_of_content_has_a_lock_of_its_own(tmp_path: Path) -> None:
-    one, other = FolderLock(tmp_path, "a.lock"), FolderLock(tmp_path, "b.lock")
-    assert (one.ensure_held(), other.ensure_held()) == ("", "")
-    one.release()
-    other.release()
+def test_locks_of_different_names_are_independent(tmp_path: Path) -> None:
+    first, second = FolderLock(tmp_path, "a.lock"), FolderLock(tmp_path, "b.lock")
+    assert (first.ensure_held(), second.ensure_held()) == ("", "")
+    first.release()
+    second.release()
 
 
-def test_a_holder_that_is_killed_gives_it_back_although_a_child_lives_on(tmp_path: Path) -> None:
+def test_lock_of_a_killed_process_is_free_although_its_child_lives(tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(tmp_path), "a.lock"],
+        [sys.executable, "-c", HOLDER_PROGRAM, str(tmp_path), "a.lock"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -59,7 +59,7 @@ def test_a_holder_that_is_killed_gives_it_back_although_a_child_lives_on(tmp_pat
         assert describe_lock_holder(tmp_path, "a.lock") == f"process {process.pid}"
         process.kill()
         process.wait()
-        os.kill(child, 0)  # it lives
+        os.kill(child, 0)  # the child lives
         assert lock.ensure_held() == ""
         assert describe_lock_holder(tmp_path, "a.lock") == f"process {os.getpid()}"
     finally:
@@ -70,19 +70,19 @@ def test_a_holder_that_is_killed_gives_it_back_although_a_child_lives_on(tmp_pat
     assert describe_lock_holder(tmp_path, "a.lock") == ""
 
 
-def test_looking_for_a_holder_makes_nothing(tmp_path: Path) -> None:
+def test_describing_the_holder_creates_no_files(tmp_path: Path) -> None:
     assert describe_lock_holder(tmp_path / "store", "a.lock") == ""
     assert describe_lock_holder(tmp_path, "a.lock") == ""
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("what", ["lock file", "folder", "folder renamed"])
-def test_who_loses_the_file_takes_it_anew_or_says_who_has_it(what: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("lost", ["lock file", "folder", "folder renamed"])
+def test_holder_that_loses_the_file_takes_the_lock_again_or_names_the_new_holder(lost: str, tmp_path: Path) -> None:
     folder = tmp_path / "store"
     first, second = FolderLock(folder, "a.lock"), FolderLock(folder, "a.lock")
     for other_is_faster in (False, True):
         assert first.ensure_held() == ""
-        match what:
+        match lost:
             case "lock file":
                 first.path.unlink()
             case "folder":
@@ -100,7 +100,7 @@ def test_who_loses_the_file_takes_it_anew_or_says_who_has_it(what: str, tmp_path
 
 
 @pytest.mark.parametrize("kind", ["fifo", "directory", "link"])
-def test_a_lock_file_that_is_none_is_an_error_and_not_waited_for(kind: str, tmp_path: Path) -> None:
+def test_lock_path_that_is_no_regular_file_raises_without_waiting(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "a.lock"
     match kind:
         case "fifo":
@@ -116,14 +116,14 @@ def test_a_lock_file_that_is_none_is_an_error_and_not_waited_for(kind: str, tmp_
     assert not (tmp_path / "elsewhere").exists()
 
 
-def test_a_file_in_place_of_the_folder_is_one_line(tmp_path: Path) -> None:
+def test_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "store").write_text("x")
     with pytest.raises(OSError, match="is a file, not a folder"):
         FolderLock(tmp_path / "store", "a.lock").ensure_held()
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
-def test_a_file_system_without_locks_is_used_with_a_warning(
+def test_file_system_without_locks_gives_a_warning(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(descriptor: int, operation: int) -> None:
@@ -138,7 +138,7 @@ def test_a_file_system_without_locks_is_used_with_a_warning(
     lock.release()
 
 
-def test_a_holder_on_another_host_is_named_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_holder_on_another_host_is_named_with_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lock = FolderLock(tmp_path, RECORDING_LOCK)
     monkeypatch.setattr(socket, "gethostname", lambda: "bench-pc")
     assert lock.ensure_held() == ""

@@ -1,4 +1,4 @@
-"""Rates in sentences: two digits, never an exponent."""
+"""Tests of the formatting of axis values with units."""
 
 import math
 
@@ -9,7 +9,7 @@ from monitor.common.unit_formatting import format_axis_value
 
 
 @pytest.mark.parametrize(
-    ("axis", "si", "said"),
+    ("axis", "si", "text"),
     [
         ("gx", math.radians(1.0), "1 °/s"),
         ("gy", math.radians(-0.0456), "-0.046 °/s"),
@@ -25,12 +25,12 @@ from monitor.common.unit_formatting import format_axis_value
         ("gx", 0.0, "0 °/s"),
     ],
 )
-def test_units_and_digits(axis, si, said):
-    assert format_axis_value(axis, si) == said
+def test_value_is_formatted_with_unit_and_digits(axis, si, text):
+    assert format_axis_value(axis, si) == text
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_a_difference_has_its_sign(axis):
+def test_difference_is_formatted_with_sign(axis):
     assert format_axis_value(axis, 0.01, sign=True) == "+" + format_axis_value(axis, 0.01)
     assert (
         format_axis_value(axis, -0.01, sign=True)
@@ -41,7 +41,7 @@ def test_a_difference_has_its_sign(axis):
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("si", [1e-30, 1e30, math.inf, -math.inf, math.nan])
-def test_no_number_breaks_a_sentence(axis, si):
+def test_extreme_values_are_formatted_without_exponent(axis, si):
     number, unit = format_axis_value(axis, si).split()
     assert math.isfinite(float(number)) == math.isfinite(si)
     assert "e" not in number.lower()

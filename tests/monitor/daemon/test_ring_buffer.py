@@ -1,4 +1,4 @@
-"""The ring keeps order, and what it could not keep is told as missing at its place."""
+"""Tests of the ring buffer: order, and overwritten samples counted as lost at their position."""
 
 import threading
 
@@ -11,21 +11,21 @@ from drivers.data_types import make_block
 from monitor.daemon.device.ring_buffer import RingBuffer
 
 
-def made(first, n, lost=0):
-    """Samples numbered from ``first`` on, the number in every column."""
+def make_numbered_block(first, n, lost=0):
+    """Return samples numbered from ``first``, with the number in every column."""
     t_ns = np.arange(first, first + n, dtype=np.int64)
     return make_block(t_ns, np.repeat(t_ns[:, None].astype(float), 6, axis=1), t_ns + 0.5, t_ns % 256, lost)
 
 
-def numbers(blocks):
-    return [int(t) for one in blocks for t in one.t_ns]
+def list_numbers(blocks):
+    return [int(t) for block in blocks for t in block.t_ns]
 
 
-def test_what_goes_in_comes_out():
+def test_pushed_samples_are_taken_unchanged():
     ring = RingBuffer(10)
     assert ring.take_samples() == []
-    ring.push_samples(made(0, 3))
-    ring.push_samples(made(3, 2))
+    ring.push_samples(make_numbered_block(0, 3))
+    ring.push_samples(make_numbered_block(3, 2))
     (taken,) = ring.take_samples()
     assert taken.t_ns.tolist() == [0, 1, 2, 3, 4]
     assert taken.values[:, 5].tolist() == [0, 1, 2, 3, 4]
@@ -35,46 +35,46 @@ def test_what_goes_in_comes_out():
     assert ring.take_samples() == []
 
 
-def test_loss_cuts_blocks_where_it_stood():
+def test_loss_separates_blocks_at_its_position():
     ring = RingBuffer(10)
-    ring.push_samples(made(2, 2, lost=2))
-    ring.push_samples(made(4, 1))
-    ring.push_samples(made(8, 2, lost=3))
+    ring.push_samples(make_numbered_block(2, 2, lost=2))
+    ring.push_samples(make_numbered_block(4, 1))
+    ring.push_samples(make_numbered_block(8, 2, lost=3))
     taken = ring.take_samples()
-    assert [(one.lost, one.t_ns.tolist()) for one in taken] == [(2, [2, 3, 4]), (3, [8, 9])]
+    assert [(block.lost, block.t_ns.tolist()) for block in taken] == [(2, [2, 3, 4]), (3, [8, 9])]
 
 
-def test_what_was_taken_does_not_change_when_the_ring_goes_on():
+def test_taken_block_does_not_change_when_the_ring_is_reused():
     ring = RingBuffer(4)
-    ring.push_samples(made(0, 4))
+    ring.push_samples(make_numbered_block(0, 4))
     (taken,) = ring.take_samples()
-    ring.push_samples(made(4, 4))
+    ring.push_samples(make_numbered_block(4, 4))
     assert taken.t_ns.tolist() == [0, 1, 2, 3]
     with pytest.raises(ValueError, match="read-only"):
         taken.values[0] = 1.0
 
 
 @pytest.mark.parametrize("sizes", [[4, 4], [3, 5], [1] * 8, [8], [9], [2, 7], [4, 1, 1, 30]])
-def test_a_full_ring_overwrites_its_oldest_and_tells(sizes):
+def test_full_ring_overwrites_its_oldest_samples_and_counts_them(sizes):
     ring = RingBuffer(4)
     total = 0
     for n in sizes:
-        ring.push_samples(made(total, n))
+        ring.push_samples(make_numbered_block(total, n))
         total += n
     taken = ring.take_samples()
-    assert numbers(taken) == list(range(total - 4, total))
-    assert [one.lost for one in taken] == [total - 4]
+    assert list_numbers(taken) == list(range(total - 4, total))
+    assert [block.lost for block in taken] == [total - 4]
     assert ring.overflowed == total - 4
 
 
-def test_loss_of_overwritten_samples_travels_on():
+def test_loss_before_overwritten_samples_is_kept():
     ring = RingBuffer(4)
-    ring.push_samples(made(5, 2, lost=5))
-    ring.push_samples(made(10, 2, lost=3))
-    ring.push_samples(made(13, 3, lost=1))
+    ring.push_samples(make_numbered_block(5, 2, lost=5))
+    ring.push_samples(make_numbered_block(10, 2, lost=3))
+    ring.push_samples(make_numbered_block(13, 3, lost=1))
     taken = ring.take_samples()
-    assert sum(one.lost for one in taken) + len(numbers(taken)) == 16
-    assert [(one.lost, one.t_ns.tolist()) for one in taken] == [(11, [11]), (1, [13, 14, 15])]
+    assert sum(block.lost for block in taken) + len(list_numbers(taken)) == 16
+    assert [(block.lost, block.t_ns.tolist()) for block in taken] == [(11, [11]), (1, [13, 14, 15])]
     assert ring.overflowed == 3
 
 
@@ -83,29 +83,29 @@ def test_loss_of_overwritten_samples_travels_on():
     capacity=st.integers(1, 12),
     steps=st.lists(st.one_of(st.none(), st.tuples(st.integers(0, 5), st.integers(1, 30))), max_size=30),
 )
-def test_received_and_lost_are_all_that_was_sent(capacity, steps):
-    """None = the reader takes; else (lost, n) is pushed."""
+def test_received_and_lost_samples_add_up_to_all_sent(capacity, steps):
+    """In ``steps``, None takes the samples and (lost, n) pushes n samples after a loss."""
     ring = RingBuffer(capacity)
-    at = told = came = 0
+    at = lost_total = received_total = 0
     seen = []
     for step in [*steps, None]:
         if step is None:
-            for one in ring.take_samples():
-                told += one.lost
-                came += len(one)
-                seen += one.t_ns.tolist()
-                # the number of the first sample says how many must have been before it
-                assert int(one.t_ns[0]) == told + came - len(one)
+            for block in ring.take_samples():
+                lost_total += block.lost
+                received_total += len(block)
+                seen += block.t_ns.tolist()
+                # The number of the first sample equals the count of samples before it.
+                assert int(block.t_ns[0]) == lost_total + received_total - len(block)
         else:
             lost, n = step
-            ring.push_samples(made(at + lost, n, lost))
+            ring.push_samples(make_numbered_block(at + lost, n, lost))
             at += lost + n
-    assert told + came == at
+    assert lost_total + received_total == at
     assert seen == sorted(set(seen))
 
 
 @pytest.mark.parametrize("capacity", [64, 100_000])
-def test_a_writer_and_a_reader_at_once(capacity):
+def test_concurrent_writer_and_reader_lose_nothing_uncounted(capacity):
     ring, pushes, stopped = RingBuffer(capacity), 3000, threading.Event()
     taken = []
 
@@ -113,7 +113,7 @@ def test_a_writer_and_a_reader_at_once(capacity):
         at = 0
         for i in range(pushes):
             n, lost = 1 + i % 37, i % 5 == 0
-            ring.push_samples(made(at + lost, n, int(lost)))
+            ring.push_samples(make_numbered_block(at + lost, n, int(lost)))
             at += n + lost
         stopped.set()
 
@@ -124,11 +124,11 @@ def test_a_writer_and_a_reader_at_once(capacity):
     writer.join()
     taken += ring.take_samples()
     sent = sum(1 + i % 37 + (i % 5 == 0) for i in range(pushes))
-    assert sum(len(one) + one.lost for one in taken) == sent
-    assert ring.overflowed + len(numbers(taken)) == sum(1 + i % 37 for i in range(pushes))
+    assert sum(len(block) + block.lost for block in taken) == sent
+    assert ring.overflowed + len(list_numbers(taken)) == sum(1 + i % 37 for i in range(pushes))
     at = 0
-    for one in taken:
-        at += one.lost
-        assert one.t_ns.tolist() == list(range(at, at + len(one)))
-        assert np.array_equal(one.values[:, 3], one.t_ns)
-        at += len(one)
+    for block in taken:
+        at += block.lost
+        assert block.t_ns.tolist() == list(range(at, at + len(block)))
+        assert np.array_equal(block.values[:, 3], block.t_ns)
+        at += len(block)

@@ -1,4 +1,4 @@
-"""What the service says of itself: where its page is, and nothing at a date that is not the samples'."""
+"""Tests of the service: the viewer address, the times of recordings, rate checks and kernels."""
 
 import math
 import threading
@@ -31,22 +31,22 @@ from monitor.settings import loading
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from tests.monitor.publishing.rerun.test_queued_view import read
+from tests.monitor.publishing.rerun.test_queued_view import read_entities
 from tests.support.ports import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
 RECORDED_S = 1_600_000_000.0
 
 
-def config(folder: Path, driver: str, viewer: str) -> loading.Config:
+def write_and_load_config(folder: Path, driver: str, viewer: str) -> loading.Config:
     path = folder / "config.toml"
     device = f'[[device]]\nname = "d"\nrate = 100.0\ndriver = {{ {driver} }}\n'
     path.write_text(f'{device}[zenoh]\nmode = "none"\n[viewer]\n{viewer}')
     return loading.load_config(path)
 
 
-class Rounds(Output):
-    """Counts the rounds of the status."""
+class StatusCounter(Output):
+    """Counts the published status reports."""
 
     def __init__(self) -> None:
         self.healths = 0
@@ -55,26 +55,28 @@ class Rounds(Output):
         self.healths += 1
 
 
-def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
+def test_viewer_address_is_logged_once_and_shown_above_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     viewer = f'mode = "auto"\nport = {free_port()}\nweb_port = {free_port()}\n'
-    board = RemoteDeviceRegistry()
-    rounds = Rounds()
-    service = Service(config(tmp_path, 'link = "virtual"', viewer), [TableOutput(board), rounds])
+    registry = RemoteDeviceRegistry()
+    status_counter = StatusCounter()
+    service = Service(
+        write_and_load_config(tmp_path, 'link = "virtual"', viewer), [TableOutput(registry), status_counter]
+    )
     assert service.viewer is not None
     thread = threading.Thread(target=service.run)
     with capture_logs() as logs:
         thread.start()
         try:
-            wait_for(lambda: board.note != "")
-            url, note = service.viewer.url, board.note
-            before = rounds.healths
-            wait_for(lambda: rounds.healths >= before + 2, "two more rounds of the status")
+            wait_for(lambda: registry.note != "")
+            url, note = service.viewer.url, registry.note
+            before = status_counter.healths
+            wait_for(lambda: status_counter.healths >= before + 2, "two more status reports")
             with (console := Console(width=200)).capture() as captured:
-                console.print(live_device_table.device_overview(board, time.monotonic()))
+                console.print(live_device_table.device_overview(registry, time.monotonic()))
         finally:
             service.request_stop()
             thread.join(PATIENCE_S)
@@ -85,21 +87,21 @@ def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
     assert [line["url"] for line in logs if line["event"] == "viewer"] == [url]
 
 
-def test_a_recording_of_long_ago_leaves_nothing_at_todays_date(tmp_path: Path) -> None:
+def test_old_recording_shows_nothing_at_the_present_time(tmp_path: Path) -> None:
     path = tmp_path / "view.rrd"
     rows = [f"{RECORDED_S + i / 100:.2f},{0.1 * (-1) ** i}" for i in range(100)]
     (tmp_path / "long-ago.csv").write_text("\n".join(["t,gz", *rows]))
-    service = Service(config(tmp_path, 'link = "replay", path = "long-ago.csv"', f'mode = "{path}"\n'))
+    service = Service(write_and_load_config(tmp_path, 'link = "replay", path = "long-ago.csv"', f'mode = "{path}"\n'))
     service.run(PATIENCE_S)
     assert service.workers[0].driver.state == "ended"
-    cells = read(path)
+    cells = read_entities(path)
     assert "ENDED" in str(cells["/d/status"])
     times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
     assert RECORDED_S <= min(times_s) <= max(times_s) <= RECORDED_S + 1.0
 
 
-class Times(Output):
-    """The times that were said of a device."""
+class TimeCollector(Output):
+    """Collects the times of the status reports and events of a device."""
 
     def __init__(self) -> None:
         self.healths: list[tuple[float | None, Health]] = []
@@ -111,24 +113,24 @@ class Times(Output):
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.healths.append((unix_s, health))
 
-    def count(self, received: bool) -> int:
-        """Reports since, or before, the first sample was received."""
+    def count_reports(self, received: bool) -> int:
+        """Count the reports with received samples, or those without."""
         return sum(bool(health.received) == received for _, health in self.healths)
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "folder"])
-def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_times(
+def test_recording_that_waits_for_kernels_uses_only_its_own_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     n, compiled, prepare = 2000, threading.Event(), kernel_compilation.prepare_kernels
 
-    def held_back(
+    def wait_then_prepare(
         group: kernel_groups.KernelGroup, tell: Callable[[kernel_compilation.CompilationProgress], None]
     ) -> Iterator[str]:
         compiled.wait(PATIENCE_S)
         yield from prepare(group, tell)
 
-    monkeypatch.setattr(kernel_compilation, "prepare_kernels", held_back)
+    monkeypatch.setattr(kernel_compilation, "prepare_kernels", wait_then_prepare)
     t_s = np.arange(n) / 100.0
     values = np.random.default_rng(1).standard_normal((n, 6)) * 1e-3
     name = {"csv": "r.csv", "npz": "r.npz", "folder": "r"}[kind]
@@ -155,15 +157,15 @@ folder = "kept"
 record = false
 """
     )
-    told = Times()
-    service = Service(loading.load_config(path), [told])
+    times = TimeCollector()
+    service = Service(loading.load_config(path), [times])
     recording.rename(away)
     thread = threading.Thread(target=service.run, args=(PATIENCE_S,))
     thread.start()
     try:
-        assert wait_for(lambda: told.count(received=False) >= 2)  # there is no recording yet
+        assert wait_for(lambda: times.count_reports(received=False) >= 2)  # the recording does not exist yet
         away.rename(recording)
-        assert wait_for(lambda: told.count(received=True) >= 2)  # its samples wait in the ring
+        assert wait_for(lambda: times.count_reports(received=True) >= 2)  # the samples wait in the ring
         assert service.workers[0].publisher.published == 0
     finally:
         compiled.set()
@@ -171,24 +173,24 @@ record = false
     assert not thread.is_alive()
     assert service.workers[0].publisher.published == n
     first_s, last_s = 0.0, (n - 1) / 100.0
-    assert {unix_s for unix_s, health in told.healths if not health.received} == {None}
-    stamps = [unix_s for unix_s, health in told.healths if health.received]
-    assert all(unix_s is not None and first_s <= unix_s <= last_s for unix_s in stamps), stamps
-    assert stamps[-1] == last_s
-    assert all(first_s <= unix_s <= last_s for unix_s in told.events), told.events
-    cells = read(view)
+    assert {unix_s for unix_s, health in times.healths if not health.received} == {None}
+    sample_times = [unix_s for unix_s, health in times.healths if health.received]
+    assert all(unix_s is not None and first_s <= unix_s <= last_s for unix_s in sample_times), sample_times
+    assert sample_times[-1] == last_s
+    assert all(first_s <= unix_s <= last_s for unix_s in times.events), times.events
+    cells = read_entities(view)
     assert "ENDED" in str(cells["/night-run/status"])
     times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
     assert first_s <= min(times_s) <= max(times_s) <= last_s
     with open_history(tmp_path / "kept" / FILE_NAME) as reader:
-        kept = past.read_history(reader, "night-run", TimeRange(-math.inf, math.inf), step_s=60)
-    assert kept.start_s.tolist() == [0]
-    assert kept.counts[:, 0].tolist() == [n]
-    assert all(first_s <= event.t_s <= last_s for event in kept.events)
+        history = past.read_history(reader, "night-run", TimeRange(-math.inf, math.inf), step_s=60)
+    assert history.start_s.tolist() == [0]
+    assert history.counts[:, 0].tolist() == [n]
+    assert all(first_s <= event.t_s <= last_s for event in history.events)
 
 
-class Estimates(Output):
-    """Estimates, and how many events there were of each kind."""
+class EstimateCollector(Output):
+    """Collects estimates, kinds of events, model comparisons and the status text."""
 
     def __init__(self) -> None:
         self.all: list[Estimate] = []
@@ -210,7 +212,7 @@ class Estimates(Output):
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 200.0])
-def test_a_rate_that_contradicts_a_recording_publishes_no_coefficient(tmp_path: Path, rate_hz: float) -> None:
+def test_recording_that_contradicts_the_rate_publishes_no_coefficients(tmp_path: Path, rate_hz: float) -> None:
     values = np.random.default_rng(1).standard_normal((6000, 6)) * 1e-2
     save_samples(tmp_path / "r.npz", np.arange(6000) / 100.0, values)
     path = tmp_path / "config.toml"
@@ -236,58 +238,62 @@ folder = "kept"
 record = false
 """
     )
-    told, board = Estimates(), RemoteDeviceRegistry()
-    Service(loading.load_config(path), [told, TableOutput(board)]).run(60.0)
+    collector, registry = EstimateCollector(), RemoteDeviceRegistry()
+    Service(loading.load_config(path), [collector, TableOutput(registry)]).run(60.0)
     with open_history(tmp_path / "kept" / FILE_NAME) as reader:
-        kept = past.read_history(reader, "d", TimeRange(-math.inf, math.inf), step_s=60)
-    (known,) = board.devices_with_problems_first(time.monotonic())
-    assert known.coefficients is not None
-    published = {Status(one) for estimate in told.all for one in estimate.coefficients.status.ravel().tolist()}
-    assert told.all[-1].rate_hz == 100.0
+        history = past.read_history(reader, "d", TimeRange(-math.inf, math.inf), step_s=60)
+    (device,) = registry.devices_with_problems_first(time.monotonic())
+    assert device.coefficients is not None
+    published = {
+        Status(status) for estimate in collector.all for status in estimate.coefficients.status.ravel().tolist()
+    }
+    assert collector.all[-1].rate_hz == 100.0
     if rate_hz == 100.0:
         assert Status.ESTIMATED in published
-        assert told.kinds >= {"limit_crossed", "model_disagrees"}
-        assert np.isfinite(kept.select_column("gz.N").last).any()
-        assert Status.ESTIMATED in known.coefficients.coefficients.status
+        assert collector.kinds >= {"limit_crossed", "model_disagrees"}
+        assert np.isfinite(history.select_column("gz.N").last).any()
+        assert Status.ESTIMATED in device.coefficients.coefficients.status
     else:
         assert published == {Status.UNESTIMATED}
-        assert not told.kinds & {"limit_crossed", "model_disagrees"}
-        assert all(look.axes == {} for look in told.gaps)
-        assert not np.isfinite(kept.select_column("gz.N").last).any()
-        assert set(known.coefficients.coefficients.status.ravel().tolist()) == {Status.UNESTIMATED}
-        assert known.status is not None
-        assert known.status.text == told.health_text
-        assert told.health_text.endswith(
+        assert not collector.kinds & {"limit_crossed", "model_disagrees"}
+        assert all(comparison.axes == {} for comparison in collector.gaps)
+        assert not np.isfinite(history.select_column("gz.N").last).any()
+        assert set(device.coefficients.coefficients.status.ravel().tolist()) == {Status.UNESTIMATED}
+        assert device.status is not None
+        assert device.status.text == collector.health_text
+        assert collector.health_text.endswith(
             "the end of the file; measured rate 100 Hz differs from the configured 200 Hz; coefficients are withheld: "
             "correct `rate` or remove it"
         )
 
 
-def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
+def test_recording_without_a_rate_is_reported(tmp_path: Path) -> None:
     save_samples(tmp_path / "r.npz", np.arange(50) / 100.0, np.ones((50, 6)))
-    told = Estimates()
+    collector = EstimateCollector()
     path = tmp_path / "config.toml"
     path.write_text(
         '[[device]]\nname = "d"\ndriver = { link = "replay", path = "r.npz" }\n'
         '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
     )
-    service = Service(loading.load_config(path), [told])
+    service = Service(loading.load_config(path), [collector])
     service.run(60.0)
     assert service.workers[0].publisher.published == 50
-    assert told.all == []
-    assert told.health_text.endswith("; no estimate: the times of the samples do not show a rate; set `rate`")
+    assert collector.all == []
+    assert collector.health_text.endswith("; no estimate: the times of the samples do not show a rate; set `rate`")
 
 
-def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full_disk(
+def test_kernels_that_cannot_be_stored_do_not_stop_processing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail_with_full_disk(
         _group: kernel_groups.KernelGroup, _tell: Callable[[kernel_compilation.CompilationProgress], None]
     ) -> Iterator[str]:
         yield kernel_groups.WINDOW
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(kernel_compilation, "prepare_kernels", full_disk)
+    monkeypatch.setattr(kernel_compilation, "prepare_kernels", fail_with_full_disk)
     save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, np.random.default_rng(1).standard_normal((500, 6)))
-    service = Service(config(tmp_path, 'link = "replay", path = "short.npz", speed = "max"', 'mode = "none"'))
+    service = Service(
+        write_and_load_config(tmp_path, 'link = "replay", path = "short.npz", speed = "max"', 'mode = "none"')
+    )
     with capture_logs() as logs:
         service.run(PATIENCE_S)
     latest = service.workers[0].publisher.latest
@@ -298,17 +304,19 @@ def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.long
-def test_a_replay_that_is_stopped_loses_nothing_it_has_counted(tmp_path: Path) -> None:
-    n = 1_000_000  # many times what the ring holds
+def test_stopped_replay_loses_no_counted_samples(tmp_path: Path) -> None:
+    n = 1_000_000  # many times the capacity of the ring
     save_samples(tmp_path / "long.npz", np.arange(n) / 100.0, np.random.default_rng(1).standard_normal((n, 6)))
-    service = Service(config(tmp_path, 'link = "replay", path = "long.npz", speed = "max"', 'mode = "none"'))
-    (station,) = service.workers
+    service = Service(
+        write_and_load_config(tmp_path, 'link = "replay", path = "long.npz", speed = "max"', 'mode = "none"')
+    )
+    (worker,) = service.workers
     thread = threading.Thread(target=service.run)
     thread.start()
-    wait_for(lambda: station.publisher.published > 0)
+    wait_for(lambda: worker.publisher.published > 0)
     service.request_stop()
     thread.join(PATIENCE_S)
     assert not thread.is_alive()
-    assert station.driver.state != "ended"
-    assert station.ring.overflowed == 0
-    assert station.publisher.published == station.driver.counts.received < n
+    assert worker.driver.state != "ended"
+    assert worker.ring.overflowed == 0
+    assert worker.publisher.published == worker.driver.counts.received < n

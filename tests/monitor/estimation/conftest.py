@@ -1,4 +1,4 @@
-"""What several tests of the estimators read."""
+"""Fixtures that several tests of the estimators use."""
 
 from pathlib import Path
 
@@ -9,5 +9,5 @@ from tests.support.recordings import recordings
 
 @pytest.fixture
 def reference() -> Path:
-    """Folder of published data whose deviations are known, or a skip without ``IMU_MONITOR_DATA``."""
+    """Return the folder of published data with known deviations; skip the test without ``IMU_MONITOR_DATA``."""
     return recordings() / "reference"

@@ -1,4 +1,4 @@
-"""A whole recording: its grid in time, its rate, and what is said about both."""
+"""Tests of the analysis of a whole recording: time grid, rate, notes, motion and changes."""
 
 import re
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +16,7 @@ from tests.support.recordings import recorded_blocks, recordings, white
 
 @pytest.mark.parametrize("rate", [100.0, None])
 @pytest.mark.parametrize("rows", [17, 1000, 10**6])
-def test_a_steady_recording(rate, rows):
+def test_analysis_of_a_regular_recording_gives_rate_and_coefficients(rate, rows):
     values = white(6000)
     found = analyze(recorded_blocks(np.arange(6000) / 100, values, rows), rate)
     assert found.notes == ()
@@ -30,7 +30,7 @@ def test_a_steady_recording(rate, rows):
 
 @pytest.mark.parametrize("rate", [100.0, None])
 @pytest.mark.parametrize("rows", [17, 1000, 10**6])
-def test_holes_stay_in_their_places(rate, rows):
+def test_missing_samples_keep_their_positions(rate, rows):
     index = np.arange(8000)
     kept = ~((index >= 3000) & (index < 3123) | (index == 5000))
     values = white(8000)
@@ -41,17 +41,17 @@ def test_holes_stay_in_their_places(rate, rows):
     assert np.array_equal(grid, expected, equal_nan=True)
 
 
-def test_a_very_long_pause_is_not_counted_among_the_short_holes():
+def test_very_long_gap_is_not_counted_among_the_short_gaps():
     index = np.concatenate([np.arange(3000), 3000 + 2 * MAX_GAP_SAMPLES + np.arange(3000)])
     index = np.delete(index, [1000, 1001, 1002])
     _, _, notes = place_samples_on_grid(recorded_blocks(index / 100, white(5997)), 100.0)
     assert "3 samples are missing in 1 place; differences that contain them are left out" in notes
 
 
-def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
+def test_very_long_gap_takes_no_memory_and_no_term_crosses_it():
     t = np.concatenate([np.arange(3000) / 100, 30.0 + 2 * MAX_GAP_SAMPLES / 100 + np.arange(3000) / 100])
     values = white(6000)
-    values[3000:] += 1.0  # a step that would show in every term across
+    values[3000:] += 1.0  # a step that would affect every term across the gap
     found = analyze(recorded_blocks(t, values), 100.0)
     assert any("too long to be kept" in note for note in found.notes)
     assert found.estimate.curve.n == 6001
@@ -59,40 +59,40 @@ def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
 
 
 @pytest.mark.parametrize("jump_s", [-40.0, 5 * 3600.0])
-def test_a_jump_of_the_times_does_not_spoil_the_rate(jump_s):
+def test_jump_of_the_times_does_not_affect_the_rate(jump_s):
     t = np.concatenate([np.arange(5000) / 100, 50.0 + jump_s + np.arange(5000) / 100])
     found = analyze(recorded_blocks(t), None)
     assert found.estimate.rate_hz == 100.0
     assert any(note.startswith(("time went", "time jumped")) for note in found.notes)
 
 
-def test_times_that_jitter_are_no_holes():
+def test_jitter_of_the_times_causes_no_gaps():
     t = np.arange(8000) / 100 + 0.001 * np.random.default_rng(1).standard_normal(8000)
     found = analyze(recorded_blocks(t), None)
     assert (found.estimate.rate_hz, found.estimate.curve.n) == (100.0, 8000)
 
 
 @pytest.mark.parametrize("n", [1, 2, MIN_SAMPLES - 1])
-def test_too_short_is_an_answer(n):
+def test_too_short_recording_is_refused(n):
     with pytest.raises(NotReady):
         analyze(recorded_blocks(np.arange(n) / 100), None)
     with pytest.raises(NotReady, match="at least 50"):
         analyze(recorded_blocks(np.arange(n) / 100), 100.0)
 
 
-def test_times_that_stand_still_ask_for_the_rate():
+def test_constant_times_ask_for_the_rate():
     with pytest.raises(NotReady, match="--rate"):
         analyze(recorded_blocks(np.zeros(500)), None)
 
 
-def test_a_list_of_tau():
+def test_listed_tau_are_used():
     blocks = recorded_blocks(np.arange(6000) / 100)
     assert analyze(blocks, 100.0, (0.1, 1.0)).estimate.curve.tau_s.tolist() == [0.1, 1.0]
     with pytest.raises(ConfigError):
         analyze(blocks, 100.0, (100.0,))
 
 
-def test_an_absent_axis_is_unestimated_and_warns_nobody():
+def test_absent_axis_is_unestimated_without_a_note():
     values = white(6000)
     values[:, 3:] = np.nan
     found = analyze(recorded_blocks(np.arange(6000) / 100, values), None, reading_notes=["of the file"])
@@ -114,66 +114,66 @@ def test_an_absent_axis_is_unestimated_and_warns_nobody():
         ("autopilot-3imu/imu1.npz", 50.0),
     ],
 )
-def test_recordings_of_real_sensors(name, rate):
+def test_real_recordings_have_the_known_rate(name, rate):
     from drivers.recordings import iter_blocks, load_samples
 
     loaded = load_samples(recordings() / name)
     blocks = list(iter_blocks(loaded))
     found = analyze(blocks, None, reading_notes=loaded.notes)
     assert found.estimate.rate_hz == pytest.approx(rate, rel=0.01)
-    received = sum(len(one) for one in blocks)
+    received = sum(len(block) for block in blocks)
     assert received <= found.estimate.curve.n <= 1.02 * received
     assert (found.estimate.coefficients.status[1, :3] != Status.UNESTIMATED).all()
 
 
-def test_too_few_averaging_times_for_a_fit_are_said():
+def test_too_few_tau_for_a_fit_give_a_note():
     found = analyze(recorded_blocks(np.arange(6000) / 100), 100.0, (0.1, 1.0, 10.0))
     assert found.notes == ("3 averaging times are too few to fit five terms; at least 5 are needed",)
     assert (found.estimate.coefficients.status == Status.UNESTIMATED).all()
 
 
-def test_times_that_contradict_the_stated_rate_are_said():
+def test_times_that_contradict_the_stated_rate_give_a_note():
     found = analyze(recorded_blocks(np.arange(6000) / 50), 100.0)
     assert "the rate used is 100 Hz, but the times increase in steps of 0.02 s, 50 Hz" in found.notes
 
 
-# --- what happened in it ---------------------------------------------------------------------------
+# --- motion and changes
 
 
-def moved(n=12_000):
-    """Two minutes at 100 Hz, turned by hand for three seconds in the middle."""
+def simulate_motion(n=12_000):
+    """Return two minutes at 100 Hz with three seconds of rotation in the middle."""
     values = white(n)
     values[6000:6300, 0] += np.sin(np.arange(300) / 20)
     return values
 
 
-def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
-    blocks = recorded_blocks(np.arange(12_000) / 100, moved())
+def test_motion_is_reported_and_removed_only_on_request():
+    blocks = recorded_blocks(np.arange(12_000) / 100, simulate_motion())
     left = analyze(blocks, 100.0)
     assert left.motions == ()
-    assert not any("moved" in note for note in left.notes)  # asked only by events_of
-    told = detect_disturbances(left)
-    [motion] = told.motions
+    assert not any("moved" in note for note in left.notes)  # only detect_disturbances looks for motion
+    with_motion = detect_disturbances(left)
+    [motion] = with_motion.motions
     assert 5900 <= motion.since < 6000
-    assert "the sensor moved once, 3 s in all: not removed; --rest removes the samples in motion" in told.notes
-    assert any(note.startswith(f"at {motion.since / 100:.1f} s: moved for 3.0 s: gx") for note in told.notes)
-    struck = detect_disturbances(analyze(blocks, 100.0, remove_motion=True))
-    assert struck.motions == told.motions
-    assert sum("s in all: removed" in note for note in struck.notes) == 1
-    assert np.isnan(struck.values[motion.since : motion.until]).all()
-    assert not np.isnan(struck.values[: motion.since]).any()
-    assert left.estimate.curve.avar[0, 0] > 1.5 * struck.estimate.curve.avar[0, 0]
-    assert struck.estimate.curve.avar[0] == pytest.approx(np.full(6, 1e-6), rel=0.1)
-    assert (struck.seconds, struck.estimate.curve.n) == (120.0, 12_000)
+    assert "the sensor moved once, 3 s in all: not removed; --rest removes the samples in motion" in with_motion.notes
+    assert any(note.startswith(f"at {motion.since / 100:.1f} s: moved for 3.0 s: gx") for note in with_motion.notes)
+    removed = detect_disturbances(analyze(blocks, 100.0, remove_motion=True))
+    assert removed.motions == with_motion.motions
+    assert sum("s in all: removed" in note for note in removed.notes) == 1
+    assert np.isnan(removed.values[motion.since : motion.until]).all()
+    assert not np.isnan(removed.values[: motion.since]).any()
+    assert left.estimate.curve.avar[0, 0] > 1.5 * removed.estimate.curve.avar[0, 0]
+    assert removed.estimate.curve.avar[0] == pytest.approx(np.full(6, 1e-6), rel=0.1)
+    assert (removed.seconds, removed.estimate.curve.n) == (120.0, 12_000)
 
 
 @pytest.mark.long
-def test_motion_is_no_change_of_noise():
-    values = moved(30_000)
+def test_motion_is_not_reported_as_changed_noise():
+    values = simulate_motion(30_000)
     assert detect_disturbances(analyze(recorded_blocks(np.arange(30_000) / 100, values), 100.0)).changes == ()
 
 
-def test_changes_are_told_with_time_and_size():
+def test_change_of_noise_is_reported_with_time_and_size():
     values = white(60_000)
     values[40_000:, 2] += 1.5e-3 * np.random.default_rng(9).standard_normal(20_000)
     found = detect_disturbances(
@@ -183,7 +183,7 @@ def test_changes_are_told_with_time_and_size():
     assert (change.kind, change.axis) == ("noise_changed", 2)
     assert change.since == pytest.approx(40_000, abs=50)
     assert found.notes[0] == "of the file"
-    [note] = [one for one in found.notes if "angle random walk" in one]
+    [note] = [note for note in found.notes if "angle random walk" in note]
     assert re.fullmatch(r"at (399|400)\.\d s: gz angle random walk rose by [78]\d % \(\d+\.\d σ\)", note)
     assert (
         "the curve of the whole recording mixes the noise before and after; --window S shows the noise over time"
@@ -191,14 +191,14 @@ def test_changes_are_told_with_time_and_size():
     )
 
 
-def test_a_sensor_that_never_rests_is_an_answer():
+def test_recording_without_rest_is_refused():
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.standard_normal((120, 6)), axis=0)
     with pytest.raises(NotReady, match=r"\d+ samples at rest; at least 50 are needed"):
         analyze(recorded_blocks(np.arange(120) / 100, values), 100.0, remove_motion=True)
 
 
-def test_axes_side_by_side_give_the_same():
+def test_parallel_axes_give_the_same_result():
     blocks = recorded_blocks(np.arange(6000) / 100)
     with ThreadPoolExecutor(2) as pool:
         side_by_side = analyze(blocks, 100.0, map_axes=pool.map)

@@ -9,24 +9,24 @@ from monitor.history.time_ranges import TimeRange
 NOW = 1_763_700_000.0
 
 
-def test_nothing_asked_is_the_last_day_without_deviations() -> None:
+def test_empty_query_means_the_last_day_without_deviations() -> None:
     assert parse_query("", NOW) == HistoryQuery(None, None, DEFAULT_PARTS)
 
 
-def test_all_at_once_in_any_order_and_a_range_keeps_its_semicolon() -> None:
-    asked = parse_query("letter=B,N;step=15min;_time=[now(-1h);30m];axis=gz;what=deviations,coefficients;_anyke", NOW)
+def test_all_parameters_are_accepted_in_any_order() -> None:
+    query = parse_query("letter=B,N;step=15min;_time=[now(-1h);30m];axis=gz;what=deviations,coefficients;_anyke", NOW)
     expected = HistoryQuery(
         TimeRange(NOW - 3600.0, NOW - 1800.0), 900, ("coefficients", "deviations"), ("gz",), ("N", "B")
     )
-    assert asked == expected
-    wanted = [
-        name for name in ("gz.N", "gz.B.bound", "gz.K", "gx.N", "gz.sigma.1", "rate") if asked.selects_column(name)
+    assert query == expected
+    selected = [
+        name for name in ("gz.N", "gz.B.bound", "gz.K", "gx.N", "gz.sigma.1", "rate") if query.selects_column(name)
     ]
-    assert wanted == ["gz.N", "gz.B.bound", "gz.sigma.1"]
+    assert selected == ["gz.N", "gz.B.bound", "gz.sigma.1"]
 
 
 @pytest.mark.parametrize(
-    ("parameters", "says"),
+    ("parameters", "message"),
     [
         ("axes=gz", 'did you mean "axis"'),
         ("axis=gq", 'axis: "gq"'),
@@ -39,17 +39,17 @@ def test_all_at_once_in_any_order_and_a_range_keeps_its_semicolon() -> None:
         ("a" * 2000, "at most"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(parameters: str, says: str) -> None:
-    with pytest.raises(ConfigError, match=says) as error:
+def test_invalid_query_is_refused_in_one_line(parameters: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
         parse_query(parameters, NOW)
     assert "\n" not in str(error.value)
 
 
 @given(st.text(max_size=200))
-def test_any_text_is_a_question_or_a_line(text: str) -> None:
-    said = ""
+def test_any_text_is_parsed_or_refused_briefly(text: str) -> None:
+    message = ""
     try:
         parse_query(text, NOW)
     except ConfigError as error:
-        said = str(error)
-    assert len(said) < 1000
+        message = str(error)
+    assert len(message) < 1000

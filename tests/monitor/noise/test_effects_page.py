@@ -1,4 +1,4 @@
-"""docs/effects.md says what the code says: names, order, sentences, parameters, units, what is NaN."""
+"""Tests that docs/effects.md agrees with the code: names, order, descriptions, parameters and units."""
 
 import re
 from dataclasses import fields
@@ -10,7 +10,7 @@ import pytest
 from monitor.noise.effect import Transform, gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER
 from monitor.noise.temperature import Temperature
-from tests.contracts.effect_examples import AXIS, model
+from tests.contracts.effect_examples import AXIS, make_model
 
 PAGE = Path(__file__).parents[3] / "docs" / "effects.md"
 SECTIONS = dict(
@@ -18,7 +18,7 @@ SECTIONS = dict(
 )
 
 
-def test_every_effect_is_there_and_transforms_are_marked_in_their_order():
+def test_page_has_every_effect_and_the_order_of_the_transforms():
     assert list(SECTIONS) == [*EFFECTS, "temperature"]
     marked = re.findall(r"^## `(\w+)` →$", PAGE.read_text("utf-8"), flags=re.MULTILINE)
     assert marked == [kind.name for kind in TRANSFORM_ORDER]
@@ -26,7 +26,7 @@ def test_every_effect_is_there_and_transforms_are_marked_in_their_order():
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_section_is_that_of_the_code(name):
+def test_section_agrees_with_the_code(name):
     section = SECTIONS[name]
     assert section.strip().startswith(EFFECTS[name].description)
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", section, flags=re.MULTILINE))
@@ -38,12 +38,14 @@ def test_section_is_that_of_the_code(name):
     assert all(re.search(rf"^\| {what} \| [^|]*\w[^|]* \|$", section, flags=re.MULTILINE) for what in properties)
 
 
-@pytest.mark.parametrize("name", sorted(set(EFFECTS) - {"saturation", "resolution"}))  # those depend on their numbers
-def test_page_says_nan_where_the_code_does(name):
-    value = model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
+@pytest.mark.parametrize(
+    "name", sorted(set(EFFECTS) - {"saturation", "resolution"})
+)  # whether these are NaN depends on their parameters
+def test_page_states_nan_where_the_code_returns_nan(name):
+    value = make_model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
     assert ("| σ²(τ) | NaN |" in SECTIONS[name]) == bool(np.isnan(value))
 
 
-def test_temperature_is_there():
+def test_page_describes_the_temperature():
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", SECTIONS["temperature"], flags=re.MULTILINE))
     assert rows == {name: unit for name, (unit, _) in gyro_and_accel_units(Temperature).items()}

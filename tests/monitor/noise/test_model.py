@@ -1,4 +1,4 @@
-"""Noise models: text and back, errors in one line, seeds."""
+"""Tests of noise models: TOML files, errors in one line, seeds and sums."""
 
 from pathlib import Path
 
@@ -23,11 +23,11 @@ def test_shipped_models_are_read_and_written_back(path):
     assert NoiseModel.from_toml(model.to_toml()) == model
 
 
-def test_some_model_is_shipped():
+def test_models_are_shipped():
     assert MODELS
 
 
-def test_wildcards_stand_for_a_kind_of_axes_and_add_to_named_ones():
+def test_wildcards_select_axes_of_one_kind_and_add_effects():
     model = NoiseModel.from_toml('[gz.bias]\nvalue = 1.0\n["g*".angle_random_walk]\nN = 2e-4')
     assert model.effects == {
         "gx": (AngleRandomWalk(N=2e-4),),
@@ -36,7 +36,7 @@ def test_wildcards_stand_for_a_kind_of_axes_and_add_to_named_ones():
     }
 
 
-def test_an_effect_that_occurs_twice_is_an_array_of_tables():
+def test_repeated_effect_is_an_array_of_tables():
     text = "[[gx.bias]]\nvalue = 1.0\n[[gx.bias]]\nvalue = 2.0\n"
     model = NoiseModel.from_toml(text)
     assert model.effects["gx"] == (ConstantBias(value=1.0), ConstantBias(value=2.0))
@@ -44,7 +44,7 @@ def test_an_effect_that_occurs_twice_is_an_array_of_tables():
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("[gq.bias]\nvalue = 1", 'unknown axis "gq"; did you mean "gz"?'),
         ("[gz.angle_randomwalk]\nN = 1", 'gz: unknown effect "angle_randomwalk"; did you mean "angle_random_walk"?'),
@@ -107,14 +107,14 @@ def test_an_effect_that_occurs_twice_is_an_array_of_tables():
         ("temperature = 25", "temperature must be a table with mean, swing, period, wander, wander_time"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(text, says):
+def test_invalid_model_is_refused_in_one_line(text, message):
     with pytest.raises(ConfigError) as error:
         NoiseModel.from_toml(text)
-    assert str(error.value).startswith(says)
+    assert str(error.value).startswith(message)
     assert "\n" not in str(error.value)
 
 
-def test_temperature_is_needed_by_the_stream_and_not_by_the_file():
+def test_temperature_is_needed_for_simulation_and_not_for_reading():
     model = NoiseModel.from_toml("sample_rate = 100\n[gz.temperature_bias]\ncoefficient = 1\nreference = 20")
     with pytest.raises(ConfigError, match=r"^gz.temperature_bias: no temperature: .* no table \[temperature\]"):
         model.start_stream(100.0, 0)
@@ -122,14 +122,14 @@ def test_temperature_is_needed_by_the_stream_and_not_by_the_file():
 
 
 def test_sum_keeps_the_first_rate_and_temperature():
-    one = NoiseModel({}, 100.0, Temperature(mean=20.0))
-    assert one + NoiseModel({}, 50.0, Temperature(mean=30.0)) == one
-    assert NoiseModel() + one == one
+    model = NoiseModel({}, 100.0, Temperature(mean=20.0))
+    assert model + NoiseModel({}, 50.0, Temperature(mean=30.0)) == model
+    assert NoiseModel() + model == model
     with pytest.raises(TypeError):
-        one + 1
+        model + 1
 
 
-def test_print_is_a_table_with_units():
+def test_printed_model_is_a_table_with_units():
     model = NoiseModel(
         {
             "gz": (AngleRandomWalk(N=1.5e-4), GSensitivity(source="az", coefficient=2e-5)),
@@ -148,7 +148,7 @@ def test_print_is_a_table_with_units():
     ]
 
 
-def test_adding_an_effect_changes_no_other_series():
+def test_added_effect_changes_no_other_series():
     white = NoiseModel({"gz": (AngleRandomWalk(N=1e-4),)})
     walk = NoiseModel({"gz": (RateRandomWalk(K=1e-5),), "ax": (AngleRandomWalk(N=1e-3),)})
     both = (walk + white).simulate(500, 100.0, 3)
@@ -162,7 +162,7 @@ def test_axes_and_equal_effects_are_independent():
     correlation = np.corrcoef(model.simulate(20_000, 1.0, 0).T) - np.eye(6)
     assert np.abs(correlation).max() < 5.0 / np.sqrt(20_000)
     twice = NoiseModel({"gx": (AngleRandomWalk(N=1.0), AngleRandomWalk(N=1.0))})
-    # independent variances add to 2; the same series twice would give 4. χ² of 20 000: 1 %
+    # Independent variances add up to 2, whereas the same series twice gives 4. χ² of 20 000 determines 1 %.
     assert twice.simulate(20_000, 1.0, 0)[:, 0].var() == pytest.approx(2.0, rel=0.05)
 
 
@@ -182,7 +182,7 @@ def test_avar_and_psd_are_sums_over_an_axis():
     assert model.two_sided_psd("gx", np.array([5.0]), 0.1)[0] == pytest.approx(1.0 + 40.0)
 
 
-def test_all_mistakes_of_a_model_file_are_told_at_once() -> None:
+def test_all_mistakes_of_a_model_file_are_reported_at_once() -> None:
     text = """
 sample_rate = -1.0
 [temperature]
@@ -200,7 +200,7 @@ sigma = 1e-3
 """
     with pytest.raises(ConfigError) as caught:
         NoiseModel.from_toml(text)
-    begins = [
+    starts = [
         "sample_rate: -1 Hz is outside the supported range",
         "temperature: ",
         'unknown axis "gq"',
@@ -210,6 +210,6 @@ sigma = 1e-3
         "gz.narrowband: frequency is missing",
         "gz.narrowband: bandwidth is missing",
     ]
-    assert len(caught.value.mistake_lines) == len(begins), caught.value.mistake_lines
-    for line, begin in zip(caught.value.mistake_lines, begins, strict=True):
-        assert line.startswith(begin), line
+    assert len(caught.value.mistake_lines) == len(starts), caught.value.mistake_lines
+    for line, start in zip(caught.value.mistake_lines, starts, strict=True):
+        assert line.startswith(start), line

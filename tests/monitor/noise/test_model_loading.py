@@ -1,4 +1,4 @@
-"""The shipped sensors: every value is its comment's number in the sheet's unit, converted; every file simulates."""
+"""Tests of the shipped sensor models: values agree with the data sheets, and each model can be simulated."""
 
 import re
 from pathlib import Path
@@ -12,16 +12,16 @@ from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 
 SENSORS = sorted(
-    {  # once each: a namespace package may name one folder several times
+    {  # a namespace package may contain one folder several times
         path.resolve()
         for root in config.__path__
         for path in Path(root).glob("models/*.toml")
-        if path.stem != "consumer-mems"  # a class of sensors, not one
+        if path.stem != "consumer-mems"  # this model describes a class of sensors
     }
 )
 DEGREE, HOUR_S, G = np.pi / 180.0, 3600.0, 9.80665
-ONE_SIDED = 1.0 / np.sqrt(2.0)  # of a density's root, to two-sided
-FLOOR = 1.0 / np.sqrt(2.0 * np.log(2.0) / np.pi)  # B of the lowest point of the curve
+ONE_SIDED = 1.0 / np.sqrt(2.0)  # converts the root of a one-sided density to two-sided
+FLOOR = 1.0 / np.sqrt(2.0 * np.log(2.0) / np.pi)  # converts the minimum of the Allan deviation to B
 SHEET_UNITS = {
     "°/s/√Hz": DEGREE * ONE_SIDED,
     "mdps/√Hz": 1e-3 * DEGREE * ONE_SIDED,
@@ -44,18 +44,18 @@ PER_COUNT = {"LSB/(°/s)": DEGREE, "LSB/g": G}
 VALUE = re.compile(r"^\w+ = (?P<value>\S+) +# (?P<si>[^;]+); (?P<number>\S+) (?P<unit>.+)$")
 
 
-def from_sheet(number: float, unit: str) -> float:
+def convert_sheet_value(number: float, unit: str) -> float:
     return PER_COUNT[unit] / number if unit in PER_COUNT else number * SHEET_UNITS[unit]
 
 
-def test_there_are_at_least_ten_of_three_grades():
+def test_there_are_at_least_ten_models_of_three_grades():
     heads = " ".join(path.read_text("utf-8").splitlines()[0] for path in SENSORS)
     assert len(SENSORS) >= 10
     assert all(grade in heads for grade in ("consumer", "industrial", "tactical"))
 
 
 @pytest.mark.parametrize("path", SENSORS, ids=lambda path: path.stem)
-def test_every_value_is_the_sheets_own(path):
+def test_values_agree_with_the_data_sheet(path):
     section, checked = "", 0
     for line in path.read_text("utf-8").splitlines():
         if line.startswith("["):
@@ -63,7 +63,7 @@ def test_every_value_is_the_sheets_own(path):
         elif line and not line.startswith(("#", "sample_rate")):
             match = VALUE.match(line)
             assert match, f"no sheet value beside: {line}"
-            expected = from_sheet(float(match["number"]), match["unit"])
+            expected = convert_sheet_value(float(match["number"]), match["unit"])
             assert float(match["value"]) == pytest.approx(expected, rel=1e-6)
             kind, effect = re.match(r'\["?([ga]).*?\.(\w+)\]', section).groups()
             units = next(iter(EFFECTS[effect].__dataclass_fields__.values())).metadata["units"]
@@ -73,7 +73,7 @@ def test_every_value_is_the_sheets_own(path):
 
 
 @pytest.mark.parametrize("path", SENSORS, ids=lambda path: path.stem)
-def test_names_its_document(path):
+def test_model_names_its_document(path):
     head = " ".join(line.lstrip("# ") for line in path.read_text("utf-8").splitlines() if line.startswith("#"))
     assert re.search(r"[Dd]ata ?[Ss]heet|Product Specification|user manual", head)
     assert re.search(r"revision (\w|\.)+", head), "which revision, or that it is not known"
@@ -82,11 +82,11 @@ def test_names_its_document(path):
 
 
 @pytest.mark.parametrize("path", SENSORS, ids=lambda path: path.stem)
-def test_simulates_at_its_rate(path):
+def test_model_simulates_the_stated_allan_variance(path):
     model = NoiseModel.from_toml(path.read_text("utf-8"))
     rate_hz = model.sample_rate_hz
     values = model.simulate(20_000, rate_hz, 1)
     for column, axis in enumerate(AXES):
-        # 20 000 first differences: half their mean square is σ²(τ0), known to 1.3 %
+        # The variance σ²(τ0) from 20 000 first differences is accurate to 1.3 %.
         stated = model.avar(axis, np.array([1.0 / rate_hz]), 1.0 / rate_hz)[0]
         assert 0.5 * np.mean(np.diff(values[:, column]) ** 2) == pytest.approx(stated, rel=0.06)

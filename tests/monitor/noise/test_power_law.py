@@ -1,4 +1,4 @@
-"""Power laws beside the classic terms, beside fractional integration written down a second time, and in time."""
+"""Tests of power-law noise against the classic terms, fractional integration and the stated Allan variance."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ RATE_HZ = 100.0
 
 
 @pytest.mark.parametrize("d", [0.02, 0.25, 0.5, 0.75, 0.97])
-def test_the_impulse_response_is_that_of_fractional_integration(d: float) -> None:
+def test_impulse_response_is_that_of_fractional_integration(d: float) -> None:
     running = power_law._FractionalNoise(1.0, d, np.random.default_rng(0))
     k = np.concatenate([np.arange(20.0), np.geomspace(20.0, 1e7, 60).round()])
     powers = np.exp(k[:, None] * np.log(running._poles))
@@ -28,24 +28,24 @@ def test_the_impulse_response_is_that_of_fractional_integration(d: float) -> Non
         (2.0, RateRandomWalk(K=2.0 * np.pi)),
     ],
 )
-def test_classic_exponents_are_the_classic_terms(exponent: float, classic) -> None:
+def test_integer_exponents_are_the_classic_terms(exponent: float, classic) -> None:
     f_hz, tau_s = np.geomspace(1e-3, 1.0, 20), np.array([2.56, 30.0, 1000.0])
-    one = PowerLaw(density=1.0, exponent=exponent)
-    np.testing.assert_allclose(one.two_sided_psd(f_hz, 0.01), classic.two_sided_psd(f_hz, 0.01), rtol=3e-4)
-    np.testing.assert_allclose(one.avar(tau_s, 0.01), classic.avar(tau_s, 0.01), rtol=1e-3)
+    noise = PowerLaw(density=1.0, exponent=exponent)
+    np.testing.assert_allclose(noise.two_sided_psd(f_hz, 0.01), classic.two_sided_psd(f_hz, 0.01), rtol=3e-4)
+    np.testing.assert_allclose(noise.avar(tau_s, 0.01), classic.avar(tau_s, 0.01), rtol=1e-3)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.5, 2.5, 2.9])
-def test_allan_variance_grows_with_its_power(exponent: float) -> None:
-    """σ²(τ) ∝ τ^(α−1), also where most of it comes from below the grid of the integral."""
+def test_allan_variance_is_a_power_of_tau(exponent: float) -> None:
+    """The relation is σ²(τ) ∝ τ^(α−1), even if most of the variance comes from below the integration grid."""
     tau_s = np.array([10.0, 100.0, 1000.0])
     avar = PowerLaw(density=1.0, exponent=exponent).avar(tau_s, 0.01)
     np.testing.assert_allclose(avar[1:] / avar[:-1], 10.0 ** (exponent - 1.0), rtol=5e-3)
 
 
 @pytest.mark.parametrize("exponent", [0.4, 1.0, 1.5, 1.9, 2.4])
-def test_steps_over_any_time_are_as_large_at_the_start_as_later(exponent: float) -> None:
-    """The stated Allan variance, over two samples and over two seconds, from the first sample on."""
+def test_allan_variance_is_the_same_at_the_start_and_later(exponent: float) -> None:
+    """The test uses cluster times of one sample and of one second."""
     rng = np.random.default_rng(3)
     runs = np.stack(
         [
@@ -62,8 +62,7 @@ def test_steps_over_any_time_are_as_large_at_the_start_as_later(exponent: float)
         assert np.mean(halves**2) == pytest.approx(stated[1], rel=0.15)
 
 
-def test_behind_a_filter() -> None:
-    """The integral of the filtered spectrum is that without a filter where the filter does nothing."""
-    one = PowerLaw(density=1.0, exponent=2.6).spectrum(0.01)
-    filtered = BandwidthLimit(cutoff=20.0, order=2).transform_spectrum(one)
-    assert filtered.avar(np.array([100.0]))[0] == pytest.approx(one.avar(np.array([100.0]))[0], rel=1e-3)
+def test_filter_does_not_change_the_variance_at_long_times() -> None:
+    spectrum = PowerLaw(density=1.0, exponent=2.6).spectrum(0.01)
+    filtered = BandwidthLimit(cutoff=20.0, order=2).transform_spectrum(spectrum)
+    assert filtered.avar(np.array([100.0]))[0] == pytest.approx(spectrum.avar(np.array([100.0]))[0], rel=1e-3)

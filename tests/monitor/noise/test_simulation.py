@@ -1,10 +1,11 @@
-"""The stream as a whole: leaks, order of transforms, effects added while it runs, truth, temperature, memory."""
+"""Tests of the simulation: transforms, cross-axis effects, effects added later, drawn values, temperature, memory."""
 
 import json
 import tracemalloc
 
 import numpy as np
 import pytest
+from scipy.signal import hilbert
 from scipy.stats import kstest
 
 from drivers.data_types import AXES
@@ -37,6 +38,7 @@ from monitor.noise.effects import (
     TemperatureBias,
     TemperatureLag,
     TurnOnTransient,
+    WanderingLine,
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
@@ -44,17 +46,17 @@ from monitor.noise.temperature import Temperature
 RATE_HZ = 100.0
 
 
-def test_transforms_act_in_their_order_wherever_they_stand():
+def test_transforms_act_in_a_fixed_order():
     assert [kind.name for kind in TRANSFORM_ORDER] == [
         "scale_factor", "bandwidth_limit", "sample_rate_error", "saturation", "resolution", "sample_hold",
         "unit_error",
     ]  # fmt: skip
     axis = (Resolution(step=0.4), Saturation(limit=1.0), ConstantBias(value=0.7), ScaleFactor(factor=2.0))
-    # 0.7 · 2 = 1.4, clipped to 1.0, rounded to 0.8; any other order gives another number
+    # 0.7 · 2 = 1.4 is clipped to 1.0 and rounded to 0.8. Any other order gives another value.
     assert NoiseModel({"gx": axis}).simulate(3, RATE_HZ, 0)[:, 0].tolist() == [0.8, 0.8, 0.8]
 
 
-def test_axes_leak_what_they_read_by_themselves():
+def test_cross_axis_effects_read_the_source_without_its_own_cross_axis_effects():
     both = NoiseModel(
         {
             "gx": (AngleRandomWalk(N=1.0), CrossAxis(source="gy", coefficient=0.5), Saturation(limit=9.0)),
@@ -73,7 +75,7 @@ def test_axes_leak_what_they_read_by_themselves():
     np.testing.assert_allclose(mixed[:, 1], 3.0 * np.rint((bare[:, 1] + 0.25 * read[:, 0]) / 3.0))
 
 
-def test_held_samples_are_the_same_ones_with_and_without_a_leak():
+def test_held_samples_do_not_depend_on_cross_axis_effects():
     axis = (AngleRandomWalk(N=1.0), RandomSampleHold(fraction=0.5))
     model = NoiseModel({"gx": axis, "gy": (ConstantBias(value=0.0),)})
     leaking = model + NoiseModel({"gx": (CrossAxis(source="gy", coefficient=1.0),)})
@@ -94,7 +96,7 @@ def test_held_samples_are_the_same_ones_with_and_without_a_leak():
     ],
     ids=lambda effect: effect.name,
 )
-def test_an_effect_added_before_the_first_sample_is_as_one_of_the_model(effect):
+def test_effect_added_before_the_first_sample_equals_an_effect_of_the_model(effect):
     model = NoiseModel({axis: (AngleRandomWalk(N=0.5), Saturation(limit=4.0)) for axis in AXES})
     running = model.start_stream(RATE_HZ, 1)
     running.add_effect("gz", effect)
@@ -102,7 +104,7 @@ def test_an_effect_added_before_the_first_sample_is_as_one_of_the_model(effect):
     np.testing.assert_array_equal(running.draw_next_samples(5000), whole)
 
 
-def test_what_is_added_acts_from_the_next_sample_on():
+def test_added_effect_acts_from_the_next_sample():
     model = NoiseModel(
         {"gz": (AngleRandomWalk(N=0.5), BandwidthLimit(cutoff=20.0, order=2)), "gx": (ConstantBias(value=1.0),)}
     )
@@ -114,15 +116,15 @@ def test_what_is_added_acts_from_the_next_sample_on():
     running.add_effect("gx", RateRamp(R=1.0))
     running.add_effect("gz", CrossAxis(source="gx", coefficient=1e-12))
     later = running.draw_next_samples(3000)
-    np.testing.assert_allclose(later[:, 2], plain[3000:, 2], atol=1e-9)  # the filter was not begun anew
+    np.testing.assert_allclose(later[:, 2], plain[3000:, 2], atol=1e-9)  # the filter was not restarted
     k = np.arange(3000)
     np.testing.assert_allclose(later[:, 0], 3.0 + 8.0 * (k >= 1000) + k / RATE_HZ)
 
 
-def test_what_cannot_be_added_is_said_and_changes_nothing():
+def test_impossible_effect_is_refused_and_changes_nothing():
     model = NoiseModel({"gz": (ConstantBias(value=1.0),)})
     running = model.start_stream(RATE_HZ, 1)
-    for axis, effect, says in (
+    for axis, effect, message in (
         ("gq", ConstantBias(value=1.0), 'unknown axis "gq"'),
         ("gz", Sinusoidal(amplitude=1.0, frequency=60.0), "gz.sinusoidal: frequency must be below 50 Hz"),
         (
@@ -134,12 +136,12 @@ def test_what_cannot_be_added_is_said_and_changes_nothing():
         ("gz", CrossAxis(source="gx", coefficient=2.0), "gz.cross_axis: the model has no effect on its source gx"),
         ("gz", TemperatureBias(coefficient=1.0, reference=2.0), "gz.temperature_bias: no temperature"),
     ):
-        with pytest.raises(ConfigError, match=f"^{says}"):
+        with pytest.raises(ConfigError, match=f"^{message}"):
             running.add_effect(axis, effect)
     np.testing.assert_array_equal(running.draw_next_samples(10), model.simulate(10, RATE_HZ, 1))
 
 
-def test_truth_tells_what_the_seed_decided():
+def test_drawn_random_values_agree_with_the_samples():
     model = NoiseModel(
         {
             "gz": (
@@ -160,9 +162,9 @@ def test_truth_tells_what_the_seed_decided():
     truth = json.loads(json.dumps(stream.drawn_random_values()))
     assert set(truth) == {"gx", "gy", "gz", "ax", "ay"}
 
-    one, other = (line["phase"] for line in truth["gz"]["sinusoidal"])  # a stated phase is in the model
+    first, third = (line["phase"] for line in truth["gz"]["sinusoidal"])  # a phase stated in the model is not drawn
     t = np.arange(10_000) / RATE_HZ
-    lines = [np.sin(2.0 * np.pi * f * t + phase) for f, phase in ((5.0, one), (6.0, 1.0), (7.0, other))]
+    lines = [np.sin(2.0 * np.pi * f * t + phase) for f, phase in ((5.0, first), (6.0, 1.0), (7.0, third))]
     np.testing.assert_allclose(values[:, 2], sum(lines), atol=1e-9)
 
     jumps = truth["gx"]["poisson_steps"][0]
@@ -181,22 +183,22 @@ def test_truth_tells_what_the_seed_decided():
     assert truth["ay"]["sample_hold"][0]["count"] == np.count_nonzero(np.diff(values[:, 4]) == 0.0)
 
 
-def test_truth_lists_no_more_than_a_stated_number():
+def test_number_of_listed_random_values_is_bounded():
     stream = NoiseModel({"gx": (Outliers(fraction=0.5, scale=1.0),)}).start_stream(RATE_HZ, 0)
     stream.draw_next_samples(5000)
-    told = stream.drawn_random_values()["gx"]["outliers"][0]
-    assert told["count"] > 2000
-    assert len(told["times"]) == len(told["errors"]) == 1000
+    outliers = stream.drawn_random_values()["gx"]["outliers"][0]
+    assert outliers["count"] > 2000
+    assert len(outliers["times"]) == len(outliers["errors"]) == 1000
 
 
-def test_dwells_are_exponential_and_either_level_comes_first():
+def test_dwell_times_are_exponential_and_both_levels_can_be_first():
     model = NoiseModel({"gx": (RandomTelegraph(amplitude=2.0, dwell_time=0.5),)})
     stream = model.start_stream(1000.0, 3)
     stream.draw_next_samples(400_000)
     dwells = np.diff(stream.drawn_random_values()["gx"]["random_telegraph"][0]["times"])
     assert kstest(dwells, "expon", args=(0.0, 0.5)).pvalue > 0.001
     firsts = [model.simulate(1, 1000.0, seed)[0, 0] for seed in range(200)]
-    assert 70 < np.count_nonzero(np.array(firsts) > 0.0) < 130  # 4.2 deviations of a fair coin
+    assert 70 < np.count_nonzero(np.array(firsts) > 0.0) < 130  # 4.2 standard deviations for equal probabilities
 
 
 @pytest.mark.parametrize(
@@ -204,19 +206,32 @@ def test_dwells_are_exponential_and_either_level_comes_first():
     [
         ExponentiallyCorrelated(sigma=2.0, correlation_time=50.0),
         Narrowband(sigma=2.0, frequency=3.0, bandwidth=0.01),
+        WanderingLine(amplitude=8.0**0.5, frequency=3.0, frequency_deviation=0.01, correlation_time=50.0),
         RandomTelegraph(amplitude=4.0, dwell_time=100.0),
     ],
     ids=lambda source: source.name,
 )
-def test_starts_stationary(source):
-    # 3000 first samples: their variance is known to 2.6 %, four of that
+def test_first_sample_is_stationary(source):
+    # The variance of 3000 first samples is known to 2.6 %; the bound is four times that.
     first = [NoiseModel({"gx": (source,)}).simulate(1, RATE_HZ, seed)[0, 0] for seed in range(3000)]
     assert np.mean(np.square(first)) == pytest.approx(4.0, rel=0.1)
 
 
-def test_generated_temperature_is_what_the_table_says():
-    warm = Temperature(mean=25.0, swing=3.0, period=40.0)
-    drawn = NoiseModel({}, RATE_HZ, warm).start_stream(RATE_HZ, 1).draw_samples_with_temperature(5000)
+def test_a_wandering_line_has_one_amplitude_and_many_frequencies():
+    line = WanderingLine(amplitude=2.0, frequency=20.0, frequency_deviation=3.0, correlation_time=5.0, phase=0.5)
+    y = NoiseModel({"gx": (line,)}).simulate(400_000, 1000.0, 1)[:, 0]
+    assert y[0] == pytest.approx(2.0 * np.sin(0.5))
+    turns = np.unwrap(np.angle(hilbert(y)))[2000:-2000]
+    assert np.abs(hilbert(y))[2000:-2000] == pytest.approx(2.0, rel=0.02)
+    hz = np.diff(turns[::100]) / (2.0 * np.pi * 0.1)
+    # 80 correlation times: the mean is known to 0.47 Hz, the deviation to 8 %
+    assert hz.mean() == pytest.approx(20.0, abs=1.5)
+    assert hz.std() == pytest.approx(3.0, rel=0.25)
+
+
+def test_generated_temperature_agrees_with_its_parameters():
+    swing = Temperature(mean=25.0, swing=3.0, period=40.0)
+    drawn = NoiseModel({}, RATE_HZ, swing).start_stream(RATE_HZ, 1).draw_samples_with_temperature(5000)
     np.testing.assert_allclose(
         drawn.temperature_c, 25.0 + 3.0 * np.sin(2.0 * np.pi * np.arange(5000) / RATE_HZ / 40.0), atol=1e-9
     )
@@ -227,7 +242,7 @@ def test_generated_temperature_is_what_the_table_says():
     assert np.isnan(NoiseModel().start_stream(RATE_HZ, 1).draw_samples_with_temperature(3).temperature_c).all()
 
 
-def test_recorded_temperature_stands_instead_and_is_held():
+def test_recorded_temperature_replaces_the_model_and_is_held():
     model = NoiseModel({"gx": (TemperatureBias(coefficient=1.0, reference=0.0),)}, None, Temperature(mean=99.0))
     drawn = model.start_stream(
         RATE_HZ, 1, np.array([np.nan, 20.0, np.nan, 22.0, np.nan])
@@ -238,7 +253,7 @@ def test_recorded_temperature_stands_instead_and_is_held():
         model.start_stream(RATE_HZ, 1, np.array([np.nan]))
 
 
-def test_true_time_runs_at_the_true_rate():
+def test_sample_rate_error_changes_the_true_time():
     axis = (
         BiasStep(time=10.0, height=1.0),
         Sinusoidal(amplitude=1.0, frequency=3.0, phase=0.0),
@@ -266,20 +281,20 @@ def test_memory_does_not_grow_with_the_length():
     )
     model = NoiseModel(dict.fromkeys(AXES, axis), None, Temperature(mean=20.0, wander=1.0, wander_time=9.0))
     stream = model.start_stream(RATE_HZ, 1)
-    stream.draw_next_samples(300_000)  # the lists of events are full
+    stream.draw_next_samples(300_000)  # the lists of events are full by now
     tracemalloc.start()
     for _ in range(30):
         stream.draw_next_samples(10_000)
-    held, peak = tracemalloc.get_traced_memory()
+    used, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert held < 100_000
+    assert used < 100_000
     assert peak < 2_000_000  # one block of 10 000 samples is 560 kB
 
 
-def test_exchanged_axes_show_each_other():
+def test_permuted_axes_show_each_other():
     plain = NoiseModel({"gx": (AngleRandomWalk(N=1.0), ConstantBias(value=9.0)), "gy": (AngleRandomWalk(N=2.0),)})
     swap = NoiseModel({"gx": (AxisPermutation(source="gy"),), "gy": (AxisPermutation(source="gx"),)})
-    drawn, swapped = (one.simulate(5000, 100.0, 1) for one in (plain, plain + swap))
+    drawn, swapped = (model.simulate(5000, 100.0, 1) for model in (plain, plain + swap))
     np.testing.assert_array_equal(swapped, drawn[:, [1, 0, 2, 3, 4, 5]])
     tau_s = np.array([1.0])
     assert (plain + swap).avar("gx", tau_s, 0.01) == plain.avar("gy", tau_s, 0.01)

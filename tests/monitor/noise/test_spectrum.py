@@ -1,4 +1,4 @@
-"""Spectra of whole axes: the integral against closed forms, filters and clocks against independent arithmetic."""
+"""Tests of the spectrum of an axis: Allan variance integrals, filters, held samples and clock errors."""
 
 import numpy as np
 import pytest
@@ -25,6 +25,7 @@ from monitor.noise.effects import (
     Saturation,
     ScaleFactor,
     Sinusoidal,
+    WanderingLine,
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.spectrum import allan_variance_of_density
@@ -46,39 +47,54 @@ SOURCES = (
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda s: s.name)
-def test_integral_over_the_spectrum_is_the_closed_form(source):
+def test_integral_over_the_spectrum_equals_the_closed_form(source):
     spectrum = source.spectrum(TAU0_S)
     tau = FACTORS * TAU0_S
     found = allan_variance_of_density(spectrum.density, tau, TAU0_S, spectrum.peaks)
     np.testing.assert_allclose(found, source.avar(tau, TAU0_S), rtol=1e-3)
 
 
-def avar_of(autocovariance: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """(4 V(m) − V(2m))/2m² with V(m) the variance of a sum of m samples."""
+@pytest.mark.parametrize(("deviation", "time_s"), [(0.05, 0.3), (0.9, 0.1), (0.9, 2.0), (0.3, 50.0)])
+def test_wandering_line_has_the_autocovariance_of_kubo(deviation, time_s):
+    lag = np.arange(400_000) * TAU0_S
+    index = (2.0 * np.pi * deviation * time_s) ** 2
+    r = 2.0 * np.cos(2.0 * np.pi * 17.3 * lag) * np.exp(-index * (np.expm1(-lag / time_s) + lag / time_s))
+    line = WanderingLine(amplitude=2.0, frequency=17.3, frequency_deviation=deviation, correlation_time=time_s)
+    factors = np.array([1, 2, 3, 7, 30, 500, 8000])
+    np.testing.assert_allclose(
+        line.avar(factors * TAU0_S, TAU0_S), compute_avar_from_autocovariance(r, factors), rtol=1e-3
+    )
+    f = 17.3 + np.array([-10.0, -2.0, -0.5, 0.0, 0.1, 1.5, 30.0])
+    expected = [TAU0_S * (2.0 * r @ np.cos(2.0 * np.pi * one * lag) - r[0]) for one in f]
+    np.testing.assert_allclose(line.two_sided_psd(f, TAU0_S), expected, rtol=5e-3, atol=1e-7)
+
+
+def compute_avar_from_autocovariance(autocovariance: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Return (4 V(m) − V(2m))/2m², where V(m) is the variance of a sum of m samples."""
     r = autocovariance
 
-    def of_sum(m: int) -> float:
+    def variance_of_sum(m: int) -> float:
         k = np.arange(1, m)
         return float(m * r[0] + 2.0 * ((m - k) * r[k]).sum())
 
-    return np.array([(4.0 * of_sum(m) - of_sum(2 * m)) / (2.0 * m**2) for m in factors])
+    return np.array([(4.0 * variance_of_sum(m) - variance_of_sum(2 * m)) / (2.0 * m**2) for m in factors])
 
 
 @pytest.mark.parametrize("order", [1, 2, 5])
 @pytest.mark.parametrize("cutoff", [0.7, 12.0, 48.0])
-def test_white_noise_through_the_low_pass(order, cutoff):
-    # autocovariance of the impulse response, from SciPy's own coefficients
+def test_low_passed_white_noise_has_the_stated_avar_and_psd(order, cutoff):
+    # The autocovariance of the impulse response is computed from SciPy's coefficients.
     b, a = butter(order, cutoff, fs=1.0 / TAU0_S)
     _, h = freqz(b, a, worN=1 << 16, whole=True)
     r = np.fft.ifft(np.abs(h) ** 2).real * 9.0 / TAU0_S
     factors = np.array([1, 2, 3, 7, 30, 500, 8000])
     model = NoiseModel({"gx": (BandwidthLimit(cutoff=cutoff, order=order), AngleRandomWalk(N=3.0))})
     found = model.avar("gx", factors * TAU0_S, TAU0_S)
-    np.testing.assert_allclose(found, avar_of(r, factors), rtol=1e-3)
+    np.testing.assert_allclose(found, compute_avar_from_autocovariance(r, factors), rtol=1e-3)
     assert model.two_sided_psd("gx", np.array([cutoff]), TAU0_S)[0] == pytest.approx(4.5)
 
 
-def test_line_and_slope_through_the_low_pass():
+def test_line_is_filtered_and_slope_is_not():
     line, slope = Sinusoidal(amplitude=2.0, frequency=17.3), RateRamp(R=1e-3)
     tau = np.array([0.01, 0.02, 3.0, 200.0])
     bare = NoiseModel({"gx": (line,)}).avar("gx", tau, TAU0_S)
@@ -88,28 +104,28 @@ def test_line_and_slope_through_the_low_pass():
 
 @pytest.mark.parametrize("source", [AngleRandomWalk(N=1.0), ExponentiallyCorrelated(sigma=1.0, correlation_time=0.05)])
 @pytest.mark.parametrize("h", [0.0, 0.1, 0.8])
-def test_held_samples(source: Source, h):
-    # autocovariance summed over the ages of the two values that are read
+def test_held_samples_have_the_stated_avar(source: Source, h):
+    # The autocovariance is summed over the ages of the two held values.
     n = 1500
     lag = np.arange(n)
     r = 100.0 * (lag == 0) if isinstance(source, AngleRandomWalk) else np.exp(-0.2 * lag)
     age = (1.0 - h) * h ** np.arange(400)
 
-    def held(k: int) -> float:
+    def held_autocovariance(k: int) -> float:
         newer = np.arange(min(k, age.size))
         pairs = np.abs(k - newer[:, None] + np.arange(age.size)[None, :])
         return float(h**k * r[0] + (age[newer, None] * age[None, :] * r[np.minimum(pairs, n - 1)]).sum())
 
-    expected = np.array([r[0], *(held(k) for k in range(1, 130))])
+    expected = np.array([r[0], *(held_autocovariance(k) for k in range(1, 130))])
     factors = np.array([1, 2, 5, 20, 60])
     found = NoiseModel({"gx": (source, RandomSampleHold(fraction=h))}).avar("gx", factors * TAU0_S, TAU0_S)
-    np.testing.assert_allclose(found, avar_of(expected, factors), rtol=1e-3)
+    np.testing.assert_allclose(found, compute_avar_from_autocovariance(expected, factors), rtol=1e-3)
 
 
-def test_a_clock_that_is_off_relabels_time_and_frequency():
+def test_sample_rate_error_rescales_time_and_frequency():
     axis = (AngleRandomWalk(N=1.0), RateRandomWalk(K=0.1), Sinusoidal(amplitude=1.0, frequency=10.0))
     true = NoiseModel({"gx": axis})
-    stated = NoiseModel({"gx": axis, "ay": (SampleRateError(ratio=1.25),)})  # stated on another axis: for all
+    stated = NoiseModel({"gx": axis, "ay": (SampleRateError(ratio=1.25),)})  # stated on one axis, valid for all
     tau = np.array([0.01, 0.3, 20.0])
     np.testing.assert_allclose(stated.avar("gx", tau, 0.01), true.avar("gx", tau / 1.25, 0.008))
     f = np.array([0.1, 8.0, 40.0])
@@ -117,7 +133,7 @@ def test_a_clock_that_is_off_relabels_time_and_frequency():
     assert stated.spectrum("gx", 0.01).lines == ((8.0, 0.5),)
 
 
-def test_leaks_bring_what_the_source_measures_by_itself():
+def test_cross_axis_effects_add_the_variance_of_the_source():
     model = NoiseModel(
         {
             "gx": (AngleRandomWalk(N=1.0), CrossAxis(source="gy", coefficient=0.5), ScaleFactor(factor=3.0)),
@@ -129,7 +145,7 @@ def test_leaks_bring_what_the_source_measures_by_itself():
     tau = np.array([1.0])
     assert model.avar("gx", tau, 0.01)[0] == pytest.approx(9.0 * (1.0 + 0.25 * 25.0 * 4.0))
     assert model.avar("gy", tau, 0.01)[0] == pytest.approx(25.0 * (4.0 + 0.01 * 9.0 * 1.0))
-    assert model.avar("gz", tau, 0.01)[0] == pytest.approx(0.09 * 100.0)  # the same series twice adds as amplitudes
+    assert model.avar("gz", tau, 0.01)[0] == pytest.approx(0.09 * 100.0)  # equal series add up as amplitudes
 
 
 @pytest.mark.parametrize(
@@ -142,26 +158,26 @@ def test_leaks_bring_what_the_source_measures_by_itself():
         (AngleRandomWalk(N=1.0), Resolution(step=20.0)),
     ],
 )
-def test_what_has_no_variance_of_its_own_says_so(axis):
+def test_non_stationary_axis_has_no_variance(axis):
     model = NoiseModel({"gx": axis, "gy": (AngleRandomWalk(N=1.0),)})
     assert np.isnan(model.avar("gx", np.array([1.0]), 0.01)).all()
     assert np.isnan(model.two_sided_psd("gx", np.array([1.0]), 0.01)).all()
     assert model.avar("gy", np.array([1.0]), 0.01).tolist() == [1.0]
 
 
-def test_range_and_resolution_that_hardly_matter():
+def test_negligible_saturation_and_resolution_keep_the_variance():
     model = NoiseModel({"gx": (AngleRandomWalk(N=1.0), Saturation(limit=100.0), Resolution(step=1.2))})
     assert model.avar("gx", np.array([2.0]), 0.01)[0] == pytest.approx(0.5 + 0.12 * 0.01 / 2.0)
 
 
 @pytest.mark.parametrize("width", [0.6, 0.8, 2.0])
-def test_rounding_is_white_down_to_the_stated_width(width):
+def test_rounding_is_white_for_sufficient_noise(width):
     values = NoiseModel({"gx": (AngleRandomWalk(N=width), Resolution(step=1.0))}).simulate(400_000, 1.0, 0)[:, 0]
-    # variance to 1.5 %: χ² of 400 000 is 0.22 %; the rounding alone is 10 % at 0.8 steps
+    # The tolerance is 1.5 %; χ² of 400 000 samples is 0.22 %, and rounding alone adds 10 % at 0.8 steps.
     assert values.var() == pytest.approx(width**2 + 1.0 / 12.0, rel=0.015)
 
 
-def test_random_walk_through_a_filter_at_long_times():
+def test_filtered_random_walk_is_unchanged_at_long_times():
     model = NoiseModel({"gx": (RateRandomWalk(K=1.0), BandwidthLimit(cutoff=5.0, order=2))})
     tau = np.array([100.0, 1e4])
     np.testing.assert_allclose(model.avar("gx", tau, 0.01), tau / 3.0, rtol=1e-3)

@@ -1,4 +1,4 @@
-"""Past results as tables, picture and files: what a person reads is what was kept."""
+"""Tests of the history as tables, plots and files."""
 
 import gzip
 import math
@@ -21,17 +21,19 @@ from monitor.publishing.plots.history_plot import save_history_plot
 from monitor.publishing.reports import history_file
 from monitor.publishing.terminal import history_text
 
-T0 = 1_763_683_200  # a midnight
+T0 = 1_763_683_200  # midnight UTC
 RNG = np.random.default_rng(1)
-WHAT = {"N": {"before": 1e-4, "after": 2e-4}}
+EVENT_VALUES = {"N": {"before": 1e-4, "after": 2e-4}}
 EVENTS = (
-    StoredEvent(T0 + 3600.0, "noise_changed", "gz noisier [not markup]", "gz", WHAT, T0, 9.0),
+    StoredEvent(T0 + 3600.0, "noise_changed", "gz noisier [not markup]", "gz", EVENT_VALUES, T0, 9.0),
     StoredEvent(T0 + 7200.0, "link_lost", "gone", represented_events=4),
 )  # fmt: skip
 
 
-def made(buckets: int = 48, hole: slice = slice(20, 24), axes: tuple[str, ...] = ("gx", "gz", "az")) -> HistoryTable:
-    """Half hours: N of each axis with one high value, R bounded, a hole, lost samples."""
+def make_history(
+    buckets: int = 48, hole: slice = slice(20, 24), axes: tuple[str, ...] = ("gx", "gz", "az")
+) -> HistoryTable:
+    """Return half-hour rows with one high value of N, a bounded R, a gap and lost samples."""
     names = (*(f"{axis}.{letter}" for axis in axes for letter in ("N", "B")), *(f"{axis}.R.bound" for axis in axes))
     names = (*names, *(f"{axis}.N.{end}" for axis in axes for end in ("lo", "hi")), "temperature", "gz.sigma.1")
     rows = []
@@ -47,19 +49,19 @@ def made(buckets: int = 48, hole: slice = slice(20, 24), axes: tuple[str, ...] =
     return build_table("bench-1", TimeRange(T0, T0 + 1800 * buckets), 1800, rows, EVENTS, 7)
 
 
-def printed(tell, *arguments: object, width: int = 110) -> str:
+def render_text(print_function, *arguments: object, width: int = 110) -> str:
     console = Console(width=width, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.capture() as captured:
-        tell(*arguments, console)
+        print_function(*arguments, console)
     console.file.close()
     return captured.get()
 
 
-def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
-    past = made()
-    text = printed(history_text.print_history_summary, past, AXES, ("N", "R"))
+def test_summary_has_first_last_extremes_and_events() -> None:
+    history = make_history()
+    text = render_text(history_text.print_history_summary, history, AXES, ("N", "R"))
     assert "bench-1: 2025-11-21 00:00 to 2025-11-22 00:00 UTC, 44 rows of 30 min, 7,920,000 samples" in text
-    n = past.select_column("gz.N")
+    n = history.select_column("gz.N")
     unit = coefficient_unit("N", "gz")
     (line,) = [line for line in text.splitlines() if line.startswith("gz N")]
     for number in (n.last[0], n.last[-1], n.low.min(), n.high.max()):
@@ -74,8 +76,8 @@ def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
     assert "… 5 earlier events" in text
 
 
-def test_one_axis_over_time_has_a_line_a_bucket() -> None:
-    text = printed(history_text.print_axis_history, made(), "gz", SYMBOLS)
+def test_axis_history_has_one_line_per_bucket() -> None:
+    text = render_text(history_text.print_axis_history, make_history(), "gz", SYMBOLS)
     lines = [line for line in text.splitlines() if line.startswith("2025-11-21")]
     assert len(lines) == 44
     assert lines[7].split()[3].startswith(f"{1e-4 * coefficient_unit('N', 'gz').factor:.1f}")
@@ -83,29 +85,29 @@ def test_one_axis_over_time_has_a_line_a_bucket() -> None:
     assert lines[9].split()[-2:] == ["12", "lost"]
 
 
-def test_a_span_of_events_alone_is_printed() -> None:
-    past = build_table("bench-1", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2)
-    text = printed(history_text.print_history_summary, past, AXES, SYMBOLS)
+def test_events_without_rows_are_printed() -> None:
+    history = build_table("bench-1", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2)
+    text = render_text(history_text.print_history_summary, history, AXES, SYMBOLS)
     assert "no rows between 2025-11-21 00:00:00" in text
     assert "gz noisier" in text
 
 
 @pytest.mark.parametrize("suffix", WRITABLE)
-def test_a_file_has_every_number_with_its_unit(tmp_path: Path, suffix: str) -> None:
-    past, path = made(), tmp_path / f"h{suffix}"
-    history_file.save_history(past, path)
-    columns = history_file.history_columns(past)
+def test_file_has_every_column_with_its_unit(tmp_path: Path, suffix: str) -> None:
+    history, path = make_history(), tmp_path / f"h{suffix}"
+    history_file.save_history(history, path)
+    columns = history_file.history_columns(history)
     assert {"t (Unix s)", "gz.N (rad/sqrt(s))", "gz.N high (rad/sqrt(s))", "az.R.bound (m/s^3)"} <= set(columns)
-    np.testing.assert_array_equal(columns["gz.N high (rad/sqrt(s))"], past.select_column("gz.N").high)
-    np.testing.assert_array_equal(columns["lost (samples)"], past.counts[:, 1])
-    found = read_back(path, suffix)
+    np.testing.assert_array_equal(columns["gz.N high (rad/sqrt(s))"], history.select_column("gz.N").high)
+    np.testing.assert_array_equal(columns["lost (samples)"], history.counts[:, 1])
+    found = read_file(path, suffix)
     assert list(found) == list(columns)
     for name, column in columns.items():
         np.testing.assert_array_equal(found[name], column, name)
 
 
-def read_back(path: Path, suffix: str) -> dict[str, np.ndarray]:
-    """By the format's own library, as another program would."""
+def read_file(path: Path, suffix: str) -> dict[str, np.ndarray]:
+    """Read the file with the library of its format, as another program would."""
     if suffix == ".npz":
         with np.load(path) as data:
             return dict(data)
@@ -127,35 +129,35 @@ def read_back(path: Path, suffix: str) -> dict[str, np.ndarray]:
     return {name: arrow[name].to_numpy() for name in arrow.column_names}
 
 
-def test_a_suffix_that_is_none_is_said(tmp_path: Path) -> None:
+def test_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"known are \.csv"):
-        history_file.save_history(made(), tmp_path / "h.doc")
+        history_file.save_history(make_history(), tmp_path / "h.doc")
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("axes", [("gx", "gz", "az"), ("az",), ("gx",)], ids=str)
-def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...]) -> None:
+def test_plot_works_for_any_axes(tmp_path: Path, axes: tuple[str, ...]) -> None:
     pytest.importorskip("matplotlib")
     from matplotlib.image import imread
 
     path = tmp_path / "h.png"
-    save_history_plot(made(axes=axes), path)
+    save_history_plot(make_history(axes=axes), path)
     picture = imread(path)
     assert picture.shape[1] == (2220 if len(axes) == 3 else 1110)
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 100
 
 
 @pytest.mark.long
-def test_a_picture_of_one_row_and_of_nothing(tmp_path: Path) -> None:
+def test_plot_needs_at_least_one_row(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    save_history_plot(made(1, slice(0, 0)), tmp_path / "one.png")
+    save_history_plot(make_history(1, slice(0, 0)), tmp_path / "one.png")
     with pytest.raises(NotReady):
         save_history_plot(build_table("a", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2), tmp_path / "none.png")
     with pytest.raises(ConfigError, match="cannot write"):
-        save_history_plot(made(), tmp_path / "nowhere" / "h.png")
+        save_history_plot(make_history(), tmp_path / "nowhere" / "h.png")
 
 
-def test_a_course_keeps_its_gaps_and_a_steady_one_is_level() -> None:
+def test_sparkline_keeps_gaps_and_shows_a_constant_as_level() -> None:
     nan = math.nan
     t_s = np.arange(4.0)
     assert history_text.sparkline(np.array([nan] * 4), t_s, (0.0, 4.0), 4) == "····"

@@ -1,7 +1,7 @@
-"""zenoh with certificates, passwords and access control: the right one gets in, every other is refused and told why.
+"""Tests of Zenoh with certificates, passwords and access control: wrong credentials are refused with a reason.
 
-What is tested are the files of ``config/secure``, with the folder of the certificates and the router's place filled in.
-Certificates are made for each run; the router is zenoh's own, in this process.
+The tests use the files in ``config/secure`` with the certificate folder and the router address filled in.
+The certificates are created for each run, and the router runs in this process.
 """
 
 import contextlib
@@ -27,18 +27,18 @@ from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
 from monitor.settings.loading import ZenohTable
-from tests.monitor.publishing import made
+from tests.monitor.publishing import example_results
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
 
-SECURE = CONFIG_FOLDER / "secure"
+SECURE_FOLDER = CONFIG_FOLDER / "secure"
 PASSWORD = "correct horse"
 USERS = {"nose": PASSWORD, "reader": "hunter2", "operator": "battery", "router": "staple"}
 
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An authority, what it signed, an operator that another one signed, and the users' passwords."""
+    """Create an authority, certificates of all users, an operator signed by another authority, and passwords."""
     folder = tmp_path_factory.mktemp("certificates")
     ours, theirs = trustme.CA(), trustme.CA()
     ours.cert_pem.write_to_path(folder / "ca.pem")
@@ -51,17 +51,17 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class World:
-    """A router of one of the shipped files, and files for those who want in."""
+class SecuredRouter:
+    """A router with a shipped configuration, and files for its clients."""
 
     def __init__(self, folder: Path, certificates: Path, router: str) -> None:
         self.endpoint = free_endpoint().replace("tcp/", "tls/")
         self._folder, self._certificates = folder, certificates
-        self.router = build_session_config({}, self.file(router))
+        self.router = build_session_config({}, self.make_config_file(router))
 
-    def file(self, shipped: str, **swaps: str) -> Path:
-        """A shipped file at home here; ``swaps`` of words in it."""
-        text = (SECURE / shipped).read_text("utf-8")
+    def make_config_file(self, shipped: str, **swaps: str) -> Path:
+        """Copy a shipped file with local addresses; ``swaps`` are further replacements."""
+        text = (SECURE_FOLDER / shipped).read_text("utf-8")
         for old, new in {
             "/etc/imu-monitor": str(self._certificates),
             "tls/0.0.0.0:7447": self.endpoint,
@@ -74,125 +74,137 @@ class World:
         path.write_text(text)
         return path
 
-    def certified(self, who: str) -> Path:
-        """Who shows the certificate of that name."""
-        return self.file("watch.json5", **{"/reader.": f"/{who}."})
+    def make_certificate_file(self, name: str) -> Path:
+        """Return the configuration of a client with the certificate of this name."""
+        return self.make_config_file("watch.json5", **{"/reader.": f"/{name}."})
 
-    def user(self, who: str, password: str) -> Path:
-        """Who gives this name and password."""
-        return self.file("watch-password.json5", **{'"reader"': f'"{who}"', "change-me": password})
-
-
-@pytest.fixture
-def by_certificate(tmp_path: Path, certificates: Path) -> Iterator[World]:
-    world = World(tmp_path, certificates, "router.json5")
-    with zenoh.open(world.router):
-        yield world
+    def make_password_file(self, name: str, password: str) -> Path:
+        """Return the configuration of a client with this name and password."""
+        return self.make_config_file("watch-password.json5", **{'"reader"': f'"{name}"', "change-me": password})
 
 
 @pytest.fixture
-def by_password(tmp_path: Path, certificates: Path) -> Iterator[World]:
-    world = World(tmp_path, certificates, "router-password.json5")
-    with zenoh.open(world.router):
-        yield world
+def certificate_router(tmp_path: Path, certificates: Path) -> Iterator[SecuredRouter]:
+    secured_router = SecuredRouter(tmp_path, certificates, "router.json5")
+    with zenoh.open(secured_router.router):
+        yield secured_router
 
 
-def nothing_kept(device: str, _parameters: str) -> bytes:
+@pytest.fixture
+def password_router(tmp_path: Path, certificates: Path) -> Iterator[SecuredRouter]:
+    secured_router = SecuredRouter(tmp_path, certificates, "router-password.json5")
+    with zenoh.open(secured_router.router):
+        yield secured_router
+
+
+def refuse_history(device: str, _parameters: str) -> bytes:
     raise NotReady(f"nothing is kept of {device}")
 
 
 @contextlib.contextmanager
-def daemon(file: Path) -> Iterator[ZenohPublisher]:
-    """A daemon's session that sends status ten times a second and answers ``reset``."""
+def run_daemon(file: Path) -> Iterator[ZenohPublisher]:
+    """Run a daemon's session that sends ten statuses per second and answers ``reset``."""
     table = ZenohTable(mode=None, listen=None, config=file)
-    out, ending = ZenohPublisher(table, ["nose"], read_history=nothing_kept), threading.Event()
+    publisher, ending = ZenohPublisher(table, ["nose"], read_history=refuse_history), threading.Event()
 
-    def work() -> None:
+    def send_and_answer() -> None:
         while not ending.wait(0.1):
-            out.put(topics.STATUS, "nose", StatusMessage.from_result("nose", time.time(), 0, made.health()).encode())
-            while not out.commands.empty():
-                out.commands.get_nowait().reply_result(b'"done"')
+            publisher.put(
+                topics.STATUS,
+                "nose",
+                StatusMessage.from_result("nose", time.time(), 0, example_results.make_health()).encode(),
+            )
+            while not publisher.commands.empty():
+                publisher.commands.get_nowait().reply_result(b'"done"')
 
-    worker = threading.Thread(target=work)
-    out.start()
-    out.set_alive("nose", True)
+    worker = threading.Thread(target=send_and_answer)
+    publisher.start()
+    publisher.set_alive("nose", True)
     worker.start()
     try:
-        yield out
+        yield publisher
     finally:
         ending.set()
         worker.join()
-        out.close()
+        publisher.close()
 
 
-def replies(file: Path, key: str) -> list[bytes]:
+def get_replies(file: Path, key: str) -> list[bytes]:
     with zenoh.open(build_session_config({"mode": "client"}, file)) as session:
         return [bytes(reply.ok.payload) for reply in session.get(key, timeout=PATIENCE_S) if reply.ok]
 
 
-def heard(arriving: ZenohSubscriber, so_far: set[str]) -> set[str]:
-    so_far |= {one.key for one in arriving.take(0.1)}
-    return so_far
+def collect_keys(subscriber: ZenohSubscriber, received_keys: set[str]) -> set[str]:
+    received_keys |= {message.key for message in subscriber.take(0.1)}
+    return received_keys
 
 
-def refusal(file: Path) -> str:
-    """What a watcher says who does not get in; nothing reaches it."""
-    with contextlib.closing(ZenohSubscriber("imu/**", file=file)) as arriving:
-        arriving.start()
-        said = wait_for(lambda: ": " in arriving.state and arriving.state)
-        assert arriving.take(0.0) == []
-    assert said.count("\n") == 0
-    return str(said)
+def wait_for_refusal(file: Path) -> str:
+    """Return the state of a client that is refused and therefore receives nothing."""
+    with contextlib.closing(ZenohSubscriber("imu/**", file=file)) as subscriber:
+        subscriber.start()
+        state = wait_for(lambda: ": " in subscriber.state and subscriber.state)
+        assert subscriber.take(0.0) == []
+    assert state.count("\n") == 0
+    return str(state)
 
 
 # --- certificates
 
 
-def test_who_has_the_right_certificate_watches_and_commands(by_certificate: World) -> None:
-    with daemon(by_certificate.file("daemon.json5")) as out:
-        wait_for(lambda: out.state == "ok")
-        for who in ("reader", "operator"):
-            with contextlib.closing(ZenohSubscriber("imu/**", file=by_certificate.certified(who))) as arriving:
-                arriving.start()
-                so_far: set[str] = set()
-                wait_for(lambda a=arriving, s=so_far: heard(a, s) >= {"imu/nose/status", "imu/nose/alive"})
-                assert arriving.state == "ok"
-        operator = by_certificate.certified("operator")
-        assert wait_for(lambda: replies(operator, "imu/nose/command/reset")) == [b'"done"']
+def test_valid_certificate_allows_watching_and_commands(certificate_router: SecuredRouter) -> None:
+    with run_daemon(certificate_router.make_config_file("daemon.json5")) as publisher:
+        wait_for(lambda: publisher.state == "ok")
+        for name in ("reader", "operator"):
+            with contextlib.closing(
+                ZenohSubscriber("imu/**", file=certificate_router.make_certificate_file(name))
+            ) as subscriber:
+                subscriber.start()
+                received_keys: set[str] = set()
+                wait_for(
+                    lambda a=subscriber, s=received_keys: collect_keys(a, s) >= {"imu/nose/status", "imu/nose/alive"}
+                )
+                assert subscriber.state == "ok"
+        operator = certificate_router.make_certificate_file("operator")
+        assert wait_for(lambda: get_replies(operator, "imu/nose/command/reset")) == [b'"done"']
 
 
 @pytest.mark.parametrize("key", ["imu/nose/command/reset", "imu/*/command/*", "imu/**", "**"])
-def test_a_reader_is_refused_commands(by_certificate: World, key: str) -> None:
-    with daemon(by_certificate.file("daemon.json5")) as out:
-        wait_for(lambda: out.state == "ok")
-        operator = by_certificate.certified("operator")
-        wait_for(lambda: replies(operator, "imu/nose/command/reset"))
-        assert replies(by_certificate.certified("reader"), key) == []
-        assert out.commands.empty()
+def test_reader_may_not_send_commands(certificate_router: SecuredRouter, key: str) -> None:
+    with run_daemon(certificate_router.make_config_file("daemon.json5")) as publisher:
+        wait_for(lambda: publisher.state == "ok")
+        operator = certificate_router.make_certificate_file("operator")
+        wait_for(lambda: get_replies(operator, "imu/nose/command/reset"))
+        assert get_replies(certificate_router.make_certificate_file("reader"), key) == []
+        assert publisher.commands.empty()
 
 
-def test_a_reader_cannot_publish(by_certificate: World) -> None:
+def test_reader_may_not_publish(certificate_router: SecuredRouter) -> None:
     with (
-        contextlib.closing(ZenohSubscriber("imu/**", file=by_certificate.certified("operator"))) as arriving,
-        zenoh.open(build_session_config({"mode": "client"}, by_certificate.certified("reader"))) as reader,
-        zenoh.open(build_session_config({"mode": "client"}, by_certificate.certified("nose"))) as nose,
+        contextlib.closing(
+            ZenohSubscriber("imu/**", file=certificate_router.make_certificate_file("operator"))
+        ) as subscriber,
+        zenoh.open(
+            build_session_config({"mode": "client"}, certificate_router.make_certificate_file("reader"))
+        ) as reader,
+        zenoh.open(build_session_config({"mode": "client"}, certificate_router.make_certificate_file("nose"))) as nose,
     ):
-        arriving.start()
-        so_far: set[str] = set()
+        subscriber.start()
+        received_keys: set[str] = set()
 
         def publish() -> bool:
             reader.put("imu/forged/status", b"forged")
             nose.put("imu/nose/status", b"true")
-            return "imu/nose/status" in heard(arriving, so_far)
+            return "imu/nose/status" in collect_keys(subscriber, received_keys)
 
         wait_for(publish)
         for _ in range(5):
             publish()
-        assert so_far == {"imu/nose/status"}
+        assert received_keys == {"imu/nose/status"}
 
 
 @pytest.mark.parametrize(
-    ("swaps", "why"),
+    ("swaps", "reason"),
     [
         ({"/reader.": "/impostor."}, "does not accept our certificate: it is not signed by its authority"),
         ({"ca.pem": "their-ca.pem"}, "its certificate is not valid: unable to get local issuer certificate"),
@@ -201,78 +213,84 @@ def test_a_reader_cannot_publish(by_certificate: World) -> None:
         ({"tls/127": "tcp/127"}, "answers, but refuses the login"),
     ],
 )
-def test_the_wrong_certificate_is_refused_and_told(by_certificate: World, swaps: dict[str, str], why: str) -> None:
-    file = by_certificate.file("watch.json5", **swaps)
-    said = refusal(file)
-    assert why in said
-    assert said.startswith(json.loads(build_session_config({}, file).get_json("connect/endpoints"))[0])
-    with daemon(file) as out:  # the daemon's status says the same
-        wait_for(lambda: why in out.state)
+def test_invalid_certificate_is_refused_with_a_reason(
+    certificate_router: SecuredRouter, swaps: dict[str, str], reason: str
+) -> None:
+    file = certificate_router.make_config_file("watch.json5", **swaps)
+    state = wait_for_refusal(file)
+    assert reason in state
+    assert state.startswith(json.loads(build_session_config({}, file).get_json("connect/endpoints"))[0])
+    with run_daemon(file) as publisher:  # the status of the daemon has the same reason
+        wait_for(lambda: reason in publisher.state)
 
 
 # --- user and password
 
 
-def test_who_knows_the_password_watches_and_commands_by_its_right(by_password: World) -> None:
-    with daemon(by_password.user("nose", USERS["nose"])) as out:
-        wait_for(lambda: out.state == "ok")
-        reader, operator = (by_password.user(who, USERS[who]) for who in ("reader", "operator"))
-        with contextlib.closing(ZenohSubscriber("imu/**", file=reader)) as arriving:
-            arriving.start()
-            so_far: set[str] = set()
-            wait_for(lambda: "imu/nose/status" in heard(arriving, so_far))
-        assert wait_for(lambda: replies(operator, "imu/nose/command/reset")) == [b'"done"']
-        assert replies(reader, "imu/nose/command/reset") == []
+def test_valid_password_allows_watching_and_commands_by_role(password_router: SecuredRouter) -> None:
+    with run_daemon(password_router.make_password_file("nose", USERS["nose"])) as publisher:
+        wait_for(lambda: publisher.state == "ok")
+        reader, operator = (password_router.make_password_file(name, USERS[name]) for name in ("reader", "operator"))
+        with contextlib.closing(ZenohSubscriber("imu/**", file=reader)) as subscriber:
+            subscriber.start()
+            received_keys: set[str] = set()
+            wait_for(lambda: "imu/nose/status" in collect_keys(subscriber, received_keys))
+        assert wait_for(lambda: get_replies(operator, "imu/nose/command/reset")) == [b'"done"']
+        assert get_replies(reader, "imu/nose/command/reset") == []
 
 
 @pytest.mark.parametrize(("user", "password"), [("reader", "wrong"), ("stranger", PASSWORD), ("", "")])
-def test_the_wrong_password_is_refused_and_not_repeated(by_password: World, user: str, password: str) -> None:
-    said = refusal(by_password.user(user, password))
-    assert "answers, but refuses the login: check user and password" in said
-    assert not password or password not in said
+def test_invalid_password_is_refused_and_not_repeated(password_router: SecuredRouter, user: str, password: str) -> None:
+    state = wait_for_refusal(password_router.make_password_file(user, password))
+    assert "answers, but refuses the login: check user and password" in state
+    assert not password or password not in state
 
 
-def test_the_past_is_told_to_those_who_get_in_alone(by_certificate: World) -> None:
-    with daemon(by_certificate.file("daemon.json5")) as out:
-        wait_for(lambda: out.state == "ok")
-        operator = by_certificate.certified("operator")
-        wait_for(lambda: replies(operator, "imu/nose/command/reset"))
-        with pytest.raises(NotReady, match="nothing is kept of nose"):  # the daemon's own word
-            query_histories(None, "nose", "", file=by_certificate.certified("reader"))
+def test_history_is_answered_only_to_valid_clients(certificate_router: SecuredRouter) -> None:
+    with run_daemon(certificate_router.make_config_file("daemon.json5")) as publisher:
+        wait_for(lambda: publisher.state == "ok")
+        operator = certificate_router.make_certificate_file("operator")
+        wait_for(lambda: get_replies(operator, "imu/nose/command/reset"))
+        with pytest.raises(NotReady, match="nothing is kept of nose"):  # this is the answer of the daemon
+            query_histories(None, "nose", "", file=certificate_router.make_certificate_file("reader"))
         with pytest.raises(LinkUnavailable, match="not signed by its authority"):
-            query_histories(None, "nose", "", file=by_certificate.certified("impostor"))
+            query_histories(None, "nose", "", file=certificate_router.make_certificate_file("impostor"))
 
 
 # --- the link and the files
 
 
-def test_samples_of_another_daemon_come_through_the_link_with_a_certificate(by_certificate: World) -> None:
-    link = zenoh_link.build(zenoh_link.Settings(key="imu/nose/samples", config=str(by_certificate.certified("reader"))))
+def test_zenoh_link_with_a_certificate_receives_samples(certificate_router: SecuredRouter) -> None:
+    link = zenoh_link.build(
+        zenoh_link.Settings(key="imu/nose/samples", config=str(certificate_router.make_certificate_file("reader")))
+    )
     link.open()
     try:
-        with zenoh.open(build_session_config({"mode": "client"}, by_certificate.certified("nose"))) as nose:
+        with zenoh.open(
+            build_session_config({"mode": "client"}, certificate_router.make_certificate_file("nose"))
+        ) as nose:
 
-            def come() -> Any:
+            def publish_and_receive() -> Any:
                 nose.put("imu/nose/samples", b"batch")
                 return link.wait_for_chunks_or_timeout(0.1)
 
-            assert wait_for(come)[0].data == b"batch"
+            assert wait_for(publish_and_receive)[0].data == b"batch"
     finally:
         link.close()
 
 
-def test_a_link_as_client_without_the_certificate_is_told_why(by_certificate: World) -> None:
-    file = by_certificate.certified("impostor")
+def test_zenoh_link_without_a_valid_certificate_reports_the_reason(certificate_router: SecuredRouter) -> None:
+    file = certificate_router.make_certificate_file("impostor")
     link = zenoh_link.build(zenoh_link.Settings(key="imu/nose/samples", mode="client", config=str(file)))
     with pytest.raises(LinkUnavailable, match="does not accept our certificate"):
         link.open()
 
 
-def test_the_shipped_daemon_reads_its_files(tmp_path: Path) -> None:
-    reading = loading.examine_config_file(SECURE / "daemon.toml")
+def test_shipped_secure_configuration_is_valid(tmp_path: Path) -> None:
+    reading = loading.examine_config_file(SECURE_FOLDER / "daemon.toml")
     config, wrong = reading.config, reading.wrong
     assert wrong == []
     assert config is not None
     assert config.zenoh.listen is None
-    for file in SECURE.glob("*.json5"):
+    for file in SECURE_FOLDER.glob("*.json5"):
         build_session_config({}, file)

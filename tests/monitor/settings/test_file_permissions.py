@@ -1,4 +1,4 @@
-"""Files that others may change are refused, secrets that others may read are warned of, and nothing else is."""
+"""Tests of file permissions: untrusted files are refused, and exposed secrets give a warning."""
 
 import os
 import tempfile
@@ -17,25 +17,25 @@ SECRET = '{transport: {auth: {usrpwd: {user: "nose", password: "hunter2"}}}}'
 
 
 @pytest.fixture
-def folder() -> Iterator[Path]:
-    """One that others get as far as: pytest's own is closed to them."""
+def public_folder() -> Iterator[Path]:
+    """Create a folder that other users can reach, unlike the folders of pytest."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name).resolve()
         path.chmod(0o755)
         if any(not above.stat().st_mode & 0o001 for above in path.parents):
-            pytest.skip(f"others do not get as far as {path.parent}")
+            pytest.skip(f"other users cannot reach {path.parent}")
         yield path
 
 
-def made(path: Path, text: str, mode: int) -> Path:
+def write_file(path: Path, text: str, mode: int) -> Path:
     path.write_text(text)
     path.chmod(mode)
     return path
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o644, 0o664, 0o400])
-def test_usual_modes_are_well(folder: Path, mode: int) -> None:
-    path = made(folder / "a.toml", VIRTUAL, mode)
+def test_usual_permissions_are_accepted(public_folder: Path, mode: int) -> None:
+    path = write_file(public_folder / "a.toml", VIRTUAL, mode)
     assert file_permissions.explain_untrusted_file(path) == ""
     assert file_permissions.describe_exposed_secret(path) == ""
     reading = loading.examine_config_file(path)
@@ -45,31 +45,31 @@ def test_usual_modes_are_well(folder: Path, mode: int) -> None:
     assert config.warnings == ()
 
 
-def test_a_file_that_anyone_may_change_is_refused(folder: Path) -> None:
-    path = made(folder / "a.toml", VIRTUAL, 0o646)
+def test_file_that_anyone_may_change_is_refused(public_folder: Path) -> None:
+    path = write_file(public_folder / "a.toml", VIRTUAL, 0o646)
     with pytest.raises(ConfigError, match=rf"anyone on this machine may change it.*chmod o-w {path}$"):
         loading.load_config(path)
     path.chmod(0o644)
     loading.load_config(path)
 
 
-def test_a_link_is_judged_by_where_it_leads(folder: Path) -> None:
-    real = made(folder / "real.toml", VIRTUAL, 0o646)
-    (folder / "link.toml").symlink_to(real)
-    assert str(real) in file_permissions.explain_untrusted_file(folder / "link.toml")
+def test_symbolic_link_is_checked_by_its_target(public_folder: Path) -> None:
+    real = write_file(public_folder / "real.toml", VIRTUAL, 0o646)
+    (public_folder / "link.toml").symlink_to(real)
+    assert str(real) in file_permissions.explain_untrusted_file(public_folder / "link.toml")
 
 
-def test_a_folder_in_which_anyone_may_swap_the_file_is_refused_but_a_sticky_one_is_not(folder: Path) -> None:
-    path = made(folder / "a.toml", VIRTUAL, 0o644)
-    folder.chmod(0o777)
-    assert file_permissions.explain_untrusted_file(path).endswith(f"in its place: chmod o-w {folder}")
-    folder.chmod(0o1777)
+def test_folder_that_anyone_may_change_is_refused_unless_sticky(public_folder: Path) -> None:
+    path = write_file(public_folder / "a.toml", VIRTUAL, 0o644)
+    public_folder.chmod(0o777)
+    assert file_permissions.explain_untrusted_file(path).endswith(f"in its place: chmod o-w {public_folder}")
+    public_folder.chmod(0o1777)
     assert file_permissions.explain_untrusted_file(path) == ""
 
 
-def test_a_secret_that_anyone_may_read_is_warned_of(folder: Path) -> None:
-    zenoh = made(folder / "z.json5", SECRET, 0o644)
-    path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
+def test_secret_that_anyone_may_read_gives_a_warning(public_folder: Path) -> None:
+    zenoh = write_file(public_folder / "z.json5", SECRET, 0o644)
+    path = write_file(public_folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
     (warning,) = loading.load_config(path).warnings
     assert warning == (
         f"{path}: zenoh.config: z.json5: holds a secret that anyone on this machine may read: chmod o-r {zenoh}"
@@ -77,24 +77,24 @@ def test_a_secret_that_anyone_may_read_is_warned_of(folder: Path) -> None:
     zenoh.chmod(0o640)
     assert loading.load_config(path).warnings == ()
     zenoh.chmod(0o644)
-    folder.chmod(0o700)
-    assert loading.load_config(path).warnings == ()  # nobody else gets there
+    public_folder.chmod(0o700)
+    assert loading.load_config(path).warnings == ()  # other users cannot reach the file
 
 
-def test_a_private_key_that_a_zenoh_file_names_is_looked_at_too(folder: Path) -> None:
-    key = made(folder / "nose.key", "-----BEGIN PRIVATE KEY-----", 0o644)
-    made(folder / "z.json5", f'{{transport: {{link: {{tls: {{connect_private_key: "{key}"}}}}}}}}', 0o644)
-    path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
+def test_private_key_of_a_zenoh_file_is_checked(public_folder: Path) -> None:
+    key = write_file(public_folder / "nose.key", "-----BEGIN PRIVATE KEY-----", 0o644)
+    write_file(public_folder / "z.json5", f'{{transport: {{link: {{tls: {{connect_private_key: "{key}"}}}}}}}}', 0o644)
+    path = write_file(public_folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
     (warning,) = loading.load_config(path).warnings
     assert f"nose.key: holds a secret that anyone on this machine may read: chmod o-r {key}" in warning
 
 
-def test_a_zenoh_file_that_anyone_may_change_or_that_zenoh_refuses_is_wrong(folder: Path) -> None:
-    zenoh = made(folder / "z.json5", SECRET, 0o602)
-    path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
+def test_untrusted_or_invalid_zenoh_file_is_refused(public_folder: Path) -> None:
+    zenoh = write_file(public_folder / "z.json5", SECRET, 0o602)
+    path = write_file(public_folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
     assert "zenoh.config: anyone on this machine may change it" in loading.examine_config_file(path).wrong[0]
     with pytest.raises(ConfigError, match="anyone on this machine may change it"):
         client_configurations((), zenoh)
-    made(zenoh, SECRET.replace('"hunter2"', '"hunter2" x'), 0o600)
+    write_file(zenoh, SECRET.replace('"hunter2"', '"hunter2" x'), 0o600)
     (line,) = loading.examine_config_file(path).wrong
     assert line == f"{path}: zenoh.config: {zenoh}: line 1, column 54: expected boolean or null"

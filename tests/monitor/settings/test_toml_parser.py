@@ -1,4 +1,4 @@
-"""TOML text: tables, or a ConfigError of one line."""
+"""Tests of the TOML parser."""
 
 import pytest
 
@@ -6,13 +6,13 @@ from drivers.errors import ConfigError
 from monitor.settings.toml_parser import parse_toml
 
 
-def test_whole_numbers_of_64_bits() -> None:
+def test_integers_of_64_bits_are_parsed() -> None:
     text = "a = 9223372036854775807\nb = [-9223372036854775808]\n[c]\nd = 1e300"
     assert parse_toml(text) == {"a": 2**63 - 1, "b": [-(2**63)], "c": {"d": 1e300}}
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("text", "reason"),
     [
         ("a = 9223372036854775808", "more than 64 bits"),
         ("[a]\nb = [{c = -9223372036854775809}]", "more than 64 bits"),
@@ -23,7 +23,7 @@ def test_whole_numbers_of_64_bits() -> None:
         ("a", "not TOML"),
     ],
 )
-def test_what_is_wrong_is_one_line(text: str, why: str) -> None:
-    with pytest.raises(ConfigError, match=why) as error:
+def test_invalid_text_is_refused_in_one_line(text: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason) as error:
         parse_toml(text)
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""What the demo runs: another sensor, effects that come; what cannot be is said of the option."""
+"""Tests of the configuration of the demo: sensors, effects and invalid options."""
 
 from pathlib import Path
 
@@ -12,14 +12,14 @@ from monitor.simulator.demo_config import DEMO_CONFIG, build_demo_config
 SHIPPED = sorted(path.stem for path in (CONFIG_FOLDER / "models").glob("*.toml"))
 
 
-def test_as_it_is_shipped_unless_told_otherwise() -> None:
+def test_default_is_the_shipped_configuration() -> None:
     config, (device,) = build_demo_config(), build_demo_config().devices
     assert (config.zenoh, config.viewer) == (load_config(DEMO_CONFIG).zenoh, load_config(DEMO_CONFIG).viewer)
     assert (device.link, device.rate_hz, device.window_s) == (load_config(DEMO_CONFIG).devices[0].link, 100.0, 600.0)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_any_sensor_of_the_catalogue(name: str) -> None:
+def test_any_shipped_sensor_can_be_used(name: str) -> None:
     (device,) = build_demo_config(name).devices
     assert isinstance(device.link, VirtualTable)
     assert Path(device.link.model).stem == name
@@ -27,7 +27,7 @@ def test_any_sensor_of_the_catalogue(name: str) -> None:
     assert WINDOW_SAMPLES[0] <= device.window_s * device.rate_hz <= WINDOW_SAMPLES[1]
 
 
-def test_a_model_file_at_its_own_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_file_is_used_at_its_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text("sample_rate = 400000.0\n[gz.angle_random_walk]\nN = 1e-4\n")
     (device,) = build_demo_config("mine.toml").devices
@@ -36,13 +36,13 @@ def test_a_model_file_at_its_own_rate(tmp_path: Path, monkeypatch: pytest.Monkey
     assert build_demo_config("mine.toml").devices[0].rate_hz == 100.0
 
 
-def test_effects_and_when_they_come() -> None:
+def test_effects_and_their_start_time_are_set() -> None:
     (device,) = build_demo_config(None, ["gz.bias:value=1", "ax.bias:value=2"], 5.0).devices
     assert isinstance(device.link, VirtualTable)
     assert (device.link.effect, device.link.effect_at) == (("gz.bias:value=1", "ax.bias:value=2"), 5.0)
 
 
-def test_what_cannot_be_is_said_of_the_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_option_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r'--sensor: no model "consumer-mem".*did you mean "consumer-mems"\?'):
         build_demo_config("consumer-mem")

@@ -1,4 +1,4 @@
-"""Effects in one line: what can be written, and what is said of what cannot."""
+"""Tests of the parser of effects in one line."""
 
 import pytest
 
@@ -8,20 +8,20 @@ from monitor.noise.effects import EFFECTS
 from monitor.simulator import parse_effects
 
 
-def test_one_axis_or_all_of_a_kind() -> None:
+def test_effect_is_parsed_for_one_axis_or_a_kind_of_axes() -> None:
     sinusoidal = EFFECTS["sinusoidal"](amplitude=1e-3, frequency=17.0)
     assert parse_effects("gz.sinusoidal:amplitude=1e-3,frequency=17") == [("gz", sinusoidal)]
     assert parse_effects(" gz.sinusoidal : frequency = 17 , amplitude = 1e-3 ") == [("gz", sinusoidal)]
     assert parse_effects("a*.sinusoidal:amplitude=1e-3,frequency=17") == [(axis, sinusoidal) for axis in AXES[3:]]
 
 
-def test_an_axis_as_a_parameter() -> None:
+def test_axis_is_accepted_as_a_parameter() -> None:
     ((axis, effect),) = parse_effects("gz.g_sensitivity:source=ax,coefficient=1e-4")
     assert (axis, effect) == ("gz", EFFECTS["g_sensitivity"](source="ax", coefficient=1e-4))
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("", "is not an effect; write axis.effect:parameter=value"),
         ("gz", "is not an effect"),
@@ -42,9 +42,9 @@ def test_an_axis_as_a_parameter() -> None:
         ("gz.sinu\\soidal:amplitude=1", "unknown effect"),
     ],
 )
-def test_what_is_wrong_is_one_line(text: str, words: str) -> None:
+def test_invalid_effect_is_refused_in_one_line(text: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         parse_effects(text)
     line = str(caught.value)
-    assert words in line
+    assert message in line
     assert "\n" not in line

@@ -1,4 +1,4 @@
-"""The simulated sensor through an ordinary serial link: every sample it made is received or known to be missing."""
+"""Tests that every sample of a simulated sensor is received through a serial link or counted as missing."""
 
 import math
 import os
@@ -22,10 +22,10 @@ pytest.importorskip("tty", reason="pseudo-terminals need a POSIX system")
 MODEL = str(CONFIG_FOLDER / "models" / "consumer-mems.toml")
 
 
-class Rig:
-    """A sensor and its driver; the sensor begins to live once the driver's link is open.
+class SensorHarness:
+    """A sensor and its driver; the sensor starts once the link of the driver is open.
 
-    It makes no more than ``allowed`` samples, and waits for its reader while the cable is in.
+    The sensor makes at most ``allowed`` samples and waits for its reader while it is connected.
     """
 
     def __init__(self, module=vectornav_binary, speed=1.0, allowed=math.inf):
@@ -55,71 +55,71 @@ class Rig:
     def wait(self, condition):
         wait_for(condition, lambda: (self.driver.state, self.driver.text, self.driver.counts))
 
-    def kinds(self):
+    def take_event_kinds(self):
         return [event.kind for event in self.driver.take_events()]
 
 
 @pytest.mark.parametrize("module", [vectornav_binary, stim300, xsens_mtdata2], ids=lambda m: m.__name__)
-def test_what_it_sends_is_received(module):
-    with Rig(module, allowed=100) as rig:
-        rig.wait(lambda: rig.imu.fault_counts.total_simulated_samples == rig.driver.counts.received == 100)
-    counts, truth = rig.driver.counts, rig.imu.fault_counts
+def test_all_sent_samples_are_received(module):
+    with SensorHarness(module, allowed=100) as harness:
+        harness.wait(lambda: harness.imu.fault_counts.total_simulated_samples == harness.driver.counts.received == 100)
+    counts, truth = harness.driver.counts, harness.imu.fault_counts
     assert (truth.sent, truth.dropped) == (100, 0)
     assert (counts.lost, counts.bad) == (0, 0)
-    values = np.concatenate([one.values for one in rig.blocks])
+    values = np.concatenate([block.values for block in harness.blocks])
     assert np.isfinite(values).all()
-    # white noise of the model: N √rate, and Q
+    # The noise consists of white noise, N times the root of the rate, and quantization.
     assert 0.5e-3 < values[:, 0].std() < 5e-3
 
 
-def test_a_pulled_cable_and_back():
-    with Rig(allowed=50) as rig:
-        counts, truth = rig.driver.counts, rig.imu.fault_counts
-        rig.wait(
+def test_unplugged_sensor_reconnects_and_missing_samples_are_counted():
+    with SensorHarness(allowed=50) as harness:
+        counts, truth = harness.driver.counts, harness.imu.fault_counts
+        harness.wait(
             lambda: truth.total_simulated_samples == counts.received == 50
-        )  # nothing is on the way when the cable is pulled
-        rig.imu.port.unplug()
-        rig.wait(lambda: rig.driver.state == "lost")
-        assert not rig.imu.port.path.exists()
-        rig.allowed = 100
-        rig.wait(lambda: truth.dropped == 50)  # half a second at 100 Hz
+        )  # no sample is in transit when the cable is unplugged
+        harness.imu.port.unplug()
+        harness.wait(lambda: harness.driver.state == "lost")
+        assert not harness.imu.port.path.exists()
+        harness.allowed = 100
+        harness.wait(lambda: truth.dropped == 50)  # half a second at 100 Hz
         assert counts.received == 50
-        rig.imu.port.plug()
-        rig.allowed = 150
-        rig.wait(lambda: rig.driver.state == "running")
-        rig.wait(lambda: truth.total_simulated_samples == 150 and counts.received == 100)
-        kinds = rig.kinds()
+        harness.imu.port.plug()
+        harness.allowed = 150
+        harness.wait(lambda: harness.driver.state == "running")
+        harness.wait(lambda: truth.total_simulated_samples == 150 and counts.received == 100)
+        kinds = harness.take_event_kinds()
     assert kinds.count("link_lost") == kinds.count("link_back") == 1
     assert "samples_lost" in kinds
-    assert (counts.lost, counts.bad) == (50, 0)  # told by the sensor's counter
+    assert (counts.lost, counts.bad) == (50, 0)  # the counter of the sensor shows the loss
     assert truth.sent == 100
 
 
-def test_nobody_reads_and_the_sensor_goes_on():
-    rig = Rig(speed=20.0)
-    rig.imu.start()
+def test_sensor_continues_without_a_reader():
+    harness = SensorHarness(speed=20.0)
+    harness.imu.start()
     try:
-        rig.wait(lambda: rig.imu.fault_counts.dropped > 200)
+        harness.wait(lambda: harness.imu.fault_counts.dropped > 200)
     finally:
-        rig.imu.stop()
-    assert rig.imu.fault_counts.sent > 0
-    assert not rig.imu.port.path.parent.exists()
+        harness.imu.stop()
+    assert harness.imu.fault_counts.sent > 0
+    assert not harness.imu.port.path.parent.exists()
 
 
-def test_plugging_twice_and_pulling_twice_is_harmless_and_leaves_nothing_open():
-    rig = Rig()
+def test_repeated_plugging_is_harmless_and_leaves_nothing_open():
+    harness = SensorHarness()
     files = set(os.listdir("/dev/fd"))
     for _ in range(20):
-        rig.imu.port.plug()
-        rig.imu.port.plug()
-        rig.imu.port.unplug()
-        rig.imu.port.unplug()
-    assert set(os.listdir("/dev/fd")) <= files  # what an earlier test left may have been closed meanwhile
-    rig.imu.stop()
+        harness.imu.port.plug()
+        harness.imu.port.plug()
+        harness.imu.port.unplug()
+        harness.imu.port.unplug()
+    assert set(os.listdir("/dev/fd")) <= files  # files of earlier tests may have been closed meanwhile
+    harness.imu.stop()
 
 
-def test_same_seed_same_noise():
-    a, b = Rig().imu, Rig().imu
+def test_equal_seeds_give_equal_noise():
+    a, b = SensorHarness().imu, SensorHarness().imu
     try:
         assert np.array_equal(a._sensor._stream.draw_next_samples(50), b._sensor._stream.draw_next_samples(50))
     finally:
@@ -127,7 +127,7 @@ def test_same_seed_same_noise():
         b.stop()
 
 
-def test_a_model_that_cannot_be_read(tmp_path):
+def test_invalid_model_is_refused(tmp_path):
     (tmp_path / "bad.toml").write_text("[gz.no_such_effect]\nx = 1\n")
     decoder = vectornav_binary.build(vectornav_binary.Settings())
     with pytest.raises(ConfigError):

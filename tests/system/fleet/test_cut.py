@@ -1,4 +1,4 @@
-"""A network that is cut in two and healed: daemon and watcher, each in its own namespace, find each other again."""
+"""Test of a network connection that is interrupted and restored between a daemon and a watcher."""
 
 import subprocess
 import threading
@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.system.fleet.namespaces import INSIDE, pair
+from tests.system.fleet.namespaces import INSIDE, create_namespaces
 
 CONFIG = f"""
 [[device]]
@@ -23,28 +23,29 @@ import contextlib, sys, time
 from monitor.publishing.remote_device_states import RemoteDeviceRegistry
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 
-board = RemoteDeviceRegistry()
-with contextlib.closing(ZenohSubscriber("imu/**", [sys.argv[1]])) as arriving:
-    arriving.start()
+registry = RemoteDeviceRegistry()
+with contextlib.closing(ZenohSubscriber("imu/**", [sys.argv[1]])) as subscriber:
+    subscriber.start()
     while True:
-        for message in arriving.take(0.2):
+        for message in subscriber.take(0.2):
             if message.payload is None:
-                board.set_liveliness_token(message.key, message.token_exists)
+                registry.set_liveliness_token(message.key, message.token_exists)
             else:
-                board.process_message(message.key, message.payload)
+                registry.process_message(message.key, message.payload)
         now_s = time.monotonic()
-        states = [one.state(now_s) for one in board.devices_with_problems_first(now_s)] or ["nobody"]
-        received = [one.status.received for one in board.devices_with_problems_first(now_s) if one.status] or [0]
-        print(states[0], received[0], arriving.state, flush=True)
+        devices = registry.devices_with_problems_first(now_s)
+        states = [device.state(now_s) for device in devices] or ["no device"]
+        received = [device.status.received for device in devices if device.status] or [0]
+        print(states[0], received[0], subscriber.state, flush=True)
 """
 
 
-def test_daemon_and_watcher_find_each_other_again(tmp_path: Path) -> None:
+def test_daemon_and_watcher_reconnect_after_an_interrupted_network(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text(CONFIG)
-    with pair() as namespaces:
-        daemon = namespaces.python(namespaces.inside, "-m", "monitor.cli", "run", str(path))
-        watcher = namespaces.python(namespaces.outside, "-c", WATCH, f"tcp/{INSIDE}:7450")
+    with create_namespaces() as namespaces:
+        daemon = namespaces.start_python(namespaces.inside, "-m", "monitor.cli", "run", str(path))
+        watcher = namespaces.start_python(namespaces.outside, "-c", WATCH, f"tcp/{INSIDE}:7450")
         newest = [""]
 
         def listen() -> None:
@@ -63,17 +64,17 @@ def test_daemon_and_watcher_find_each_other_again(tmp_path: Path) -> None:
         try:
             wait_for(lambda: newest[0].startswith("running"))
             before = int(newest[0].split()[1])
-            namespaces.cable("down")
+            namespaces.set_cable("down")
             wait_for(lambda: newest[0].startswith(("silent", "gone")))
             cut_s = time.monotonic()
-            # zenoh's lease is 10 s: after it the session is given up on both sides
+            # zenoh's lease is 10 s, after which both sides close the session
             wait_for(lambda: time.monotonic() > cut_s + 12.0, "the end of the lease")
-            namespaces.cable("up")
-            # the samples of the cut are among those that were received
+            namespaces.set_cable("up")
+            # the daemon has also received the samples during the interruption
             wait_for(lambda: newest[0].startswith("running") and int(newest[0].split()[1]) > before + 1000)
             wait_for(lambda: newest[0].rstrip().endswith("ok"))
         finally:
-            _end(daemon, watcher)
+            _terminate(daemon, watcher)
             for reader in readers:
                 reader.join(PATIENCE_S)
             for pipe in (daemon.stdout, daemon.stderr, watcher.stdout, watcher.stderr):
@@ -81,7 +82,7 @@ def test_daemon_and_watcher_find_each_other_again(tmp_path: Path) -> None:
                 pipe.close()
 
 
-def _end(*children: "subprocess.Popen[str]") -> None:
+def _terminate(*children: "subprocess.Popen[str]") -> None:
     for child in children:
         child.terminate()
         try:

@@ -1,4 +1,4 @@
-"""A configured password is found in nothing that the program says: standard output, logs at their finest, status."""
+"""Test that no command writes a configured password to standard output, the debug log or the status."""
 
 import json
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S
-from tests.support.zenoh_sessions import router
+from tests.support.zenoh_sessions import open_router
 
 PASSWORD = "tr0ub4dor-and-3"
 ZENOH = """{{
@@ -35,7 +35,7 @@ format = "json"
 """
 
 
-def said_by(*arguments: str) -> str:
+def run_program(*arguments: str) -> str:
     done = subprocess.run(
         [sys.executable, "-m", "monitor.cli", *arguments],
         capture_output=True,
@@ -47,22 +47,22 @@ def said_by(*arguments: str) -> str:
 
 
 @pytest.mark.parametrize("broken", ["", " x", ', pasword: "tr0ub4dor-and-3"'])
-def test_a_password_is_said_nowhere(tmp_path: Path, broken: str) -> None:
+def test_password_is_never_written(tmp_path: Path, broken: str) -> None:
     endpoint = free_endpoint()
     (tmp_path / "z.json5").write_text(ZENOH.format(endpoint=endpoint, password=PASSWORD, broken=broken))
     path = tmp_path / "a.toml"
     path.write_text(CONFIG.format(password=PASSWORD))
-    with router(endpoint):
-        said = {
-            "check": said_by("check", str(path)),
-            "run": said_by("run", str(path), "--seconds", "4"),
-            "watch": said_by("watch", "--zenoh", str(tmp_path / "z.json5"), "--seconds", "2"),
+    with open_router(endpoint):
+        outputs = {
+            "check": run_program("check", str(path)),
+            "run": run_program("run", str(path), "--seconds", "4"),
+            "watch": run_program("watch", "--zenoh", str(tmp_path / "z.json5"), "--seconds", "2"),
         }
-    assert all(said.values()), said
-    for command, text in said.items():
+    assert all(outputs.values()), outputs
+    for command, text in outputs.items():
         assert PASSWORD not in text, (command, text)
     if not broken:
-        lines = [json.loads(line) for line in said["run"].splitlines() if line.startswith("{")]
+        lines = [json.loads(line) for line in outputs["run"].splitlines() if line.startswith("{")]
         assert any("socket://bench:***@127.0.0.1:1" in str(line) for line in lines)
     else:
-        assert "line 3" in said["run"]
+        assert "line 3" in outputs["run"]

@@ -1,4 +1,4 @@
-"""What the daemon can be reached by: nothing beyond loopback, as its sockets say and as a scan from outside finds."""
+"""Tests that the daemon and its viewer listen only on loopback, by their sockets and by a port scan from outside."""
 
 import contextlib
 import json
@@ -13,7 +13,7 @@ import pytest
 
 from tests.support.ports import free_port
 from tests.support.waiting import PATIENCE_S, stays_true, wait_for
-from tests.system.fleet.namespaces import INSIDE, pair
+from tests.system.fleet.namespaces import INSIDE, create_namespaces
 
 LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
 CONFIG = """
@@ -41,12 +41,12 @@ for port in range(1, 65536):
             found["closed"] += 1
 print(json.dumps(found))
 """
-OPEN = "import socket, sys; s = socket.create_server(('0.0.0.0', 45678)); print('up', flush=True); input()"
+OPEN_PORT = "import socket, sys; s = socket.create_server(('0.0.0.0', 45678)); print('up', flush=True); input()"
 
 
 @contextlib.contextmanager
-def daemon(path: Path, *before: str) -> Iterator[psutil.Process]:
-    """``imu-monitor run`` with the page, as a process."""
+def start_daemon(path: Path, *before: str) -> Iterator[psutil.Process]:
+    """Start ``imu-monitor run`` with the web viewer in a separate process."""
     ports = {name: free_port() for name in ("zenoh", "port", "web")}
     path.write_text(CONFIG.format(**ports))
     child = subprocess.Popen(
@@ -58,49 +58,54 @@ def daemon(path: Path, *before: str) -> Iterator[psutil.Process]:
         yield psutil.Process(child.pid)
     finally:
         child.send_signal(signal.SIGTERM)
-        _, said = child.communicate(timeout=PATIENCE_S)
-    assert child.returncode == 0, said
+        _, output = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 0, output
 
 
-def listening(process: psutil.Process) -> set[tuple[str, str]]:
-    """Program and address of every socket of a process and all its children that takes what comes: TCP and UDP."""
+def listening_sockets(process: psutil.Process) -> set[tuple[str, str]]:
+    """Return program and address of every listening TCP socket and open UDP socket of a process and its children."""
     found = set()
-    for one in (process, *process.children(recursive=True)):
+    for member in (process, *process.children(recursive=True)):
         with contextlib.suppress(psutil.NoSuchProcess):
-            for s in one.net_connections("inet"):
+            for s in member.net_connections("inet"):
                 if s.laddr and (s.status == psutil.CONN_LISTEN or s.status == psutil.CONN_NONE):
-                    found.add((one.name(), s.laddr.ip))
+                    found.add((member.name(), s.laddr.ip))
     return found
 
 
-def taking(pid: int) -> int:
-    """Listening TCP sockets in the namespace of a process."""
+def count_listening_sockets(pid: int) -> int:
+    """Return the number of listening TCP sockets in the network namespace of a process."""
     lines = Path(f"/proc/{pid}/net/tcp").read_text("ascii").splitlines()[1:]
     return sum(line.split()[3] == "0A" for line in lines)
 
 
 def test_every_socket_of_the_daemon_and_its_viewer_is_on_loopback(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    with daemon(tmp_path / "a.toml") as process:
-        wait_for(lambda: len({name for name, _ in listening(process)}) > 1)
-        wait_for(lambda: any(name.startswith("rerun") for name, _ in listening(process)), "a socket of the viewer")
-        assert stays_true(lambda: {address for _, address in listening(process)} <= set(LOOPBACK), 1.0)
+    with start_daemon(tmp_path / "a.toml") as process:
+        wait_for(lambda: len({name for name, _ in listening_sockets(process)}) > 1)
+        wait_for(
+            lambda: any(name.startswith("rerun") for name, _ in listening_sockets(process)), "a socket of the viewer"
+        )
+        assert stays_true(lambda: {address for _, address in listening_sockets(process)} <= set(LOOPBACK), 1.0)
 
 
-def test_a_scan_from_another_namespace_finds_nothing(tmp_path: Path) -> None:
+def test_scan_from_another_namespace_finds_no_port_of_the_daemon(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    with pair() as namespaces:
-        beside = namespaces.python(namespaces.inside, "-c", OPEN.replace("input()", "import time; time.sleep(86_400)"))
+    with create_namespaces() as namespaces:
+        open_port = namespaces.start_python(
+            namespaces.inside, "-c", OPEN_PORT.replace("input()", "import time; time.sleep(86_400)")
+        )
         try:
-            assert beside.stdout is not None
-            assert beside.stdout.readline() == "up\n"
-            with daemon(tmp_path / "a.toml", "ip", "netns", "exec", namespaces.inside) as process:
-                wait_for(lambda: any(one.name().startswith("rerun") for one in process.children(True)))
-                wait_for(lambda: taking(process.pid) >= 4)  # zenoh, the viewer's two, and that one
-                scan = namespaces.python(namespaces.outside, "-c", SCAN, INSIDE)
-                said, _ = scan.communicate(timeout=PATIENCE_S)
+            assert open_port.stdout is not None
+            assert open_port.stdout.readline() == "up\n"
+            with start_daemon(tmp_path / "a.toml", "ip", "netns", "exec", namespaces.inside) as process:
+                wait_for(lambda: any(child.name().startswith("rerun") for child in process.children(True)))
+                # zenoh, two of the viewer, and the port of OPEN_PORT
+                wait_for(lambda: count_listening_sockets(process.pid) >= 4)
+                scan = namespaces.start_python(namespaces.outside, "-c", SCAN, INSIDE)
+                output, _ = scan.communicate(timeout=PATIENCE_S)
         finally:
-            beside.kill()
-            beside.communicate()
-    # the scan does find what is open: the port that this test opened on purpose
-    assert json.loads(said) == {"open": [45678], "closed": 65534}
+            open_port.kill()
+            open_port.communicate()
+    # the scan can find an open port, namely the port that this test opened on purpose
+    assert json.loads(output) == {"open": [45678], "closed": 65534}

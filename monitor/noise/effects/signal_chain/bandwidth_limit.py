@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from math import floor, pi, sin
 from typing import ClassVar, Final
 
@@ -17,6 +18,7 @@ FILTER_KINDS: Final = ("butterworth", "iir", "fir")
 """Kinds of low-pass filters. The first kind is the default."""
 LENGTH_ITERATIONS: Final = 60
 """Number of bisections for the length of a moving average."""
+MAX_CACHED_LENGTHS: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +128,7 @@ def moving_average_power(length: float, cycles: Floats | float) -> Floats:
     return np.asarray(np.abs(total / length) ** 2)
 
 
+@lru_cache(MAX_CACHED_LENGTHS)
 def moving_average_length(order: int, cutoff_cycles: float) -> float:
     """Return the length in samples of a chain of equal moving averages, by bisection.
 

@@ -1,1 +1,1 @@
-"""A file a room: what its readers are tried with, and what must hold of what comes out."""
+"""Fuzz targets. Each module contains the targets of one kind of reader."""

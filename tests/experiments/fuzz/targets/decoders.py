@@ -1,9 +1,9 @@
-"""Every decoder of the folder, with the ``SampleClock`` behind it.
+"""Fuzz targets of every decoder, followed by ``SampleClock``.
 
-Streams: a programme of raw bytes, frames with a check that holds around any payload, damaged and cut ones, repeats.
-What comes out must be the same for two cuts of the stream, and each sample one that
-``tests.experiments.fuzz.formats`` finds.
-Frames and messages: one by one or all at once must make no difference.
+The input of a stream decoder consists of raw bytes, frames with a valid checksum around any payload, damaged frames,
+truncated frames and repetitions. The samples must not depend on how the stream is divided into chunks, and
+``tests.experiments.fuzz.formats`` must find each sample. The samples of frames and messages must not depend on whether
+the decoder receives them one by one or all at once.
 """
 
 import importlib
@@ -24,31 +24,31 @@ from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
-from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, EXAMPLES, NAMES, Example
-from tests.experiments.fuzz.checks import fed, seen
-from tests.experiments.fuzz.formats import FORMATS, some_of
-from tests.experiments.fuzz.stamped import Stamped
-from tests.experiments.fuzz.tape import Tape, pieces_of
+from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
+from tests.experiments.fuzz.checked_clock import CheckedClock
+from tests.experiments.fuzz.checks import feed_and_check, summarize_blocks
+from tests.experiments.fuzz.formats import FORMATS, is_subsequence
+from tests.experiments.fuzz.input_reader import InputReader, encode_pieces
 from tests.experiments.fuzz.target import Check, target
 from tests.support.settings import read_settings
 
-LONGEST: Final = 3000
-"""Bytes of a stream; repeats would make it longer."""
-CALLS: Final = 4
-STAMPED: Final = 6
-"""Blocks that go on to the clock; it has a target of its own."""
+MAX_STREAM_BYTES: Final = 3000
+"""Limit of the length of a stream in bytes, including repetitions."""
+MAX_CALLS: Final = 4
+MAX_TIMED_BLOCKS: Final = 6
+"""Limit of the blocks that are passed to the clock, which has a separate target."""
 START_NS: Final = 1_000_000_000
 RATES_HZ: Final = (None, 100.0, 1000.0, 12.5)
-MORE: Final = (
+EXTRA_EXAMPLES: Final = (
     Example("vectornav_binary", {"compensated": True}),
     Example("witmotion", {"packet": "bluetooth"}),
     Example("text", {"columns": ("gx", "-", "az"), "header": 1, "first_line": "keep", "delimiter": " "}),
 )
-"""Settings that the contract's examples leave out."""
+"""Examples with settings that ``decoder_examples`` does not contain."""
 
 
-def samples_of(data: bytes, decoder: Decoder) -> SampleBlock:
-    """A few samples of small values, out of any bytes."""
+def build_samples(data: bytes, decoder: Decoder) -> SampleBlock:
+    """Build a few samples with small values from any bytes."""
     n = 1 + min(len(data) // 8, 7)
     table = np.frombuffer(data.ljust(8 * n, b"\0")[: 8 * n], np.int8).reshape(n, 8) / 16.0
     ticks = np.full(n, NO_TICK, np.int64)
@@ -69,61 +69,66 @@ def _settings(name: str, i: int) -> Any:
 
 @cache
 def _examples(name: str) -> tuple[Example, ...]:
-    return tuple(e for e in (*EXAMPLES, *MORE) if e.name == name)
+    return tuple(e for e in (*EXAMPLES, *EXTRA_EXAMPLES) if e.name == name)
 
 
-def _stream(tape: Tape, wrap: Callable[[bytes], bytes], decoder: Decoder) -> bytes:
+def _build_stream(reader: InputReader, wrap: Callable[[bytes], bytes], decoder: Decoder) -> bytes:
     out, last = b"", b""
-    while tape and len(out) < LONGEST:
-        kind, data = tape.byte() % 8, tape.piece()
+    while reader and len(out) < MAX_STREAM_BYTES:
+        kind, data = reader.read_byte() % 8, reader.read_piece()
         if kind == 1:
             last = wrap(data)
             out += last
         elif kind == 2:
-            hurt = bytearray(wrap(data[1:]))
-            hurt[data[0] % len(hurt) if data else 0] ^= 1 << len(data) % 8
-            out += hurt
+            damaged = bytearray(wrap(data[1:]))
+            damaged[data[0] % len(damaged) if data else 0] ^= 1 << len(data) % 8
+            out += damaged
         elif kind == 3:
             out += wrap(data[1:])[: data[0] if data else 0]
         elif kind == 4:
-            out += last * min(data[0] % 64 if data else 1, LONGEST // max(len(last), 1))
+            out += last * min(data[0] % 64 if data else 1, MAX_STREAM_BYTES // max(len(last), 1))
         elif kind == 5:
-            out += b"".join(chunk.data for chunk in decoder.encode(samples_of(data, decoder)))
+            out += b"".join(chunk.data for chunk in decoder.encode(build_samples(data, decoder)))
         else:
             out += data
     return out
 
 
-def stream_check(name: str) -> Check:
-    """The target of one stream decoder."""
+def make_stream_check(name: str) -> Check:
+    """Return the check of one stream decoder."""
 
     def check(data: bytes) -> None:
-        tape = Tape(data)
-        i = tape.byte() % len(_examples(name))
+        reader = InputReader(data)
+        i = reader.read_byte() % len(_examples(name))
         settings = _examples(name)[i].settings
         form = FORMATS["text-nmea" if settings.get("nmea") else name]
-        step, rate, pace = 1 + tape.byte(), tape.choice(RATES_HZ), tape.byte()
+        step, rate, pace = 1 + reader.read_byte(), reader.choose(RATES_HZ), reader.read_byte()
         build, keys = _settings(name, i)
-        wire = _stream(tape, lambda part: form.wrap(part, settings), build(keys))
+        wire = _build_stream(reader, lambda part: form.wrap(part, settings), build(keys))
         one, other = build(keys), build(keys)
-        whole = fed(one, [[Chunk(wire, START_NS)]])
-        step = max(step, len(wire) // CALLS)
-        clock = Stamped(other.timing, rate)
+        whole = feed_and_check(one, [[Chunk(wire, START_NS)]])
+        step = max(step, len(wire) // MAX_CALLS)
+        clock = CheckedClock(other.timing, rate)
         starts = range(0, len(wire), step)
         calls = [[Chunk(wire[at : at + step], START_NS + at * 1000 * (pace + 1))] for at in starts]
-        parts = fed(other, calls)
-        for each in parts[:STAMPED]:
-            clock.put(each)
-        assert seen(whole) == seen(parts), "another cut gives other samples"
-        assert one.bad == other.bad, "another cut counts other bad frames"
-        if form.readings is not None:
-            assert some_of(seen(whole)[0], form.readings(wire, settings)), "a sample that no valid frame holds"
+        parts = feed_and_check(other, calls)
+        for each in parts[:MAX_TIMED_BLOCKS]:
+            clock.assign_times(each)
+        assert summarize_blocks(whole) == summarize_blocks(parts), "the samples depend on how the bytes are divided"
+        assert one.bad == other.bad, "the number of bad frames depends on how the bytes are divided"
+        if form.find_readings is not None:
+            assert is_subsequence(summarize_blocks(whole)[0], form.find_readings(wire, settings)), (
+                "a sample that no valid frame contains"
+            )
 
     return check
 
 
-def wire_check(name: str) -> Check:
-    """The target of one stream decoder, raw: no programme, and two cuts only where a sample comes out."""
+def make_wire_check(name: str) -> Check:
+    """Return the check of one stream decoder with raw bytes.
+
+    The bytes are divided differently only if the decoder returns a sample.
+    """
 
     def check(data: bytes) -> None:
         i = data[0] % len(_examples(name)) if data else 0
@@ -131,40 +136,44 @@ def wire_check(name: str) -> Check:
         form = FORMATS["text-nmea" if settings.get("nmea") else name]
         build, keys = _settings(name, i)
         one, wire = build(keys), data[1:]
-        whole = fed(one, [[Chunk(wire, START_NS)]])
+        whole = feed_and_check(one, [[Chunk(wire, START_NS)]])
         if not whole:
             return
-        if form.readings is not None:
-            assert some_of(seen(whole)[0], form.readings(wire, settings)), "a sample that no valid frame holds"
+        if form.find_readings is not None:
+            assert is_subsequence(summarize_blocks(whole)[0], form.find_readings(wire, settings)), (
+                "a sample that no valid frame contains"
+            )
         other, half = build(keys), len(wire) // 2
-        parts = fed(other, [[Chunk(wire[:half], START_NS)], [Chunk(wire[half:], START_NS)]])
-        assert seen(whole) == seen(parts), "another cut gives other samples"
+        parts = feed_and_check(other, [[Chunk(wire[:half], START_NS)], [Chunk(wire[half:], START_NS)]])
+        assert summarize_blocks(whole) == summarize_blocks(parts), "the samples depend on how the bytes are divided"
 
     return check
 
 
 def wire_seeds(name: str) -> Iterator[bytes]:
-    """What a device would send."""
+    """Return the bytes that a device would send."""
     rng = np.random.default_rng(5)
     for i in range(len(_examples(name))):
         build, keys = _settings(name, i)
         for n in (8, 24):
             yield bytes([i]) + b"".join(
-                chunk.data for chunk in build(keys).encode(samples_of(rng.bytes(n), build(keys)))
+                chunk.data for chunk in build(keys).encode(build_samples(rng.bytes(n), build(keys)))
             )
 
 
 def stream_seeds(name: str) -> Iterator[bytes]:
-    """Encoded samples, as raw bytes and as orders to encode; frames of payloads."""
+    """Return encoded samples as raw bytes, samples to be encoded, and frames around payloads."""
     rng = np.random.default_rng(1)
     for i, example in enumerate(_examples(name)):
         build, keys = _settings(name, i)
-        made = b"".join(chunk.data for chunk in build(keys).encode(samples_of(rng.bytes(24), build(keys))))
+        encoded = b"".join(chunk.data for chunk in build(keys).encode(build_samples(rng.bytes(24), build(keys))))
         head = bytes([i, 40, 1, 200])
-        yield head + pieces_of(made, b"\0")
+        yield head + encode_pieces(encoded, b"\0")
         yield head + b"\5\x18" + rng.bytes(24) + b"\0\x09rubbish\r\n" + b"\5\x18" + rng.bytes(24)
         yield head + b"\1\x20" + rng.bytes(32) + b"\4\1\7" + b"\2\x20" + rng.bytes(32) + b"\3\x20" + rng.bytes(32)
-        inner = {"vectornav_binary": made[1:-2], "xsens_mtdata2": made[4:-1], "stim300": made[:-4]}.get(name, made)
+        inner = {"vectornav_binary": encoded[1:-2], "xsens_mtdata2": encoded[4:-1], "stim300": encoded[:-4]}.get(
+            name, encoded
+        )
         if example.name in ("text", "vectornav_ascii"):
             inner = inner.strip().strip(b"$").partition(b"\r")[0].rpartition(b"*")[0] or inner
         yield head + b"".join(b"\1" + bytes([len(part)]) + part for part in [inner[:190]] * 4)
@@ -232,16 +241,16 @@ def _can_decoder(i: int) -> DbcDecoder:
     return DbcDecoder(messages, settings, timing)
 
 
-def _frames(tape: Tape, decoder: DbcDecoder) -> list[Chunk]:
-    """Frames to the decoder's addresses and to others."""
+def _build_frames(reader: InputReader, decoder: DbcDecoder) -> list[Chunk]:
+    """Return frames with addresses of the decoder and with other addresses."""
     addresses = [address & ~(1 << 30) for address in decoder.addresses]
     t_ns = START_NS
     chunks = []
-    while tape and len(chunks) < 40:
-        kind, data = tape.byte(), tape.piece()[:64]
+    while reader and len(chunks) < 40:
+        kind, data = reader.read_byte(), reader.read_piece()[:64]
         t_ns += (kind >> 4) * 1_000_000
         if kind % 4 == 3:
-            samples = samples_of(data, decoder)
+            samples = build_samples(data, decoder)
             chunks += [replace(chunk, t_ns=t_ns) for chunk in decoder.encode(samples)]
             continue
         address = addresses[kind // 4 % len(addresses)]
@@ -253,18 +262,18 @@ def _frames(tape: Tape, decoder: DbcDecoder) -> list[Chunk]:
     return chunks
 
 
-def _same_one_by_one(
+def _check_independence_of_chunks(
     build: Callable[[], Decoder], chunks: list[Chunk], rate_hz: float | None
 ) -> tuple[list[SampleBlock], Decoder]:
-    """The samples of all chunks at once, which are those of the chunks one by one."""
+    """Return the samples of all chunks at once, and check that they equal the samples of single chunks."""
     one, other = build(), build()
-    clock = Stamped(other.timing, rate_hz)
-    parts = fed(other, [[chunk] for chunk in chunks])
-    for each in parts[:STAMPED]:
-        clock.put(each)
-    whole = fed(one, [chunks])
-    assert seen(whole) == seen(parts), "one by one gives other samples"
-    assert one.bad == other.bad, "one by one counts other bad frames"
+    clock = CheckedClock(other.timing, rate_hz)
+    parts = feed_and_check(other, [[chunk] for chunk in chunks])
+    for each in parts[:MAX_TIMED_BLOCKS]:
+        clock.assign_times(each)
+    whole = feed_and_check(one, [chunks])
+    assert summarize_blocks(whole) == summarize_blocks(parts), "single chunks give other samples"
+    assert one.bad == other.bad, "single chunks give another number of bad frames"
     return whole, one
 
 
@@ -276,39 +285,41 @@ def _can_seeds() -> Iterator[bytes]:
 
 
 def check_dbc(data: bytes) -> None:
-    """Frames through a CAN database."""
-    tape = Tape(data)
-    i, rate = tape.byte() % len(CAN), tape.choice(RATES_HZ)
-    _same_one_by_one(lambda: _can_decoder(i), _frames(tape, _can_decoder(i)), rate)
+    """Check frames that are decoded with a CAN database."""
+    reader = InputReader(data)
+    i, rate = reader.read_byte() % len(CAN), reader.choose(RATES_HZ)
+    _check_independence_of_chunks(lambda: _can_decoder(i), _build_frames(reader, _can_decoder(i)), rate)
 
 
 # --- messages
 
 
-def _plain(name: str) -> Decoder:
+def _build_decoder(name: str) -> Decoder:
     module = importlib.import_module(f"drivers.decoders.{name}")
     decoder: Decoder = module.build(module.Settings())
     return decoder
 
 
 def check_ros2(data: bytes) -> None:
-    """CDR messages: numbers that come out stand in the payload, at its own stamp."""
-    tape = Tape(data)
-    rate = tape.choice(RATES_HZ)
+    """Check that the values and the time of each sample are those of a CDR message."""
+    reader = InputReader(data)
+    rate = reader.choose(RATES_HZ)
     chunks = []
-    while tape and len(chunks) < 20:
-        kind, payload, beside = tape.byte(), tape.piece(), tape.piece()
+    while reader and len(chunks) < 20:
+        kind, payload, attachment = reader.read_byte(), reader.read_piece(), reader.read_piece()
         if kind % 2:
-            beside = beside.ljust(33 if kind % 4 == 1 else 77, b"\0")[: 33 if kind % 4 == 1 else 77]
-        chunks.append(Chunk(payload, 5, attachment=beside))
-    whole, _ = _same_one_by_one(lambda: _plain("ros2_imu"), chunks, rate)
+            attachment = attachment.ljust(33 if kind % 4 == 1 else 77, b"\0")[: 33 if kind % 4 == 1 else 77]
+        chunks.append(Chunk(payload, 5, attachment=attachment))
+    whole, _ = _check_independence_of_chunks(lambda: _build_decoder("ros2_imu"), chunks, rate)
     known = iter([reading for chunk in chunks if (reading := _ros2_reading(chunk.data)) is not None])
     for one in whole:
         for t_ns, row in zip(one.t_ns.tolist(), one.values.tolist(), strict=True):
-            assert any(t_ns == t and _same(row, values) for t, values in known), "a sample that no message holds"
+            assert any(t_ns == t and _rows_equal(row, values) for t, values in known), (
+                "a sample that no message contains"
+            )
 
 
-def _same(row: list[float], values: list[float]) -> bool:
+def _rows_equal(row: list[float], values: list[float]) -> bool:
     return all(a != a or a == b for a, b in zip(row, values, strict=True))
 
 
@@ -327,8 +338,8 @@ def _ros2_reading(data: bytes) -> tuple[int, list[float]] | None:
 def _ros2_seeds() -> Iterator[bytes]:
     rng = np.random.default_rng(3)
     for _ in range(3):
-        decoder = _plain("ros2_imu")
-        chunks = decoder.encode(samples_of(rng.bytes(24), decoder))
+        decoder = _build_decoder("ros2_imu")
+        chunks = decoder.encode(build_samples(rng.bytes(24), decoder))
         yield b"\1" + b"".join(
             b"\1" + bytes([203]) + chunk.data.ljust(392, b"\0") + bytes([33]) + chunk.attachment for chunk in chunks
         )
@@ -336,83 +347,91 @@ def _ros2_seeds() -> Iterator[bytes]:
 
 
 def check_samples(data: bytes) -> None:
-    """Messages of other monitors, raw or put together."""
-    tape = Tape(data)
-    rate = tape.choice(RATES_HZ)
+    """Check messages of other monitors, as raw bytes or built from fields."""
+    reader = InputReader(data)
+    rate = reader.choose(RATES_HZ)
     chunks = []
-    while tape and len(chunks) < 20:
-        chunks.append(Chunk(tape.piece() if tape.byte() % 2 else message_of(tape), 5))
-    _same_one_by_one(lambda: _plain("samples"), chunks, rate)
+    while reader and len(chunks) < 20:
+        chunks.append(Chunk(reader.read_piece() if reader.read_byte() % 2 else build_message(reader), 5))
+    _check_independence_of_chunks(lambda: _build_decoder("samples"), chunks, rate)
 
 
-def message_of(tape: Tape) -> bytes:
-    """A map with the right keys, and often the right sizes."""
-    kind = tape.byte()
-    axes = [tape.choice((*COLUMNS, *AXES, "other")) for _ in range(1 + kind % 7)]
-    rows = tape.byte() % 32
-    numbers = [tape.byte() / 8.0 if kind & 8 else tape.wild() for _ in range(rows * len(axes) % 50)]
+def build_message(reader: InputReader) -> bytes:
+    """Build a map with valid keys and often valid sizes."""
+    kind = reader.read_byte()
+    axes = [reader.choose((*COLUMNS, *AXES, "other")) for _ in range(1 + kind % 7)]
+    rows = reader.read_byte() % 32
+    numbers = [
+        reader.read_byte() / 8.0 if kind & 8 else reader.read_special_float() for _ in range(rows * len(axes) % 50)
+    ]
     payload: dict[str, Any] = {
-        "schema": tape.choice((SCHEMA, *SCHEMAS, "other")),
+        "schema": reader.choose((SCHEMA, *SCHEMAS, "other")),
         "axes": list(dict.fromkeys(axes)) if kind & 16 else axes,
-        "samples": tape.choice((0, 1, rows, 1 << 53, tape.int64())),
+        "samples": reader.choose((0, 1, rows, 1 << 53, reader.read_int64())),
     }
     width = len(payload["axes"])
     rows = len(numbers) // width
     payload["data"] = np.array(numbers[: rows * width]).tobytes()
     if kind & 32:
-        payload["t"] = np.array([tape.wild() for _ in range(rows)]).tobytes()
+        payload["t"] = np.array([reader.read_special_float() for _ in range(rows)]).tobytes()
     else:
-        payload |= {"t": tape.wild(), "t0": tape.wild(), "rate": tape.wild()}
+        payload |= {
+            "t": reader.read_special_float(),
+            "t0": reader.read_special_float(),
+            "rate": reader.read_special_float(),
+        }
     if kind & 64:
-        payload["lost"] = tape.choice((0, 1, 1000, 1 << 40, 1 << 53, tape.int64()))
+        payload["lost"] = reader.choose((0, 1, 1000, 1 << 40, 1 << 53, reader.read_int64()))
     return msgspec.msgpack.encode(payload)
 
 
 def _samples_seeds() -> Iterator[bytes]:
     rng = np.random.default_rng(4)
     for _ in range(3):
-        decoder = _plain("samples")
-        made = decoder.encode(samples_of(rng.bytes(24), decoder))[0].data
-        n = 200 + -(-(len(made) - 200) // 64) if len(made) >= 200 else len(made)
-        yield b"\1" + (b"\1" + bytes([n]) + made) * 2
+        decoder = _build_decoder("samples")
+        encoded = decoder.encode(build_samples(rng.bytes(24), decoder))[0].data
+        n = 200 + -(-(len(encoded) - 200) // 64) if len(encoded) >= 200 else len(encoded)
+        yield b"\1" + (b"\1" + bytes([n]) + encoded) * 2
         yield b"\1" + rng.bytes(400)
 
 
-def wire_message(name: str) -> Check:
-    """The target of one decoder of messages, raw: one message."""
+def make_message_check(name: str) -> Check:
+    """Return the check of one message decoder with one raw message."""
 
     def check(data: bytes) -> None:
-        fed(_plain(name), [[Chunk(data, 5)]])
+        feed_and_check(_build_decoder(name), [[Chunk(data, 5)]])
 
     return check
 
 
-def _messages(name: str) -> Iterator[bytes]:
+def _message_seeds(name: str) -> Iterator[bytes]:
     rng = np.random.default_rng(6)
     for n in (8, 24):
-        yield from (chunk.data for chunk in _plain(name).encode(samples_of(rng.bytes(n), _plain(name))))
+        yield from (
+            chunk.data for chunk in _build_decoder(name).encode(build_samples(rng.bytes(n), _build_decoder(name)))
+        )
 
 
 def wire_dbc(data: bytes) -> None:
-    """Frames of eight bytes, each behind a byte that says to which address."""
+    """Check frames of eight bytes. A byte before each frame selects its address."""
     decoder = _can_decoder(data[0] % len(CAN) if data else 0)
     addresses = [address & ~(1 << 30) for address in decoder.addresses]
     cut = [data[at : at + 9] for at in range(1, min(len(data), 100), 9)]
-    fed(decoder, [[Chunk(part[1:], START_NS, addresses[part[0] % len(addresses)]) for part in cut]])
+    feed_and_check(decoder, [[Chunk(part[1:], START_NS, addresses[part[0] % len(addresses)]) for part in cut]])
 
 
 target("wire-dbc", lambda: [bytes([i, *range(100)]) for i in range(len(CAN))], 100)(wire_dbc)
 for _name in ("ros2_imu", "samples"):
-    target(f"wire-{_name}", partial(_messages, _name), 512)(wire_message(_name))
+    target(f"wire-{_name}", partial(_message_seeds, _name), 512)(make_message_check(_name))
 
-ALONE: Final = {
+NON_STREAM_TARGETS: Final = {
     "dbc": (check_dbc, _can_seeds),
     "ros2_imu": (check_ros2, _ros2_seeds),
     "samples": (check_samples, _samples_seeds),
 }
-for _name in NAMES:
-    if _name in ALONE:
-        target(f"decoder-{_name}", ALONE[_name][1], 1024)(ALONE[_name][0])
+for _name in DECODER_NAMES:
+    if _name in NON_STREAM_TARGETS:
+        target(f"decoder-{_name}", NON_STREAM_TARGETS[_name][1], 1024)(NON_STREAM_TARGETS[_name][0])
     else:
-        target(f"decoder-{_name}", partial(stream_seeds, _name), 400, WORDS.get(_name, ()))(stream_check(_name))
-        target(f"wire-{_name}", partial(wire_seeds, _name), 250, WORDS.get(_name, ()))(wire_check(_name))
+        target(f"decoder-{_name}", partial(stream_seeds, _name), 400, WORDS.get(_name, ()))(make_stream_check(_name))
+        target(f"wire-{_name}", partial(wire_seeds, _name), 250, WORDS.get(_name, ()))(make_wire_check(_name))

@@ -1,7 +1,7 @@
-"""Recordings and logs: every format of the folder, from bytes, cut and damaged, with lengths that lie.
+"""Fuzz targets of every format of recordings and logs: truncated, damaged, or with wrong lengths.
 
-What comes out of a recording is numbers or NaN, as many in each column as there are times, and times that fit int64
-nanoseconds. A log gives chunks of possible sizes at possible times, or ends with the words of its link.
+A recording contains finite numbers or NaN, equally many in each column, and times that fit into int64 nanoseconds. A
+log contains chunks with possible sizes and times, or ends with an error of its link.
 """
 
 import gzip
@@ -21,35 +21,35 @@ import numpy as np
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links.replay_link import Settings, build
 from drivers.recordings import FORMATS, WRITABLE, iter_blocks, load_samples, memory_check, save_samples
-from tests.experiments.fuzz.checks import one_line
-from tests.experiments.fuzz.tape import Tape
+from tests.experiments.fuzz.checks import check_error_message
+from tests.experiments.fuzz.input_reader import InputReader
 from tests.experiments.fuzz.target import Check, target
 
 LARGEST_NS: Final = 1 << 62
-ROOM: Final = Path("/dev/shm") if Path("/dev/shm").is_dir() else None
+MEMORY_FOLDER: Final = Path("/dev/shm") if Path("/dev/shm").is_dir() else None
 RATE_HZ: Final = 100.0
 FREE_BYTES: Final = 100_000_000
-"""What readers are told to be free: a recording that a file only states is refused, one that is read stays small."""
+"""Free memory that the readers see. They reject a file that only declares a large recording."""
 
 
 @cache
-def folder() -> Path:
-    """A folder of this process, in memory where there is one."""
-    kept = tempfile.TemporaryDirectory(dir=ROOM)
-    _KEPT.append(kept)
-    return Path(kept.name)
+def get_folder() -> Path:
+    """Return the folder of this process, which is in memory if possible."""
+    folder = tempfile.TemporaryDirectory(dir=MEMORY_FOLDER)
+    _FOLDERS.append(folder)
+    return Path(folder.name)
 
 
-_KEPT: Final[list[tempfile.TemporaryDirectory[str]]] = []
+_FOLDERS: Final[list[tempfile.TemporaryDirectory[str]]] = []
 
 
-def recorded(path: Path) -> None:
-    """Read a recording, and look at all of it."""
+def check_recording(path: Path) -> None:
+    """Read a recording and check its contents."""
     try:
         with mock.patch.object(memory_check, "available_bytes", return_value=FREE_BYTES):
             recording = load_samples(path, RATE_HZ)
     except (RecordingError, ConfigError) as error:
-        one_line(error)
+        check_error_message(error)
         return
     n = len(recording)
     assert n >= 1
@@ -63,7 +63,7 @@ def recorded(path: Path) -> None:
         assert (np.abs(recording.t_s) * 1e9 < LARGEST_NS).all()
     for note in recording.notes:
         assert "\n" not in note, "a note of several lines"
-        assert len(note) < 2000, "an endless note"
+        assert len(note) < 2000, "a note that is too long"
     rows = 0
     for block in iter_blocks(recording, 4096):
         rows += len(block)
@@ -71,25 +71,25 @@ def recorded(path: Path) -> None:
     assert rows == n
 
 
-def recording_check(suffix: str) -> Check:
-    """The target of one format: the file's bytes."""
+def make_recording_check(suffix: str) -> Check:
+    """Return the check of one format, which reads the bytes as a file."""
 
     def check(data: bytes) -> None:
-        path = folder() / f"a{suffix}"
+        path = get_folder() / f"a{suffix}"
         path.write_bytes(data)
-        recorded(path)
+        check_recording(path)
 
     return check
 
 
 def recording_seeds(suffix: str) -> Iterator[bytes]:
-    """What the project writes."""
+    """Return recordings that the project writes, and truncated ones."""
     rng = np.random.default_rng(7)
     if suffix not in WRITABLE:
         yield from robot_log_seeds(suffix)
         return
     for n, axes in ((3, ("gz",)), (12, ("gx", "gy", "gz", "ax", "ay", "az"))):
-        path = folder() / f"seed{suffix}"
+        path = get_folder() / f"seed{suffix}"
         values = np.round(rng.normal(size=(n, 6)), 2)
         save_samples(path, np.arange(n) * 0.01, values, np.full(n, 25.0), axes)
         data = path.read_bytes()
@@ -126,7 +126,7 @@ def robot_log_seeds(suffix: str) -> Iterator[bytes]:
 
 
 def _arrow_seeds(suffix: str) -> Iterator[bytes]:
-    """Other types, nulls, compression, dictionaries."""
+    """Return tables with other types, nulls, compression and dictionaries."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -138,13 +138,13 @@ def _arrow_seeds(suffix: str) -> Iterator[bytes]:
             "word": pa.array(["a", "b", "a", None]).dictionary_encode(),
         }
     )
-    for how in ("lz4", "zstd", None):
+    for compression in ("lz4", "zstd", None):
         sink = io.BytesIO()
         if suffix == ".parquet":
-            parquet.write_table(table, sink, compression=how or "none")
+            parquet.write_table(table, sink, compression=compression or "none")
         else:
             new = pa.ipc.new_file if suffix == ".arrow" else pa.ipc.new_stream
-            with new(sink, table.schema, options=pa.ipc.IpcWriteOptions(compression=how)) as writer:
+            with new(sink, table.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as writer:
                 writer.write_table(table)
         yield sink.getvalue()
 
@@ -161,7 +161,7 @@ WORDS: Final = {
 for _suffix in FORMATS:
     _name = f"recording-{_suffix[1:].replace('.', '-')}"
     target(_name, partial(recording_seeds, _suffix), SIZES.get(_suffix, 6000), WORDS.get(_suffix, ()))(
-        recording_check(_suffix)
+        make_recording_check(_suffix)
     )
 
 
@@ -172,42 +172,42 @@ for _suffix in FORMATS:
     ("'descr': '<f8', 'fortran_order': False, 'shape': (4,), }", "'|O'", "(9999999999,)", "('<f8', (3,))", "'<U9'"),
 )
 def npz_arrays(data: bytes) -> None:
-    """An archive that is whole, of arrays whose headers say anything."""
-    tape = Tape(data)
+    """Check a complete archive of arrays with any headers."""
+    reader = InputReader(data)
     with zipfile.ZipFile(packed := io.BytesIO(), "w") as archive:
-        for name in ("t", "gz", "fs", "temperature")[: 1 + tape.byte() % 4]:
-            kind = tape.byte()
-            body = tape.piece() * (1 + tape.byte() % 16 * (kind & 1) * 100)
-            header = tape.piece() if kind & 2 else _header(tape).encode()
+        for name in ("t", "gz", "fs", "temperature")[: 1 + reader.read_byte() % 4]:
+            kind = reader.read_byte()
+            body = reader.read_piece() * (1 + reader.read_byte() % 16 * (kind & 1) * 100)
+            header = reader.read_piece() if kind & 2 else _header(reader).encode()
             version = (1, 2, 3, 9)[kind >> 2 & 3 if kind & 16 else 0]
             size = struct.pack("<H" if version == 1 else "<I", len(header))
             how = zipfile.ZIP_DEFLATED if kind & 32 else zipfile.ZIP_STORED
             archive.writestr(f"{name}.npy", b"\x93NUMPY" + bytes([version, 0]) + size + header + body, how)
     whole = packed.getvalue()
-    path = folder() / "a.npz"
-    path.write_bytes(whole[: -22 if tape.byte() & 1 else None])
-    recorded(path)
+    path = get_folder() / "a.npz"
+    path.write_bytes(whole[: -22 if reader.read_byte() & 1 else None])
+    check_recording(path)
 
 
-def _header(tape: Tape) -> str:
-    dtype = tape.choice(
+def _header(reader: InputReader) -> str:
+    dtype = reader.choose(
         ("'<f8'", "'<i2'", "'>f4'", "'|u1'", "'<f2'", "'|O'", "'<c16'", "'|b1'", "'<M8[s]'", "[('a', '<f8')]")
     )
-    shape = tape.choice(
+    shape = reader.choose(
         ("(4,)", "(7,)", "()", "(2, 2)", "(99999999999,)", "(300000000,)", "(-1,)", "(0,)", "(1 << 3,)")
     )
-    return f"{{'descr': {dtype}, 'fortran_order': {tape.byte() % 2 == 1}, 'shape': {shape}, }}\n"
+    return f"{{'descr': {dtype}, 'fortran_order': {reader.read_byte() % 2 == 1}, 'shape': {shape}, }}\n"
 
 
 # --- logs
 
 
-def replayed(path: Path, channel: str | None = None) -> None:
-    """Replay a file to its end."""
+def check_replay(path: Path, channel: str | None = None) -> None:
+    """Replay a file to its end and check its chunks."""
     try:
         link = build(Settings(path=str(path), speed="max", channel=channel))
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)
         return
     try:
         with mock.patch.object(memory_check, "available_bytes", return_value=FREE_BYTES):
@@ -217,36 +217,36 @@ def replayed(path: Path, channel: str | None = None) -> None:
                 assert abs(chunk.t_ns) < LARGEST_NS, "a time beyond int64"
                 assert 0 <= chunk.address < 1 << 32, "no CAN identifier"
                 if link.carrier == "frames":
-                    assert len(chunk.data) <= 64, "no CAN frame is so long"
+                    assert len(chunk.data) <= 64, "longer than any CAN frame"
     except (LinkUnavailable, LinkEnded) as error:
-        one_line(error)
+        check_error_message(error)
     finally:
         link.close()
 
 
-def log_check(suffix: str) -> Check:
-    """The target of one kind of log."""
+def make_log_check(suffix: str) -> Check:
+    """Return the check of one format of logs."""
 
     def check(data: bytes) -> None:
-        path = folder() / f"log{suffix}"
+        path = get_folder() / f"log{suffix}"
         path.write_bytes(data)
-        replayed(path)
+        check_replay(path)
 
     return check
 
 
 def log_seeds(suffix: str) -> Iterator[bytes]:
-    """What python-can writes."""
+    """Return logs that python-can writes."""
     import can
 
-    for how in ({}, {"compression_level": 0}) if suffix == ".blf" else ({},):
-        path = folder() / f"seed-log{suffix}"
-        with can.Logger(path, **how) as log:
-            _log(log)
+    for options in ({}, {"compression_level": 0}) if suffix == ".blf" else ({},):
+        path = get_folder() / f"seed-log{suffix}"
+        with can.Logger(path, **options) as log:
+            _write_messages(log)
         yield path.read_bytes()
 
 
-def _log(log: Any) -> None:
+def _write_messages(log: Any) -> None:
     import can
 
     for i in range(6):
@@ -281,33 +281,33 @@ LOG_WORDS: Final = {
 }
 
 for _suffix in (".asc", ".blf", ".log", ".trc", ".csv"):
-    target(f"log-{_suffix[1:]}", partial(log_seeds, _suffix), 2000, LOG_WORDS[_suffix])(log_check(_suffix))
+    target(f"log-{_suffix[1:]}", partial(log_seeds, _suffix), 2000, LOG_WORDS[_suffix])(make_log_check(_suffix))
 
 FRAMES: Final = b"t,id_hex,data_hex,bus,extended\n0.01,123,0102ff,0,0\n0.02,18F02980,01,1,1\n"
 
 
 @target("log-frames-csv", [FRAMES], 600, ("1e999", "nan", "-1", "0x", "ffffffffffffffffff", '"', "\r\n", "inf"))
 def log_frames(data: bytes) -> None:
-    """A CSV of frames, behind a header that is one."""
-    path = folder() / "frames.csv"
+    """Check a CSV file of CAN frames with a valid header."""
+    path = get_folder() / "frames.csv"
     path.write_bytes(data if data[:1] == b"t" else b"t,id_hex,data_hex,bus,extended\n" + data)
-    replayed(path, "1" if data[-1:] == b"\n" else None)
+    check_replay(path, "1" if data[-1:] == b"\n" else None)
 
 
 @target("log-gz", lambda: [gzip.compress(FRAMES, mtime=0)], 600)
-def log_zipped(data: bytes) -> None:
-    """Compressed frames, and compressed captured bytes."""
+def log_compressed(data: bytes) -> None:
+    """Check compressed CAN frames and compressed captured bytes."""
     for name in ("frames.csv.gz", "a.bin.gz", "a.log.gz"):
-        path = folder() / name
+        path = get_folder() / name
         path.write_bytes(data)
-        replayed(path)
+        check_replay(path)
 
 
 @target("log-recording", lambda: [json.dumps({"t": [0, 1, 2], "gz": [1, 2, 3]}).encode()], 400)
 def log_recording(data: bytes) -> None:
-    """A recording of any times, replayed as messages."""
-    tape = Tape(data)
-    rows = [",".join(repr(tape.wild()) for _ in range(2)) for _ in range(1 + tape.byte() % 40)]
-    path = folder() / "replayed.csv"
+    """Check the replay of a recording with any times."""
+    reader = InputReader(data)
+    rows = [",".join(repr(reader.read_special_float()) for _ in range(2)) for _ in range(1 + reader.read_byte() % 40)]
+    path = get_folder() / "replayed.csv"
     path.write_text("t,gz\n" + "\n".join(rows) + "\n")
-    replayed(path)
+    check_replay(path)

@@ -1,4 +1,4 @@
-"""What other processes send or leave: payloads on the bus, JSON files of other commands, words of a command line."""
+"""Fuzz targets of data from other processes: zenoh messages, JSON files of other commands, and command lines."""
 
 import math
 from collections.abc import Iterator
@@ -21,12 +21,12 @@ from monitor.publishing.terminal.live_device_table import device_overview
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
 from monitor.simulator.effect_option_parser import parse_effects
-from tests.experiments.fuzz.checks import one_line
-from tests.experiments.fuzz.tape import Tape
+from tests.experiments.fuzz.checks import check_error_message
+from tests.experiments.fuzz.input_reader import InputReader
 from tests.experiments.fuzz.target import target
-from tests.experiments.fuzz.targets.decoders import message_of, samples_of
-from tests.experiments.fuzz.targets.files import folder
-from tests.experiments.fuzz.targets.settings import possible
+from tests.experiments.fuzz.targets.decoders import build_message, build_samples
+from tests.experiments.fuzz.targets.files import get_folder
+from tests.experiments.fuzz.targets.settings import check_finite
 
 # --- messages of daemons
 
@@ -56,35 +56,35 @@ def _payloads() -> tuple[bytes, ...]:
     return tuple(msgspec.json.encode({"schema": topic.schema_name(), **HEADS, **m}) for topic, m in MESSAGES.items())
 
 
-def _messages() -> Iterator[bytes]:
+def _message_seeds() -> Iterator[bytes]:
     for i, payload in enumerate(_payloads()):
         yield bytes([i]) + payload
         yield bytes([i]) + payload[:-1] + b',"x":' + b"[" * 1200
 
 
-def _taken(data: bytes) -> RemoteDeviceRegistry:
-    board = RemoteDeviceRegistry(lambda: 1.0)
+def _process_message(data: bytes) -> RemoteDeviceRegistry:
+    registry = RemoteDeviceRegistry(lambda: 1.0)
     name = NAMES[data[0] % len(NAMES)] if data else "status"
-    board.process_message(f"imu/a/{name}", data[1:])
-    return board
+    registry.process_message(f"imu/a/{name}", data[1:])
+    return registry
 
 
-@target("heard", _messages, 2000, WORDS)
-def heard(data: bytes) -> None:
-    """A message of a daemon: taken, or counted as malformed."""
-    board = _taken(data)
-    assert board.malformed in (0, 1)
+@target("daemon-message", _message_seeds, 2000, WORDS)
+def daemon_message(data: bytes) -> None:
+    """Check that a message of a daemon is processed or counted as malformed."""
+    registry = _process_message(data)
+    assert registry.malformed in (0, 1)
 
 
-@target("board", _messages, 2000, WORDS)
-def board(data: bytes) -> None:
-    """The same, and then shown."""
-    console = Console(width=100, height=30, file=_Nowhere(), force_terminal=True)
-    console.print(device_overview(_taken(data), 2.0))
+@target("device-table", _message_seeds, 2000, WORDS)
+def device_table(data: bytes) -> None:
+    """Check that the table of devices can show a device after any message."""
+    console = Console(width=100, height=30, file=_CheckedTerminal(), force_terminal=True)
+    console.print(device_overview(_process_message(data), 2.0))
 
 
-class _Nowhere:
-    """A terminal that obeys what it should not."""
+class _CheckedTerminal:
+    """Terminal that fails if it receives a control character."""
 
     encoding = "utf-8"
 
@@ -93,37 +93,39 @@ class _Nowhere:
         return len(text)
 
     def flush(self) -> None:
-        """Nothing is kept."""
+        """Do nothing, because there is no buffer."""
 
 
 @target(
-    "samples-message", lambda: [encode_samples("a", 3, samples_of(bytes(range(24)), _Plain())), bytes(range(80))], 600
+    "samples-message",
+    lambda: [encode_samples("a", 3, build_samples(bytes(range(24)), _UntimedDecoder())), bytes(range(80))],
+    600,
 )
 def samples_message(data: bytes) -> None:
-    """A map of samples: what is read is packed and read again as the same."""
+    """Check that a decoded message is the same after it has been encoded and decoded again."""
     if data[:1] < b"\x40":
-        data = message_of(Tape(data))
+        data = build_message(InputReader(data))
     try:
         batch = decode_samples(data)
     except DecodeError as error:
-        one_line(error)
+        check_error_message(error)
         return
     rows = batch.block
     assert (np.abs(rows.t_ns) < 1 << 62).all()
     if (np.diff(rows.t_ns) > 0).all():
-        again = decode_samples(encode_samples(batch.device, batch.total_samples, rows)).block
-        assert np.array_equal(again.values, rows.values, equal_nan=True)
-        assert np.abs(again.t_ns - rows.t_ns).max() <= 1100, "times that came back as others"
+        decoded_again = decode_samples(encode_samples(batch.device, batch.total_samples, rows)).block
+        assert np.array_equal(decoded_again.values, rows.values, equal_nan=True)
+        assert np.abs(decoded_again.t_ns - rows.t_ns).max() <= 1100, "the times have changed"
 
 
-class _Plain:
+class _UntimedDecoder:
     timing = None
 
 
 # --- files of other commands
 
 
-def _analysis() -> Iterator[bytes]:
+def _analysis_seeds() -> Iterator[bytes]:
     axes = {axis: {"allan": {"tau": [1.0]}, "coefficients": dict.fromkeys("QNBKR", LETTER)} for axis in ("gx", "az")}
     yield msgspec.json.encode(
         {"schema": "imu-monitor/analyze/1", "rate": 100.0, "samples": 9, "axes": axes, "notes": []}
@@ -131,24 +133,24 @@ def _analysis() -> Iterator[bytes]:
     yield b'{"x":' + b"[" * 2000
 
 
-@target("analysis", _analysis, 2500, (*WORDS, '"coefficients"', '"imu-monitor/analyze/1"'))
+@target("analysis", _analysis_seeds, 2500, (*WORDS, '"coefficients"', '"imu-monitor/analyze/1"'))
 def analysis(data: bytes) -> None:
-    """What ``analyze --json`` wrote, exported in every format."""
+    """Check the export of a file of ``analyze --json`` in every format."""
     try:
         noise = from_analysis_json(data)
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)
         return
     for form in FORMATS:
         try:
             text = export(noise, form)
         except ImuError as error:
-            one_line(error)
+            check_error_message(error)
         else:
             assert "nan" not in text.lower().replace("nanosec", ""), text
 
 
-def _thermal() -> Iterator[bytes]:
+def _thermal_seeds() -> Iterator[bytes]:
     row = {
         "powers": 1, "time_constants": [60.0], "reference": 25.0, "sizes": [0.0, 1e-5, 1e-6], "start": [0.1],
         "phi": 0.5, "sigma": 1e-6, "covariance": np.eye(5).tolist(), "temperature": [20.0, 40.0],
@@ -157,15 +159,15 @@ def _thermal() -> Iterator[bytes]:
     yield b'{"x":' + b"[" * 2000
 
 
-@target("thermal-model", _thermal, 2500, (*WORDS, '"covariance":[[1,2],[3]]', '"powers":', "[0.5]", "[[", "]]"))
+@target("thermal-model", _thermal_seeds, 2500, (*WORDS, '"covariance":[[1,2],[3]]', '"powers":', "[0.5]", "[[", "]]"))
 def thermal_model(data: bytes) -> None:
-    """A model file of ``thermal fit``."""
-    path = folder() / "thermal.json"
+    """Check a model file of ``thermal fit``."""
+    path = get_folder() / "thermal.json"
     path.write_bytes(data)
     try:
         models = thermal.read_model_file(path)
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)
         return
     for model in models.values():
         n = model.coefficients.size
@@ -175,7 +177,7 @@ def thermal_model(data: bytes) -> None:
         assert np.isfinite(model.covariance).all()
 
 
-# --- words of a command line
+# --- command line
 
 
 def _text(data: bytes) -> str:
@@ -189,35 +191,35 @@ def _text(data: bytes) -> str:
     ("gz.", "random_telegraph", ":", "=", ",", "nan", "inf", "1e999", "9" * 30, "1_0", '"', "\\", "\x7f", "\n"),
 )
 def effects(data: bytes) -> None:
-    """Effects as people write them."""
+    """Check effects in the notation of the command line."""
     try:
         found = parse_effects(_text(data))
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)
         return
     assert found
     for _, effect in found:
-        possible([getattr(effect, f.name) for f in fields(effect)])
+        check_finite([getattr(effect, f.name) for f in fields(effect)])
 
 
 @target("duration", (b"30min", b"1.5 h", b"2d", b"1e3 s"), 40, ("ms", "e", ".", " ", "1e999", "-", "\0"))
 def duration(data: bytes) -> None:
-    """Durations: seconds above 0, or a line."""
+    """Check that a duration is positive and finite, or rejected."""
     try:
         seconds = loading.parse_duration_s(_text(data))
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)
         return
     assert 0.0 < seconds < math.inf, seconds
 
 
 @target("rate", (b"10 Hz", b"0.5Hz", b"every sample"), 40, ("Hz", ".", "0", "1" * 320, "0." + "0" * 30))
 def rate(data: bytes) -> None:
-    """Rates: seconds between two, or a line."""
+    """Check that a rate gives a finite period, or is rejected."""
     try:
         seconds = loading.parse_rate_as_period(_text(data), "every sample")
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)
         return
     assert 0.0 <= seconds < math.inf, seconds
 
@@ -226,7 +228,7 @@ def rate(data: bytes) -> None:
     "command-line", (b"octave", b"0.1,1,10", b"1,2", b"auto", b"a.rrd", b"1h"), 60, (",", "nan", "inf", "1e999", ".rrd")
 )
 def command_line(data: bytes) -> None:
-    """Arguments that are more than a word."""
+    """Check arguments of several parts."""
     text = _text(data)
     for read in (
         options.parse_averaging_times,
@@ -235,21 +237,21 @@ def command_line(data: bytes) -> None:
         lambda word: options.parse_duration("--window", word),
     ):
         try:
-            possible(read(text))
+            check_finite(read(text))
         except ConfigError as error:
-            one_line(error)
+            check_error_message(error)
 
 
 @target(
-    "listening",
+    "subscriber-arguments",
     (b"imu/**\0tcp/127.0.0.1:7450", b"*/a/status\0udp/h:1"),
     80,
     ("/**", "$*", "tcp/", "#iface=lo", "?", "[::1]:7450"),
 )
-def listening(data: bytes) -> None:
-    """Key expression and endpoint of ``watch``; nothing is opened."""
+def subscriber_arguments(data: bytes) -> None:
+    """Check key expression and endpoint of ``watch``, without opening a session."""
     keyexpr, _, endpoint = _text(data).partition("\0")
     try:
         ZenohSubscriber(keyexpr, (endpoint,))
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)

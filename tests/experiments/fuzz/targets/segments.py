@@ -1,4 +1,4 @@
-"""Segments of the daemon's own recordings, which it reads by itself when it starts: cut, damaged, or another's."""
+"""Fuzz targets of the segments of recordings that a daemon reads at its start."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -17,40 +17,40 @@ from drivers.recordings.segment_file import (
     read_metadata,
     read_samples,
 )
-from tests.experiments.fuzz.checks import LARGEST_LOSS, one_line
+from tests.experiments.fuzz.checks import MAX_LOST_SAMPLES, check_error_message
 from tests.experiments.fuzz.target import target
-from tests.experiments.fuzz.targets.files import LARGEST_NS, folder, replayed
+from tests.experiments.fuzz.targets.files import LARGEST_NS, check_replay, get_folder
 
 NAME: Final = "00000001_2026-11-22T03-00-00Z.arrows"
 
 
-def _written(of: SegmentMetadata, packed: bool) -> bytes:
-    path = folder() / f"seed-{NAME}"
-    writer = SegmentFileWriter(path, of)
+def _write_segment(metadata: SegmentMetadata, compressed: bool) -> bytes:
+    path = get_folder() / f"seed-{NAME}"
+    writer = SegmentFileWriter(path, metadata)
     for i in range(3):
         rng = np.random.default_rng(i)
         rows = make_block(10**18 + np.arange(4) * 10**7, rng.normal(size=(4, 6)), np.full(4, 20.0), np.arange(4), i)
-        if of.kind == "samples":
+        if metadata.kind == "samples":
             writer.write_samples([rows], DaemonState(100.0, (1.7e9,) * 6, 5.0, (1e-4,) * 30, (True,) * 30))
         else:
             writer.write_chunks([Chunk(rng.bytes(9), 10**18 + i, i, b"beside"[:i])])
     writer.close()
-    if packed:
+    if compressed:
         list(compress_segment_stepwise(path))
     data = path.read_bytes()
     path.unlink()
     return data
 
 
-def _samples() -> Iterator[bytes]:
-    for packed in (False, True):
-        data = _written(SegmentMetadata("a", "samples", "gx,gy", "bytes", "stim300"), packed)
+def _sample_seeds() -> Iterator[bytes]:
+    for compressed in (False, True):
+        data = _write_segment(SegmentMetadata("a", "samples", "gx,gy", "bytes", "stim300"), compressed)
         yield from (data, data[: len(data) * 2 // 3])
 
 
-def _raw() -> Iterator[bytes]:
-    yield _written(SegmentMetadata("a", "raw", "", "bytes", "stim300"), False)
-    yield _written(SegmentMetadata("a", "raw", "", "messages", "samples"), True)
+def _raw_seeds() -> Iterator[bytes]:
+    yield _write_segment(SegmentMetadata("a", "raw", "", "bytes", "stim300"), False)
+    yield _write_segment(SegmentMetadata("a", "raw", "", "messages", "samples"), True)
 
 
 WORDS: Final = (
@@ -68,10 +68,10 @@ WORDS: Final = (
 )
 
 
-@target("segment", _samples, 8000, WORDS)
+@target("segment", _sample_seeds, 8000, WORDS)
 def segment(data: bytes) -> None:
-    """Samples: those before the damage, or a line."""
-    path = folder() / NAME
+    """Check the samples before the damage, or the error."""
+    path = get_folder() / NAME
     path.write_bytes(data)
     try:
         read_metadata(path)
@@ -81,20 +81,20 @@ def segment(data: bytes) -> None:
         for _ in compress_segment_stepwise(path):
             pass
     except RecordingError as error:
-        one_line(error)
+        check_error_message(error)
         return
     for rows, state in ((piece.samples, piece.state) for piece in pieces):
         assert rows.values.shape == (len(rows), 6)
         assert not np.isinf(rows.values).any()
         assert (np.abs(rows.t_ns) < LARGEST_NS).all()
-        assert 0 <= rows.lost <= 10 * LARGEST_LOSS
+        assert 0 <= rows.lost <= 10 * MAX_LOST_SAMPLES
         assert state.rate is None or 0.0 < state.rate < float("inf")
 
 
-@target("segment-raw", _raw, 4000, WORDS)
+@target("segment-raw", _raw_seeds, 4000, WORDS)
 def segment_raw(data: bytes) -> None:
-    """Bytes as they came, read and replayed."""
-    path = folder() / NAME
+    """Check recorded bytes that are read and replayed."""
+    path = get_folder() / NAME
     path.write_bytes(data)
     try:
         for chunk in read_chunks(path):
@@ -103,5 +103,5 @@ def segment_raw(data: bytes) -> None:
             assert abs(chunk.t_ns) < LARGEST_NS
             assert 0 <= chunk.address < 1 << 32
     except RecordingError as error:
-        one_line(error)
-    replayed(path)
+        check_error_message(error)
+    check_replay(path)

@@ -1,7 +1,7 @@
-"""Configuration files, model files and CAN databases.
+"""Fuzz targets of configuration files, model files and CAN databases.
 
-What comes out of a configuration is whole and possible: finite numbers within their ranges. What is wrong with it is
-told a line each, and never by an exception.
+A valid configuration contains only finite numbers within their ranges. Each mistake in a configuration is reported in
+one line and never raises an exception.
 """
 
 import datetime
@@ -22,42 +22,42 @@ from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
 from monitor.settings import loading
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS
-from tests.experiments.fuzz.checks import fed, one_line
-from tests.experiments.fuzz.tape import WILD, Tape
+from tests.experiments.fuzz.checks import check_error_message, feed_and_check
+from tests.experiments.fuzz.input_reader import SPECIAL_FLOATS, InputReader
 from tests.experiments.fuzz.target import target
 from tests.experiments.fuzz.targets.decoders import SECOND_DATABASE, SECOND_SIGNALS
-from tests.experiments.fuzz.targets.files import folder
+from tests.experiments.fuzz.targets.files import get_folder
 from tests.support.settings import read_settings
 
 CONFIG: Final = shipped_config_paths.CONFIG_FOLDER
-LINES_AT_MOST: Final = 2000
+MAX_LINES: Final = 2000
 
 
 @cache
-def room() -> Path:
-    """A folder with the files that configurations name."""
-    here = folder() / "config"
-    here.mkdir()
-    (here / "imu.dbc").write_text(CAN_DATABASE)
-    (here / "a.csv").write_text("t,gz\n0,1\n0.01,2\n")
-    shutil.copy(CONFIG / "models" / "bmi088.toml", here / "model.toml")
-    return here
+def get_config_folder() -> Path:
+    """Return a folder with the files that the configurations name."""
+    folder = get_folder() / "config"
+    folder.mkdir()
+    (folder / "imu.dbc").write_text(CAN_DATABASE)
+    (folder / "a.csv").write_text("t,gz\n0,1\n0.01,2\n")
+    shutil.copy(CONFIG / "models" / "bmi088.toml", folder / "model.toml")
+    return folder
 
 
-def examples() -> list[str]:
-    """The shipped configurations, and one with every room in it."""
+def load_example_texts() -> list[str]:
+    """Return the shipped configurations and one that contains every table."""
     shipped = [file.read_text("utf-8").replace('"j1939_imu"', '"imu.dbc"') for file in sorted(CONFIG.glob("*.toml"))]
-    return [*shipped, EVERYTHING]
+    return [*shipped, COMPLETE_CONFIG]
 
 
-def texts() -> Iterator[bytes]:
-    """Those, and what nobody would write."""
-    yield from (text.encode() for text in examples())
+def generate_seeds() -> Iterator[bytes]:
+    """Generate the example configurations and two with extreme nesting or numbers."""
+    yield from (text.encode() for text in load_example_texts())
     yield b"a = " + b"[" * 2500
     yield b"rate = " + b"9" * 4400
 
 
-EVERYTHING: Final = """
+COMPLETE_CONFIG: Final = """
 [[device]]
 name = "a"
 rate = 100.0
@@ -100,14 +100,14 @@ level = "debug"
 """
 
 
-def configured(text: bytes) -> None:
-    """Read a configuration, and look at all of it."""
-    path = room() / "a.toml"
+def check_config(text: bytes) -> None:
+    """Read a configuration and check its contents or its errors."""
+    path = get_config_folder() / "a.toml"
     path.write_bytes(text)
     reading = loading.examine_config_file(path)
     config, wrong = reading.config, reading.wrong
     assert (config is None) == bool(wrong)
-    assert len(wrong) < LINES_AT_MOST
+    assert len(wrong) < MAX_LINES
     for line in wrong:
         assert "\n" not in line, f"several lines: {line[:200]}"
         assert len(line) < 5000
@@ -115,37 +115,37 @@ def configured(text: bytes) -> None:
         try:
             loading.load_config(path)
         except ConfigError as error:
-            one_line(error)
+            check_error_message(error)
         else:
             raise AssertionError("a wrong file was loaded")
         return
     assert config.devices
     for device in config.devices:
-        possible(device)
+        check_finite(device)
         assert 0.0 < device.window_s < float("inf")
         assert device.rate_hz is None or 0.0 < device.rate_hz < float("inf"), device.rate_hz
         assert min(device.refit_s, device.publish_s, device.silence_s, device.alarms_per_day) >= 0.0
         assert loading.DEVICE_NAME.fullmatch(device.name)
-    possible(config.storage)
+    check_finite(config.storage)
 
 
-def possible(value: Any) -> None:
-    """No number that is none, in any field."""
+def check_finite(value: Any) -> None:
+    """Check that all numbers in a value and its fields are finite."""
     if isinstance(value, float):
         assert value == value, "not a number"
         assert abs(value) < float("inf"), "infinite"
     elif isinstance(value, tuple | list):
-        for one in value:
-            possible(one)
+        for item in value:
+            check_finite(item)
     elif isinstance(value, Mapping):
-        for one in value.values():
-            possible(one)
+        for item in value.values():
+            check_finite(item)
     elif isinstance(value, SettingsModel):
         for name in type(value).model_fields:
-            possible(getattr(value, name))
+            check_finite(getattr(value, name))
     elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
-            possible(getattr(value, field.name))
+            check_finite(getattr(value, field.name))
 
 
 WORDS: Final = (
@@ -154,38 +154,38 @@ WORDS: Final = (
 )  # fmt: skip
 
 
-@target("settings", texts, 4500, WORDS)
+@target("settings", generate_seeds, 4500, WORDS)
 def settings_text(data: bytes) -> None:
-    """Any text as a configuration."""
-    configured(data)
+    """Check any text as a configuration."""
+    check_config(data)
 
 
 @cache
-def tables() -> list[dict[str, Any]]:
-    return [tomllib.loads(text) for text in examples()]
+def load_example_tables() -> list[dict[str, Any]]:
+    return [tomllib.loads(text) for text in load_example_texts()]
 
 
 @target("settings-values", lambda: [bytes([i, *range(8 * k, 8 * k + 16)]) for i in range(7) for k in range(6)], 100)
 def settings_values(data: bytes) -> None:
-    """A shipped configuration with some of its values replaced by others, of any kind."""
-    tape = Tape(data)
-    table = _copy(tape.choice(tables()))
+    """Check a shipped configuration in which values are replaced by values of any type."""
+    reader = InputReader(data)
+    table = _copy(reader.choose(load_example_tables()))
     for _ in range(6):
-        if not tape:
+        if not reader:
             break
         at: Any = table
         for _ in range(8):
             keys = list(at) if isinstance(at, dict) else list(range(len(at)))
             if not keys:
                 break
-            key = keys[tape.byte() % len(keys)]
-            if not isinstance(at[key], dict | list) or tape.byte() % 8 == 0:
-                at[key] = strange(tape)
+            key = keys[reader.read_byte() % len(keys)]
+            if not isinstance(at[key], dict | list) or reader.read_byte() % 8 == 0:
+                at[key] = draw_unusual_value(reader)
                 break
             at = at[key]
-        if tape.byte() % 4 == 0 and isinstance(at, dict):
-            at[tape.choice(KEYS)] = strange(tape)
-    configured(_toml(table).encode("utf-8", "surrogatepass"))
+        if reader.read_byte() % 4 == 0 and isinstance(at, dict):
+            at[reader.choose(KEYS)] = draw_unusual_value(reader)
+    check_config(_toml(table).encode("utf-8", "surrogatepass"))
 
 
 KEYS: Final = (
@@ -196,36 +196,38 @@ KEYS: Final = (
 )  # fmt: skip
 
 
-def strange(tape: Tape) -> Any:
-    """A value that nobody would write."""
-    kind = tape.byte() % 12
+def draw_unusual_value(reader: InputReader) -> Any:
+    """Return a value that is unusual in a configuration."""
+    kind = reader.read_byte() % 12
     if kind == 0:
-        return tape.choice(WILD)
+        return reader.choose(SPECIAL_FLOATS)
     if kind == 1:
-        return tape.choice((0, -1, 1, 1 << 31, 1 << 63, 10**400, -(10**30), 10**5000))
+        return reader.choose((0, -1, 1, 1 << 31, 1 << 63, 10**400, -(10**30), 10**5000))
     if kind == 2:
-        return tape.choice(
+        return reader.choose(
             ("", "x", "1e999 s", "1e-320 Hz", "0.0 Hz", "nan", "every sample", "off", "\x1b[2J", "ü" * 300)
         )
     if kind == 3:
-        return [strange(tape) for _ in range(tape.byte() % 4)]
+        return [draw_unusual_value(reader) for _ in range(reader.read_byte() % 4)]
     if kind == 4:
-        return {tape.choice(KEYS): strange(tape) for _ in range(tape.byte() % 3)}
+        return {reader.choose(KEYS): draw_unusual_value(reader) for _ in range(reader.read_byte() % 3)}
     if kind == 5:
-        return tape.byte() % 2 == 0
+        return reader.read_byte() % 2 == 0
     if kind == 6:
-        return tape.choice((datetime.date(1, 1, 1), datetime.datetime(9999, 1, 1), datetime.time(1, 2)))
+        return reader.choose((datetime.date(1, 1, 1), datetime.datetime(9999, 1, 1), datetime.time(1, 2)))
     if kind == 7:
-        return tape.choice(
+        return reader.choose(
             ("replay", "serial", "can", "zenoh", "virtual", "loopback", "base", "dbc", "text", "stim300")
         )
     if kind == 8:
-        return tape.piece().decode("utf-8", "replace")[:50]
+        return reader.read_piece().decode("utf-8", "replace")[:50]
     if kind == 9:
-        return tape.wild()
+        return reader.read_special_float()
     if kind == 10:
-        return tape.choice(("a.csv", "imu.dbc", "model.toml", "/nowhere", ".", "~nobody/x", "\0", "a.csv/x", "x" * 300))
-    return tape.int64()
+        return reader.choose(
+            ("a.csv", "imu.dbc", "model.toml", "/nowhere", ".", "~nobody/x", "\0", "a.csv/x", "x" * 300)
+        )
+    return reader.read_int64()
 
 
 def _copy(value: Any) -> Any:
@@ -284,15 +286,15 @@ def _word(text: str) -> str:
     ),
 )
 def model(data: bytes) -> None:
-    """A model file: what is read can be written, and read again as the same."""
-    path = folder() / "a-model.toml"
+    """Check that a model is the same after it has been written and read again."""
+    path = get_folder() / "a-model.toml"
     path.write_bytes(data)
     try:
         found = read_model(path)
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)
         return
-    possible([value for _, effect in found for value in (getattr(effect, f.name) for f in fields(effect))])
+    check_finite([value for _, effect in found for value in (getattr(effect, f.name) for f in fields(effect))])
     str(found)
     assert NoiseModel.from_toml(found.to_toml()).to_toml() == found.to_toml()
 
@@ -312,17 +314,17 @@ def _databases() -> Iterator[bytes]:
     ("BO_ ", " SG_ ", "|", "@1+", "@0-", "(0,0)", "1e400", "nan", "SIG_VALTYPE_", "BA_ ", "M", "m0"),
 )
 def database(data: bytes) -> None:
-    """A CAN database: a decoder of it, or a line; what the decoder gives is sound."""
-    path = folder() / "a.dbc"
+    """Check that a CAN database is rejected, or gives a decoder with valid samples."""
+    path = get_folder() / "a.dbc"
     path.write_bytes(data)
     signals = CAN_SIGNALS if b"RateOfTurn" in data else SECOND_SIGNALS
     try:
         decoder = dbc.build(read_settings(dbc.Settings, {"file": str(path), "signals": signals}))
     except ConfigError as error:
-        one_line(error)
+        check_error_message(error)
         return
     tail = data[-64:]
-    fed(
+    feed_and_check(
         decoder,
         [[Chunk(tail[: 8 + i % 2 * 56], 5, address & ~(1 << 30)) for i in range(3) for address in decoder.addresses]],
     )

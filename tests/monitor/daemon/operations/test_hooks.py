@@ -1,4 +1,4 @@
-"""Hooks are run with the event on their standard input, never by a shell, never for ever, and never by the thousand."""
+"""Tests of hooks, which run commands with an event on standard input and limit their number and time."""
 
 import json
 import os
@@ -16,15 +16,15 @@ from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 EVENT = Event("limit_crossed", 2_000_000_000, "gz $(touch no) `touch no` ; touch no", "gz", {}, 1_000_000_000, 5.0)
 
 
-def program(folder: Path, text: str, name: str = "tell") -> str:
-    """A program of Python."""
+def write_program(folder: Path, text: str, name: str = "tell") -> str:
+    """Write an executable Python program."""
     path = folder / name
     path.write_text(f"#!{sys.executable} -S\nimport json, os, sys, time\n{text}\n")
     path.chmod(0o755)
     return str(path)
 
 
-def hook(
+def make_hook(
     *command: str, timeout_s: float = PATIENCE_S, on: str = "*", devices: tuple[str, ...] = (), key: str = ""
 ) -> Hook:
     return Hook.model_construct(
@@ -32,38 +32,38 @@ def hook(
     )
 
 
-class Running:
-    """Hooks of one test, closed at its end."""
+class RunningHooks:
+    """Hooks that are closed at the end of the test."""
 
     def __init__(self, *hooks: Hook) -> None:
         self.sent: list[tuple[str, bytes]] = []
         self.now_s = 0.0
-        self.hooks = Hooks(hooks, self.put, lambda: self.now_s)
+        self.hooks = Hooks(hooks, self.publish, lambda: self.now_s)
 
-    def put(self, key: str, payload: bytes) -> str:
+    def publish(self, key: str, payload: bytes) -> str:
         self.sent.append((key, payload))
         return ""
 
-    def __enter__(self) -> "Running":
+    def __enter__(self) -> "RunningHooks":
         return self
 
     def __exit__(self, *_: object) -> None:
         self.hooks.close()
 
-    def happen(self, event: Event = EVENT, device: str = "d") -> None:
+    def raise_event(self, event: Event = EVENT, device: str = "d") -> None:
         self.hooks.publish_event(device, 1.76e9, 7, event)
 
 
-def test_a_command_gets_the_event_and_no_word_of_it_is_run(tmp_path: Path) -> None:
+def test_command_receives_the_event_and_its_text_is_not_executed(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     write = (
         "names = ('DEVICE', 'KIND', 'AXIS')\n"
-        "said = [sys.argv[1:], json.load(sys.stdin), [os.environ['IMU_MONITOR_' + name] for name in names]]\n"
-        f"open({str(out)!r} + '.part', 'w').write(json.dumps(said))\n"
+        "received = [sys.argv[1:], json.load(sys.stdin), [os.environ['IMU_MONITOR_' + name] for name in names]]\n"
+        f"open({str(out)!r} + '.part', 'w').write(json.dumps(received))\n"
         f"os.rename({str(out)!r} + '.part', {str(out)!r})\n"
     )
-    with Running(hook(program(tmp_path, write), "$HOME", "; rm -r x")) as running:
-        running.happen()
+    with RunningHooks(make_hook(write_program(tmp_path, write), "$HOME", "; rm -r x")) as running:
+        running.raise_event()
         wait_for(out.exists)
     arguments, event, named = json.loads(out.read_text())
     assert arguments == ["$HOME", "; rm -r x"]
@@ -74,36 +74,36 @@ def test_a_command_gets_the_event_and_no_word_of_it_is_run(tmp_path: Path) -> No
     assert running.hooks.state == "ok"
 
 
-def test_only_the_kinds_and_devices_that_are_named_set_it_off() -> None:
-    with Running(hook(on="link_lost", devices=("b",), key="site/alarms"), hook(key="all")) as running:
-        running.happen()
-        running.happen(Event("link_lost", 0, ""), "a")
-        running.happen(Event("link_lost", 0, ""), "b")
+def test_hook_runs_only_for_the_selected_kinds_and_devices() -> None:
+    with RunningHooks(make_hook(on="link_lost", devices=("b",), key="site/alarms"), make_hook(key="all")) as running:
+        running.raise_event()
+        running.raise_event(Event("link_lost", 0, ""), "a")
+        running.raise_event(Event("link_lost", 0, ""), "b")
     assert [key for key, _ in running.sent] == ["all", "all", "site/alarms", "all"]
     assert json.loads(running.sent[2][1])["device"] == "b"
 
 
-def test_a_command_that_fails_is_said_until_one_goes_well(tmp_path: Path) -> None:
+def test_failed_command_is_reported_until_one_succeeds(tmp_path: Path) -> None:
     path = tmp_path / "fail"
     path.touch()
     text = f"print('first'); print('no modem\\x1b[31m')\nsys.exit(3 if os.path.exists({str(path)!r}) else 0)"
-    with Running(hook(program(tmp_path, text))) as running:
-        running.happen()
+    with RunningHooks(make_hook(write_program(tmp_path, text))) as running:
+        running.raise_event()
         wait_for(lambda: running.hooks.state != "ok")
         assert running.hooks.state == "tell: exit status 3: no modem�[31m (1 failed since the start)"
         path.unlink()
-        running.happen()
+        running.raise_event()
         wait_for(lambda: running.hooks.state == "ok")
 
 
-def test_a_program_that_cannot_be_started_is_said(tmp_path: Path) -> None:
-    with Running(hook(str(tmp_path / "none"))) as running:
-        running.happen()
+def test_program_that_cannot_be_started_is_reported(tmp_path: Path) -> None:
+    with RunningHooks(make_hook(str(tmp_path / "none"))) as running:
+        running.raise_event()
         wait_for(lambda: "none: cannot be started: No such file" in running.hooks.state)
 
 
-def test_a_command_that_does_not_end_is_killed_with_all_it_started(tmp_path: Path) -> None:
-    """One that does not read its input and prints without end."""
+def test_command_beyond_its_time_limit_is_killed_with_its_children(tmp_path: Path) -> None:
+    """The command does not read its input and prints without end."""
     child = tmp_path / "child"
     text = (
         "pid = os.fork()\n"
@@ -111,17 +111,17 @@ def test_a_command_that_does_not_end_is_killed_with_all_it_started(tmp_path: Pat
         "while True: os.write(1, b'x' * 1000); time.sleep(0.001)\n"
     )
     for timeout_s in (2.0, 8.0, 32.0):  # a loaded machine may need longer to start the command
-        with Running(hook(program(tmp_path, text), timeout_s=timeout_s)) as running:
-            running.happen()
+        with RunningHooks(make_hook(write_program(tmp_path, text), timeout_s=timeout_s)) as running:
+            running.raise_event()
             wait_for(lambda timeout_s=timeout_s: f"killed after {timeout_s:g} s" in running.hooks.state)
         if child.exists():
             break
     pid = int(child.read_text())
-    wait_for(lambda: not alive(pid))
+    wait_for(lambda: not is_running(pid))
 
 
-def alive(pid: int) -> bool:
-    """Whether a process runs; one that nobody has waited for does not."""
+def is_running(pid: int) -> bool:
+    """Return True if the process runs; a zombie process does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
@@ -129,22 +129,22 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-def test_what_still_runs_when_the_service_ends_is_killed(tmp_path: Path) -> None:
+def test_running_command_is_killed_when_the_service_ends(tmp_path: Path) -> None:
     mark = tmp_path / "pid"
     text = f"open({str(mark)!r}, 'w').write(str(os.getpid()))\ntime.sleep({FOREVER_S})"
-    running = Running(hook(program(tmp_path, text), timeout_s=FOREVER_S))
-    running.happen()
+    running = RunningHooks(make_hook(write_program(tmp_path, text), timeout_s=FOREVER_S))
+    running.raise_event()
     wait_for(lambda: mark.exists() and mark.read_text() != "")
     running.hooks.close()  # returns, although the command would run on for a day
-    wait_for(lambda: not alive(int(mark.read_text())))
+    wait_for(lambda: not is_running(int(mark.read_text())))
     assert not [t for t in threading.enumerate() if t.name.startswith("hooks")]
 
 
-def test_a_flood_is_held_back_and_does_not_drown_what_is_rare() -> None:
-    with Running(hook(key="site")) as running:
+def test_flood_of_events_is_suppressed_but_a_rare_event_is_not() -> None:
+    with RunningHooks(make_hook(key="site")) as running:
         for _ in range(1000):
-            running.happen(Event("samples_lost", 0, "1 sample missing"))
-        running.happen()
+            running.raise_event(Event("samples_lost", 0, "1 sample missing"))
+        running.raise_event()
         assert len(running.sent) == BURST + 1
         assert json.loads(running.sent[-1][1])["kind"] == "limit_crossed"
         assert (
@@ -152,16 +152,16 @@ def test_a_flood_is_held_back_and_does_not_drown_what_is_rare() -> None:
         )
         running.now_s = 2.5 * RUN_INTERVAL_S
         for _ in range(10):
-            running.happen(Event("samples_lost", 0, "1 sample missing"))
+            running.raise_event(Event("samples_lost", 0, "1 sample missing"))
         assert len(running.sent) == BURST + 1 + 2
 
 
-def test_no_more_run_or_wait_than_there_is_room_for(tmp_path: Path) -> None:
+def test_number_of_running_and_queued_commands_is_bounded(tmp_path: Path) -> None:
     marks = tmp_path / "marks"
     marks.mkdir()
     text = f"open(os.path.join({str(marks)!r}, str(os.getpid())), 'w')\ntime.sleep({FOREVER_S})"
-    with Running(hook(program(tmp_path, text), timeout_s=FOREVER_S)) as running:
+    with RunningHooks(make_hook(write_program(tmp_path, text), timeout_s=FOREVER_S)) as running:
         for i in range(MAX_QUEUED + THREADS + 50):
-            running.happen(device=f"d{i}")  # returns at once, although no command ends
+            running.raise_event(device=f"d{i}")  # returns at once, although no command ends
         wait_for(lambda: len(os.listdir(marks)) == THREADS)
         assert "suppressed" in running.hooks.state

@@ -1,4 +1,4 @@
-"""The test of innovations: how often chance passes it, and what does."""
+"""Tests of the innovation test: false alarm rate and detection."""
 
 import numpy as np
 import pytest
@@ -7,28 +7,28 @@ from scipy.stats import chi2
 from monitor.drift.compensation.innovation_test import FALSE_ALARM_PROBABILITY, INTERVALS, LIMIT, InnovationTest
 
 
-def test_chance_passes_next_to_never():
-    """150 000 looks, 1.7 days of an axis."""
-    one = InnovationTest()
-    assert not any(one.detect_new_misfit(x) for x in np.random.default_rng(0).standard_normal(150_000).tolist())
+def test_white_innovations_cause_no_alarm():
+    """The test uses 150 000 intervals, which are 1.7 days of one axis."""
+    test = InnovationTest()
+    assert not any(test.detect_new_misfit(x) for x in np.random.default_rng(0).standard_normal(150_000).tolist())
 
 
-def test_twice_the_noise_is_told_once_and_again_when_it_comes_back():
-    one = InnovationTest()
+def test_doubled_noise_is_reported_once_per_occurrence():
+    test = InnovationTest()
     rng = np.random.default_rng(1)
 
-    def alarms(scale: float, n: int) -> int:
-        return sum(one.detect_new_misfit(x) for x in (scale * rng.standard_normal(n)).tolist())
+    def count_alarms(scale: float, n: int) -> int:
+        return sum(test.detect_new_misfit(x) for x in (scale * rng.standard_normal(n)).tolist())
 
-    assert np.isnan(one.mean_square_innovation)
-    assert alarms(1.0, 200) == 0
-    assert alarms(2.0, 400) == 1
-    assert one.mean_square_innovation > LIMIT
-    assert alarms(1.0, 400) == 0
-    assert alarms(2.0, 400) == 1
-    one.forget_innovations()
-    assert alarms(1.0, INTERVALS - 1) == 0
+    assert np.isnan(test.mean_square_innovation)
+    assert count_alarms(1.0, 200) == 0
+    assert count_alarms(2.0, 400) == 1
+    assert test.mean_square_innovation > LIMIT
+    assert count_alarms(1.0, 400) == 0
+    assert count_alarms(2.0, 400) == 1
+    test.forget_innovations()
+    assert count_alarms(1.0, INTERVALS - 1) == 0
 
 
-def test_the_limit_is_a_quantile_of_chi2():
+def test_limit_is_a_quantile_of_the_chi2_distribution():
     assert pytest.approx(chi2.isf(FALSE_ALARM_PROBABILITY, INTERVALS) / INTERVALS, rel=1e-12) == LIMIT

@@ -1,4 +1,4 @@
-"""The compensation of a stream of blocks: times, looks and events."""
+"""Tests of the live drift compensation of blocks: times, updates and events."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ RATE_HZ = 100.0
 SIGMA = 1e-3
 
 
-def fed(
+def compensate_noise(
     live: LiveDriftCompensation, seconds: float, start_s: float = 0.0, scale: float = 1.0, lost: int = 0, seed: int = 0
 ):
     n = round(seconds * RATE_HZ)
@@ -20,45 +20,45 @@ def fed(
     return live.compensate_block(make_block(t_ns, values, np.full(n, 21.0), np.arange(n), lost))
 
 
-def test_blocks_keep_what_is_not_a_rate():
+def test_other_columns_and_lost_count_are_preserved():
     live = LiveDriftCompensation(RATE_HZ)
-    first, second = fed(live, 30.0), fed(live, 10.0, 31.0, lost=100)
+    first, second = compensate_noise(live, 30.0), compensate_noise(live, 10.0, 31.0, lost=100)
     assert (second.lost, len(second)) == (100, 1000)
     assert (first.temperature_c == 21.0).all()
     np.testing.assert_array_equal(first.ticks, np.arange(3000))
-    looks = live.take_drift_updates()
-    assert [look.t_ns for look in looks[:3]] == [990_000_000, 1_990_000_000, 2_990_000_000]
-    assert looks[-1].t_ns == 39_990_000_000
+    updates = live.take_drift_updates()
+    assert [update.t_ns for update in updates[:3]] == [990_000_000, 1_990_000_000, 2_990_000_000]
+    assert updates[-1].t_ns == 39_990_000_000
     assert not live.take_drift_updates()
-    np.testing.assert_allclose(looks[-1].expected, 0.01, atol=3e-4)
+    np.testing.assert_allclose(updates[-1].expected, 0.01, atol=3e-4)
 
 
-def test_noise_that_grows_is_an_event_with_its_times():
+def test_growing_noise_is_reported_as_an_event():
     live = LiveDriftCompensation(RATE_HZ)
-    fed(live, 100.0)
+    compensate_noise(live, 100.0)
     for axis in range(3):
         live.apply_identification_result(
             axis, ArmaModel((0.0, 0.0), 0.0, 0.0, mean=0.01, white_variance=SIGMA**2 / 100.0, order=(0, 0), count=100)
         )
-    fed(live, 100.0, 100.0)
+    compensate_noise(live, 100.0, 100.0)
     assert not live.take_events()
-    fed(live, 300.0, 200.0, scale=1.9)
+    compensate_noise(live, 300.0, 200.0, scale=1.9)
     events = live.take_events()
     assert {event.kind for event in events} == {EVENT_KIND}
     assert {event.axis for event in events} == {"gx", "gy", "gz"}
-    one = events[0]
-    assert 200.0 < one.t_ns / 1e9 < 350.0
-    assert one.since_ns is not None
-    assert "times as large as expected" in one.text
-    assert one.values["innovation"]["mean_square"] == pytest.approx(one.sigma**2)
+    event = events[0]
+    assert 200.0 < event.t_ns / 1e9 < 350.0
+    assert event.since_ns is not None
+    assert "times as large as expected" in event.text
+    assert event.values["innovation"]["mean_square"] == pytest.approx(event.sigma**2)
 
 
-def test_another_rate_begins_anew_and_nearly_the_same_does_not():
+def test_only_a_clearly_different_rate_starts_a_new_compensator():
     live = LiveDriftCompensation(RATE_HZ)
-    fed(live, 20.0)
-    kept = live.compensator
+    compensate_noise(live, 20.0)
+    compensator = live.compensator
     live.set_rate(101.0)
-    assert live.compensator is kept
+    assert live.compensator is compensator
     live.set_rate(200.0)
-    assert live.compensator is not kept
+    assert live.compensator is not compensator
     assert live.compensator.rate_hz == 200.0

@@ -1,4 +1,4 @@
-"""The adaptive filter of the drift: beside matrices, outliers and steps, covariances for ever."""
+"""Tests of the adaptive drift filter: textbook filter, outliers, steps and positive covariances."""
 
 import numpy as np
 import pytest
@@ -11,20 +11,20 @@ from monitor.drift.compensation.arma import ArmaModel
 MODEL = ArmaModel((1.5, -0.53), -0.7, 0.2, mean=3.0, white_variance=1.0, count=900)
 
 
-def unidentified(adapts: bool) -> np.void:
+def make_filter_without_model(adapts: bool) -> np.void:
     rows = np.zeros(1, sage_husa.DRIFT_FILTER)
     rows["adaptive"] = adapts
     return rows[0]
 
 
-def adopted(adapts: bool, model: ArmaModel = MODEL) -> np.void:
-    row = unidentified(adapts)
+def make_filter_with_model(adapts: bool, model: ArmaModel = MODEL) -> np.void:
+    row = make_filter_without_model(adapts)
     sage_husa.restart_with_model(row, model)
     return row
 
 
-def test_without_adaptation_it_is_the_textbook_filter():
-    row = adopted(False)
+def test_without_adaptation_the_filter_is_a_kalman_filter():
+    row = make_filter_with_model(False)
     phi1, phi2 = MODEL.phi
     a = np.array([[0.0, 1.0, 0.0], [phi2, phi1, 0.0], [0.0, 0.0, 1.0]])
     b, h = np.array([1.0, phi1 + MODEL.theta, 0.0]), np.array([1.0, 0.0, 1.0])
@@ -34,52 +34,52 @@ def test_without_adaptation_it_is_the_textbook_filter():
         gain = p @ h / s
         x, p = x + gain * (z - h @ x), p - np.outer(gain, h @ p)
         x, p = a @ x, a @ p @ a.T + MODEL.variance * np.outer(b, b) + np.diag([0.0, 0.0, row["level_variance"]])
-        total, became = sage_husa.update_with_interval(row, z, np.nan, 1e-12)
+        total, outcome = sage_husa.update_with_interval(row, z, np.nan, 1e-12)
         sage_husa.predict_next_interval(row)
-        assert became == sage_husa.USED
+        assert outcome == sage_husa.USED
         assert total == pytest.approx(s)
     np.testing.assert_allclose(row["state"], x, rtol=1e-9)
     np.testing.assert_allclose(row["covariance"], p, rtol=1e-9, atol=1e-15)
 
 
-def test_noise_that_doubles_is_noticed_and_only_by_the_one_that_adapts():
+def test_only_the_adaptive_filter_notices_increased_noise():
     rng = np.random.default_rng(1)
-    one, other = adopted(True), adopted(False)
+    adaptive, fixed = make_filter_with_model(True), make_filter_with_model(False)
     for _ in range(3000):
         z = 3.0 + 2.0 * rng.standard_normal()
-        for row in (one, other):
+        for row in (adaptive, fixed):
             sage_husa.update_with_interval(row, z, 4.0 * rng.chisquare(3) / 3.0, 1e-12)
             sage_husa.predict_next_interval(row)
-    assert one["white_variance"] == pytest.approx(4.0, rel=0.25)
-    assert other["white_variance"] == 1.0
+    assert adaptive["white_variance"] == pytest.approx(4.0, rel=0.25)
+    assert fixed["white_variance"] == 1.0
 
 
-def test_an_outlier_is_left_out_and_a_step_taken_after_it_has_stayed():
-    row = adopted(True)
+def test_outlier_is_rejected_and_a_lasting_step_is_accepted():
+    row = make_filter_with_model(True)
     row["rest_count"] = 40.0
     for k in range(60):
-        became = sage_husa.update_with_interval(row, 3.0 + (100.0 if k == 5 else 0.0), 1.0, 1e-12)[1]
+        outcome = sage_husa.update_with_interval(row, 3.0 + (100.0 if k == 5 else 0.0), 1.0, 1e-12)[1]
         sage_husa.predict_next_interval(row)
-        assert became == (sage_husa.REJECTED if 5 <= k <= 11 else sage_husa.USED), k
-    told = []
+        assert outcome == (sage_husa.REJECTED if 5 <= k <= 11 else sage_husa.USED), k
+    outcomes = []
     for _ in range(120):
-        told.append(sage_husa.update_with_interval(row, 103.0, 1.0, 1e-12)[1])
+        outcomes.append(sage_husa.update_with_interval(row, 103.0, 1.0, 1e-12)[1])
         sage_husa.predict_next_interval(row)
-    assert told.index(sage_husa.STEPPED) == 92  # as long as the level before had been confirmed: 40 + 60 − 7 intervals
-    assert told[93:] == [sage_husa.USED] * 27
+    assert outcomes.index(sage_husa.STEPPED) == 92  # the previous level was confirmed for 40 + 60 − 7 intervals
+    assert outcomes[93:] == [sage_husa.USED] * 27
     assert sage_husa.expected_bias_and_variance(row)[0] == pytest.approx(103.0, abs=1.0)
 
 
-def test_what_wanders_far_off_is_no_step():
-    row = adopted(True)
+def test_diverging_values_are_not_accepted_as_a_step():
+    row = make_filter_with_model(True)
     for k in range(400):
-        _, became = sage_husa.update_with_interval(row, 3.0 + 100.0 + 20.0 * k, 1.0, 1e-12)
+        _, outcome = sage_husa.update_with_interval(row, 3.0 + 100.0 + 20.0 * k, 1.0, 1e-12)
         sage_husa.predict_next_interval(row)
-        assert became == sage_husa.REJECTED
+        assert outcome == sage_husa.REJECTED
 
 
-def test_a_first_level_has_to_be_confirmed():
-    row = unidentified(True)
+def test_first_level_must_be_confirmed():
+    row = make_filter_without_model(True)
     for k in range(sage_husa.MIN_CONFIRMED_INTERVALS - 1):
         sage_husa.update_with_interval(row, 50.0, 1.0, 1e-12)
         assert row["rest_count"] == k + 1
@@ -103,9 +103,9 @@ def test_a_first_level_has_to_be_confirmed():
         ]
     ),
 )
-def test_covariances_stay_positive_whatever_comes(course, model):
-    row = adopted(True, model)
-    for kind, z, scatter in course:
+def test_covariances_stay_positive_for_any_input(inputs, model):
+    row = make_filter_with_model(True, model)
+    for kind, z, scatter in inputs:
         if kind != "missing":
             value = {"used": z, "outlier": 1e6 * z, "same": model.mean}[kind]
             total, _ = sage_husa.update_with_interval(row, value, scatter, 1e-30)

@@ -1,4 +1,4 @@
-"""Which axes are said to depend on temperature, how large a loop is said to be, and silence on noise alone."""
+"""Tests of the detection of temperature dependence and hysteresis, including noise that has neither."""
 
 from dataclasses import replace
 
@@ -7,16 +7,16 @@ import pytest
 
 from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, find_temperature_dependence, heating_direction
 from monitor.drift.thermal.interval_means import IntervalMeans
-from tests.monitor.drift.cycles import NOISES, SHAPES, chamber_means, drift
+from tests.monitor.drift.temperature_cycles import NOISES, SHAPES, simulate_chamber_means, simulate_noise_means
 
-COUNT = 75
+INTERVAL_COUNT = 75
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("law", ["linear", "cubic"])
-def test_a_bias_of_temperature_is_named_in_every_cycle(shape: str, law: str) -> None:
-    noise = drift("random walk", COUNT, np.random.default_rng(1))
-    found = find_temperature_dependence(chamber_means(shape, noise, law, 50.0 * noise.std()))
+def test_temperature_dependent_bias_is_found_in_every_cycle(shape: str, law: str) -> None:
+    noise = simulate_noise_means("random walk", INTERVAL_COUNT, np.random.default_rng(1))
+    found = find_temperature_dependence(simulate_chamber_means(shape, noise, law, 50.0 * noise.std()))
     assert found is not None
     assert found.explains_most_variance
     assert found.share > 0.99
@@ -26,62 +26,70 @@ def test_a_bias_of_temperature_is_named_in_every_cycle(shape: str, law: str) -> 
 
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_noise_is_not_said_to_depend_on_temperature(shape: str, noise: str) -> None:
+def test_noise_is_not_attributed_to_temperature(shape: str, noise: str) -> None:
     for seed in range(3):
-        means = chamber_means(shape, drift(noise, COUNT, np.random.default_rng(seed)))
+        means = simulate_chamber_means(shape, simulate_noise_means(noise, INTERVAL_COUNT, np.random.default_rng(seed)))
         assert find_temperature_dependence(means) is None
-        loop = find_hysteresis(means)
-        assert (loop is None) == (shape == "heating")
-        assert loop is None or not loop.hysteresis_is_significant
+        hysteresis = find_hysteresis(means)
+        assert (hysteresis is None) == (shape == "heating")
+        assert hysteresis is None or not hysteresis.hysteresis_is_significant
 
 
 @pytest.mark.parametrize("law", ["loop", "lag", "play"])
 @pytest.mark.parametrize("shape", SHAPES[:-1])
-def test_hysteresis_has_its_size(shape: str, law: str) -> None:
-    curve = chamber_means(shape, drift("white", COUNT, np.random.default_rng(4)), "cubic", 200.0).bias
-    assert not find_hysteresis(chamber_means(shape, curve)).hysteresis_is_significant  # type: ignore[union-attr]
-    found = find_hysteresis(chamber_means(shape, curve, law, 100.0))
+def test_size_of_hysteresis_is_estimated(shape: str, law: str) -> None:
+    curve = simulate_chamber_means(
+        shape, simulate_noise_means("white", INTERVAL_COUNT, np.random.default_rng(4)), "cubic", 200.0
+    ).bias
+    assert not find_hysteresis(simulate_chamber_means(shape, curve)).hysteresis_is_significant  # type: ignore[union-attr]
+    found = find_hysteresis(simulate_chamber_means(shape, curve, law, 100.0))
     assert found is not None
     assert found.hysteresis_is_significant
     assert found.size == pytest.approx(100.0, rel=0.12)
 
 
-def test_a_steady_drift_is_neither_temperature_nor_hysteresis() -> None:
-    means = chamber_means("ramp", drift("white", COUNT, np.random.default_rng(5)) + np.linspace(0.0, 100.0, COUNT))
+def test_steady_drift_is_neither_temperature_nor_hysteresis() -> None:
+    means = simulate_chamber_means(
+        "ramp",
+        simulate_noise_means("white", INTERVAL_COUNT, np.random.default_rng(5))
+        + np.linspace(0.0, 100.0, INTERVAL_COUNT),
+    )
     assert find_temperature_dependence(means) is None
-    loop = find_hysteresis(means)
-    assert loop is not None
-    assert not loop.hysteresis_is_significant
+    hysteresis = find_hysteresis(means)
+    assert hysteresis is not None
+    assert not hysteresis.hysteresis_is_significant
 
 
-def test_a_loop_alone_is_temperature_too() -> None:
+def test_pure_hysteresis_is_found_as_temperature_dependence() -> None:
     found = find_temperature_dependence(
-        chamber_means("ramp", drift("white", COUNT, np.random.default_rng(6)), "loop", 100.0)
+        simulate_chamber_means(
+            "ramp", simulate_noise_means("white", INTERVAL_COUNT, np.random.default_rng(6)), "loop", 100.0
+        )
     )
     assert found is not None
     assert found.form == "cubic with hysteresis"
     assert found.share > 0.95
 
 
-def test_missing_means_and_units_do_not_matter() -> None:
-    noise = drift("random walk", COUNT, np.random.default_rng(7))
-    means = chamber_means("sine", noise, "cubic", 100.0)
-    bias, warmth = 1e-6 * means.bias, means.temperature_c.copy()
-    bias[20:26], warmth[40] = np.nan, np.nan
-    found = find_temperature_dependence(replace(means, bias=bias, temperature_c=warmth))
+def test_missing_values_and_units_do_not_change_the_result() -> None:
+    noise = simulate_noise_means("random walk", INTERVAL_COUNT, np.random.default_rng(7))
+    means = simulate_chamber_means("sine", noise, "cubic", 100.0)
+    bias, temperature_c = 1e-6 * means.bias, means.temperature_c.copy()
+    bias[20:26], temperature_c[40] = np.nan, np.nan
+    found = find_temperature_dependence(replace(means, bias=bias, temperature_c=temperature_c))
     whole = find_temperature_dependence(means)
     assert found is not None
     assert whole is not None
     assert found.share == pytest.approx(whole.share, abs=0.01)
-    looped = replace(chamber_means("sine", noise, "play", 100.0), temperature_c=warmth)
+    looped = replace(simulate_chamber_means("sine", noise, "play", 100.0), temperature_c=temperature_c)
     size = find_hysteresis(replace(looped, bias=np.where(np.isfinite(bias), 1e-6 * looped.bias, np.nan)))
     assert size is not None
     assert size.size == pytest.approx(1e-4, rel=0.15)
 
 
-def test_many_means_are_averaged_and_few_are_no_answer() -> None:
-    noise = drift("white", 2000, np.random.default_rng(8))
-    found = find_hysteresis(chamber_means("ramp", noise, "loop", 20.0))
+def test_many_intervals_are_averaged_and_too_few_are_refused() -> None:
+    noise = simulate_noise_means("white", 2000, np.random.default_rng(8))
+    found = find_hysteresis(simulate_chamber_means("ramp", noise, "loop", 20.0))
     assert found is not None
     assert found.size == pytest.approx(20.0, rel=0.15)
     short = IntervalMeans(1.0, np.arange(8.0), np.ones(8), np.array([0.0, 1.0, 2.0, 3.0, 3.0, 2.0, 1.0, 0.0]))
@@ -89,10 +97,10 @@ def test_many_means_are_averaged_and_few_are_no_answer() -> None:
     assert find_temperature_dependence(short) is None
 
 
-def test_a_dwell_keeps_the_direction_and_noise_is_no_reversal() -> None:
+def test_heating_direction_is_kept_in_dwells_and_ignores_noise() -> None:
     rng = np.random.default_rng(9)
-    course = np.concatenate([np.linspace(0.0, 10.0, 30), np.full(20, 10.0), np.linspace(10.0, 0.0, 30)])
-    direction = heating_direction(course + 0.02 * rng.standard_normal(course.size))
+    temperature_c = np.concatenate([np.linspace(0.0, 10.0, 30), np.full(20, 10.0), np.linspace(10.0, 0.0, 30)])
+    direction = heating_direction(temperature_c + 0.02 * rng.standard_normal(temperature_c.size))
     assert set(direction[:28]) == {1.0}
     assert set(direction[52:]) == {-1.0}
     assert np.count_nonzero(np.diff(direction)) == 1

@@ -1,4 +1,4 @@
-"""Means as samples come against those of the whole recording, wherever it is cut and whatever is missing."""
+"""Tests of interval means of a stream against interval means of the whole recording."""
 
 from itertools import pairwise
 
@@ -11,13 +11,13 @@ from monitor.drift.thermal.interval_means import compute_interval_means
 from monitor.drift.thermal.running_interval_means import BUFFER_ROWS, RunningIntervalMeans
 
 
-def recording(seed: int, n: int, holes: float) -> tuple[np.ndarray, np.ndarray]:
+def simulate_recording(seed: int, n: int, missing_share: float) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     values = 9.81 + 1e-3 * rng.standard_normal((n, 6)) + 1e-5 * np.arange(n)[:, None]
-    values[rng.random((n, 6)) < holes] = np.nan
-    warmth = 25.0 + 0.01 * rng.standard_normal(n)
-    warmth[rng.random(n) < 0.5 * holes] = np.nan
-    return values, warmth
+    values[rng.random((n, 6)) < missing_share] = np.nan
+    temperature_c = 25.0 + 0.01 * rng.standard_normal(n)
+    temperature_c[rng.random(n) < 0.5 * missing_share] = np.nan
+    return values, temperature_c
 
 
 @pytest.mark.long
@@ -29,10 +29,10 @@ def recording(seed: int, n: int, holes: float) -> tuple[np.ndarray, np.ndarray]:
     hole=st.tuples(st.integers(0, 1500), st.integers(0, 700)),
 )
 @settings(deadline=None)
-def test_equal_to_those_of_the_whole(length, seed, holes, cuts, hole):
-    values, warmth = recording(seed, 1500, holes)
+def test_running_means_equal_those_of_the_whole_recording(length, seed, missing_share, cuts, hole):
+    values, temperature_c = simulate_recording(seed, 1500, missing_share)
     first, lost = hole[0], min(hole[1], 1500 - hole[0])
-    values[first : first + lost], warmth[first : first + lost] = np.nan, np.nan
+    values[first : first + lost], temperature_c[first : first + lost] = np.nan, np.nan
     means, found = RunningIntervalMeans(length), []
     edges = sorted({0, 1500, first, first + lost, *cuts} - set(range(first + 1, first + lost)))
     behind = 0
@@ -40,29 +40,33 @@ def test_equal_to_those_of_the_whole(length, seed, holes, cuts, hole):
         if lost and lo == first:
             behind = lost
         else:
-            found += means.add_samples(values[lo:hi], warmth[lo:hi], behind)
+            found += means.add_samples(values[lo:hi], temperature_c[lo:hi], behind)
             behind = 0
-    if behind:  # missing samples travel with the block that follows them
-        found += means.add_samples(values[:0], warmth[:0], behind)
-    assert [one.end for one in found] == [length * (k + 1) for k in range(1500 // length)]
+    if behind:  # missing samples are reported with the following block
+        found += means.add_samples(values[:0], temperature_c[:0], behind)
+    assert [interval.end for interval in found] == [length * (k + 1) for k in range(1500 // length)]
     for axis in range(6):
-        want = compute_interval_means(values[:, axis], warmth, 1.0, float(length))
-        np.testing.assert_allclose([one.bias[axis] for one in found], want.bias, rtol=1e-12)
-        np.testing.assert_allclose([one.error[axis] for one in found], want.error, rtol=1e-6)
-        np.testing.assert_allclose([one.temperature_c for one in found], want.temperature_c, rtol=1e-12)
+        want = compute_interval_means(values[:, axis], temperature_c, 1.0, float(length))
+        np.testing.assert_allclose([interval.bias[axis] for interval in found], want.bias, rtol=1e-12)
+        np.testing.assert_allclose([interval.error[axis] for interval in found], want.error, rtol=1e-6)
+        np.testing.assert_allclose([interval.temperature_c for interval in found], want.temperature_c, rtol=1e-12)
 
 
-def test_cuts_make_no_difference_at_all():
-    values, warmth = recording(1, 5 * BUFFER_ROWS, 0.2)
-    whole = RunningIntervalMeans(3 * BUFFER_ROWS).add_samples(values, warmth, 0)
+def test_block_sizes_do_not_change_the_means():
+    values, temperature_c = simulate_recording(1, 5 * BUFFER_ROWS, 0.2)
+    whole = RunningIntervalMeans(3 * BUFFER_ROWS).add_samples(values, temperature_c, 0)
     means = RunningIntervalMeans(3 * BUFFER_ROWS)
-    single = [one for k in range(len(values)) for one in means.add_samples(values[k : k + 1], warmth[k : k + 1], 0)]
+    single = [
+        interval
+        for k in range(len(values))
+        for interval in means.add_samples(values[k : k + 1], temperature_c[k : k + 1], 0)
+    ]
     assert len(whole) == len(single) == 1
     assert whole[0].bias.tolist() == single[0].bias.tolist()
     assert whole[0].error.tolist() == single[0].error.tolist()
 
 
-def test_a_hole_of_years_is_passed_over_at_once():
+def test_very_long_gap_is_skipped_at_once():
     means = RunningIntervalMeans(100, longest=5)
     found = means.add_samples(np.ones((30, 6)), np.full(30, 20.0), 10**12)
     assert len(found) == 5

@@ -1,4 +1,4 @@
-"""What a model says of itself: its equation, and how its bias bends with its time constants."""
+"""Tests of the thermal model: difference equation, derivatives and covariance."""
 
 import numpy as np
 import pytest
@@ -10,36 +10,38 @@ from monitor.drift.thermal.thermal_model import (
 )
 from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors
 
-X = np.random.default_rng(5).standard_normal(40).cumsum()
+TEMPERATURE_SERIES = np.random.default_rng(5).standard_normal(40).cumsum()
 
 
-def model(shape: ThermalModelForm, sizes: list[float], start: list[float]) -> ThermalModel:
+def make_model(shape: ThermalModelForm, sizes: list[float], start: list[float]) -> ThermalModel:
     n = len(sizes) + 2 * len(start)
     return ThermalModel(shape, 60.0, 25.0, np.array(sizes), np.array(start), 0.0, 1.0, np.zeros((n, n)), 20.0, 30.0)
 
 
-def test_the_equation_is_that_of_the_lags():
-    """One lag, half of it left after an interval: Y_n − ½ Y_{n−1} = ½ · 10 T_n + ½ · 3."""
-    one = model(ThermalModelForm(0, (60.0 / np.log(2.0),)), [3.0, 10.0], [0.0])
-    assert one.equation == {"a": pytest.approx([-0.5]), "b": pytest.approx([5.0]), "c": pytest.approx(1.5)}
-    assert model(ThermalModelForm(1, ()), [3.0, 2.0], []).equation == {"a": [], "b": [2.0], "c": 3.0}
-    assert model(ThermalModelForm(2, ()), [3.0, 2.0, 1.0], []).equation is None
+def test_difference_equation_has_the_coefficients_of_the_lag():
+    """A lag that decays by half per interval gives Y_n − ½ Y_{n−1} = ½ · 10 T_n + ½ · 3."""
+    lagged = make_model(ThermalModelForm(0, (60.0 / np.log(2.0),)), [3.0, 10.0], [0.0])
+    assert lagged.equation == {"a": pytest.approx([-0.5]), "b": pytest.approx([5.0]), "c": pytest.approx(1.5)}
+    assert make_model(ThermalModelForm(1, ()), [3.0, 2.0], []).equation == {"a": [], "b": [2.0], "c": 3.0}
+    assert make_model(ThermalModelForm(2, ()), [3.0, 2.0, 1.0], []).equation is None
 
 
-def test_the_bias_bends_with_its_time_constants_as_differences_say():
+def test_derivatives_by_time_constant_equal_finite_differences():
     constants, sizes, start = (100.0, 700.0), [1.0, 2.0, -3.0, 4.0], [0.5, -0.7]
 
-    def bias(at: int, by: float) -> np.ndarray:
-        moved = tuple(one * np.exp(by if i == at else 0.0) for i, one in enumerate(constants))
-        return build_regressors(ThermalModelForm(1, moved), X, 60.0, with_initial_state=True) @ np.array(sizes + start)
+    def compute_bias(at: int, by: float) -> np.ndarray:
+        changed = tuple(constant * np.exp(by if i == at else 0.0) for i, constant in enumerate(constants))
+        return build_regressors(
+            ThermalModelForm(1, changed), TEMPERATURE_SERIES, 60.0, with_initial_state=True
+        ) @ np.array(sizes + start)
 
     found = bias_derivatives_by_log_time_constant(
-        model(ThermalModelForm(1, constants), sizes, start), X, np.array(sizes + start)
+        make_model(ThermalModelForm(1, constants), sizes, start), TEMPERATURE_SERIES, np.array(sizes + start)
     )
-    want = np.stack([(bias(at, 1e-5) - bias(at, -1e-5)) / 2e-5 for at in (0, 1)], axis=1)
+    want = np.stack([(compute_bias(at, 1e-5) - compute_bias(at, -1e-5)) / 2e-5 for at in (0, 1)], axis=1)
     np.testing.assert_allclose(found, want, rtol=1e-4, atol=1e-5)
 
 
-def test_the_covariance_is_that_of_least_squares():
+def test_covariance_is_that_of_least_squares():
     rows = np.random.default_rng(6).standard_normal((50, 3)) * [1.0, 1e-4, 1e5]
     np.testing.assert_allclose(coefficient_covariance(rows, 2.0), 4.0 * np.linalg.inv(rows.T @ rows), rtol=1e-6)

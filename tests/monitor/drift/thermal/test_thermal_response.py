@@ -1,4 +1,4 @@
-"""Responses to temperature against the recursions that they stand for."""
+"""Tests of the regressors for delayed responses to temperature against recursions."""
 
 import numpy as np
 import pytest
@@ -15,13 +15,13 @@ from monitor.drift.thermal.thermal_response import (
     solve_least_squares,
 )
 
-T = np.random.default_rng(3).standard_normal(200).cumsum()
+TEMPERATURE_SERIES = np.random.default_rng(3).standard_normal(200).cumsum()
 
 
-def test_a_lag_is_scipys_filter():
+def test_first_order_lag_equals_scipys_filter():
     p = 0.8
-    want, _ = lfilter([1.0 - p], [1.0, -p], T, zi=[p * T[0]])
-    np.testing.assert_allclose(apply_first_order_lag(T, p), want, rtol=1e-12)
+    want, _ = lfilter([1.0 - p], [1.0, -p], TEMPERATURE_SERIES, zi=[p * TEMPERATURE_SERIES[0]])
+    np.testing.assert_allclose(apply_first_order_lag(TEMPERATURE_SERIES, p), want, rtol=1e-12)
 
 
 @given(
@@ -29,28 +29,28 @@ def test_a_lag_is_scipys_filter():
     constants=st.lists(st.floats(0.3, 30.0), min_size=1, max_size=3, unique=True),
     seed=st.integers(0, 1000),
 )
-def test_the_equation_makes_the_same_as_the_lags(powers, constants, seed):
-    """Y_n + a_1 Y_{n−1} + … = b_0 x_n + … + c, run forward from where the lags stand, gives what the lags give."""
+def test_difference_equation_reproduces_the_sum_of_lags(powers, constants, seed):
+    """Running Y_n + a_1 Y_{n−1} + … = b_0 x_n + … + c forward gives the same values as the lags."""
     shape = ThermalModelForm(powers, tuple(constants))
     sizes = np.random.default_rng(seed).standard_normal(1 + powers + len(constants))
-    y = build_regressors(shape, T, 1.0) @ sizes
+    y = build_regressors(shape, TEMPERATURE_SERIES, 1.0) @ sizes
     a, b, c = difference_equation_coefficients(shape, sizes, 1.0)
     assert (a.size, b.size) == (len(constants), len(constants) + powers)
     assert np.all(np.abs(np.roots(np.concatenate([[1.0], a]))) < 1.0)
     k = len(constants)
     for n in range(k, 60):
-        made = c + b @ T[n - np.arange(b.size)] - a @ y[n - 1 - np.arange(k)]
-        assert made == pytest.approx(y[n], rel=1e-7, abs=1e-7)
+        predicted = c + b @ TEMPERATURE_SERIES[n - np.arange(b.size)] - a @ y[n - 1 - np.arange(k)]
+        assert predicted == pytest.approx(y[n], rel=1e-7, abs=1e-7)
 
 
-def test_what_was_left_behind_dies_away_with_the_roots():
+def test_initial_states_decay_with_the_lag_roots():
     shape = ThermalModelForm(0, (2.0, 9.0))
-    columns = build_regressors(shape, T, 1.0, with_initial_state=True)
+    columns = build_regressors(shape, TEMPERATURE_SERIES, 1.0, with_initial_state=True)
     assert columns.shape == (200, 5)
     np.testing.assert_allclose(columns[1, -2:], compute_lag_roots(shape, 1.0))
 
 
-def test_sizes_do_not_depend_on_units():
-    columns = build_regressors(ThermalModelForm(3, (4.0,)), T, 1.0)
+def test_least_squares_is_accurate_for_columns_of_different_size():
+    columns = build_regressors(ThermalModelForm(3, (4.0,)), TEMPERATURE_SERIES, 1.0)
     want = np.array([1e-3, 2e-5, -3e-6, 1e-9, 4e-5])
     np.testing.assert_allclose(solve_least_squares(columns, columns @ want), want, rtol=1e-6)

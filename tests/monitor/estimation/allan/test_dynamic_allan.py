@@ -1,4 +1,4 @@
-"""Dynamic curves: the same as one batch after another, and the experiment of the paper behind them."""
+"""Tests of dynamic Allan curves against batch results and against the experiment of the paper."""
 
 import numpy as np
 import pytest
@@ -19,34 +19,34 @@ from monitor.noise.effects import (
 from monitor.noise.model import NoiseModel
 
 RATE_HZ = 100.0
-QUIET = {"Q": 2.0e-5, "N": 1.5e-4, "B": 4.0e-5, "K": 1.5e-6, "R": 0.0}
-LOUD = QUIET | {"N": 3.0e-4, "B": 1.2e-4, "K": 2.0e-5, "R": 2.0e-6}  # Q stays
+BEFORE = {"Q": 2.0e-5, "N": 1.5e-4, "B": 4.0e-5, "K": 1.5e-6, "R": 0.0}
+AFTER = BEFORE | {"N": 3.0e-4, "B": 1.2e-4, "K": 2.0e-5, "R": 2.0e-6}  # Q does not change
 JUMP_S, END_S, WINDOW_S = 250.0, 600.0, 100.0
 
 
-def model(size: dict[str, float]) -> NoiseModel:
+def make_model(coefficients: dict[str, float]) -> NoiseModel:
     sources = (
-        QuantizationNoise(Q=size["Q"]),
-        AngleRandomWalk(N=size["N"]),
-        BiasInstability(B=size["B"]),
-        RateRandomWalk(K=size["K"]),
-        RateRamp(R=size["R"]),
+        QuantizationNoise(Q=coefficients["Q"]),
+        AngleRandomWalk(N=coefficients["N"]),
+        BiasInstability(B=coefficients["B"]),
+        RateRandomWalk(K=coefficients["K"]),
+        RateRamp(R=coefficients["R"]),
     )
     return NoiseModel(dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), sources))
 
 
-def jumping(seed: int) -> np.ndarray:
-    """600 s at 100 Hz: at 250 s N doubles, B trebles, K grows thirteenfold, a ramp begins; Q does not change."""
+def simulate_jump(seed: int) -> np.ndarray:
+    """Simulate 600 s at 100 Hz; at 250 s N doubles, B trebles, K grows and a ramp begins, while Q is constant."""
     before, after = round(JUMP_S * RATE_HZ), round((END_S - JUMP_S) * RATE_HZ)
-    quiet = model(QUIET).simulate(before, RATE_HZ, seed)
-    loud = model(LOUD).simulate(after, RATE_HZ, seed + 1000)
+    first_part = make_model(BEFORE).simulate(before, RATE_HZ, seed)
+    second_part = make_model(AFTER).simulate(after, RATE_HZ, seed + 1000)
     second = round(RATE_HZ)
-    level = quiet[-second:].mean(axis=0) - loud[:second].mean(axis=0)  # the bias goes on from where it was
-    return np.concatenate([quiet, loud + level])
+    level = first_part[-second:].mean(axis=0) - second_part[:second].mean(axis=0)  # keeps the bias continuous
+    return np.concatenate([first_part, second_part + level])
 
 
-def test_every_step_is_a_batch_over_its_window() -> None:
-    values = jumping(1)[20_000:32_000]
+def test_every_step_equals_a_batch_over_its_window() -> None:
+    values = simulate_jump(1)[20_000:32_000]
     values[:, 5] += 9.81
     values[[500, 4321]] = np.nan
     found = compute_dynamic_allan(values, RATE_HZ, 40.0, "octave", 7.0)
@@ -70,65 +70,64 @@ def test_every_step_is_a_batch_over_its_window() -> None:
         entered = expected.entered
         lo, hi = deviation_intervals(avar, expected.edf)
         assert found.deviation[row] == pytest.approx(np.sqrt(avar), rel=1e-9)
-        # the window takes the slopes of long τ from a grid of points, which the fit passes on
+        # The window interpolates the slopes of long τ from a grid, which changes the fit slightly.
         assert found.lo[row] == pytest.approx(lo, rel=5e-3, nan_ok=True)
         assert found.hi[row] == pytest.approx(hi, rel=5e-3, nan_ok=True)
-        known = expected.coefficients
-        np.testing.assert_array_equal(found.status[row], known.status)
-        for mine, theirs in (
-            (found.value, known.value),
-            (found.value_lo, known.lo),
-            (found.value_hi, known.hi),
+        coefficients = expected.coefficients
+        np.testing.assert_array_equal(found.status[row], coefficients.status)
+        for dynamic, batch_result in (
+            (found.value, coefficients.value),
+            (found.value_lo, coefficients.lo),
+            (found.value_hi, coefficients.hi),
         ):
-            np.testing.assert_allclose(mine[row], theirs, rtol=5e-3, atol=1e-9)
+            np.testing.assert_allclose(dynamic[row], batch_result, rtol=5e-3, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
-def experiment() -> list:
-    return [compute_dynamic_allan(jumping(seed), RATE_HZ, WINDOW_S) for seed in range(4)]
+def dynamic_results() -> list:
+    return [compute_dynamic_allan(simulate_jump(seed), RATE_HZ, WINDOW_S) for seed in range(4)]
 
 
-def test_of_a_jump_in_n_b_k_r_the_window_shows_it_and_q_stays(experiment: list) -> None:
-    """ "Dynamic extraction of random drift error coefficients of MEMS gyroscopes", its experiment, 24 axes."""
+def test_dynamic_curves_show_the_jump_and_constant_q(dynamic_results: list) -> None:
+    """Repeat the experiment in "Dynamic extraction of random drift error coefficients of MEMS gyroscopes" (24 axes)."""
     q, n = SYMBOLS.index("Q"), SYMBOLS.index("N")
-    t_s = experiment[0].t_s
+    t_s = dynamic_results[0].t_s
     before, after = t_s <= JUMP_S, t_s >= JUMP_S + WINDOW_S
-    values = np.concatenate([one.value for one in experiment], axis=2)  # [T, 5, 24]
-    assert values[before, n].mean() == pytest.approx(QUIET["N"], rel=0.01)
-    assert values[after, n].mean() == pytest.approx(LOUD["N"], rel=0.02)
-    # at every single step beyond one window N is nearer to its new size, and at none before the jump
-    half = np.sqrt(QUIET["N"] * LOUD["N"])
+    values = np.concatenate([result.value for result in dynamic_results], axis=2)  # [T, 5, 24]
+    assert values[before, n].mean() == pytest.approx(BEFORE["N"], rel=0.01)
+    assert values[after, n].mean() == pytest.approx(AFTER["N"], rel=0.02)
+    # N is nearer to its new value at every step beyond one window, and at no step before the jump.
+    half = np.sqrt(BEFORE["N"] * AFTER["N"])
     assert (values[before, n] < half).all()
     assert (values[after, n] > half).all()
-    # midway old and new share the window: the variance is halfway
+    # Halfway, the window contains both noise levels, so the variance is their mean.
     midway = values[np.argmin(abs(t_s - JUMP_S - WINDOW_S / 2)), n]
-    assert np.mean(midway**2) == pytest.approx((QUIET["N"] ** 2 + LOUD["N"] ** 2) / 2, rel=0.1)
+    assert np.mean(midway**2) == pytest.approx((BEFORE["N"] ** 2 + AFTER["N"] ** 2) / 2, rel=0.1)
     quantization = np.nanmean(values[:, q], axis=1)
-    assert quantization == pytest.approx(np.full(t_s.size, QUIET["Q"]), rel=0.05)
+    assert quantization == pytest.approx(np.full(t_s.size, BEFORE["Q"]), rel=0.05)
 
 
-def test_the_longest_deviations_rise_by_flicker_and_walk(experiment: list) -> None:
-    t_s, tau_s = experiment[0].t_s, experiment[0].tau_s
+def test_long_deviations_rise_by_the_expected_factor(dynamic_results: list) -> None:
+    t_s, tau_s = dynamic_results[0].t_s, dynamic_results[0].tau_s
     at = int(np.argmin(abs(tau_s - 5.0)))
-    deviation = np.concatenate([one.deviation[:, at] for one in experiment], axis=1)
+    deviation = np.concatenate([result.deviation[:, at] for result in dynamic_results], axis=1)
     before, after = (np.sqrt(np.mean(deviation[rows] ** 2)) for rows in (t_s <= JUMP_S, t_s >= JUMP_S + WINDOW_S))
     tau = tau_s[at : at + 1]
-    expected = [np.sqrt(model(size).avar("gx", tau, 1 / RATE_HZ)[0]) for size in (QUIET, LOUD)]
+    expected = [np.sqrt(make_model(size).avar("gx", tau, 1 / RATE_HZ)[0]) for size in (BEFORE, AFTER)]
     assert [before, after] == pytest.approx(expected, rel=0.15)
     assert after > 1.8 * before
 
 
-def test_the_whole_recording_hides_what_the_window_shows(experiment: list) -> None:
-    """The mean of both variances, in which no time stands."""
-    values = jumping(0)
+def test_curve_of_the_whole_recording_averages_both_noise_levels(dynamic_results: list) -> None:
+    values = simulate_jump(0)
     avar, _ = batch.overlapping_avar(values, np.array([16]))
     whole = np.sqrt(avar[0].mean())
-    at = int(np.argmin(abs(experiment[0].tau_s - 0.16)))
-    mine = experiment[0].deviation[:, at].mean(axis=1)
-    assert mine[0] < 0.8 * whole < 0.8 * mine[-1]
+    at = int(np.argmin(abs(dynamic_results[0].tau_s - 0.16)))
+    dynamic = dynamic_results[0].deviation[:, at].mean(axis=1)
+    assert dynamic[0] < 0.8 * whole < 0.8 * dynamic[-1]
 
 
-def test_a_long_recording_is_shown_in_a_bounded_number_of_steps() -> None:
+def test_number_of_steps_of_a_long_recording_is_bounded() -> None:
     values = np.random.default_rng(3).standard_normal((200_000, 6))
     shares: list[float] = []
     found = compute_dynamic_allan(values, 10.0, 20.0, (0.1, 0.4, 1.6), step_s=1.0, progress=shares.append)
@@ -138,7 +137,7 @@ def test_a_long_recording_is_shown_in_a_bounded_number_of_steps() -> None:
     assert shares == pytest.approx(np.arange(1, found.t_s.size + 1) / found.t_s.size)
 
 
-def test_an_axis_that_is_not_measured_says_nothing() -> None:
+def test_unmeasured_axis_has_no_values() -> None:
     values = np.random.default_rng(4).standard_normal((2000, 6))
     values[:, 3:] = np.nan
     found = compute_dynamic_allan(values, 10.0, 100.0)
@@ -147,15 +146,15 @@ def test_an_axis_that_is_not_measured_says_nothing() -> None:
     assert (found.status[:, SYMBOLS.index("N"), :3] == Status.ESTIMATED).all()
 
 
-def test_a_recording_shorter_than_the_window_gives_no_answer() -> None:
+def test_recording_shorter_than_the_window_is_refused() -> None:
     with pytest.raises(NotReady, match=r"50 s are recorded, less than the window of 60 s"):
         compute_dynamic_allan(np.zeros((500, 6)), 10.0, 60.0)
 
 
 @pytest.mark.parametrize(
-    ("window_s", "step_s", "says"),
+    ("window_s", "step_s", "message"),
     [(5.0, None, r"window of 5 s: 50 samples at 10 Hz; possible are 10 to"), (20.0, 0.0, "step of 0 s")],
 )
-def test_what_is_impossible_is_a_wrong_request(window_s: float, step_s: float | None, says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
+def test_impossible_window_or_step_is_refused(window_s: float, step_s: float | None, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         compute_dynamic_allan(np.zeros((500, 6)), 10.0, window_s, step_s=step_s)

@@ -1,4 +1,4 @@
-"""Overlapping Hadamard variance: published numbers, allantools, plain sums, simulation."""
+"""Tests of the overlapping Hadamard variance against published values, allantools, direct sums and simulation."""
 
 import allantools
 import numpy as np
@@ -14,7 +14,7 @@ from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWa
 from tests.support.allan_references import columns, nist_1000
 
 
-def test_thousand_points_of_nist_sp_1065():
+def test_nist_sp_1065_values_are_reproduced():
     found, terms = hadamard_variance(nist_1000()[:, None], np.array([1, 10, 100]))
     assert np.sqrt(found[:, 0]) == pytest.approx([2.943883e-01, 9.581083e-02, 3.237638e-02], abs=5e-8)
     assert terms.ravel().tolist() == [998, 971, 701]
@@ -22,7 +22,7 @@ def test_thousand_points_of_nist_sp_1065():
 
 @pytest.mark.parametrize("rate_hz", [1.0, 100.0])
 @pytest.mark.parametrize("kind", ["float", "int"])
-def test_equals_allantools(kind, rate_hz):
+def test_deviations_equal_allantools(kind, rate_hz):
     rng = np.random.default_rng(7)
     y = 1e2 * rng.standard_normal(900) + np.cumsum(rng.standard_normal(900))
     y = np.rint(y).astype(np.int64) if kind == "int" else y
@@ -42,7 +42,7 @@ def test_equals_allantools(kind, rate_hz):
     scale=st.sampled_from([1e-4, 1.0, 1e3]),
     seed=st.integers(0, 99),
 )
-def test_is_the_mean_over_three_clusters_whatever_is_missing_or_drifts(n, m, holes, offset, drift, scale, seed):
+def test_variance_is_the_mean_over_three_clusters_without_missing_terms(n, m, holes, offset, drift, scale, seed):
     rate = np.random.default_rng(seed).standard_normal(n)
     rate[[h for h in holes if h < n]] = np.nan
     found, terms = hadamard_variance((offset + scale * (rate + drift * np.arange(n)))[:, None], np.array([m]))
@@ -57,7 +57,7 @@ def test_is_the_mean_over_three_clusters_whatever_is_missing_or_drifts(n, m, hol
         assert np.isnan(found[0, 0])
 
 
-def test_a_linear_drift_of_a_thousand_times_the_noise_is_not_seen():
+def test_large_linear_drift_has_no_effect():
     rng = np.random.default_rng(1)
     noise = rng.standard_normal((600, 1))
     factors = np.array([1, 8, 64, 200])
@@ -69,35 +69,35 @@ def test_a_linear_drift_of_a_thousand_times_the_noise_is_not_seen():
     assert hadamard_estimator_moments(2000, 64).mean[4] == 0.0
 
 
-def test_white_noise_reads_as_in_allan_s_variance():
-    one, allan = hadamard_estimator_moments(10_000, 100), total_estimator_moments(10_000, 100).allan
-    assert one.mean[:4] / allan[:4] == pytest.approx([10.0 / 9.0, 1.0, 0.8113, 0.5], abs=1e-4)
+def test_white_noise_gives_the_allan_variance():
+    hadamard, allan = hadamard_estimator_moments(10_000, 100), total_estimator_moments(10_000, 100).allan
+    assert hadamard.mean[:4] / allan[:4] == pytest.approx([10.0 / 9.0, 1.0, 0.8113, 0.5], abs=1e-4)
 
 
 @pytest.mark.parametrize(("n", "m"), [(60, 1), (60, 7), (61, 20), (300, 90), (900, 10)])
-def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
+def test_moments_equal_sums_over_all_pairs_of_terms(n, m):
     starts = np.arange(n + 1 - 3 * m)
     rows = np.zeros((starts.size, n + 1))
     for p, weight in enumerate((-1.0, 3.0, -3.0, 1.0)):
         rows[starts, starts + p * m] = weight
     lags = phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     noise = np.stack([rows @ g @ rows.T for g in lags])
-    one = hadamard_estimator_moments(n, m)
-    np.testing.assert_allclose(one.mean[:4], noise[:, 0, 0] / (6 * m * m), rtol=1e-9)
+    moments = hadamard_estimator_moments(n, m)
+    np.testing.assert_allclose(moments.mean[:4], noise[:, 0, 0] / (6 * m * m), rtol=1e-9)
     exact = 2.0 * np.einsum("aij,bij->ab", noise, noise) / (6.0 * m * m * starts.size) ** 2
     scale = np.sqrt(np.outer(exact.diagonal(), exact.diagonal()))
-    assert (np.abs(one.covariance[:4, :4] - exact) < 1e-5 * scale).all()
+    assert (np.abs(moments.covariance[:4, :4] - exact) < 1e-5 * scale).all()
 
 
-def test_degrees_of_freedom_agree_with_greenhall_and_riley_where_that_is_good():
+def test_degrees_of_freedom_agree_with_greenhall_and_riley():
     for m in (32, 125, 333):
-        one = hadamard_estimator_moments(1000, m)
-        edf = 2.0 * one.mean[1:4] ** 2 / one.covariance.diagonal()[1:4]
+        moments = hadamard_estimator_moments(1000, m)
+        edf = 2.0 * moments.mean[1:4] ** 2 / moments.covariance.diagonal()[1:4]
         formula = [edf_greenhall(alpha, 3, m, 1001, overlapping=True, modified=False) for alpha in (0, -1, -2)]
         assert edf == pytest.approx(formula, rel=2e-3)
 
 
-def test_intervals_hold_what_they_promise():
+def test_intervals_have_the_stated_coverage():
     n, runs, rate_hz = 512, 3000, 200.0
     rng = np.random.default_rng(22)
     theta = np.array([0.0, 1.0, 0.02, 1e-3, 0.0])
@@ -107,14 +107,14 @@ def test_intervals_hold_what_they_promise():
     )
     factors = np.array([4, 16, 64, 128, 170])
     curve = compute_hadamard_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
-    white = 1.0 / curve.tau_s  # of these, white noise is all but a ten-thousandth
+    white = 1.0 / curve.tau_s  # white noise makes all but a ten-thousandth of the variance
     np.testing.assert_allclose(curve.hvar.mean(axis=1), white, rtol=0.1)
-    held = (curve.lo**2 <= white[:, None]) & (white[:, None] <= curve.hi**2)
-    assert (held.mean(axis=1) > 0.94).all()
-    assert (held.mean(axis=1) < 0.982).all()
+    covered = (curve.lo**2 <= white[:, None]) & (white[:, None] <= curve.hi**2)
+    assert (covered.mean(axis=1) > 0.94).all()
+    assert (covered.mean(axis=1) < 0.982).all()
 
 
-def test_gaps_cost_degrees_of_freedom_and_unknown_noise_all_intervals():
+def test_gaps_reduce_degrees_of_freedom_and_unknown_noise_gives_no_intervals():
     values = np.random.default_rng(3).standard_normal((400, 2))
     whole = compute_hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, np.nan])
     assert whole.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128]
@@ -122,10 +122,10 @@ def test_gaps_cost_degrees_of_freedom_and_unknown_noise_all_intervals():
     assert np.isfinite(whole.hi[:, 0]).all()
     assert np.isnan(whole.hi[:, 1]).all()
     values[100, 0] = np.nan
-    less = compute_hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, 1.0])
-    np.testing.assert_allclose((less.edf / whole.edf)[:7, 0], (less.terms / whole.terms)[:7, 0])
-    assert np.isnan(less.hi[7, 0])  # not a term is left
-    assert (less.terms[:, 0] == whole.terms[:, 0] - 3 * less.factors)[:5].all()
+    shorter = compute_hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, 1.0])
+    np.testing.assert_allclose((shorter.edf / whole.edf)[:7, 0], (shorter.terms / whole.terms)[:7, 0])
+    assert np.isnan(shorter.hi[7, 0])  # no term is left
+    assert (shorter.terms[:, 0] == whole.terms[:, 0] - 3 * shorter.factors)[:5].all()
 
 
 # --- published results on real data
@@ -133,7 +133,7 @@ def test_gaps_cost_degrees_of_freedom_and_unknown_noise_all_intervals():
 
 @pytest.mark.data
 @pytest.mark.parametrize(("data", "table"), [("phase-dat", "ohdev"), ("pink", "ohdev"), ("ocxo", "ohdev-octave-ci")])
-def test_stable32(reference, data, table):
+def test_stable32_values_are_reproduced(reference, data, table):
     if data == "phase-dat":
         y, within = np.diff(columns(reference / "phase-dat.csv", "x")[0]), 5e-5
     elif data == "pink":

@@ -1,4 +1,4 @@
-"""Rounds over the live window equal the whole-recording functions on its last samples."""
+"""Tests that live total and Hadamard curves equal those of the batch functions on the window."""
 
 import numpy as np
 import pytest
@@ -15,23 +15,23 @@ from monitor.estimation.allan.window import AllanWindow
 THETA = np.repeat(np.array([[1e-12], [1e-10], [1e-12], [1e-14], [0.0]]), 6, axis=1)
 
 
-def made(n, seed=0):
+def simulate_values(n, seed=0):
     values = 1e-4 * np.random.default_rng(seed).standard_normal((n, 6))
     values[:, 5] += 9.81
     return values
 
 
-def one_round(slow):
+def run_one_round(live):
     for _ in range(100):
-        slow.compute_next_tau()
-        result = slow.curves_of_last_round(100.0, THETA)
+        live.compute_next_tau()
+        result = live.curves_of_last_round(100.0, THETA)
         if result is not None:
             return result
-    raise AssertionError("a round has no end")
+    raise AssertionError("the round did not finish")
 
 
-def check(slow, window, values):
-    found = one_round(slow)
+def check_against_batch(live, window, values):
+    found = run_one_round(live)
     last = values[-window.length :]
     for curve, expected, name in (
         (found[0], compute_total_curve(last, 100.0, THETA, found[0].factors), "tvar"),
@@ -46,11 +46,11 @@ def check(slow, window, values):
 @pytest.mark.long
 @pytest.mark.parametrize("factors", [cluster_sizes(300, 1.0), np.array([3, 150])])
 @pytest.mark.parametrize("samples", [180, 300, 301, 1000])
-def test_equals_the_batch_on_the_window(samples, factors):
-    values = made(samples)
+def test_curves_equal_the_batch_on_the_window(samples, factors):
+    values = simulate_values(samples)
     window = AllanWindow(300, factors)
     window.append_samples(values)
-    check(LiveTotalAndHadamard(window), window, values)
+    check_against_batch(LiveTotalAndHadamard(window), window, values)
 
 
 @pytest.mark.long
@@ -61,105 +61,105 @@ def test_equals_the_batch_on_the_window(samples, factors):
     skipped=st.integers(0, 30),
     seed=st.integers(0, 99),
 )
-def test_equals_the_batch_with_gaps_anywhere(samples, holes, skipped, seed):
-    values = made(samples, seed)
+def test_curves_equal_the_batch_with_gaps(samples, holes, skipped, seed):
+    values = simulate_values(samples, seed)
     for row, axis in holes:
         values[row % samples, axis] = np.nan
     window = AllanWindow(200, cluster_sizes(200, 1.0))
     window.append_samples(values)
     window.append_missing_samples(skipped)
-    check(LiveTotalAndHadamard(window), window, np.concatenate([values, np.full((skipped, 6), np.nan)]))
+    check_against_batch(LiveTotalAndHadamard(window), window, np.concatenate([values, np.full((skipped, 6), np.nan)]))
 
 
 @pytest.mark.long
-def test_a_window_with_a_span_for_each_tau_gives_the_same():
-    values = made(900)
+def test_window_with_a_span_per_tau_gives_the_same_curves():
+    values = simulate_values(900)
     window = AllanWindow(500, np.array([1, 4, 4, 16]), np.array([64, 100, 500, 200]))
     window.append_samples(values)
-    check(LiveTotalAndHadamard(window), window, values)
+    check_against_batch(LiveTotalAndHadamard(window), window, values)
 
 
-def test_chosen_clusters_wait_until_the_window_holds_them():
+def test_long_clusters_wait_until_the_window_is_long_enough():
     window = AllanWindow(500, cluster_sizes(500, 1.0))
-    slow = LiveTotalAndHadamard(window, np.array([100, 300, 499]), np.array([150]))
-    window.append_samples(made(300))
+    live = LiveTotalAndHadamard(window, np.array([100, 300, 499]), np.array([150]))
+    window.append_samples(simulate_values(300))
     for _ in range(50):
-        slow.compute_next_tau()
-    assert slow.curves_of_last_round(100.0, THETA) is None
-    window.append_samples(made(200))
-    totals, hadamards = one_round(slow)
+        live.compute_next_tau()
+    assert live.curves_of_last_round(100.0, THETA) is None
+    window.append_samples(simulate_values(200))
+    totals, hadamards = run_one_round(live)
     assert totals.factors.tolist() == [100, 300, 499]
     assert hadamards.factors.tolist() == [150]
 
 
-def test_each_step_sees_the_window_of_its_moment_and_a_round_is_handed_over_whole():
-    values = made(1200)
+def test_each_step_uses_the_current_window_and_rounds_are_returned_completely():
+    values = simulate_values(1200)
     window = AllanWindow(400, cluster_sizes(400, 1.0))
     window.append_samples(values[:600])
-    slow = LiveTotalAndHadamard(window, np.array([2, 300]), np.array([4]))
-    slow.compute_next_tau()
+    live = LiveTotalAndHadamard(window, np.array([2, 300]), np.array([4]))
+    live.compute_next_tau()
     window.append_samples(values[600:900])
-    slow.compute_next_tau()
-    assert slow.curves_of_last_round(100.0, THETA) is None
-    slow.compute_next_tau()
-    totals, hadamards = slow.curves_of_last_round(100.0, THETA)
+    live.compute_next_tau()
+    assert live.curves_of_last_round(100.0, THETA) is None
+    live.compute_next_tau()
+    totals, hadamards = live.curves_of_last_round(100.0, THETA)
     early = compute_total_curve(values[200:600], 100.0, THETA, np.array([2, 300]))
     late = compute_total_curve(values[500:900], 100.0, THETA, np.array([2, 300]))
     np.testing.assert_allclose(totals.tvar, [early.tvar[0], late.tvar[1]], rtol=1e-9)
     window.append_samples(values[900:])
-    slow.compute_next_tau()
-    assert np.array_equal(slow.curves_of_last_round(100.0, THETA)[0].tvar, totals.tvar)
-    assert np.array_equal(slow.curves_of_last_round(100.0, THETA)[1].hvar, hadamards.hvar)
+    live.compute_next_tau()
+    assert np.array_equal(live.curves_of_last_round(100.0, THETA)[0].tvar, totals.tvar)
+    assert np.array_equal(live.curves_of_last_round(100.0, THETA)[1].hvar, hadamards.hvar)
 
 
-def test_an_emptied_window_takes_its_results_along():
+def test_emptied_window_discards_the_curves():
     window = AllanWindow(400, cluster_sizes(400, 1.0))
-    slow = LiveTotalAndHadamard(window)
-    slow.compute_next_tau()
-    window.append_samples(made(400))
-    one_round(slow)
+    live = LiveTotalAndHadamard(window)
+    live.compute_next_tau()
+    window.append_samples(simulate_values(400))
+    run_one_round(live)
     window.discard_samples()
-    window.append_samples(made(MIN_SAMPLES - 1))
-    slow.compute_next_tau()
-    assert slow.curves_of_last_round(100.0, THETA) is None
-    window.append_samples(made(100))
-    check(slow, window, np.concatenate([made(MIN_SAMPLES - 1), made(100)]))
+    window.append_samples(simulate_values(MIN_SAMPLES - 1))
+    live.compute_next_tau()
+    assert live.curves_of_last_round(100.0, THETA) is None
+    window.append_samples(simulate_values(100))
+    check_against_batch(live, window, np.concatenate([simulate_values(MIN_SAMPLES - 1), simulate_values(100)]))
 
 
 @pytest.mark.long
-def test_a_growing_window_is_followed():
-    values = made(400)
+def test_longest_tau_grows_with_the_window():
+    values = simulate_values(400)
     window = AllanWindow(400, cluster_sizes(400, 1.0))
-    slow = LiveTotalAndHadamard(window)
+    live = LiveTotalAndHadamard(window)
     longest = []
     for start in range(0, 400, 4):
         window.append_samples(values[start : start + 4])
-        slow.compute_next_tau()
-        result = slow.curves_of_last_round(100.0, THETA)
+        live.compute_next_tau()
+        result = live.curves_of_last_round(100.0, THETA)
         longest.append(0 if result is None else int(result[0].factors[-1]))
     assert longest == sorted(longest)
     assert longest[-1] >= 128
 
 
-def test_a_constant_axis_has_no_variance():
+def test_constant_axis_has_zero_variance():
     values = np.zeros((300, 6))
     values[:, 5], values[:, 4] = 9.80665, 1.0 / 3.0
     window = AllanWindow(300, cluster_sizes(300, 1.0))
     window.append_samples(values)
-    slow = LiveTotalAndHadamard(window)
-    totals, hadamards = one_round(slow)
+    live = LiveTotalAndHadamard(window)
+    totals, hadamards = run_one_round(live)
     assert (hadamards.hvar == 0.0).all()
     assert (totals.tvar == 0.0).all()
 
 
 @pytest.mark.long
-def test_clusters_beyond_what_phase_can_hold_are_left_out():
+def test_clusters_that_overflow_the_phase_are_left_out():
     length = 200_000
     short = AllanWindow(length, np.array([1]))
-    slow = LiveTotalAndHadamard(short)
+    live = LiveTotalAndHadamard(short)
     swing = np.where(np.arange(length) < length // 2, 30.0, -30.0)[:, None] * np.ones(6)
     short.append_samples(swing)
-    totals, _ = one_round(slow)
+    totals, _ = run_one_round(live)
     expected = compute_total_curve(swing, 100.0, THETA, totals.factors)
     assert totals.factors[-1] < length // 100
     np.testing.assert_allclose(totals.tvar, expected.tvar, rtol=1e-9)
@@ -176,15 +176,15 @@ def test_impossible_clusters_are_refused(totals, hadamards):
         LiveTotalAndHadamard(window, np.array(totals, np.int64), np.array(hadamards, np.int64))
 
 
-def test_the_window_is_only_looked_at():
+def test_window_is_not_modified():
     window = AllanWindow(200, cluster_sizes(200, 1.0))
-    window.append_samples(made(300))
+    window.append_samples(simulate_values(300))
     before = window.avar()
     phase, missing, _, unit = window.view_phase_ring()
     assert not phase.flags.writeable
     assert not missing.flags.writeable
     assert unit.shape == (6,)
-    one_round(LiveTotalAndHadamard(window))
+    run_one_round(LiveTotalAndHadamard(window))
     assert np.array_equal(window.avar(), before)
-    window.append_samples(made(5))  # it still advances
+    window.append_samples(simulate_values(5))  # the window still advances
     assert window.samples_since_reset == 305

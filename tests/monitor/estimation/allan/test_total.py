@@ -1,4 +1,4 @@
-"""Total variance: published numbers, allantools, plain sums of the reflected rate, simulation."""
+"""Tests of the total variance against published values, allantools, direct sums and simulation."""
 
 import csv
 
@@ -15,16 +15,16 @@ from monitor.noise.effects import AngleRandomWalk, BiasInstability, Quantization
 from tests.support.allan_references import nist_1000
 
 
-def reflected(rate, m):
-    """D_k(m) of the reflected rate for every k, NaN where a sample is missing: the definition, with no phase in it."""
+def compute_reflected_differences(rate, m):
+    """Return D_k(m) of the reflected rate by its definition, NaN where a sample is missing."""
     n = len(rate)
-    longer = np.concatenate([rate[::-1], rate, rate[::-1]])
-    sums = np.convolve(longer, np.ones(m), "valid") / m
+    extended = np.concatenate([rate[::-1], rate, rate[::-1]])
+    sums = np.convolve(extended, np.ones(m), "valid") / m
     return np.array([sums[n + i] - sums[n + i - m] for i in range(1, n)])
 
 
-def differences(n, m):
-    """The weights [n - 1, n + 1] of all terms on phase, written out from x*."""
+def compute_difference_weights(n, m):
+    """Return the weights [n - 1, n + 1] of all terms on the phase, following the definition of x*."""
     rows = np.zeros((n - 1, n + 1))
     for i in range(1, n):
         for place, weight in ((i - m, 1.0), (i, -2.0), (i + m, 1.0)):
@@ -37,7 +37,7 @@ def differences(n, m):
     return rows
 
 
-def test_thousand_points_of_nist_sp_1065():
+def test_nist_sp_1065_values_are_reproduced():
     found, terms = total_variance(nist_1000()[:, None], np.array([1, 10, 100]))
     assert np.sqrt(found[:, 0]) == pytest.approx([2.922319e-01, 9.134743e-02, 3.406530e-02], abs=5e-8)
     assert terms.ravel().tolist() == [999, 999, 999]
@@ -45,7 +45,7 @@ def test_thousand_points_of_nist_sp_1065():
 
 @pytest.mark.parametrize("rate_hz", [1.0, 100.0])
 @pytest.mark.parametrize("kind", ["float", "int", "float32"])
-def test_equals_allantools_up_to_the_longest_cluster(kind, rate_hz):
+def test_deviations_equal_allantools_up_to_the_longest_cluster(kind, rate_hz):
     rng = np.random.default_rng(5)
     y = 1e2 * rng.standard_normal(700) + np.cumsum(rng.standard_normal(700))
     y = {"float": y, "int": np.rint(y).astype(np.int64), "float32": y.astype(np.float32)}[kind]
@@ -66,11 +66,11 @@ def test_equals_allantools_up_to_the_longest_cluster(kind, rate_hz):
     scale=st.sampled_from([1e-4, 1.0, 1e3]),
     seed=st.integers(0, 99),
 )
-def test_is_the_mean_over_the_reflected_rate_whatever_is_missing(n, m, holes, offset, scale, seed):
+def test_variance_is_the_mean_over_the_reflected_rate_without_missing_terms(n, m, holes, offset, scale, seed):
     rate = np.random.default_rng(seed).standard_normal(n)
     rate[[h for h in holes if h < n]] = np.nan
     found, terms = total_variance((offset + scale * rate)[:, None], np.array([m]))
-    squares = reflected(rate, m) ** 2 if m < n else np.array([])
+    squares = compute_reflected_differences(rate, m) ** 2 if m < n else np.array([])
     whole = ~np.isnan(squares)
     assert terms[0, 0] == whole.sum()
     if whole.any():
@@ -79,7 +79,7 @@ def test_is_the_mean_over_the_reflected_rate_whatever_is_missing(n, m, holes, of
         assert np.isnan(found[0, 0])
 
 
-def test_columns_do_not_mix_and_the_input_is_left_alone():
+def test_columns_are_independent_and_the_input_is_not_modified():
     values = np.random.default_rng(0).standard_normal((80, 3))
     values[:, 1], values[10, 2], values[11, 2] = np.nan, np.inf, -np.inf
     before = values.copy()
@@ -92,58 +92,58 @@ def test_columns_do_not_mix_and_the_input_is_left_alone():
         np.testing.assert_allclose(found[:, [k]], alone, rtol=1e-12)
 
 
-# --- what it estimates
+# --- properties of the estimator
 
 
-def test_bias_is_the_published_one_up_to_half_the_record():
+def test_bias_is_the_published_one_up_to_half_the_recording():
     for share, m in ((8, 12_500), (4, 25_000), (2, 50_000)):
-        one = total_estimator_moments(100_000, m)
-        loss = (1.0 - one.mean / one.allan) * share
+        moments = total_estimator_moments(100_000, m)
+        loss = (1.0 - moments.mean / moments.allan) * share
         assert loss[:4] == pytest.approx([-4.0 / 3.0, 0.0, 0.481, 0.750], abs=1e-3)
 
 
 @pytest.mark.parametrize(("n", "m"), [(40, 1), (40, 7), (41, 20), (40, 29), (41, 40), (300, 37), (301, 290)])
-def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
-    rows = differences(n, m)
+def test_moments_equal_sums_over_all_pairs_of_terms(n, m):
+    rows = compute_difference_weights(n, m)
     lags = moments_module.phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     noise = np.stack([rows @ g @ rows.T for g in lags])
     ramp = rows @ (0.5 * np.arange(n + 1.0) ** 2)
     mean = np.append(noise.diagonal(axis1=1, axis2=2).mean(axis=1), np.mean(ramp**2)) / (2 * m * m)
-    one = total_estimator_moments(n, m)
-    np.testing.assert_allclose(one.mean, mean, rtol=1e-7)
+    moments = total_estimator_moments(n, m)
+    np.testing.assert_allclose(moments.mean, mean, rtol=1e-7)
     theta = np.array([3.0, 1.0, 0.3, 1.0 / n**2, 1.0 / n**3])
-    together = np.tensordot(theta[:4], noise, 1)
-    variance = (2 * (together**2).sum() + 4 * theta[4] * ramp @ together @ ramp) / (2 * m * m * (n - 1)) ** 2
-    assert theta @ one.covariance @ theta == pytest.approx(variance, rel=1e-9 if n <= 256 else 0.02)
+    combined = np.tensordot(theta[:4], noise, 1)
+    variance = (2 * (combined**2).sum() + 4 * theta[4] * ramp @ combined @ ramp) / (2 * m * m * (n - 1)) ** 2
+    assert theta @ moments.covariance @ theta == pytest.approx(variance, rel=1e-9 if n <= 256 else 0.02)
 
 
 @pytest.mark.parametrize("m", [3, 33, 80, 150, 350, 600, 699])
-def test_the_coarse_grid_of_a_long_record_is_good_to_a_few_percent(m):
+def test_moments_on_the_coarse_grid_are_accurate_to_five_percent(m):
     n = 700
-    rows = differences(n, m)
+    rows = compute_difference_weights(n, m)
     lags = moments_module.phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     exact = [2.0 * ((rows @ g @ rows.T) ** 2).sum() / (2 * m * m * (n - 1.0)) ** 2 for g in lags]
     np.testing.assert_allclose(total_estimator_moments(n, m).covariance.diagonal()[:4], exact, rtol=0.05)
 
 
 @pytest.mark.parametrize(("share", "stated"), [(8, (12.0, 9.14, 7.08)), (4, (6.0, 4.46, 3.36)), (2, (3.0, 2.12, 1.5))])
-def test_degrees_of_freedom_are_howe_s_up_to_half_the_record(share, stated):
-    one = total_estimator_moments(64_000, 64_000 // share)
-    edf = 2.0 * one.mean[1:4] ** 2 / one.covariance.diagonal()[1:4]
+def test_degrees_of_freedom_agree_with_howe(share, stated):
+    moments = total_estimator_moments(64_000, 64_000 // share)
+    edf = 2.0 * moments.mean[1:4] ** 2 / moments.covariance.diagonal()[1:4]
     assert edf == pytest.approx(stated, rel=0.02)
 
 
-def test_a_ramp_alone_is_corrected_to_its_own_variance():
+def test_pure_ramp_gives_its_allan_variance():
     n, slope = 600, 0.01
     theta = np.array([[0.0], [0.0], [0.0], [0.0], [slope**2]])
     curve = compute_total_curve(slope * np.arange(n)[:, None], 1.0, theta)
     np.testing.assert_allclose(curve.tvar[:, 0], 0.5 * slope**2 * curve.factors**2, rtol=1e-9)
-    assert np.isnan(curve.edf).all()  # nothing in it varies
+    assert np.isnan(curve.edf).all()  # a ramp has no random variation
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 200.0])
-def test_intervals_hold_what_they_promise_up_to_half_the_record(rate_hz):
-    """χ² is a little wide at few degrees of freedom, 97 % at T/2; the counting error of 3000 records is 0.4 %."""
+def test_intervals_have_the_stated_coverage_up_to_half_the_recording(rate_hz):
+    """χ² covers 97 % at T/2 with few degrees of freedom; 3000 recordings determine the coverage to 0.4 %."""
     n, runs = 512, 3000
     rng = np.random.default_rng(21)
     theta = np.array([1e-4, 1.0, 0.02, 1e-3, 0.0])
@@ -160,14 +160,14 @@ def test_intervals_hold_what_they_promise_up_to_half_the_record(rate_hz):
     curve = compute_total_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
     truth = sum(s.avar(factors / rate_hz, 1.0 / rate_hz) for s in sources)
     np.testing.assert_allclose(curve.tvar.mean(axis=1), truth, rtol=0.1)
-    held = (curve.lo**2 <= truth[:, None]) & (truth[:, None] <= curve.hi**2)
-    assert (held[:3].mean(axis=1) > 0.944).all()
-    assert (held[:3].mean(axis=1) < 0.981).all()
+    covered = (curve.lo**2 <= truth[:, None]) & (truth[:, None] <= curve.hi**2)
+    assert (covered[:3].mean(axis=1) > 0.944).all()
+    assert (covered[:3].mean(axis=1) < 0.981).all()
     assert np.isnan(curve.lo[3]).all()
     assert np.isnan(curve.hi[3]).all()
 
 
-def test_the_shortest_cluster_is_allan_s_and_the_grid_ends_below_the_record():
+def test_shortest_cluster_equals_the_allan_variance_and_the_grid_ends_below_the_length():
     values = np.random.default_rng(2).standard_normal((300, 6))
     curve = compute_total_curve(values, 50.0, np.tile([[0.0], [0.02], [0.0], [0.0], [0.0]], 6))
     assert curve.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128, 256]
@@ -177,7 +177,7 @@ def test_the_shortest_cluster_is_allan_s_and_the_grid_ends_below_the_record():
     assert octave_cluster_sizes(255)[-1] == 128
 
 
-def test_without_known_noise_or_with_too_little_left_there_is_no_curve():
+def test_unknown_noise_or_too_few_terms_give_no_curve():
     values = np.random.default_rng(3).standard_normal((400, 2))
     values[200, 1] = np.nan
     theta = np.array([[0.0, 0.0], [np.nan, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
@@ -194,7 +194,7 @@ def test_without_known_noise_or_with_too_little_left_there_is_no_curve():
 
 
 @pytest.mark.data
-def test_phase_dat_of_stable32(reference):
+def test_stable32_values_of_phase_dat_are_reproduced(reference):
     with (reference / "phase-dat.csv").open() as stream:
         x = np.array([float(row["x"]) for row in csv.DictReader(stream)])
     with (reference / "phase-dat-stable32-totdev.csv").open() as stream:

@@ -1,4 +1,4 @@
-"""Covariances of Allan variances: against plain sums, against Greenhall & Riley, against simulation."""
+"""Tests of covariances of Allan variances against direct sums, Greenhall and Riley, and simulation."""
 
 import allantools
 import numpy as np
@@ -17,8 +17,8 @@ from monitor.estimation.allan.uncertainty import (
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 
 
-def plain_sum(n: int, first: int, second: int) -> np.ndarray:
-    """C^ab of two cluster sizes for all pairs a ≤ b, lag by lag, pair of terms by pair of terms."""
+def sum_covariances_directly(n: int, first: int, second: int) -> np.ndarray:
+    """Return C^ab of two cluster sizes for all pairs a ≤ b, summed over all pairs of terms."""
 
     def phase(t):
         t = np.abs(t).astype(float)
@@ -36,14 +36,14 @@ def plain_sum(n: int, first: int, second: int) -> np.ndarray:
 
 @pytest.mark.long
 @pytest.mark.parametrize("n", [64, 501, 900])
-def test_table_is_the_plain_sum(n):
+def test_covariance_table_equals_the_direct_sum(n):
     factors = np.array([1, 2, 3, 4, 7, 8, 30, 32, 100, 128, 250, 400])
     factors = factors[2 * factors < n + 1]
     covariance = covariance_table(n, factors).covariance
     for i, first in enumerate(factors):
         for j, second in enumerate(factors):
-            expected = plain_sum(n, first, second)
-            # sampled 1/f ends at half the rate: its second differences are smaller at the shortest τ
+            expected = sum_covariances_directly(n, first, second)
+            # Sampled 1/f noise ends at half the rate, so its second differences are smaller at the shortest τ.
             flicker = np.sqrt(np.prod(BiasInstability(B=1.0).avar(np.array([first, second], float), 1.0)))
             share = flicker / (2.0 * np.log(2.0) / np.pi)
             expected *= np.array([share ** ((a == 2) + (b == 2)) for a, b in PAIRS])
@@ -55,7 +55,7 @@ def test_table_is_the_plain_sum(n):
 @pytest.mark.parametrize(
     ("source", "alpha"), [(AngleRandomWalk(N=1.0), 0), (BiasInstability(B=1.0), -1), (RateRandomWalk(K=1.0), -2)]
 )
-def test_degrees_of_freedom_agree_with_greenhall_and_riley_where_that_is_good(source, alpha):
+def test_degrees_of_freedom_agree_with_greenhall_and_riley(source, alpha):
     factors = 2 ** np.arange(5, 12)
     t = covariance_table(20_000, factors)
     a = 1 - alpha
@@ -74,21 +74,21 @@ def test_degrees_of_freedom_agree_with_greenhall_and_riley_where_that_is_good(so
         (RateRandomWalk(K=1.0), (3, 3)),
     ],
 )
-def test_covariance_is_that_of_simulated_curves(source, pair):
+def test_covariance_agrees_with_simulated_curves(source, pair):
     n, factors, runs = 512, np.array([1, 4, 16, 64, 128]), 3000
     t = covariance_table(n, factors)
     rng = np.random.default_rng(11)
     records = np.stack([source.start_series(1.0, rng).draw_next_samples(n) for _ in range(runs)], axis=1)
     measured = np.cov(overlapping_avar(records, factors)[0])
     stated = t.covariance[:, :, PAIRS.index(pair)]
-    # a sample covariance of 3000 curves scatters by 3–5 % of the two deviations
+    # A sample covariance of 3000 curves scatters by 3–5 % of the product of both standard deviations.
     deviation = np.sqrt(stated.diagonal())
     error = np.abs(measured - stated) / np.outer(deviation, deviation)
     assert error.max() < 0.25
     assert np.median(error) < 0.05
 
 
-def test_interval_is_chi_square():
+def test_interval_follows_the_chi_square_distribution():
     lo, hi = deviation_intervals(np.array([4.0, np.nan]), np.array([7.3, 5.0]), 0.9)
     assert lo[0] == pytest.approx(np.sqrt(7.3 * 4.0 / chi2.ppf(0.95, 7.3)))
     assert hi[0] == pytest.approx(np.sqrt(7.3 * 4.0 / chi2.ppf(0.05, 7.3)))
@@ -97,25 +97,25 @@ def test_interval_is_chi_square():
     np.testing.assert_allclose([lo[0], hi[0]], expected)
 
 
-def test_a_fraction_of_a_degree_of_freedom_bounds_nothing_from_above_not_even_zeros():
+def test_very_few_degrees_of_freedom_give_no_upper_bound():
     lo, hi = deviation_intervals(np.array([0.0, 1.0, np.nan, 0.0]), np.array([1e-3, 1e-3, 1e-3, 10.0]))
     np.testing.assert_array_equal(lo[[0, 2, 3]], [0.0, np.nan, 0.0])
     np.testing.assert_array_equal(hi, [np.inf, np.inf, np.nan, 0.0])
 
 
-def test_too_short_a_window_is_nan_not_a_number():
+def test_cluster_longer_than_half_the_window_has_no_covariance():
     t = covariance_table(100, np.array([1, 50, 51]))
     assert t.terms.tolist() == [99, 1, -1]
     assert np.isfinite(t.covariance[:2, :2]).all()
     assert np.isnan(t.covariance[2]).all()
 
 
-def test_tables_are_renewed_as_the_window_grows_and_kept_when_it_is_full():
+def test_covariance_tables_are_renewed_with_growing_windows():
     tables = CovarianceTablesByAxis(np.array([1, 2, 4]), capacity=10_000)
-    made = [tables.table_of_axis(0, n, n) for n in range(8, 10_001)]
-    lengths = sorted({t.n for t in made})
+    tables_by_length = [tables.table_of_axis(0, n, n) for n in range(8, 10_001)]
+    lengths = sorted({t.n for t in tables_by_length})
     assert len(lengths) < np.log(10_000 / 8) / np.log(TABLE_STEP) + 12
-    assert all(t.n <= n < TABLE_STEP * t.n + 1 for n, t in zip(range(8, 10_001), made, strict=True))
+    assert all(t.n <= n < TABLE_STEP * t.n + 1 for n, t in zip(range(8, 10_001), tables_by_length, strict=True))
     assert tables.table_of_axis(0, 10_000, 10_000).n == 10_000
     assert tables.table_of_axis(0, 10_000, 10_000) is tables.table_of_axis(0, 10_000, 10_000)
     assert tables.table_of_axis(0, 50, 50).n == 50

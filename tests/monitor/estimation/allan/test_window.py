@@ -1,4 +1,4 @@
-"""The sliding window equals the whole-recording curve of its last samples, at every position, whatever came before."""
+"""Tests that the sliding Allan window equals the batch curve of its last samples at every position."""
 
 from itertools import pairwise
 
@@ -26,30 +26,32 @@ LENGTH = 100
 GRAVITY = np.array([0.0, 0.0, 0.01, 0.0, 0.0, 9.81])
 
 
-def made(n, seed=0, noise=1e-4):
+def simulate_values(n, seed=0, noise=1e-4):
     return noise * np.random.default_rng(seed).standard_normal((n, 6)) + GRAVITY
 
 
-def expected(values, length=LENGTH, factors=FACTORS):
+def compute_batch_avar(values, length=LENGTH, factors=FACTORS):
     return overlapping_avar(values[-length:], factors)
 
 
-def expected_of_spans(window, values):
-    """Row by row, each over its own span."""
-    rows = [expected(values, span, np.array([m])) for m, span in zip(window.factors, window.spans, strict=True)]
+def compute_batch_avar_of_spans(window, values):
+    """Compute each row over its own span."""
+    rows = [
+        compute_batch_avar(values, span, np.array([m])) for m, span in zip(window.factors, window.spans, strict=True)
+    ]
     return np.concatenate([avar for avar, _ in rows]), np.concatenate([terms for _, terms in rows])
 
 
-def check(window, values, rel=1e-9, largest=0.0):
-    """The window against the batch of the last samples of ``values``.
+def check_against_batch(window, values, rel=1e-9, largest=0.0):
+    """Compare the window with the batch of the last samples of ``values``.
 
-    Where few terms remain, and those small, the unit of the integer phase shows: one each side of a second difference.
-    ``largest``: deviation ever held, of which the sums keep 2^-53.
+    With few and small terms, the unit of the integer phase limits the accuracy of each second difference.
+    ``largest`` is the largest deviation so far; the sums are accurate to 2^-53 of it.
     """
     if (window.spans == window.length).all():
-        avar, terms = expected(values, window.length, window.factors)
+        avar, terms = compute_batch_avar(values, window.length, window.factors)
     else:
-        avar, terms = expected_of_spans(window, values)
+        avar, terms = compute_batch_avar_of_spans(window, values)
     assert np.array_equal(window.term_counts(), terms)
     found = window.avar()
     assert np.array_equal(np.isnan(found), np.isnan(avar))
@@ -58,28 +60,28 @@ def check(window, values, rel=1e-9, largest=0.0):
     assert (np.isnan(avar) | (np.abs(found - avar) <= within)).all(), np.nanmax(np.abs(found - avar) / within)
 
 
-def assert_same(one, other):
-    """Bit for bit: how the samples were cut must not be seen."""
-    assert np.array_equal(one.avar(), other.avar(), equal_nan=True)
-    assert np.array_equal(one.term_counts(), other.term_counts())
-    assert one.samples_in_window == other.samples_in_window
-    assert one.samples_since_reset == other.samples_since_reset
+def assert_same_state(first, second):
+    """Compare bit for bit because block sizes must not matter."""
+    assert np.array_equal(first.avar(), second.avar(), equal_nan=True)
+    assert np.array_equal(first.term_counts(), second.term_counts())
+    assert first.samples_in_window == second.samples_in_window
+    assert first.samples_since_reset == second.samples_since_reset
 
 
-# --- one truth, whatever the cut
+# --- block sizes
 
 
 def test_every_position_equals_the_batch():
-    values = made(700)
-    values[rng_rows(700, 12)] = np.nan
+    values = simulate_values(700)
+    values[choose_rows(700, 12)] = np.nan
     values[300:330, 2] = np.nan
     window = AllanWindow(LENGTH, FACTORS)
     for i in range(len(values)):
         window.append_samples(values[i : i + 1])
-        check(window, values[: i + 1])
+        check_against_batch(window, values[: i + 1])
 
 
-def rng_rows(n, k):
+def choose_rows(n, k):
     return np.random.default_rng(5).choice(n, k, replace=False)
 
 
@@ -94,7 +96,7 @@ def rng_rows(n, k):
     ),
     length=st.sampled_from([100, 101, 163, 164, 165, 300]),
 )
-def test_blocks_of_any_cut_equal_one_by_one(cuts, values, length):
+def test_any_block_sizes_give_the_same_result(cuts, values, length):
     factors = cluster_sizes(length, 1.0, "decade10")
     whole, cut, single = (AllanWindow(length, factors) for _ in range(3))
     whole.append_samples(values)
@@ -106,7 +108,7 @@ def test_blocks_of_any_cut_equal_one_by_one(cuts, values, length):
     assert np.array_equal(whole.term_counts(), single.term_counts())
     assert np.array_equal(cut.term_counts(), single.term_counts())
     for window in (whole, cut, single):
-        check(window, values, largest=70.0)
+        check_against_batch(window, values, largest=70.0)
     atol = (2.0**-50 * 70.0) ** 2
     np.testing.assert_allclose(whole.avar(), single.avar(), rtol=1e-13, atol=atol)
     np.testing.assert_allclose(cut.avar(), single.avar(), rtol=1e-13, atol=atol)
@@ -117,29 +119,29 @@ def test_blocks_of_any_cut_equal_one_by_one(cuts, values, length):
     holes=st.lists(st.tuples(st.integers(0, 800), st.integers(1, 160), st.integers(0, 6)), max_size=6),
     length=st.integers(100, 260),
 )
-def test_missing_anywhere_on_one_axis_or_all(holes, length):
-    values = made(800, seed=length)
+def test_missing_samples_on_one_or_all_axes_equal_the_batch(holes, length):
+    values = simulate_values(800, seed=length)
     for at, n, axis in holes:
         values[at : at + n, slice(None) if axis == 6 else axis] = np.nan
     factors = cluster_sizes(length, 1.0)
     window = AllanWindow(length, factors)
     for start in range(0, len(values), 37):
         window.append_samples(values[start : start + 37])
-        check(window, values[: start + 37])
+        check_against_batch(window, values[: start + 37])
 
 
-# --- life
+# --- filling and resetting
 
 
-def test_growing_full_and_reset():
-    values = made(260)
+def test_window_grows_fills_and_resets():
+    values = simulate_values(260)
     window = AllanWindow(LENGTH, FACTORS)
     assert np.isnan(window.avar()).all()
     assert not window.term_counts().any()
     window.append_samples(values[:60])
     assert (window.samples_in_window, window.samples_since_reset) == (60, 60)
-    check(window, values[:60])
-    assert np.isnan(window.avar()[-2:]).sum() == 6  # m = 50 needs a hundred
+    check_against_batch(window, values[:60])
+    assert np.isnan(window.avar()[-2:]).sum() == 6  # m = 50 needs 100 samples
     window.append_samples(values[60:])
     assert (window.samples_in_window, window.samples_since_reset) == (100, 260)
     window.discard_samples()
@@ -148,48 +150,48 @@ def test_growing_full_and_reset():
     window.append_samples(values)
     fresh = AllanWindow(LENGTH, FACTORS)
     fresh.append_samples(values)
-    assert_same(window, fresh)
+    assert_same_state(window, fresh)
 
 
-def test_an_empty_block_changes_nothing():
+def test_empty_block_changes_nothing():
     window = AllanWindow(LENGTH, FACTORS)
     window.append_samples(np.empty((0, 6)))
     assert window.samples_since_reset == 0
 
 
 @pytest.mark.parametrize("n", [0, 1, 37, 64, 99, 100])
-def test_skipping_is_that_many_missing_rows(n):
-    values = made(500)
+def test_skipping_equals_missing_rows(n):
+    values = simulate_values(500)
     skipped, missing = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
     for window in (skipped, missing):
         window.append_samples(values[:250])
     skipped.append_missing_samples(n)
     missing.append_samples(np.full((n, 6), np.nan))
-    assert_same(skipped, missing)
+    assert_same_state(skipped, missing)
     for window in (skipped, missing):
         window.append_samples(values[250:])
-    assert_same(skipped, missing)
-    check(skipped, values)
+    assert_same_state(skipped, missing)
+    check_against_batch(skipped, values)
 
 
-def test_a_skip_longer_than_the_window_empties_it():
+def test_skip_longer_than_the_window_empties_it():
     window, fresh = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
-    window.append_samples(made(500))
+    window.append_samples(simulate_values(500))
     window.append_missing_samples(10**12)
-    for one in (window, fresh):
-        one.append_samples(made(70, seed=3))
-    assert_same(window, fresh)
+    for sliding in (window, fresh):
+        sliding.append_samples(simulate_values(70, seed=3))
+    assert_same_state(window, fresh)
 
 
-def test_skips_in_pieces_cross_the_piece_length():
+def test_long_skip_is_processed_in_parts():
     length = 9000
     factors = np.array([1, 100, 4500])
-    values = made(20_000)
+    values = simulate_values(20_000)
     window = AllanWindow(length, factors)
     window.append_samples(values)
     window.append_missing_samples(8999)
     window.append_samples(values[:1])
-    check(window, np.concatenate([values, np.full((8999, 6), np.nan), values[:1]]))
+    check_against_batch(window, np.concatenate([values, np.full((8999, 6), np.nan), values[:1]]))
 
 
 @pytest.mark.parametrize(
@@ -209,31 +211,31 @@ def test_impossible_windows_are_refused(length, factors):
         AllanWindow(length, np.array(factors, np.int64))
 
 
-# --- forgetting all but the newest
+# --- missing samples
 
 
-def broken(n, seed=0):
-    """Noise with single samples, an axis and a stretch of all axes missing."""
-    values = made(n, seed)
+def simulate_values_with_gaps(n, seed=0):
+    """Return noise in which single samples, part of one axis and a stretch of all axes are missing."""
+    values = simulate_values(n, seed)
     values[np.random.default_rng(seed + 1).choice(n, n // 60, replace=False)] = np.nan
     values[n // 2 : n // 2 + 9, 3] = np.nan
     values[n // 3 : n // 3 + 5] = np.nan
     return values
 
 
-# --- a span for each row
+# --- one span per row
 
 
-SPANNED = np.array([1, 1, 2, 7, 7, 3, 50, 16])
+FACTORS_WITH_SPANS = np.array([1, 1, 2, 7, 7, 3, 50, 16])
 SPANS = np.array([2, 300, 5, 14, 100, 163, 300, 299])
 
 
-def test_every_row_equals_the_batch_of_its_own_span_at_every_position():
-    values = broken(900)
-    window = AllanWindow(300, SPANNED, SPANS)
+def test_each_row_equals_the_batch_of_its_own_span():
+    values = simulate_values_with_gaps(900)
+    window = AllanWindow(300, FACTORS_WITH_SPANS, SPANS)
     for i in range(len(values)):
         window.append_samples(values[i : i + 1])
-        check(window, values[: i + 1])
+        check_against_batch(window, values[: i + 1])
 
 
 @settings(max_examples=40, deadline=None)
@@ -242,31 +244,31 @@ def test_every_row_equals_the_batch_of_its_own_span_at_every_position():
     shares=st.lists(st.floats(0.0, 1.0), min_size=8, max_size=8),
     holes=st.lists(st.tuples(st.integers(0, 690), st.integers(1, 80), st.integers(0, 6)), max_size=4),
 )
-def test_rows_of_any_span_and_blocks_of_any_cut(cuts, shares, holes):
-    values = made(700, seed=len(cuts))
+def test_any_spans_and_block_sizes_give_the_same_result(cuts, shares, holes):
+    values = simulate_values(700, seed=len(cuts))
     for at, n, axis in holes:
         values[at : at + n, slice(None) if axis == 6 else axis] = np.nan
-    spans = 2 * SPANNED + np.floor(np.array(shares) * (200 - 2 * SPANNED)).astype(np.int64)
-    cut, single = (AllanWindow(200, SPANNED, spans) for _ in range(2))
+    spans = 2 * FACTORS_WITH_SPANS + np.floor(np.array(shares) * (200 - 2 * FACTORS_WITH_SPANS)).astype(np.int64)
+    cut, single = (AllanWindow(200, FACTORS_WITH_SPANS, spans) for _ in range(2))
     for a, b in pairwise([0, *sorted(cuts), len(values)]):
         cut.append_samples(values[a:b])
     for row in values:
         single.append_samples(row[None])
     assert np.array_equal(cut.term_counts(), single.term_counts())
     np.testing.assert_allclose(cut.avar(), single.avar(), rtol=1e-13)
-    check(cut, values)
+    check_against_batch(cut, values)
 
 
-def test_full_length_spans_are_the_plain_window():
-    values = broken(900)
+def test_full_length_spans_equal_a_window_without_spans():
+    values = simulate_values_with_gaps(900)
     plain, spanned = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS, np.full(FACTORS.size, LENGTH))
     for window in (plain, spanned):
         window.append_samples(values)
-    assert_same(plain, spanned)
+    assert_same_state(plain, spanned)
 
 
 def test_slope_and_length_are_those_of_the_whole_window():
-    values = made(900)
+    values = simulate_values(900)
     plain, spanned = AllanWindow(300, np.array([1, 2])), AllanWindow(300, np.array([1, 2]), np.array([10, 20]))
     for window in (plain, spanned):
         window.append_samples(values)
@@ -274,12 +276,12 @@ def test_slope_and_length_are_those_of_the_whole_window():
     assert np.array_equal(plain.drift_slopes_by_axis_and_tau()[0], spanned.drift_slopes_by_axis_and_tau()[0])
 
 
-def test_a_transient_leaves_each_row_after_its_own_span():
-    values = made(900)
+def test_transient_leaves_each_row_after_its_span():
+    values = simulate_values(900)
     values[600:603] += 1e6 * 1e-4
     window = AllanWindow(300, np.array([1, 1]), np.array([20, 300]))
     window.append_samples(values[:623])
-    check(window, values[:623])
+    check_against_batch(window, values[:623])
     short, long = window.avar()[:, 0]
     assert short < 1e-7 < 1.0 < long
 
@@ -294,45 +296,45 @@ def test_impossible_spans_are_refused(factors, spans):
 
 
 @pytest.mark.parametrize(("length", "rate_hz"), [(100, 1.0), (100, 100.0), (360_000, 100.0), (3_600_000, 1000.0)])
-def test_quick_spans_fit_any_window(length, rate_hz):
+def test_display_spans_fit_any_window(length, rate_hz):
     factors = np.unique([*cluster_sizes(length, rate_hz), length // 2])
     window = AllanWindow(length, factors, newest_samples_per_displayed_tau(factors, rate_hz, length))
     assert ((window.spans >= 16 * factors) | (window.spans == length)).all()
     assert (window.spans >= min(10 * rate_hz, length)).all()
 
 
-# --- the kernel, called from other compiled code
+# --- the kernel called from other compiled code
 
 
-def test_staged_samples_can_be_taken_one_at_a_time():
-    values = broken(STAGE_SAMPLES)
+def test_staged_samples_can_be_appended_singly():
+    values = simulate_values_with_gaps(STAGE_SAMPLES)
     window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
     for row in values:
         plain.append_samples(row[None])
     window._stage[:] = values
     for row in range(STAGE_SAMPLES):
         append_staged_samples(window._ints, window._floats, window._missing, window._taus, row, 1)
-    assert_same(window, plain)
+    assert_same_state(window, plain)
     window._stage[:] = values[::-1]
     append_staged_samples(window._ints, window._floats, window._missing, window._taus, 100, 300)
     plain.append_samples(values[::-1][100:400])
-    assert_same(window, plain)
+    assert_same_state(window, plain)
 
 
 # --- long runs, large values
 
 
-def test_ten_thousand_turns_of_phase_and_ring():
-    """Gravity alone turns the 64-bit phase every 3300 samples at the finest scale; the ring turns every 165."""
-    values = made(50_000, seed=8)
+def test_phase_and_ring_overflow_leave_the_curve_exact():
+    """Gravity overflows the 64-bit phase every 3300 samples at the finest scale; the ring wraps every 165 samples."""
+    values = simulate_values(50_000, seed=8)
     window = AllanWindow(LENGTH, FACTORS)
     for turn in range(40):
         window.append_samples(values)
-        check(window, values[-(1000 + turn) :])
+        check_against_batch(window, values[-(1000 + turn) :])
     assert window.samples_since_reset == 2_000_000
 
 
-def test_full_scale_square_wave_at_the_longest_tau_does_not_overflow():
+def test_full_scale_square_wave_does_not_overflow():
     length = 4096
     factors = cluster_sizes(length, 1.0)
     m = int(factors[-1])
@@ -340,131 +342,131 @@ def test_full_scale_square_wave_at_the_longest_tau_does_not_overflow():
     values = sign * np.array(FULL_SCALE[:6])
     window = AllanWindow(length, factors)
     window.append_samples(values)
-    check(window, values, rel=1e-12)
+    check_against_batch(window, values, rel=1e-12)
 
 
 @pytest.mark.parametrize("height", [1e-4 * 1e6, 400.0, 2000.0])
-@pytest.mark.parametrize("held", [1, 5, 400, 3000])
-def test_what_a_transient_added_is_taken_out_again(height, held):
-    """Held longer than the longest τ, and beyond full scale: then σ² at long τ is wrong while it is in there."""
+@pytest.mark.parametrize("duration", [1, 5, 400, 3000])
+def test_transient_is_removed_from_the_sums_completely(height, duration):
+    """A transient beyond full scale and longer than the longest τ makes σ² wrong only while the window contains it."""
     length = 1000
-    values = made(9000, seed=11)
-    values[2000 : 2000 + held] += height
+    values = simulate_values(9000, seed=11)
+    values[2000 : 2000 + duration] += height
     factors = cluster_sizes(length, 1.0)
     window = AllanWindow(length, factors)
     window.append_samples(values[:2500])
-    assert window.avar()[0, 0] > 1e-5 or held > 1000
+    assert window.avar()[0, 0] > 1e-5 or duration > 1000
     window.append_samples(values[2500:])
-    check(window, values)
+    check_against_batch(window, values)
 
 
 @pytest.mark.parametrize("wrong", [1e6, 1e12, 1e300, np.inf, -np.inf])
-def test_impossible_values_do_not_stay(wrong):
-    values = made(1000)
+def test_impossible_values_do_not_remain(wrong):
+    values = simulate_values(1000)
     values[200:203] = wrong
     window = AllanWindow(LENGTH, FACTORS)
     window.append_samples(values[:250])
     assert np.isfinite(window.avar()[0]).all()
     window.append_samples(values[250:])
-    check(window, values)
+    check_against_batch(window, values)
 
 
 @pytest.mark.parametrize("wrong", [1e300, np.inf, -np.inf])
-def test_what_phase_cannot_hold_counts_as_missing(wrong):
-    values, missing = made(150), made(150)
+def test_values_beyond_the_phase_range_count_as_missing(wrong):
+    values, missing = simulate_values(150), simulate_values(150)
     values[120, 4], missing[120, 4] = wrong, np.nan
     window = AllanWindow(LENGTH, FACTORS)
     window.append_samples(values)
-    check(window, missing)
+    check_against_batch(window, missing)
 
 
-def test_a_swing_beyond_twice_full_scale_recovers():
-    """±2000 m/s² for longer than the longest τ wraps the second difference: finite nonsense, then exact again."""
+def test_swing_beyond_twice_full_scale_recovers():
+    """±2000 m/s² for longer than the longest τ wraps the second difference; later values are exact again."""
     length = 4096
     factors = cluster_sizes(length, 1.0)
-    values = made(40_000, seed=2)
+    values = simulate_values(40_000, seed=2)
     values[8000:10_000] = 2000.0
     values[10_000:12_000] = -2000.0
     window = AllanWindow(length, factors)
     window.append_samples(values[:12_000])
     assert np.isfinite(window.avar()).all()
     window.append_samples(values[12_000:])
-    check(window, values)
+    check_against_batch(window, values)
 
 
-# --- symmetries
+# --- invariance
 
 
-def test_an_offset_or_a_scale_changes_nothing_else():
-    values = made(3000)
-    plain, moved, larger = (AllanWindow(LENGTH, FACTORS) for _ in range(3))
+def test_offset_has_no_effect_and_scale_is_quadratic():
+    values = simulate_values(3000)
+    plain, shifted, scaled = (AllanWindow(LENGTH, FACTORS) for _ in range(3))
     plain.append_samples(values)
-    moved.append_samples(values + np.array([1.0, -2.0, 3.0, -20.0, 30.0, 100.0]))
-    larger.append_samples(2.0 * values)
-    np.testing.assert_allclose(moved.avar(), plain.avar(), rtol=1e-9)
-    np.testing.assert_allclose(larger.avar(), 4.0 * plain.avar(), rtol=1e-9)
+    shifted.append_samples(values + np.array([1.0, -2.0, 3.0, -20.0, 30.0, 100.0]))
+    scaled.append_samples(2.0 * values)
+    np.testing.assert_allclose(shifted.avar(), plain.avar(), rtol=1e-9)
+    np.testing.assert_allclose(scaled.avar(), 4.0 * plain.avar(), rtol=1e-9)
 
 
-def test_a_slope_adds_its_own_variance():
-    """A ramp alone gives σ² = R² τ²/2 (IEEE Std 952), at every position."""
+def test_ramp_has_its_known_variance():
+    """A pure ramp gives σ² = R² τ²/2 (IEEE Std 952) at every position."""
     slope = np.array([1e-3, -2e-3, 1e-5, 1e-2, 3e-3, -1e-3])
     window = AllanWindow(LENGTH, FACTORS)
     window.append_samples(np.arange(5000)[:, None] * slope)
     np.testing.assert_allclose(window.avar(), 0.5 * (FACTORS[:, None] * slope) ** 2, rtol=1e-9)
 
 
-def test_an_axis_that_is_never_measured():
-    values = made(500)
+def test_unmeasured_axis_has_no_terms():
+    values = simulate_values(500)
     values[:, 4] = np.nan
     window = AllanWindow(LENGTH, FACTORS)
     window.append_samples(values)
     assert np.isnan(window.avar()[:, 4]).all()
     assert not window.term_counts()[:, 4].any()
-    check(window, values)
+    check_against_batch(window, values)
 
 
-# --- arrays as they come
+# --- array types
 
 
-@pytest.mark.parametrize("how", ["read-only", "fortran", "strided", "float32", "integers", "list"])
-def test_any_array_is_taken_by_the_one_compiled_version(how):
-    values = np.rint(made(300) * 1e4)
-    same = {
+@pytest.mark.parametrize("array_type", ["read-only", "fortran", "strided", "float32", "integers", "list"])
+def test_any_array_type_is_accepted_without_recompilation(array_type):
+    values = np.rint(simulate_values(300) * 1e4)
+    converted = {
         "read-only": values.copy(),
         "fortran": np.asfortranarray(values),
         "strided": np.repeat(values, 2, axis=0)[::2],
         "float32": values.astype(np.float32),
         "integers": values.astype(np.int32),
         "list": values.tolist(),
-    }[how]
-    if how == "read-only":
-        same.flags.writeable = False
+    }[array_type]
+    if array_type == "read-only":
+        converted.flags.writeable = False
     window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
     plain.append_samples(values)
     versions = append_staged_samples.signatures
-    window.append_samples(same)
-    assert_same(window, plain)
+    window.append_samples(converted)
+    assert_same_state(window, plain)
     assert append_staged_samples.signatures == versions
-    assert how == "list" or same is not values
+    assert array_type == "list" or converted is not values
 
 
-def test_updating_leaves_the_caller_s_array_writable():
-    values = made(10)
+def test_input_array_stays_writable():
+    values = simulate_values(10)
     AllanWindow(LENGTH, FACTORS).append_samples(values)
     assert values.flags.writeable
 
 
 @pytest.mark.parametrize("shape", [(10, 5), (10, 7), (6,), (10, 6, 1)])
-def test_a_wrong_shape_is_refused(shape):
+def test_wrong_shape_is_refused(shape):
     with pytest.raises(ValueError, match=r"\[n, 6\]"):
         AllanWindow(LENGTH, FACTORS).append_samples(np.zeros(shape))
 
 
-# --- any order of calls
+# --- random sequences of calls
 
 
-class Calls(RuleBasedStateMachine):
-    """A window of several spans, beside the samples that it should hold: those of each axis, missing ones as NaN."""
+class WindowCalls(RuleBasedStateMachine):
+    """Calls a window of several spans and keeps the expected samples of each axis, with missing samples as NaN."""
 
     def __init__(self):
         super().__init__()
@@ -472,18 +474,18 @@ class Calls(RuleBasedStateMachine):
         self.window = AllanWindow(
             length, np.array([1, 3, 1, 20, 65, 20]), np.array([length, 99, 40, length, length, 77])
         )
-        self.held = np.empty((0, 6))
+        self.expected_samples = np.empty((0, 6))
         self.given = 0
 
     @rule(n=st.integers(0, 200), holes=st.lists(st.tuples(st.integers(0, 199), st.integers(0, 5)), max_size=4))
     def update(self, n, holes):
-        rows = made(n, self.given)
+        rows = simulate_values(n, self.given)
         self.given += 1
         for row, axis in holes:
             if row < n:
                 rows[row, axis] = np.nan
         self.window.append_samples(rows)
-        self.held = np.concatenate([self.held, rows])[-self.window.length :]
+        self.expected_samples = np.concatenate([self.expected_samples, rows])[-self.window.length :]
 
     @rule(n=st.integers(1, 3))
     def update_one_by_one(self, n):
@@ -494,47 +496,52 @@ class Calls(RuleBasedStateMachine):
     def skip(self, n):
         self.window.append_missing_samples(n)
         empty = n > self.window.length
-        self.held = np.concatenate([self.held[:0] if empty else self.held, np.full((0 if empty else n, 6), np.nan)])
-        self.held = self.held[-self.window.length :]
+        self.expected_samples = np.concatenate(
+            [self.expected_samples[:0] if empty else self.expected_samples, np.full((0 if empty else n, 6), np.nan)]
+        )
+        self.expected_samples = self.expected_samples[-self.window.length :]
 
     @rule(axis=st.integers(0, 5), n=st.integers(0, LENGTH + 33))
     def forget(self, axis, n):
         self.window.keep_newest(axis, n)
-        self.held[: max(len(self.held) - n, 0), axis] = np.nan
+        self.expected_samples[: max(len(self.expected_samples) - n, 0), axis] = np.nan
 
     @rule()
     def reset(self):
         self.window.discard_samples()
-        self.held = self.held[:0]
+        self.expected_samples = self.expected_samples[:0]
 
     @invariant()
-    def is_the_batch(self):
-        assert self.window.samples_in_window == len(self.held)
-        check(self.window, self.held)
-        if len(self.held) >= 3:
+    def window_equals_the_batch(self):
+        assert self.window.samples_in_window == len(self.expected_samples)
+        check_against_batch(self.window, self.expected_samples)
+        if len(self.expected_samples) >= 3:
             np.testing.assert_allclose(
-                self.window.drift_slopes_by_axis_and_tau()[0], rate_slope_from_thirds(self.held), rtol=1e-6, atol=1e-12
+                self.window.drift_slopes_by_axis_and_tau()[0],
+                rate_slope_from_thirds(self.expected_samples),
+                rtol=1e-6,
+                atol=1e-12,
             )
-            seen, true = (
+            found, expected = (
                 self.window.drift_slopes_by_axis_and_tau()[1],
-                rate_slope_per_tau(self.held, self.window.factors),
+                rate_slope_per_tau(self.expected_samples, self.window.factors),
             )
-            assert np.array_equal(np.isnan(seen), np.isnan(true))
-            whole = np.isfinite(self.held).all(axis=0)  # with a gap, each puts another mean in its place
-            np.testing.assert_allclose(seen[:, whole], true[:, whole], rtol=1e-5, atol=1e-12)
+            assert np.array_equal(np.isnan(found), np.isnan(expected))
+            whole = np.isfinite(self.expected_samples).all(axis=0)  # window and batch replace a gap by different means
+            np.testing.assert_allclose(found[:, whole], expected[:, whole], rtol=1e-5, atol=1e-12)
 
 
 @pytest.mark.long
-def test_any_order_of_calls_leaves_the_batch_of_what_is_held():
-    run_state_machine_as_test(Calls, settings=settings(max_examples=60, stateful_step_count=20, deadline=None))
+def test_random_sequences_of_calls_equal_the_batch():
+    run_state_machine_as_test(WindowCalls, settings=settings(max_examples=60, stateful_step_count=20, deadline=None))
 
 
-# --- one axis begins anew
+# --- restart of one axis
 
 
 @pytest.mark.parametrize("kept", [0, 1, 5, 90, LENGTH - 1])
-def test_forgetting_one_axis_makes_its_older_samples_missing(kept):
-    values = made(3 * LENGTH)
+def test_keeping_the_newest_samples_of_one_axis_makes_older_ones_missing(kept):
+    values = simulate_values(3 * LENGTH)
     values[LENGTH : LENGTH + 7, 2] = np.nan
     window, expected = AllanWindow(LENGTH, FACTORS), values[: 2 * LENGTH].copy()
     window.append_samples(expected)
@@ -548,8 +555,8 @@ def test_forgetting_one_axis_makes_its_older_samples_missing(kept):
         assert window.avar()[terms > 0] == pytest.approx(avar[terms > 0], rel=1e-9)
 
 
-def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
-    values = made(LENGTH) + 1e-3 * np.arange(LENGTH)[:, None]
+def test_slope_of_a_restarted_axis_uses_its_own_samples():
+    values = simulate_values(LENGTH) + 1e-3 * np.arange(LENGTH)[:, None]
     window = AllanWindow(LENGTH, FACTORS)
     window.append_samples(values)
     window.keep_newest(4, 60)
@@ -563,21 +570,21 @@ def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
         rate_slope_from_thirds(values)[[0, 5]], rel=1e-6
     )
     expected = rate_slope_per_tau(values[-60:], FACTORS)[:, 4]
-    there = np.isfinite(expected)
-    assert window.drift_slopes_by_axis_and_tau(lengths)[1][there, 4] == pytest.approx(expected[there], rel=1e-6)
+    known = np.isfinite(expected)
+    assert window.drift_slopes_by_axis_and_tau(lengths)[1][known, 4] == pytest.approx(expected[known], rel=1e-6)
 
 
-# --- for ever
+# --- very long runs
 
 
 @pytest.mark.long
-def test_ten_million_samples_with_gaps_and_a_transient_leave_no_trace():
-    """The same program runs 10⁹; see docs/benchmarks.md."""
+def test_ten_million_samples_with_gaps_and_a_transient_leave_no_error():
+    """The benchmark runs 10⁹ samples; see docs/benchmarks.md."""
     assert long_run.run(10, lambda line: None) < 1e-9
 
 
 @pytest.mark.parametrize("gap", [(20, 3), (480, 5), (900, 6)])
-def test_a_small_gap_leaves_the_slope(gap):
+def test_small_gap_hardly_changes_the_slope(gap):
     n, (at, missing) = 1000, gap
     factors = np.array([1, 4, 16, 64, 250])
     values = 9.81 + 1e-2 * np.random.default_rng(7).standard_normal((n, 6)) + 1e-3 * np.arange(n)[:, None]
@@ -589,7 +596,7 @@ def test_a_small_gap_leaves_the_slope(gap):
     np.testing.assert_allclose(
         window.drift_slopes_by_axis_and_tau()[0], whole.drift_slopes_by_axis_and_tau()[0], rtol=0.01
     )
-    # a missing sample stands for the level, here up to the whole ramp away
+    # A missing sample is replaced by the mean level, which differs from the ramp by up to its whole height.
     np.testing.assert_allclose(
         window.drift_slopes_by_axis_and_tau()[1][3:], whole.drift_slopes_by_axis_and_tau()[1][3:], rtol=0.05
     )

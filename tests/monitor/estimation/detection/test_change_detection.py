@@ -1,4 +1,4 @@
-"""The detector finds what changes, when, and says the letters; it keeps silent else, however samples are cut."""
+"""Tests of the detection of changes in noise and bias: kinds, times, letters and false alarms."""
 
 import numpy as np
 import pytest
@@ -23,28 +23,28 @@ SIGMA = 1e-3
 GZ = 2
 
 
-def white(n, seed=0):
+def simulate_white_noise(n, seed=0):
     return SIGMA * np.random.default_rng(seed).standard_normal((n, 6)) + [0.0, 0.0, 0.1, 0.0, 0.0, 9.81]
 
 
-def found(values, rate_hz=100.0, **options):
+def find_changes(values, rate_hz=100.0, **options):
     detector = NoiseAndBiasChangeDetector(rate_hz, **options)
     detector.process_samples(values)
     return detector.take_changes()
 
 
-def only(values, **options):
-    changes = found(values, **options)
+def find_single_change(values, **options):
+    changes = find_changes(values, **options)
     assert len(changes) == 1, [change.text for change in changes]
     assert changes[0].axis == GZ
     return changes[0]
 
 
-# --- one truth, whatever the cut
+# --- block sizes
 
 
-def eventful():
-    values = white(30_000)
+def simulate_changing_noise():
+    values = simulate_white_noise(30_000)
     values[12_000:16_000, 0] *= 1.7
     values[20_000:, 1] += 5 * SIGMA
     values[21_000:21_100:3, 4] += 0.1
@@ -53,22 +53,22 @@ def eventful():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_blocks_of_any_cut_equal_one_by_one(seed):
-    values = eventful()
+def test_any_block_sizes_give_the_same_changes(seed):
+    values = simulate_changing_noise()
     whole, cut = NoiseAndBiasChangeDetector(100.0), NoiseAndBiasChangeDetector(100.0)
     whole.process_samples(values)
     edges = np.unique(np.random.default_rng(seed).integers(0, len(values), 200))
     for part in np.split(values, edges):
         cut.process_samples(part)
-    one, other = whole.take_changes(), cut.take_changes()
-    assert {change.kind for change in one} == {"noise_changed", "bias_stepped", "outlier_burst"}
-    assert one == other
+    first, second = whole.take_changes(), cut.take_changes()
+    assert {change.kind for change in first} == {"noise_changed", "bias_stepped", "outlier_burst"}
+    assert first == second
     for a, b in zip(whole._state, cut._state, strict=True):
         assert np.array_equal(a, b)
 
 
-def test_one_by_one_equals_the_block():
-    values = eventful()[:13_000]
+def test_single_samples_give_the_same_state_as_a_block():
+    values = simulate_changing_noise()[:13_000]
     whole, single = NoiseAndBiasChangeDetector(100.0), NoiseAndBiasChangeDetector(100.0)
     whole.process_samples(values)
     for row in values:
@@ -77,8 +77,8 @@ def test_one_by_one_equals_the_block():
     assert np.array_equal(whole._state.cusum, single._state.cusum)
 
 
-def test_the_reference_is_the_allan_variance_of_disjoint_pairs():
-    values = white(1 << 16)
+def test_reference_is_the_allan_variance_of_disjoint_pairs():
+    values = simulate_white_noise(1 << 16)
     detector = NoiseAndBiasChangeDetector(100.0)
     detector.process_samples(values)
     band = detector._state.band
@@ -86,67 +86,69 @@ def test_the_reference_is_the_allan_variance_of_disjoint_pairs():
         means = values[:, GZ].reshape(-1, 1 << j).mean(1)
         squares = 0.5 * (means[1::2] - means[::2]) ** 2
         assert band[GZ, j, N] == squares.size
-        assert band[GZ, j, S] / band[GZ, j, N] == pytest.approx(squares.mean(), rel=2e-3)  # clipping takes 2e-4
+        assert band[GZ, j, S] / band[GZ, j, N] == pytest.approx(
+            squares.mean(), rel=2e-3
+        )  # clipping reduces the variance by 2e-4
     assert (band[:, :6, F] < 2.0).all()
 
 
-def test_a_missing_sample_costs_its_own_differences_only():
-    values = white(4096)
+def test_missing_sample_removes_only_its_own_differences():
+    values = simulate_white_noise(4096)
     values[1000, GZ] = np.nan
     detector = NoiseAndBiasChangeDetector(100.0)
     detector.process_samples(values)
     terms = detector._state.band[GZ, :9, N]
     pairs = 4096 // (2 << np.arange(9))
     short = 2 ** np.arange(9) < TICK_SAMPLES
-    # blocks of a tick and more bear the loss of a sixteenth
+    # Blocks of at least one tick tolerate the loss of a sixteenth of their samples.
     assert np.array_equal(terms, pairs - short) or terms[8] == 0.0
     assert np.array_equal(terms[:5], pairs[:5] - 1)
     assert terms[5] == pairs[5]
 
 
-def test_skipped_samples_are_missing_samples():
-    values = white(12_000)
-    one, other = NoiseAndBiasChangeDetector(100.0), NoiseAndBiasChangeDetector(100.0)
-    one.process_samples(values[:5000])
-    one.skip_missing_samples(700)
-    one.process_samples(values[5000:])
-    other.process_samples(np.concatenate([values[:5000], np.full((700, 6), np.nan), values[5000:]]))
-    assert one.samples_since_start == other.samples_since_start == 12_700
-    assert np.array_equal(one._state.cum, other._state.cum)
+def test_skipped_samples_equal_missing_samples():
+    values = simulate_white_noise(12_000)
+    skipping, missing = NoiseAndBiasChangeDetector(100.0), NoiseAndBiasChangeDetector(100.0)
+    skipping.process_samples(values[:5000])
+    skipping.skip_missing_samples(700)
+    skipping.process_samples(values[5000:])
+    missing.process_samples(np.concatenate([values[:5000], np.full((700, 6), np.nan), values[5000:]]))
+    assert skipping.samples_since_start == missing.samples_since_start == 12_700
+    assert np.array_equal(skipping._state.cum, missing._state.cum)
 
 
-# --- silence
+# --- no false alarms
 
 
-def test_unchanging_noise_is_nothing():
-    assert found(white(300_000, seed=4)) == []
+def test_constant_noise_causes_no_alarm():
+    assert find_changes(simulate_white_noise(300_000, seed=4)) == []
 
 
-def test_single_outliers_are_nothing():
-    values = white(60_000)
+def test_single_outliers_cause_no_alarm():
+    values = simulate_white_noise(60_000)
     values[7_000::5_000, GZ] += 1.0
     values[0, GZ] = 5.0
-    assert found(values) == []
+    assert find_changes(values) == []
 
 
-def test_steps_of_resolution_are_nothing():
-    values = np.round(white(200_000) / (2.0 * SIGMA)) * 2.0 * SIGMA
-    assert found(values) == []
+def test_coarse_quantization_causes_no_alarm():
+    values = np.round(simulate_white_noise(200_000) / (2.0 * SIGMA)) * 2.0 * SIGMA
+    assert find_changes(values) == []
 
 
-def test_a_constant_axis_is_nothing():
-    assert found(np.full((20_000, 6), 9.81)) == []
+def test_constant_axis_causes_no_alarm():
+    assert find_changes(np.full((20_000, 6), 9.81)) == []
 
 
-def test_what_changes_while_learning_becomes_the_reference():
-    values = white(60_000)
+def test_change_while_learning_becomes_part_of_the_reference():
+    values = simulate_white_noise(60_000)
     values[:2_000, GZ] *= 3.0
-    assert found(values) == []
+    assert find_changes(values) == []
 
 
-def test_a_steady_resonance_has_fewer_degrees_of_freedom():
+def test_constant_resonance_reduces_the_degrees_of_freedom():
     rng = np.random.default_rng(2)
-    values = white(200_000)
+    values = simulate_white_noise(200_000)
     values[:, GZ] += 3.0 * SIGMA * lfilter([0.2], [1.0, -1.2, 0.98], rng.standard_normal(200_000))
     detector = NoiseAndBiasChangeDetector(100.0)
     detector.process_samples(values)
@@ -158,10 +160,10 @@ def test_a_steady_resonance_has_fewer_degrees_of_freedom():
 
 
 @pytest.mark.parametrize("factor", [1.5, 3.0, 0.6])
-def test_louder_white_noise_is_named(factor):
-    values = white(60_000)
+def test_changed_white_noise_is_reported_as_n(factor):
+    values = simulate_white_noise(60_000)
     values[40_000:, GZ] = 0.1 + factor * (values[40_000:, GZ] - 0.1)
-    change = only(values)
+    change = find_single_change(values)
     assert change.kind == "noise_changed"
     assert list(change.what) == ["N"]
     before, after = change.what["N"]
@@ -173,21 +175,21 @@ def test_louder_white_noise_is_named(factor):
     assert change.text.startswith(f"gz angle random walk {'rose' if factor > 1 else 'fell'} by ")
 
 
-def test_accelerometers_have_their_own_words():
-    values = white(40_000)
+def test_accelerometer_noise_has_its_own_name():
+    values = simulate_white_noise(40_000)
     values[20_000:, 5] = 9.81 + 2.0 * (values[20_000:, 5] - 9.81)
-    (change,) = found(values)
+    (change,) = find_changes(values)
     assert AXES[change.axis] == "az"
     assert change.text.startswith("az velocity random walk rose by ")
 
 
-def test_a_new_resonance_is_a_band_of_frequencies():
+def test_new_resonance_is_reported_as_a_frequency_band():
     rng = np.random.default_rng(2)
-    values = white(80_000)
+    values = simulate_white_noise(80_000)
     r, angle = np.exp(-np.pi / 100.0), 2.0 * np.pi * 0.2
-    made = lfilter([1.0], [1.0, -2.0 * r * np.cos(angle), r * r], rng.standard_normal(60_000))
-    values[20_000:, GZ] += SIGMA * made / made.std()
-    change = found(values)[0]
+    resonance = lfilter([1.0], [1.0, -2.0 * r * np.cos(angle), r * r], rng.standard_normal(60_000))
+    values[20_000:, GZ] += SIGMA * resonance / resonance.std()
+    change = find_changes(values)[0]
     assert change.kind == "noise_changed"
     assert set(change.what) == {"band", "rms"}
     low, high = change.what["band"]
@@ -195,10 +197,10 @@ def test_a_new_resonance_is_a_band_of_frequencies():
     assert "Hz rose by" in change.text
 
 
-def test_a_step_is_told_once_with_its_height():
-    values = white(120_000)
+def test_step_is_reported_once_with_its_height():
+    values = simulate_white_noise(120_000)
     values[50_011:, GZ] += 4 * SIGMA
-    change = only(values)
+    change = find_single_change(values)
     assert change.kind == "bias_stepped"
     before, after = change.what["bias"]
     assert after - before == pytest.approx(4 * SIGMA, rel=0.25)
@@ -206,22 +208,22 @@ def test_a_step_is_told_once_with_its_height():
     assert change.text.startswith("gz bias stepped by +0.2")
 
 
-def test_a_step_on_the_border_of_all_blocks_is_found_too():
-    values = white(1 << 17)
+def test_step_at_a_common_block_boundary_is_found():
+    values = simulate_white_noise(1 << 17)
     values[1 << 16 :, GZ] += 3 * SIGMA
-    change = only(values)
+    change = find_single_change(values)
     assert change.kind == "bias_stepped"
     assert abs(change.since - (1 << 16)) <= 40
 
 
-def test_a_learned_ramp_is_no_step():
-    values = white(200_000)
+def test_learned_ramp_is_not_a_step():
+    values = simulate_white_noise(200_000)
     values[:, GZ] += np.linspace(0.0, 50 * SIGMA, 200_000)
-    assert [change.kind for change in found(values) if change.kind == "bias_stepped"] == []
+    assert [change.kind for change in find_changes(values) if change.kind == "bias_stepped"] == []
 
 
-def test_a_burst_is_told_once_and_forgotten():
-    values = white(80_000)
+def test_outlier_burst_is_reported_once():
+    values = simulate_white_noise(80_000)
     at = 20_000 + np.random.default_rng(1).choice(300, 20, replace=False)
     values[at, GZ] += 0.05 * np.random.default_rng(3).standard_normal(20)
     detector = NoiseAndBiasChangeDetector(100.0)
@@ -233,11 +235,11 @@ def test_a_burst_is_told_once_and_forgotten():
     assert detector._state.born[GZ] == 0
 
 
-def test_after_a_change_the_new_noise_is_the_reference():
-    values = white(120_000)
+def test_new_noise_becomes_the_reference_after_a_change():
+    values = simulate_white_noise(120_000)
     values[40_000:, GZ] = 0.1 + 1.5 * (values[40_000:, GZ] - 0.1)
     values[90_000:, GZ] = 0.1 + (values[90_000:, GZ] - 0.1) / 1.5
-    first, second = found(values)
+    first, second = find_changes(values)
     assert first.what["N"][1] > first.what["N"][0]
     assert second.what["N"][1] < second.what["N"][0]
     assert second.what["N"][0] == pytest.approx(1.5e-4, rel=0.05)
@@ -246,22 +248,22 @@ def test_after_a_change_the_new_noise_is_the_reference():
 # --- the experiment of "Dynamic extraction of random drift error coefficients of MEMS gyroscopes"
 
 
-def test_the_papers_experiment():
-    """600 s at 100 Hz; at 250 s N doubles, B trebles, K and R begin to matter, Q stays.
+def test_change_in_the_experiment_of_the_paper_is_found():
+    """Simulate 600 s at 100 Hz; at 250 s N doubles, B trebles, K and R become relevant and Q is constant.
 
-    Q 2e-5 (which makes 5/6 of the first octave's variance), N 1.5e-4 → 3e-4, B 4e-5 → 1.2e-4, K 1.5e-6 → 2e-5,
-    R 0 → 2e-6. At 1 s the variance goes from 2.4e-8 to 9.7e-8, of which B is 6e-9 and K 1e-10: that B and K changed
-    needs clusters of 10 s and more, of which 250 s are too few to learn from. N is named, within ten seconds.
+    Q is 2e-5 (5/6 of the variance of the first octave), N 1.5e-4 → 3e-4, B 4e-5 → 1.2e-4, K 1.5e-6 → 2e-5, R 0 → 2e-6.
+    At 1 s the variance rises from 2.4e-8 to 9.7e-8, of which B makes 6e-9 and K 1e-10. Changes of B and K only show
+    in clusters of at least 10 s, for which 250 s are too short to learn. N is found within ten seconds.
     """
     q = QuantizationNoise(Q=2e-5)
-    calm = (q, AngleRandomWalk(N=1.5e-4), BiasInstability(B=4e-5), RateRandomWalk(K=1.5e-6))
-    rough = (q, AngleRandomWalk(N=3e-4), BiasInstability(B=1.2e-4), RateRandomWalk(K=2e-5), RateRamp(R=2e-6))
+    before = (q, AngleRandomWalk(N=1.5e-4), BiasInstability(B=4e-5), RateRandomWalk(K=1.5e-6))
+    after = (q, AngleRandomWalk(N=3e-4), BiasInstability(B=1.2e-4), RateRandomWalk(K=2e-5), RateRamp(R=2e-6))
     parts = [
         NoiseModel(dict.fromkeys(AXES, sources)).simulate(n, 100.0, seed)
-        for sources, n, seed in ((calm, 25_000, 1), (rough, 35_000, 2))
+        for sources, n, seed in ((before, 25_000, 1), (after, 35_000, 2))
     ]
     first = {}
-    for change in found(np.concatenate(parts)):
+    for change in find_changes(np.concatenate(parts)):
         first.setdefault(change.axis, change)
     assert len(first) == 6
     assert abs(np.median([change.since for change in first.values()]) / 100.0 - 250.0) < 1.0
@@ -274,48 +276,48 @@ def test_the_papers_experiment():
         assert change.what["N"][1] == pytest.approx(3e-4, rel=0.2)
 
 
-# --- letters
+# --- identification of the changed coefficient
 
 
-def octaves(before, after, terms=10_000.0):
+def make_variances(before, after, terms=10_000.0):
     tau = 0.01 * 2.0 ** np.arange(12)
 
-    def variance(letters):
+    def compute_variance(letters):
         sources = {"Q": QuantizationNoise, "N": AngleRandomWalk, "B": BiasInstability, "K": RateRandomWalk}
         return sum(sources[c](**{c: value}).avar(tau, 0.01) for c, value in letters.items())
 
     n = terms / 2.0 ** np.arange(12)
-    return HaarVariancesBeforeAfter(variance(before), 10 * n, variance(after), n)
+    return HaarVariancesBeforeAfter(compute_variance(before), 10 * n, compute_variance(after), n)
 
 
 MIX = {"Q": 2e-6, "N": 1.5e-4, "B": 4e-5, "K": 1.5e-6}
 
 
 @pytest.mark.parametrize(("letter", "factor"), [("N", 1.5), ("N", 0.7), ("Q", 10.0), ("B", 10.0), ("K", 100.0)])
-def test_exact_variances_name_the_letter_that_changed(letter, factor):
-    what = identify_changed_coefficients(octaves(MIX, MIX | {letter: factor * MIX[letter]}), 100.0)
+def test_exact_variances_identify_the_changed_coefficient(letter, factor):
+    what = identify_changed_coefficients(make_variances(MIX, MIX | {letter: factor * MIX[letter]}), 100.0)
     assert list(what) == [letter]
     assert what[letter][1] == pytest.approx(factor * MIX[letter], rel=0.05)
 
 
-def test_two_letters():
-    what = identify_changed_coefficients(octaves(MIX, MIX | {"Q": 2e-5, "N": 3e-4}, terms=100_000.0), 100.0)
+def test_two_changed_coefficients_are_identified():
+    what = identify_changed_coefficients(make_variances(MIX, MIX | {"Q": 2e-5, "N": 3e-4}, terms=100_000.0), 100.0)
     assert list(what) == ["Q", "N"]
 
 
-def test_nothing_known_names_nothing():
+def test_unknown_variances_identify_nothing():
     none = np.zeros(12)
     assert identify_changed_coefficients(HaarVariancesBeforeAfter(none, none, none, none), 100.0) == {}
 
 
-# --- learning and refusing
+# --- learning and invalid arguments
 
 
-def test_learned_after_its_time():
+def test_octaves_are_ready_after_the_learning_time():
     detector = NoiseAndBiasChangeDetector(100.0)
-    detector.process_samples(white(int(LEARN_S * 100) - TICK_SAMPLES))
+    detector.process_samples(simulate_white_noise(int(LEARN_S * 100) - TICK_SAMPLES))
     assert not detector.octaves_ready_for_alarm[0].any()
-    detector.process_samples(white(4 * TICK_SAMPLES))
+    detector.process_samples(simulate_white_noise(4 * TICK_SAMPLES))
     assert detector.octaves_ready_for_alarm[0].all()
     assert detector.octaves_ready_for_alarm[:, 0].sum() >= 6
     detector.restart_references(GZ)
@@ -325,19 +327,19 @@ def test_learned_after_its_time():
 
 
 @pytest.mark.parametrize(("rate", "alarms"), [(0.0, 1.0), (float("nan"), 1.0), (100.0, 0.0), (100.0, -1.0)])
-def test_impossible_arguments(rate, alarms):
+def test_impossible_arguments_are_refused(rate, alarms):
     with pytest.raises(ConfigError):
         NoiseAndBiasChangeDetector(rate, alarms)
 
 
-def test_samples_of_another_shape():
+def test_samples_of_another_shape_are_refused():
     with pytest.raises(ValueError, match="expected is"):
         NoiseAndBiasChangeDetector(100.0).process_samples(np.zeros((3, 5)))
 
 
 @pytest.mark.parametrize(("rate_hz", "alarms_per_day"), [(1e6, 1e-6), (1e-3, 1e4), (1e9, 1e-6)])
-def test_thresholds_are_finite_at_the_ends_of_what_is_supported(rate_hz: float, alarms_per_day: float) -> None:
-    """The share of false alarms for one look is far below the distance of 1 from the next smaller double."""
+def test_thresholds_are_finite_at_the_limits_of_the_supported_range(rate_hz: float, alarms_per_day: float) -> None:
+    """The false alarm probability of one test is far below the spacing of doubles next to 1."""
     levels = NoiseAndBiasChangeDetector(rate_hz, alarms_per_day)._state.levels
     assert np.isfinite(levels).all()
     assert levels[2] > 2.0  # standard deviations

@@ -1,4 +1,4 @@
-"""The window beside its model: a true model is seldom accused, a wrong one where it is wrong, by as much as it is."""
+"""Tests of the comparison of a window with its noise model: false alarms, location and size of deviations."""
 
 from dataclasses import replace
 
@@ -36,29 +36,35 @@ from monitor.noise.model import NoiseModel
 
 RATE = 100.0
 WHITE = AngleRandomWalk(N=1.5e-4)
-CLASSIC = (QuantizationNoise(Q=8e-6), WHITE, BiasInstability(B=2e-4), RateRandomWalk(K=4e-5), ConstantBias(value=0.2))
+FIVE_TERMS = (
+    QuantizationNoise(Q=8e-6),
+    WHITE,
+    BiasInstability(B=2e-4),
+    RateRandomWalk(K=4e-5),
+    ConstantBias(value=0.2),
+)
 
 
-def model_of(*effects: Effect, axes: tuple[str, ...] = AXES) -> NoiseModel:
+def make_model(*effects: Effect, axes: tuple[str, ...] = AXES) -> NoiseModel:
     return NoiseModel(dict.fromkeys(axes, effects))
 
 
-def estimate(values: np.ndarray, window: int | None = None) -> Estimate:
-    """One look at samples [n, 6]."""
+def estimate_values(values: np.ndarray, window: int | None = None) -> Estimate:
+    """Estimate the curve of samples [n, 6]."""
     estimator = Estimator(RATE, (window or len(values)) / RATE)
     estimator.add_samples(make_block(np.arange(len(values)) * 10_000_000, values.copy()))
     return estimator.get_estimate(fit_coefficients=False)
 
 
-def simulated(model: NoiseModel, n: int, seed: int) -> Estimate:
-    return estimate(model.simulate(n, RATE, seed))
+def simulate_estimate(model: NoiseModel, n: int, seed: int) -> Estimate:
+    return estimate_values(model.simulate(n, RATE, seed))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
     "effects",
     [
-        CLASSIC,
+        FIVE_TERMS,
         (WHITE, ExponentiallyCorrelated(sigma=1e-3, correlation_time=5.0)),
         (WHITE, Sinusoidal(amplitude=2e-3, frequency=7.3)),
         (WHITE, Narrowband(sigma=2e-3, frequency=20.0, bandwidth=0.5)),
@@ -67,81 +73,83 @@ def simulated(model: NoiseModel, n: int, seed: int) -> Estimate:
     ],
     ids=lambda effects: effects[-1].name,
 )
-def test_scores_of_a_true_model_are_those_of_chance(effects: tuple[Effect, ...]) -> None:
-    """At every τ: a wrong number of degrees of freedom would show in the spread."""
-    model = model_of(*effects)
+def test_scores_of_a_true_model_are_standard_normal(effects: tuple[Effect, ...]) -> None:
+    """The test covers every τ; a wrong number of degrees of freedom would change the spread."""
+    model = make_model(*effects)
     in_force = ModelAllanVariances(model, 12_000)
-    looks = [in_force.compare_with_estimate(simulated(model, 12_000, seed)) for seed in range(40)]
-    assert all(list(look.axes) == list(AXES) for look in looks)
-    z = np.array([one.z for look in looks for one in look.axes.values()])
-    judged = ~np.isnan(z).any(axis=0)
-    assert judged.sum() >= 12
-    n = len(z)  # 240: the mean is sure to 1/√n, the spread to 1/√2n; 4.5 σ for all of 70 numbers
-    assert np.abs(z[:, judged].mean(axis=0)).max() < 4.5 / np.sqrt(n)
-    narrow = 0.1 if effects[-1].name == "rate_ramp" else 0.75  # a ramp is allowed for by more than it needs
-    spread = z[:, judged].std(axis=0)
+    comparisons = [in_force.compare_with_estimate(simulate_estimate(model, 12_000, seed)) for seed in range(40)]
+    assert all(list(comparison.axes) == list(AXES) for comparison in comparisons)
+    z = np.array([axis.z for comparison in comparisons for axis in comparison.axes.values()])
+    valid = ~np.isnan(z).any(axis=0)
+    assert valid.sum() >= 12
+    n = len(z)  # 240; the mean has an error of 1/√n and the spread of 1/√2n; 4.5 σ allows for 70 values
+    assert np.abs(z[:, valid].mean(axis=0)).max() < 4.5 / np.sqrt(n)
+    min_spread = 0.1 if effects[-1].name == "rate_ramp" else 0.75  # the allowance for a ramp is larger than needed
+    spread = z[:, valid].std(axis=0)
     assert spread.max() < 1.0 + 4.5 / np.sqrt(2 * n)
-    assert spread.min() > narrow
-    assert sum(one.gap > one.threshold for look in looks for one in look.axes.values()) <= 3  # 0.4 are to be expected
+    assert spread.min() > min_spread
+    assert (
+        sum(axis.gap > axis.threshold for comparison in comparisons for axis in comparison.axes.values()) <= 3
+    )  # 0.4 are expected
 
 
-def test_what_is_wrong_is_found_where_it_is_and_as_large_as_it_is() -> None:
-    true = model_of(*CLASSIC)
+def test_unmodeled_line_is_found_at_its_averaging_time_with_its_size() -> None:
+    true = make_model(*FIVE_TERMS)
     measured = true + NoiseModel({"gz": (Sinusoidal(amplitude=6e-4, frequency=5.0),)})
-    look = ModelAllanVariances(true, 30_000).compare_with_estimate(simulated(measured, 30_000, 5))
-    gz = look.axes["gz"]
+    comparison = ModelAllanVariances(true, 30_000).compare_with_estimate(simulate_estimate(measured, 30_000, 5))
+    gz = comparison.axes["gz"]
     assert gz.gap > gz.threshold
     lo, hi = gz.tau_s
-    assert lo <= 0.08 <= hi  # a line is largest at half its period
-    assert look.tau_s[gz.row] in (0.04, 0.08)
+    assert lo <= 0.08 <= hi  # a line has its maximum at half its period
+    assert comparison.tau_s[gz.row] in (0.04, 0.08)
     assert gz.gap == np.nanmax(np.abs(gz.z)) == abs(gz.z[gz.row])
-    tau = look.tau_s[gz.row : gz.row + 1]
+    tau = comparison.tau_s[gz.row : gz.row + 1]
     expected = np.sqrt(measured.avar("gz", tau, 1 / RATE) / true.avar("gz", tau, 1 / RATE))[0]
     assert gz.ratio == pytest.approx(expected, rel=0.03)
-    assert not any(look.axes[axis].gap > look.axes[axis].threshold for axis in AXES if axis != "gz")
+    assert not any(comparison.axes[axis].gap > comparison.axes[axis].threshold for axis in AXES if axis != "gz")
 
 
-def test_a_sensor_that_is_too_quiet_is_found_too() -> None:
-    look = ModelAllanVariances(model_of(WHITE), 10_000).compare_with_estimate(
-        simulated(model_of(AngleRandomWalk(N=1.2e-4)), 10_000, 1)
+def test_too_little_noise_is_also_found() -> None:
+    comparison = ModelAllanVariances(make_model(WHITE), 10_000).compare_with_estimate(
+        simulate_estimate(make_model(AngleRandomWalk(N=1.2e-4)), 10_000, 1)
     )
-    for one in look.axes.values():
-        assert one.gap > one.threshold
-        assert one.z[one.row] < 0.0
-        assert one.ratio == pytest.approx(0.8, rel=0.06)
+    for axis in comparison.axes.values():
+        assert axis.gap > axis.threshold
+        assert axis.z[axis.row] < 0.0
+        assert axis.ratio == pytest.approx(0.8, rel=0.06)
 
 
-def test_a_part_of_a_percent_is_told_where_the_window_allows_it() -> None:
-    """z is in the window's own standard deviations: at one sample, 1/√edf of the deviation."""
+def test_small_difference_is_found_in_a_long_window() -> None:
+    """z is in standard deviations of the window, 1/√edf of the deviation at one sample."""
     n = 100_000
-    look = ModelAllanVariances(model_of(WHITE), n).compare_with_estimate(
-        simulated(model_of(AngleRandomWalk(N=1.5e-4 * 1.02)), n, 3)
+    comparison = ModelAllanVariances(make_model(WHITE), n).compare_with_estimate(
+        simulate_estimate(make_model(AngleRandomWalk(N=1.5e-4 * 1.02)), n, 3)
     )
-    shortest = [one.z[0] for one in look.axes.values()]
+    shortest = [axis.z[0] for axis in comparison.axes.values()]
     assert np.mean(shortest) == pytest.approx(0.04 / np.sqrt(2 / (2 * n / 3)), rel=0.25)  # edf = 2/3 n
 
 
-def test_axes_without_a_model_or_without_samples_are_not_judged() -> None:
-    model = model_of(WHITE, axes=("gx", "gz")) + NoiseModel({"ay": (ConstantBias(value=1.0),)})
+def test_axes_without_model_or_samples_are_not_compared() -> None:
+    model = make_model(WHITE, axes=("gx", "gz")) + NoiseModel({"ay": (ConstantBias(value=1.0),)})
     heated = model + NoiseModel({"gx": (TemperatureBias(coefficient=1e-3, reference=20.0),)})
-    values = model_of(WHITE).simulate(5000, RATE, 1)
-    assert list(ModelAllanVariances(model, 5000).compare_with_estimate(estimate(values)).axes) == ["gx", "gz"]
-    assert list(ModelAllanVariances(heated, 5000).compare_with_estimate(estimate(values)).axes) == [
+    values = make_model(WHITE).simulate(5000, RATE, 1)
+    assert list(ModelAllanVariances(model, 5000).compare_with_estimate(estimate_values(values)).axes) == ["gx", "gz"]
+    assert list(ModelAllanVariances(heated, 5000).compare_with_estimate(estimate_values(values)).axes) == [
         "gz"
-    ]  # its temperature is not known
+    ]  # the temperature of gx is unknown
     values[:, 2] = np.nan
-    assert list(ModelAllanVariances(model, 5000).compare_with_estimate(estimate(values)).axes) == ["gx"]
+    assert list(ModelAllanVariances(model, 5000).compare_with_estimate(estimate_values(values)).axes) == ["gx"]
 
 
-def test_too_few_samples_are_no_look() -> None:
-    in_force = ModelAllanVariances(model_of(WHITE), 5000)
-    values = model_of(WHITE).simulate(MIN_SAMPLES, RATE, 1)
-    assert in_force.compare_with_estimate(estimate(values[:-1], 5000)).axes == {}
-    assert list(in_force.compare_with_estimate(estimate(values, 5000)).axes) == list(AXES)
+def test_too_few_samples_give_no_comparison() -> None:
+    in_force = ModelAllanVariances(make_model(WHITE), 5000)
+    values = make_model(WHITE).simulate(MIN_SAMPLES, RATE, 1)
+    assert in_force.compare_with_estimate(estimate_values(values[:-1], 5000)).axes == {}
+    assert list(in_force.compare_with_estimate(estimate_values(values, 5000)).axes) == list(AXES)
 
 
-def test_an_axis_that_began_anew_is_judged_by_its_own_samples() -> None:
-    model = model_of(WHITE)
+def test_restarted_axis_is_compared_by_its_own_samples() -> None:
+    model = make_model(WHITE)
     estimator = Estimator(RATE, 200.0)
     values = model.simulate(20_000, RATE, 1)
     values[:17_000, 2] *= 3.0
@@ -150,36 +158,36 @@ def test_an_axis_that_began_anew_is_judged_by_its_own_samples() -> None:
     gz = in_force.compare_with_estimate(estimator.get_estimate(fit_coefficients=False)).axes["gz"]
     assert gz.gap > gz.threshold
     estimator.restart_axis(2, 3000)
-    look = in_force.compare_with_estimate(estimator.get_estimate(fit_coefficients=False))
-    assert look.axes["gz"].gap <= look.axes["gz"].threshold
-    assert (look.axes["gz"].samples, look.axes["gx"].samples) == (3000, 20_000)
+    comparison = in_force.compare_with_estimate(estimator.get_estimate(fit_coefficients=False))
+    assert comparison.axes["gz"].gap <= comparison.axes["gz"].threshold
+    assert (comparison.axes["gz"].samples, comparison.axes["gx"].samples) == (3000, 20_000)
     assert count_axis_samples_in_window(estimator.get_estimate(fit_coefficients=False).curve, 2) == 3000
-    # fewer samples, fewer τ that say something
-    assert np.isfinite(look.axes["gz"].z).sum() < np.isfinite(look.axes["gx"].z).sum()
+    # With fewer samples, fewer τ can be compared.
+    assert np.isfinite(comparison.axes["gz"].z).sum() < np.isfinite(comparison.axes["gx"].z).sum()
 
 
-def test_gaps_in_the_samples_cost_certainty_and_nothing_else() -> None:
-    model = model_of(*CLASSIC)
+def test_gaps_do_not_cause_disagreement() -> None:
+    model = make_model(*FIVE_TERMS)
     values = model.simulate(30_000, RATE, 2)
     values[np.random.default_rng(1).random(30_000) < 0.01] = np.nan
-    look = ModelAllanVariances(model, 30_000).compare_with_estimate(estimate(values))
-    assert list(look.axes) == list(AXES)
-    assert not any(one.gap > one.threshold for one in look.axes.values())
+    comparison = ModelAllanVariances(model, 30_000).compare_with_estimate(estimate_values(values))
+    assert list(comparison.axes) == list(AXES)
+    assert not any(axis.gap > axis.threshold for axis in comparison.axes.values())
 
 
-def test_a_rate_known_better_is_another_label() -> None:
-    model = model_of(WHITE)
+def test_refined_rate_rescales_the_model_but_not_the_gap() -> None:
+    model = make_model(WHITE)
     in_force = ModelAllanVariances(model, 10_000)
-    found = simulated(model, 10_000, 4)
+    found = simulate_estimate(model, 10_000, 4)
     before = in_force.compare_with_estimate(found).axes["gz"]
     curve: AllanCurve = replace(found.curve, tau_s=found.curve.factors / 104.0)
     after = in_force.compare_with_estimate(replace(found, rate_hz=104.0, curve=curve)).axes["gz"]
-    assert after.model == pytest.approx(before.model * np.sqrt(1.04))  # N over the root of a shorter τ
+    assert after.model == pytest.approx(before.model * np.sqrt(1.04))  # N divided by the root of a shorter τ
     assert in_force.compare_with_estimate(found).axes["gz"].gap == before.gap
 
 
-def test_scores_against_the_distribution_itself() -> None:
-    """The cube root against the exact quantiles, out to those that decide."""
+def test_normal_score_agrees_with_the_chi_square_distribution() -> None:
+    """Compare the cube root approximation with exact quantiles over the range used for decisions."""
     for edf in (MIN_EDF, 10.0, 1000.0):
         z = np.array([-1.5, 0.0, 2.0, 3.0, 3.8])
         exact = chi2.ppf(norm.cdf(z), edf) / edf
@@ -187,9 +195,9 @@ def test_scores_against_the_distribution_itself() -> None:
     assert np.isnan(chi2_ratio_to_normal_score(np.ones(1), np.array([MIN_EDF - 0.01]))[0])
 
 
-def test_limits_pay_for_every_number() -> None:
+def test_threshold_accounts_for_the_number_of_values() -> None:
     rng = np.random.default_rng(1)
     largest = np.abs(rng.standard_normal((200_000, 12))).max(axis=1)
     assert np.mean(largest > max_abs_z_limit(0.05, 12)) == pytest.approx(0.05, abs=0.002)
-    together = 0.8 * rng.standard_normal((200_000, 1)) + 0.6 * rng.standard_normal((200_000, 12))
-    assert np.mean(np.abs(together).max(axis=1) > max_abs_z_limit(0.05, 12)) < 0.05
+    correlated = 0.8 * rng.standard_normal((200_000, 1)) + 0.6 * rng.standard_normal((200_000, 12))
+    assert np.mean(np.abs(correlated).max(axis=1) > max_abs_z_limit(0.05, 12)) < 0.05

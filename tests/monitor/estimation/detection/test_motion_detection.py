@@ -1,4 +1,4 @@
-"""Motion, knocks and handling are found; noise, vibration, coarse resolution and outliers are not motion."""
+"""Tests of motion detection: motion and knocks are found; noise, vibration, quantization and outliers are ignored."""
 
 from itertools import pairwise
 
@@ -12,15 +12,15 @@ from tests.support.recordings import recordings
 
 RATE = 100.0
 NOISE = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2])
-LYING = np.array([0.01, -0.02, 0.005, 0.1, -0.2, 9.81])
+MEAN_AT_REST = np.array([0.01, -0.02, 0.005, 0.1, -0.2, 9.81])
 
 
-def still(seconds, seed=0, rate=RATE):
-    return LYING + NOISE * np.random.default_rng(seed).standard_normal((round(seconds * rate), 6))
+def simulate_rest(seconds, seed=0, rate=RATE):
+    return MEAN_AT_REST + NOISE * np.random.default_rng(seed).standard_normal((round(seconds * rate), 6))
 
 
-def turned_by_hand(values, since_s, until_s, rate=RATE):
-    """A rotation to and fro about x, seen by gx, and by ay and az through gravity."""
+def add_hand_rotation(values, since_s, until_s, rate=RATE):
+    """Add a rotation to and fro about x, which gx measures directly and ay and az measure through gravity."""
     t = np.arange(round((until_s - since_s) * rate)) / rate
     angle = 0.3 * np.sin(2 * np.pi * 0.7 * t) ** 2
     rows = slice(round(since_s * rate), round(since_s * rate) + t.size)
@@ -30,23 +30,28 @@ def turned_by_hand(values, since_s, until_s, rate=RATE):
     return values
 
 
-def stream(values, edges, lost_before=None, rate=RATE):
-    """Rows in blocks cut at the edges, all that comes out joined, and the detector."""
-    rest = MotionDetector(rate)
-    out, most = [], 0
+def detect_in_blocks(values, edges, lost_before=None, rate=RATE):
+    """Return the joined output values and times, the detector and the largest delay in samples."""
+    detector = MotionDetector(rate)
+    out, max_delay = [], 0
     given = taken = 0
     for a, b in pairwise(edges):
         lost = lost_before if lost_before and a == lost_before else 0
-        came = rest.advance_and_take_decided(make_block(np.arange(a, b), values[a:b].copy(), lost=lost))
-        out += came
-        given, taken = given + b - a, taken + sum(len(one) for one in came)
-        most = max(most, given - taken)
-    out += rest.flush_delayed_samples()
-    return np.concatenate([one.values for one in out]), np.concatenate([one.t_ns for one in out]), rest, most
+        blocks = detector.advance_and_take_decided(make_block(np.arange(a, b), values[a:b].copy(), lost=lost))
+        out += blocks
+        given, taken = given + b - a, taken + sum(len(block) for block in blocks)
+        max_delay = max(max_delay, given - taken)
+    out += detector.flush_delayed_samples()
+    return (
+        np.concatenate([block.values for block in out]),
+        np.concatenate([block.t_ns for block in out]),
+        detector,
+        max_delay,
+    )
 
 
-def test_a_motion_is_struck_out_with_its_onset_and_its_end():
-    values = turned_by_hand(still(60), 30.0, 34.3)
+def test_motion_is_removed_from_its_start_to_its_end():
+    values = add_hand_rotation(simulate_rest(60), 30.0, 34.3)
     mask, (motion,) = detect_motion(values, RATE)
     assert motion.kind == "motion"
     assert 29.0 <= motion.since / RATE <= 30.0
@@ -57,14 +62,14 @@ def test_a_motion_is_struck_out_with_its_onset_and_its_end():
     assert np.array_equal(mask, expected)
     assert motion.axis in ("gx", "ay")
     assert motion.peak == pytest.approx(
-        np.abs(values[:, AXES.index(motion.axis)] - LYING[AXES.index(motion.axis)]).max(), rel=0.02
+        np.abs(values[:, AXES.index(motion.axis)] - MEAN_AT_REST[AXES.index(motion.axis)]).max(), rel=0.02
     )
     assert motion.text.startswith("moved for 4.")
 
 
 @pytest.mark.parametrize("cut", ["rows", "blocks", "whole", "odd"])
-def test_any_cut_gives_the_same(cut):
-    values = turned_by_hand(still(40, seed=3), 10.0, 12.0)
+def test_block_sizes_do_not_change_the_result(cut):
+    values = add_hand_rotation(simulate_rest(40, seed=3), 10.0, 12.0)
     values[1703:1709, 3] += 3.0
     values[2500:2520] = np.nan
     edges = {
@@ -74,58 +79,58 @@ def test_any_cut_gives_the_same(cut):
         "odd": sorted({0, 4000, *np.random.default_rng(1).integers(1, 4000, 60).tolist()}),
     }[cut]
     mask, motions = detect_motion(values, RATE)
-    assert [one.kind for one in motions] == ["motion", "knock"]
-    out, t, rest, _ = stream(values, list(edges))
+    assert [motion.kind for motion in motions] == ["motion", "knock"]
+    out, t, detector, _ = detect_in_blocks(values, list(edges))
     assert np.array_equal(out, np.where(mask[:, None], np.nan, values), equal_nan=True)
     assert np.array_equal(t, np.arange(4000))
-    assert rest.take_motions() == motions
-    assert rest.take_motions() == []
-    assert (rest.episodes, rest.samples_in_motion) == (2, mask.sum())
+    assert detector.take_motions() == motions
+    assert detector.take_motions() == []
+    assert (detector.episodes, detector.samples_in_motion) == (2, mask.sum())
 
 
-def test_samples_are_held_back_for_two_blocks():
-    *_, most = stream(still(20), list(range(2001)))
-    assert most == 2 * samples_per_block(RATE)
+def test_samples_are_delayed_by_two_blocks():
+    *_, max_delay = detect_in_blocks(simulate_rest(20), list(range(2001)))
+    assert max_delay == 2 * samples_per_block(RATE)
 
 
-def test_missing_samples_keep_their_places():
-    values = turned_by_hand(still(40), 30.0, 32.0)
+def test_missing_samples_keep_their_positions():
+    values = add_hand_rotation(simulate_rest(40), 30.0, 32.0)
     _, (motion,) = detect_motion(values, RATE)
     kept = np.delete(values, slice(1000, 1260), axis=0)
     edges = [*range(0, 1000, 100), *range(1000, len(kept), 100), len(kept)]
-    rest = MotionDetector(RATE)
+    detector = MotionDetector(RATE)
     for a, b in pairwise(edges):
-        rest.advance_and_take_decided(make_block(np.arange(a, b), kept[a:b].copy(), lost=260 if a == 1000 else 0))
-    rest.flush_delayed_samples()
-    (found,) = rest.take_motions()
+        detector.advance_and_take_decided(make_block(np.arange(a, b), kept[a:b].copy(), lost=260 if a == 1000 else 0))
+    detector.flush_delayed_samples()
+    (found,) = detector.take_motions()
     assert (found.kind, found.since, found.until) == (motion.kind, motion.since, motion.until)
 
 
-def test_a_very_long_pause_is_no_work():
-    rest = MotionDetector(RATE)
-    rest.advance_and_take_decided(make_block(np.arange(2000), still(20)))
-    rest.advance_and_take_decided(make_block(np.arange(2000), still(20, seed=1), lost=10**12))
-    rest.flush_delayed_samples()
-    assert rest.take_motions() == []
+def test_very_long_gap_takes_no_time():
+    detector = MotionDetector(RATE)
+    detector.advance_and_take_decided(make_block(np.arange(2000), simulate_rest(20)))
+    detector.advance_and_take_decided(make_block(np.arange(2000), simulate_rest(20, seed=1), lost=10**12))
+    detector.flush_delayed_samples()
+    assert detector.take_motions() == []
 
 
-def test_moving_is_shown_while_it_lasts():
-    values = turned_by_hand(still(30), 20.0, 23.0)
-    rest = MotionDetector(RATE)
-    shown = []
+def test_is_moving_is_true_during_motion():
+    values = add_hand_rotation(simulate_rest(30), 20.0, 23.0)
+    detector = MotionDetector(RATE)
+    moving = []
     for a in range(0, 3000, 10):
-        rest.advance_and_take_decided(make_block(np.arange(a, a + 10), values[a : a + 10].copy()))
-        shown.append(rest.is_moving)
-    seconds = np.flatnonzero(shown) / 10.0
+        detector.advance_and_take_decided(make_block(np.arange(a, a + 10), values[a : a + 10].copy()))
+        moving.append(detector.is_moving)
+    seconds = np.flatnonzero(moving) / 10.0
     assert 20.0 < seconds[0] < 20.6
     assert 23.0 < seconds[-1] < 25.0
-    rest.flush_delayed_samples()
-    assert not rest.is_moving
+    detector.flush_delayed_samples()
+    assert not detector.is_moving
 
 
-def test_a_knock_rings_and_an_outlier_does_not():
-    values = still(60)
-    values[2000, 5] += 5.0  # one sample: for the statistics of outliers
+def test_knock_is_found_and_a_single_outlier_is_not():
+    values = simulate_rest(60)
+    values[2000, 5] += 5.0  # one sample is an outlier, not a knock
     t = np.arange(12) / RATE
     values[4000:4012, 5] += 4.0 * np.exp(-t / 0.03) * np.cos(2 * np.pi * 31 * t)
     mask, (knock,) = detect_motion(values, RATE)
@@ -135,8 +140,8 @@ def test_a_knock_rings_and_an_outlier_does_not():
     assert mask.sum() <= (2 + 1 + REMOVED_AFTER) * samples_per_block(RATE)
 
 
-def test_another_orientation_is_handling_and_rest_soon_after():
-    values = turned_by_hand(still(60), 30.0, 32.0)
+def test_new_orientation_is_reported_and_accepted_as_rest():
+    values = add_hand_rotation(simulate_rest(60), 30.0, 32.0)
     values[3200:, 3:] += [9.81 * np.sin(0.5), 0.0, 9.81 * (np.cos(0.5) - 1.0)]
     values[3200:, 0] += 2e-3  # g-sensitivity
     mask, (motion,) = detect_motion(values, RATE)
@@ -146,30 +151,32 @@ def test_another_orientation_is_handling_and_rest_soon_after():
 
 
 @pytest.mark.parametrize("moving_s", [3.0, 20.0])
-def test_a_recording_that_begins_in_motion(moving_s):
-    values = still(90)
-    turned_by_hand(values, 0.0, moving_s)
+def test_motion_at_the_start_is_found(moving_s):
+    values = simulate_rest(90)
+    add_hand_rotation(values, 0.0, moving_s)
     values[: round(moving_s * RATE), 0] += 0.4 * np.sin(np.arange(round(moving_s * RATE)) / 9.0)
-    turned_by_hand(values, 70.0, 72.0)
+    add_hand_rotation(values, 70.0, 72.0)
     mask, motions = detect_motion(values, RATE)
     assert mask[: round(moving_s * RATE)].mean() > 0.8
     assert not mask[round((moving_s + 5.0) * RATE) : 6900].any()
     assert 69.0 < motions[-1].since / RATE <= 70.0
 
 
-def test_a_slow_start_in_motion_is_unlearned_when_rest_comes():
-    """Too slight to be surely motion: learned as rest at first; what follows is far quieter."""
-    values = still(120)
+def test_slight_motion_at_the_start_is_unlearned():
+    """The motion is too slight to be recognized, so it is learned as rest until much less noise follows."""
+    values = simulate_rest(120)
     t = np.arange(1500) / RATE
     values[:1500, :3] += 0.05 * np.sin(2 * np.pi * np.outer(t, [3.1, 4.3, 5.9]))
     values[:1500, 3:] += 0.4 * np.sin(2 * np.pi * np.outer(t, [3.7, 4.9, 6.1]))
-    turned_by_hand(values, 60.0, 62.0)
+    add_hand_rotation(values, 60.0, 62.0)
     _, motions = detect_motion(values, RATE)
-    assert [round(one.since / RATE) for one in motions] == [59] or [round(one.since / RATE) for one in motions] == [60]
+    assert [round(motion.since / RATE) for motion in motions] == [59] or [
+        round(motion.since / RATE) for motion in motions
+    ] == [60]
 
 
-def test_a_new_vibration_is_motion_for_a_minute_and_rest_then():
-    values = still(240)
+def test_new_vibration_is_accepted_as_rest_after_a_minute():
+    values = simulate_rest(240)
     rows = np.arange(len(values) - 10000)
     values[10000:, 3:] += 0.2 * np.sin(2 * np.pi * 17.3 / RATE * rows)[:, None]
     mask, (motion,) = detect_motion(values, RATE)
@@ -179,8 +186,8 @@ def test_a_new_vibration_is_motion_for_a_minute_and_rest_then():
     assert REFERENCE_BLOCKS * BLOCK_S == 60.0
 
 
-def test_motion_that_goes_on_is_never_taken_for_rest():
-    values = still(300)
+def test_continuous_motion_is_never_accepted_as_rest():
+    values = simulate_rest(300)
     rng = np.random.default_rng(5)
     wander = np.convolve(rng.standard_normal(len(values) + 199), np.ones(200) / 200, "valid")
     values[6000:, :3] += 3.0 * wander[6000:, None]
@@ -188,8 +195,8 @@ def test_motion_that_goes_on_is_never_taken_for_rest():
     assert mask[6100:].mean() > 0.9
 
 
-def test_a_constant_rate_held_for_long_is_rest_after_ten_seconds():
-    values = still(60)
+def test_constant_rate_is_accepted_as_rest_after_ten_seconds():
+    values = simulate_rest(60)
     values[2000:, 2] += 0.5
     mask, (motion,) = detect_motion(values, RATE)
     assert motion.seconds == pytest.approx(10.0, abs=1.0)
@@ -197,7 +204,7 @@ def test_a_constant_rate_held_for_long_is_rest_after_ten_seconds():
 
 
 @pytest.mark.parametrize(
-    "disturbed",
+    "disturbance",
     [
         "white",
         "line",
@@ -211,45 +218,47 @@ def test_a_constant_rate_held_for_long_is_rest_after_ten_seconds():
         "ramp",
     ],
 )
-def test_what_is_no_motion(disturbed):
+def test_noise_and_disturbances_are_no_motion(disturbance):
     rng = np.random.default_rng(7)
-    values = still(1200, seed=8)
+    values = simulate_rest(1200, seed=8)
     n = len(values)
     t = np.arange(n)[:, None] / RATE
-    if disturbed == "line":
+    if disturbance == "line":
         values += 3 * NOISE * np.sin(2 * np.pi * 13.36 * t)
-    elif disturbed == "slow line":
+    elif disturbance == "slow line":
         values += 3 * NOISE * np.sin(2 * np.pi * 0.565 * t)
-    elif disturbed == "modulated":
+    elif disturbance == "modulated":
         values += 3 * NOISE * np.sin(2 * np.pi * 13.36 * t) * (1.0 + 0.9 * np.sin(2 * np.pi * 0.002 * t))
-    elif disturbed == "coarse":
+    elif disturbance == "coarse":
         values = np.round(values / (4 * NOISE)) * 4 * NOISE
-    elif disturbed == "three levels":
-        values = np.round((values - LYING) / (1.5 * NOISE)).clip(-1, 1) * 1.5 * NOISE
-    elif disturbed == "outliers":
+    elif disturbance == "three levels":
+        values = np.round((values - MEAN_AT_REST) / (1.5 * NOISE)).clip(-1, 1) * 1.5 * NOISE
+    elif disturbance == "outliers":
         values += (rng.random((n, 6)) < 0.09) * 7 * NOISE * rng.standard_normal((n, 6))
-    elif disturbed == "random walk":
+    elif disturbance == "random walk":
         values += np.cumsum(0.02 * NOISE * rng.standard_normal((n, 6)), axis=0)
-    elif disturbed == "correlated":
+    elif disturbance == "correlated":
         for k in range(1, n):
-            values[k] += 0.95 * (values[k - 1] - LYING)
-    elif disturbed == "ramp":
+            values[k] += 0.95 * (values[k - 1] - MEAN_AT_REST)
+    elif disturbance == "ramp":
         values += 10 * NOISE * t / 60.0
     mask, motions = detect_motion(values, RATE)
-    assert not mask.any(), [one.text for one in motions]
+    assert not mask.any(), [motion.text for motion in motions]
 
 
 @pytest.mark.parametrize("rate", [4.16, 20.0, 262.0, 2000.0])
-def test_any_rate(rate):
+def test_motion_is_found_at_any_rate(rate):
     length_s = max(60.0, 300 / rate)
-    values = turned_by_hand(still(length_s, rate=rate), length_s / 2, length_s / 2 + max(3.0, 20 / rate), rate)
+    values = add_hand_rotation(
+        simulate_rest(length_s, rate=rate), length_s / 2, length_s / 2 + max(3.0, 20 / rate), rate
+    )
     _, motions = detect_motion(values, rate)
     assert len(motions) == 1
     assert motions[0].since / rate <= length_s / 2 < motions[0].until / rate
 
 
-def test_axes_that_are_absent_and_values_that_never_change():
-    values = turned_by_hand(still(60), 30.0, 33.0)
+def test_missing_and_constant_axes_are_accepted():
+    values = add_hand_rotation(simulate_rest(60), 30.0, 33.0)
     values[:, 1:] = np.nan
     _, (motion,) = detect_motion(values, RATE)
     assert motion.axis == "gx"
@@ -258,13 +267,13 @@ def test_axes_that_are_absent_and_values_that_never_change():
     assert detect_motion(np.empty((0, 6)), RATE)[0].shape == (0,)
 
 
-def test_a_constant_that_begins_to_toggle_is_no_motion():
+def test_constant_that_starts_to_toggle_is_no_motion():
     values = np.zeros((12000, 6))
     values[6000:] = 0.01 * (np.random.default_rng(0).random((6000, 6)) < 0.2)
     assert detect_motion(values, RATE)[1] == []
 
 
-def recording(name):
+def load_recording(name):
     data = np.load(recordings() / f"{name}.npz")
     absent = np.full(len(data["gx"]), np.nan)
     values = np.stack([data[axis] if axis in data.files else absent for axis in AXES], axis=1)
@@ -273,7 +282,7 @@ def recording(name):
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("name", "most"),
+    ("name", "max_share"),
     [
         ("adis16405/run1", 0.0),
         ("adis16405/run2", 0.0),
@@ -286,14 +295,14 @@ def recording(name):
         ("vn100-serial/static-12min", 0.01),  # touched at the very end
     ],
 )
-def test_static_recordings_stay_at_rest(name, most):
-    values, rate = recording(name)
-    assert detect_motion(values, rate)[0].mean() <= most
+def test_static_recordings_are_at_rest(name, max_share):
+    values, rate = load_recording(name)
+    assert detect_motion(values, rate)[0].mean() <= max_share
 
 
 @pytest.mark.data
-def test_moved_by_hand_on_the_bench():
-    values, rate = recording("px4-bench/bench-69s")
+def test_motion_by_hand_on_the_bench_is_found():
+    values, rate = load_recording("px4-bench/bench-69s")
     _, (motion,) = detect_motion(values, rate)
     assert motion.since / rate == pytest.approx(1.9, abs=0.4)
     assert motion.until / rate == pytest.approx(6.9, abs=0.5)
@@ -301,8 +310,8 @@ def test_moved_by_hand_on_the_bench():
 
 @pytest.mark.data
 @pytest.mark.parametrize("unit", ["imu1", "imu2", "imu3"])
-def test_on_the_ground_and_in_flight(unit):
-    values, rate = recording(f"autopilot-3imu/{unit}")
+def test_flight_is_motion_and_waiting_on_the_ground_is_rest(unit):
+    values, rate = load_recording(f"autopilot-3imu/{unit}")
     mask, _ = detect_motion(values, rate)
     assert not mask[round(20 * rate) : round(55 * rate)].any()
     assert mask[round(72 * rate) :].mean() > 0.99
@@ -310,18 +319,18 @@ def test_on_the_ground_and_in_flight(unit):
 
 @pytest.mark.data
 @pytest.mark.parametrize("unit", range(5))
-def test_hand_rotations_and_standstills(unit):
-    values, rate = recording(f"mpu9150-rotations/unit{unit}")
+def test_hand_rotations_and_rests_are_separated(unit):
+    values, rate = load_recording(f"mpu9150-rotations/unit{unit}")
     mask, motions = detect_motion(values, rate)
     turning = np.abs(values[:, :3] - np.median(values[:, :3], axis=0)).max(axis=1) > 0.3
     assert mask[turning].mean() > 0.95
     assert 0.4 < mask.mean() < 0.65
-    assert sum(one.kind == "handling/orientation" for one in motions) >= 18
+    assert sum(motion.kind == "handling/orientation" for motion in motions) >= 18
 
 
 @pytest.mark.data
-def test_a_car_that_parks_and_drives_off():
-    values, rate = recording("can-car/drive-a")
+def test_parking_and_driving_of_a_car_are_separated():
+    values, rate = load_recording("can-car/drive-a")
     mask, _ = detect_motion(values, rate)
     for parked in ((54, 80), (178, 204), (286, 320)):
         assert not mask[round(parked[0] * rate) : round(parked[1] * rate)].any()

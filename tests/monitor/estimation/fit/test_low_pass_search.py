@@ -1,4 +1,4 @@
-"""The sensor's own low-pass: its columns, whether it is found, and that N and its interval survive it."""
+"""Tests of the search for a low-pass filter in the sensor, which must not affect N and its interval."""
 
 import numpy as np
 import pytest
@@ -11,30 +11,30 @@ from monitor.estimation.estimator import Estimator
 from monitor.estimation.fit.low_pass_search import LowPass, is_visible_in_spectrum, power_spectrum
 
 RATE_HZ = 100.0
-N = 1.5e-4
+ANGLE_RANDOM_WALK = 1.5e-4
 
 
-def filtered(order, cutoff_hz, n, seed=1):
-    """White noise of N through a digital Butterworth low-pass, settled."""
+def simulate_filtered_noise(order, cutoff_hz, n, seed=1):
+    """Return white noise of level N after a digital Butterworth low-pass filter, without the transient."""
     sections = butter(order, cutoff_hz, fs=RATE_HZ, output="sos")
-    white = N * np.sqrt(RATE_HZ) * np.random.default_rng(seed).standard_normal((n + 5000, 6))
+    white = ANGLE_RANDOM_WALK * np.sqrt(RATE_HZ) * np.random.default_rng(seed).standard_normal((n + 5000, 6))
     return sosfilt(sections, white, axis=0)[5000:]
 
 
-def analyzed(values):
+def analyze_values(values):
     return analyze([make_block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
 
 
-def held(found):
+def count_intervals_containing_n(found):
     c = found.estimate.coefficients
-    return int(((c.lo[1] <= N) & (c.hi[1] >= N)).sum())
+    return int(((c.lo[1] <= ANGLE_RANDOM_WALK) & (c.hi[1] >= ANGLE_RANDOM_WALK)).sum())
 
 
 @pytest.mark.parametrize(("order", "cutoff_hz"), [(1, 10.0), (2, 30.0), (4, 5.0)])
-def test_a_column_is_the_allan_variance_of_filtered_noise(order, cutoff_hz):
+def test_column_is_the_allan_variance_of_filtered_noise(order, cutoff_hz):
     factors = np.array([1, 2, 5, 16, 100, 1000])
-    values = filtered(order, cutoff_hz, 400_000)
-    measured = overlapping_avar(values, factors)[0].mean(axis=1) / (N**2 * RATE_HZ)
+    values = simulate_filtered_noise(order, cutoff_hz, 400_000)
+    measured = overlapping_avar(values, factors)[0].mean(axis=1) / (ANGLE_RANDOM_WALK**2 * RATE_HZ)
     stated = LowPass("digital", order, cutoff_hz / RATE_HZ).avar(factors)
     assert measured[:4] == pytest.approx(stated[:4], rel=0.02)
     assert measured == pytest.approx(stated, rel=0.12)
@@ -42,7 +42,7 @@ def test_a_column_is_the_allan_variance_of_filtered_noise(order, cutoff_hz):
 
 @pytest.mark.long
 @pytest.mark.parametrize("cutoff_hz", [3.0, 20.0])
-def test_an_analogue_filter_is_that_of_a_much_faster_digital_one(cutoff_hz):
+def test_analogue_filter_equals_a_much_faster_digital_filter(cutoff_hz):
     sections = butter(2, cutoff_hz, fs=20 * RATE_HZ, output="sos")
     fast = sosfilt(sections, np.random.default_rng(2).standard_normal((2_000_000, 6)), axis=0)[20_000:]
     factors = np.array([1, 2, 8, 64])
@@ -54,67 +54,67 @@ def test_an_analogue_filter_is_that_of_a_much_faster_digital_one(cutoff_hz):
 @pytest.mark.long
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 @pytest.mark.parametrize("cutoff_hz", [3.0, 10.0, 33.0])
-def test_n_survives_any_bandwidth(order, cutoff_hz):
-    found = analyzed(filtered(order, cutoff_hz, 360_000, seed=order))
-    assert held(found) >= 4
-    assert found.estimate.coefficients.value[1] == pytest.approx(N, rel=0.03)
-    there = np.isfinite(found.bandwidth_hz)
-    assert there.sum() >= 4
-    # at a tenth of the noise an order is easily taken for its neighbour, with a cutoff a little off
-    assert found.bandwidth_hz[there] == pytest.approx(cutoff_hz, rel=0.3)
+def test_n_is_correct_for_any_bandwidth(order, cutoff_hz):
+    found = analyze_values(simulate_filtered_noise(order, cutoff_hz, 360_000, seed=order))
+    assert count_intervals_containing_n(found) >= 4
+    assert found.estimate.coefficients.value[1] == pytest.approx(ANGLE_RANDOM_WALK, rel=0.03)
+    known = np.isfinite(found.bandwidth_hz)
+    assert known.sum() >= 4
+    # At low noise levels, an order is easily confused with its neighbor at a slightly different cutoff.
+    assert found.bandwidth_hz[known] == pytest.approx(cutoff_hz, rel=0.3)
 
 
 @pytest.mark.long
 def test_white_noise_and_lines_have_no_bandwidth():
-    white = N * 10.0 * np.random.default_rng(4).standard_normal((200_000, 6))
-    assert np.isnan(analyzed(white).bandwidth_hz).all()
+    white = ANGLE_RANDOM_WALK * 10.0 * np.random.default_rng(4).standard_normal((200_000, 6))
+    assert np.isnan(analyze_values(white).bandwidth_hz).all()
     line = white + 2e-3 * np.sin(2.0 * np.pi * 20.3 * np.arange(200_000) / RATE_HZ)[:, None]
-    assert np.isnan(analyzed(line).bandwidth_hz).all()
+    assert np.isnan(analyze_values(line).bandwidth_hz).all()
 
 
 @pytest.mark.long
-def test_the_live_estimate_finds_it_too():
-    values = filtered(2, 20.0, 120_000)
+def test_live_estimate_finds_the_filter():
+    values = simulate_filtered_noise(2, 20.0, 120_000)
     estimator = Estimator(RATE_HZ, 1200.0)
     estimator.add_samples(make_block(np.arange(len(values)) * 10_000_000, values))
     before = estimator.get_estimate()
-    for _ in range(6 * 65):  # pieces of six searches
+    for _ in range(6 * 65):  # steps of the searches of six axes
         estimator.step_slow_statistics()
     after = estimator.get_estimate()
     assert np.isnan(before.fitted[0]).any() or (before.fitted[0] != after.fitted[0]).any()
     c = after.coefficients
-    assert ((c.lo[1] <= N) & (c.hi[1] >= N)).sum() >= 5
+    assert ((c.lo[1] <= ANGLE_RANDOM_WALK) & (c.hi[1] >= ANGLE_RANDOM_WALK)).sum() >= 5
     assert np.isfinite(after.fitted).all()
     np.testing.assert_allclose(after.fitted[0], after.curve.avar[0], rtol=0.03)
 
 
 @pytest.mark.long
-def test_what_does_not_fall_beyond_the_cutoff_is_no_filter():
-    # a strong wide resonance: the shortest τ lie low as behind a low-pass, and the spectrum does not end
+def test_resonance_is_not_taken_for_a_filter():
+    # A strong wide resonance lowers the shortest τ as a low-pass does, but its spectrum does not end.
     rng = np.random.default_rng(3)
-    values = N * np.sqrt(RATE_HZ) * rng.standard_normal((200_000, 6))
+    values = ANGLE_RANDOM_WALK * np.sqrt(RATE_HZ) * rng.standard_normal((200_000, 6))
     sections = butter(2, [3.0, 5.0], "bandpass", fs=RATE_HZ, output="sos")
-    values += 20.0 * N * np.sqrt(RATE_HZ) * sosfilt(sections, rng.standard_normal((200_000, 6)), axis=0)
+    values += 20.0 * ANGLE_RANDOM_WALK * np.sqrt(RATE_HZ) * sosfilt(sections, rng.standard_normal((200_000, 6)), axis=0)
     found = analyze([make_block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
     assert (found.fit.misfit > 1.0).all() or (found.fit.left_out > 0).all()
     assert np.isnan(found.bandwidth_hz).all()
 
 
-def test_a_spectrum_is_asked_by_medians():
-    spectrum = power_spectrum(filtered(2, 20.0, 100_000)[:, 0])
+def test_filter_visibility_uses_medians_of_the_spectrum():
+    spectrum = power_spectrum(simulate_filtered_noise(2, 20.0, 100_000)[:, 0])
     assert is_visible_in_spectrum(LowPass("digital", 2, 0.2), spectrum)
     assert not is_visible_in_spectrum(LowPass("digital", 2, 0.05), spectrum)
-    assert not is_visible_in_spectrum(LowPass("digital", 2, 0.001), spectrum)  # lower than any of its bins
+    assert not is_visible_in_spectrum(LowPass("digital", 2, 0.001), spectrum)  # below the lowest bin
     spectrum[700:703] *= 1e6  # a line beyond the cutoff
     assert is_visible_in_spectrum(LowPass("digital", 2, 0.2), spectrum)
     assert power_spectrum(np.zeros(100)).size == 0
     assert not is_visible_in_spectrum(LowPass("digital", 2, 0.2), power_spectrum(np.zeros(100)))
 
 
-def test_a_spectrum_is_that_of_the_samples_there_are():
-    there = filtered(2, 20.0, 100_000)[:, 0]
+def test_spectrum_ignores_missing_samples():
+    values = simulate_filtered_noise(2, 20.0, 100_000)[:, 0]
     absent = np.full(100_000, np.nan)
-    assert np.median(power_spectrum(np.concatenate([absent, there])) / power_spectrum(there)) == pytest.approx(
+    assert np.median(power_spectrum(np.concatenate([absent, values])) / power_spectrum(values)) == pytest.approx(
         1.0, rel=0.2
     )
     assert power_spectrum(absent).size == 0

@@ -1,4 +1,4 @@
-"""Exports: read back by what would read them, numbers against closed forms by hand."""
+"""Tests of the exports: files are read as their target program does and compared with closed forms."""
 
 import json
 import math
@@ -43,20 +43,23 @@ value = 9.8
 """
 
 
-def noise(text: str = MODEL) -> exporters.NoiseCoefficients:
+def make_coefficients(text: str = MODEL) -> exporters.NoiseCoefficients:
     return exporters.from_model(NoiseModel.from_toml(text), "bench-1.toml")
 
 
-def analysed(status: str = "upper_bound") -> exporters.NoiseCoefficients:
-    """gx and gy as ``analyze --json`` writes them; K of gy estimated, of gx with this status."""
+def make_analysis_coefficients(status: str = "upper_bound") -> exporters.NoiseCoefficients:
+    """Return coefficients of an analysis; K of gy is estimated, and K of gx has this status."""
 
-    def one(value: float | None, hi: float | None, status: str) -> dict[str, Any]:
+    def make_coefficient(value: float | None, hi: float | None, status: str) -> dict[str, Any]:
         return {"value": value, "lo": None if value is None else value * 0.9, "hi": hi, "status": status}
 
     axes = {
-        "gx": {"N": one(1e-4, 1.1e-4, "estimated"), "K": one(None, 9e-6 if status == "upper_bound" else None, status)},
-        "gy": {"N": one(2e-4, 2.1e-4, "estimated"), "K": one(3e-6, 4e-6, "estimated")},
-        "ax": {"N": one(1e-3, 1.1e-3, "estimated"), "K": one(None, 5e-5, "upper_bound")},
+        "gx": {
+            "N": make_coefficient(1e-4, 1.1e-4, "estimated"),
+            "K": make_coefficient(None, 9e-6 if status == "upper_bound" else None, status),
+        },
+        "gy": {"N": make_coefficient(2e-4, 2.1e-4, "estimated"), "K": make_coefficient(3e-6, 4e-6, "estimated")},
+        "ax": {"N": make_coefficient(1e-3, 1.1e-3, "estimated"), "K": make_coefficient(None, 5e-5, "upper_bound")},
     }
     payload = {
         "schema": "imu-monitor/analyze/1",
@@ -68,8 +71,8 @@ def analysed(status: str = "upper_bound") -> exporters.NoiseCoefficients:
     return exporters.from_analysis_json(json.dumps(payload), "bench-1.json")
 
 
-def yaml(text: str) -> dict[str, float | str]:
-    """``key: value  # comment`` lines, numbers as YAML 1.1 defines a float: with a point and a signed exponent."""
+def parse_yaml(text: str) -> dict[str, float | str]:
+    """Parse ``key: value  # comment`` lines; YAML 1.1 floats need a point and a signed exponent."""
     found: dict[str, float | str] = {}
     for line in text.splitlines():
         key, value = (
@@ -82,15 +85,15 @@ def yaml(text: str) -> dict[str, float | str]:
 
 
 def test_effects_of_one_name_add_as_variances() -> None:
-    assert noise().axes["gz"]["B"].value == pytest.approx(5.0e-5)
-    assert "B" not in noise().axes["gx"]
-    assert noise().left_out == ("az.bias",)
+    assert make_coefficients().axes["gz"]["B"].value == pytest.approx(5.0e-5)
+    assert "B" not in make_coefficients().axes["gx"]
+    assert make_coefficients().left_out == ("az.bias",)
 
 
-def test_kalibr_has_the_worst_axis_in_continuous_time_units() -> None:
-    louder = MODEL.replace("[az.bias]", "[[ay.angle_random_walk]]\nN = 2.0e-3\n[az.bias]")
-    text = exporters.export(noise(louder), "kalibr", 10.0, rostopic="/imu/data")
-    found = yaml(text)
+def test_kalibr_uses_the_worst_axis_in_continuous_time_units() -> None:
+    noisier = MODEL.replace("[az.bias]", "[[ay.angle_random_walk]]\nN = 2.0e-3\n[az.bias]")
+    text = exporters.export(make_coefficients(noisier), "kalibr", 10.0, rostopic="/imu/data")
+    found = parse_yaml(text)
     assert found == {
         "rostopic": "/imu/data",
         "update_rate": 200.0,
@@ -106,18 +109,18 @@ def test_kalibr_has_the_worst_axis_in_continuous_time_units() -> None:
     assert text.isascii()
 
 
-def test_kalibr_density_is_that_of_the_samples() -> None:
-    """Kalibr makes σ of a sample by 1/√Δt: that of the white noise that the model simulates."""
+def test_kalibr_density_agrees_with_the_samples() -> None:
+    """Kalibr multiplies its density by 1/√Δt to get σ of a sample of white noise."""
     model = NoiseModel.from_toml(MODEL.replace("Q = 2.0e-6", "Q = 0.0").replace("K = 1.0e-6", "K = 1.0e-9"))
-    density = yaml(exporters.export(exporters.from_model(model), "kalibr"))["gyroscope_noise_density"]
+    density = parse_yaml(exporters.export(exporters.from_model(model), "kalibr"))["gyroscope_noise_density"]
     samples = model.simulate(200_000, 200.0, 1)[:, 0]
     assert isinstance(density, float)
     assert samples.std() == pytest.approx(density * math.sqrt(200.0), rel=0.01)
 
 
-def test_kalibr_takes_an_estimate_before_a_bound_and_says_a_bound() -> None:
-    text = exporters.export(analysed(), "kalibr")
-    found = yaml(text)
+def test_kalibr_prefers_an_estimate_and_marks_a_bound() -> None:
+    text = exporters.export(make_analysis_coefficients(), "kalibr")
+    found = parse_yaml(text)
     assert found["gyroscope_random_walk"] == pytest.approx(3e-6)
     assert "# K: worst axis gy (gx <= 9e-06, gy 3e-06)" in text
     assert found["accelerometer_random_walk"] == pytest.approx(5e-5)
@@ -125,26 +128,28 @@ def test_kalibr_takes_an_estimate_before_a_bound_and_says_a_bound() -> None:
     assert found["gyroscope_noise_density"] == pytest.approx(2e-4)
 
 
-def test_kalibr_refuses_what_it_would_read_as_zero() -> None:
+def test_kalibr_refuses_zero_or_missing_values() -> None:
     with pytest.raises(ConfigError, match=r"kalibr needs K \(rate_random_walk\) above 0 on the gyro axes"):
-        exporters.export(noise(MODEL.replace("K = 1.0e-6", "K = 0.0")), "kalibr")
+        exporters.export(make_coefficients(MODEL.replace("K = 1.0e-6", "K = 0.0")), "kalibr")
     with pytest.raises(ConfigError, match="no sample_rate"):
-        exporters.export(noise(MODEL.replace("sample_rate = 200.0", "")), "kalibr")
+        exporters.export(make_coefficients(MODEL.replace("sample_rate = 200.0", "")), "kalibr")
 
 
-def test_a_recording_that_does_not_say_enough_is_no_answer() -> None:
+def test_insufficient_recording_is_refused() -> None:
     empty = exporters.from_analysis_json(
         '{"schema": "imu-monitor/analyze/1", "samples": 3, "notes": ["few"], "axes": {}}'
     )
     with pytest.raises(NotReady, match="a longer recording is needed"):
         exporters.export(empty, "kalman")
-    without_accelerometers = exporters.NoiseCoefficients({"gx": analysed().axes["gx"]}, 100.0, "", measured=True)
+    without_accelerometers = exporters.NoiseCoefficients(
+        {"gx": make_analysis_coefficients().axes["gx"]}, 100.0, "", measured=True
+    )
     with pytest.raises(NotReady, match="accel axes"):
         exporters.export(without_accelerometers, "kalibr")
 
 
-def properties(text: str) -> dict[str, dict[str, Any]]:
-    """MATLAB's name-value pairs, a table a maker; continuation and comments as MATLAB reads them."""
+def parse_matlab_properties(text: str) -> dict[str, dict[str, Any]]:
+    """Parse the name-value pairs per constructor, with continuations and comments as in MATLAB."""
     joined = re.sub(r"\.\.\..*\n", " ", re.sub(r"^%.*\n", "", text, flags=re.M))
     found: dict[str, dict[str, Any]] = {}
     for variable, maker, body in re.findall(r"(\w+) = (\w+)\((.*)\);", joined):
@@ -155,8 +160,8 @@ def properties(text: str) -> dict[str, dict[str, Any]]:
     return found
 
 
-def test_matlab_gets_a_value_an_axis_and_the_noise_type_of_n() -> None:
-    found = properties(exporters.export(noise(), "gyroparams", 2.0))
+def test_matlab_gets_a_value_per_axis_and_single_sided_noise() -> None:
+    found = parse_matlab_properties(exporters.export(make_coefficients(), "gyroparams", 2.0))
     gyro, accel, imu = found["gyro=gyroparams"], found["accel=accelparams"], found["imu=imuSensor"]
     assert gyro["NoiseDensity"] == pytest.approx([2e-4, 2e-4, 2e-4])
     assert gyro["BiasInstability"] == pytest.approx([0.0, 0.0, 1e-4])
@@ -168,28 +173,28 @@ def test_matlab_gets_a_value_an_axis_and_the_noise_type_of_n() -> None:
     assert imu == {"SampleRate": "200.0", "Gyroscope": "gyro", "Accelerometer": "accel"}
 
 
-def test_matlab_never_simulates_a_bound() -> None:
-    text = exporters.export(analysed(), "gyroparams")
-    found = properties(text)
+def test_matlab_gets_zero_instead_of_a_bound() -> None:
+    text = exporters.export(make_analysis_coefficients(), "gyroparams")
+    found = parse_matlab_properties(text)
     assert found["gyro=gyroparams"]["RandomWalk"] == pytest.approx([0.0, 3e-6, 0.0])
     assert "% K, (rad/s)*sqrt(Hz); gx only bounded, <= 9e-06; gz unknown" in text
     assert text.isascii()
 
 
-def test_what_matlab_makes_of_bias_instability_is_flicker_of_that_b() -> None:
-    """White noise of that σ through 1/A(z), A of ``fractalcoef``: Kasdin's a_k = a_{k-1} (k - 3/2)/k."""
-    gyro = properties(exporters.export(noise(), "gyroparams"))["gyro=gyroparams"]
+def test_matlab_bias_instability_gives_flicker_noise_of_this_level() -> None:
+    """MATLAB filters white noise by 1/A(z); A of ``fractalcoef`` has a_k = a_{k-1} (k - 3/2)/k by Kasdin."""
+    gyro = parse_matlab_properties(exporters.export(make_coefficients(), "gyroparams"))["gyro=gyroparams"]
     b, poles = gyro["BiasInstability"][2], int(gyro["BiasInstabilityCoefficients"][12:-1])
     a = np.ones(poles + 1)
     for k in range(1, poles + 1):
         a[k] = a[k - 1] * (k - 1.5) / k
-    f = np.geomspace(2.0 / poles, 0.05, 20)  # cycles a sample
+    f = np.geomspace(2.0 / poles, 0.05, 20)  # cycles per sample
     gain = 1.0 / np.abs(np.exp(-2j * np.pi * f[:, None] * np.arange(poles + 1)) @ a) ** 2
     assert b**2 * gain == pytest.approx((5e-5) ** 2 / (2 * np.pi * f), rel=0.1)
 
 
-def test_kalman_blocks_by_hand() -> None:
-    text = exporters.export(noise(), "kalman")
+def test_kalman_blocks_have_the_expected_values() -> None:
+    text = exporters.export(make_coefficients(), "kalman")
     found = tomllib.loads(text)
     assert found["schema"] == "imu-monitor/kalman/1"
     dt, n, k = 0.005, 1e-4, 1e-6
@@ -211,8 +216,8 @@ def test_kalman_blocks_by_hand() -> None:
 
 
 @pytest.mark.parametrize("dt", [1e-3, 0.5, 30.0, 200.0])
-def test_discrete_noise_is_the_integral_of_the_continuous(dt: float) -> None:
-    """Van Loan, IEEE Trans. Automatic Control 23(3), 1978, with the model's matrices."""
+def test_discrete_noise_is_the_integral_of_the_continuous_noise(dt: float) -> None:
+    """The integral follows Van Loan, IEEE Trans. Automatic Control 23(3), 1978."""
     n, k, sigma, time = 2e-4, 3e-6, 4e-5, 50.0
     f = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1 / time]])
     g = np.diag([n**2, k**2, 2 * sigma**2 / time])
@@ -223,13 +228,13 @@ def test_discrete_noise_is_the_integral_of_the_continuous(dt: float) -> None:
 
 
 @pytest.mark.parametrize("x", [0.0999, 0.1001])
-def test_series_and_closed_form_meet(x: float) -> None:
+def test_series_and_closed_form_agree_at_their_boundary(x: float) -> None:
     own = process_noise_matrix(x, 0.0, 0.0, 1.0, 1.0)[0, 0]
     assert own == pytest.approx(2.0 * (x - 2 * (1 - math.exp(-x)) + (1 - math.exp(-2 * x)) / 2), rel=1e-10)
 
 
-def test_the_markov_process_peaks_where_it_is_said_to() -> None:
-    """Allan variance of exponentially correlated noise, IEEE Std 952, C.1.1.7: peak of the closed form."""
+def test_markov_process_has_its_peak_at_the_stated_tau() -> None:
+    """The Allan variance of exponentially correlated noise is given by IEEE Std 952, C.1.1.7."""
 
     def deviation(log_tau: float) -> float:  # σ = T = 1
         tau = math.exp(log_tau)
@@ -240,29 +245,29 @@ def test_the_markov_process_peaks_where_it_is_said_to() -> None:
     assert -peak.fun == pytest.approx(MARKOV_PEAK_RATIO, rel=2e-3)
 
 
-def test_flicker_without_a_middle_needs_a_correlation_time() -> None:
+def test_bias_instability_without_a_plateau_needs_a_correlation_time() -> None:
     text = "sample_rate = 10.0\n[gx.bias_instability]\nB = 1e-5"
-    without = exporters.export(noise(text), "kalman")
+    without = exporters.export(make_coefficients(text), "kalman")
     assert tomllib.loads(without)["gx"]["states"] == ["angle", "bias_walk"]
     assert "# B is omitted" in without
-    given = tomllib.loads(exporters.export(noise(text), "kalman", 3.0, dt_s=2.0, correlation_time_s=100.0))
+    given = tomllib.loads(exporters.export(make_coefficients(text), "kalman", 3.0, dt_s=2.0, correlation_time_s=100.0))
     assert given["inflation"] == 3.0
     assert given["gx"]["correlation_time"] == 100.0
     sigma = 3e-5 * math.sqrt(2 * math.log(2) / math.pi) / (0.437 * math.sqrt(2))
     assert given["gx"]["Q"][2][2] == pytest.approx(sigma**2 * (1 - math.exp(-0.04)), rel=1e-6)
 
 
-def test_kalman_counts_a_bound_and_says_so() -> None:
-    text = exporters.export(analysed(), "kalman")
+def test_kalman_uses_a_bound_and_marks_it() -> None:
+    text = exporters.export(make_analysis_coefficients(), "kalman")
     assert tomllib.loads(text)["gx"]["psd_walk"] == pytest.approx(9e-6**2)
     assert "# UPPER BOUND instead of a value: K" in text
-    unseen = exporters.export(analysed("unestimated"), "kalman")
+    unseen = exporters.export(make_analysis_coefficients("unestimated"), "kalman")
     assert tomllib.loads(unseen)["gx"]["psd_walk"] == 0.0
     assert "# unknown, set to 0: B, K" in unseen
 
 
 @pytest.mark.parametrize("form", list(exporters.FORMATS))
-def test_the_shipped_model_goes_into_every_format(form: str) -> None:
+def test_shipped_model_can_be_exported_to_every_format(form: str) -> None:
     model = NoiseModel.from_toml((CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text())
     text = exporters.export(exporters.from_model(model, "consumer-mems.toml"), form)
     assert text.isascii()
@@ -271,38 +276,38 @@ def test_the_shipped_model_goes_into_every_format(form: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("form", "inflation", "options", "says"),
+    ("form", "inflation", "options", "message"),
     [
-        ("yaml", 1.0, {}, 'unknown format "yaml"; possible are kalibr, gyroparams, kalman'),
+        ("yaml", 1.0, {}, 'unknown format "yaml"; possible are kalibr, allan_variance_ros, openvins'),
         ("kalibr", 0.5, {}, "inflation: 0.5 is outside the supported range"),
         ("kalibr", math.nan, {}, "inflation: nan"),
         ("kalman", 1.0, {"dt_s": 0.0}, "a time step of 1 µs"),
         ("kalman", 1.0, {"correlation_time_s": -1.0}, "correlation time: -1 s"),
     ],
 )
-def test_a_wrong_request_is_said(form: str, inflation: float, options: dict[str, float], says: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(says)):
-        exporters.export(noise(), form, inflation, **options)
+def test_invalid_request_is_refused(form: str, inflation: float, options: dict[str, float], message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        exporters.export(make_coefficients(), form, inflation, **options)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": "imu-monitor/event/1", "axes": {}}', b"\xff\xfe"])
-def test_what_is_no_analysis_is_refused(text: str | bytes) -> None:
+def test_invalid_analysis_is_refused(text: str | bytes) -> None:
     with pytest.raises(ConfigError):
         exporters.from_analysis_json(text)
 
 
 @pytest.mark.parametrize("form", ["kalibr", "gyroparams", "kalman"])
-def test_an_axis_whose_slow_part_is_temperature_is_warned_of(form: str) -> None:
-    one = {"value": 1e-4, "lo": 9e-5, "hi": 1.1e-4, "status": "estimated"}
-    axis = {"coefficients": dict.fromkeys("NBK", one)}
+def test_temperature_dependent_axis_gives_a_warning(form: str) -> None:
+    estimated = {"value": 1e-4, "lo": 9e-5, "hi": 1.1e-4, "status": "estimated"}
+    axis = {"coefficients": dict.fromkeys("NBK", estimated)}
     axes: dict[str, Any] = dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), axis)
     old = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
     assert "WARNING" not in exporters.export(exporters.from_analysis_json(old), form)
     axes["gy"] = {**axis, "temperature": {"share": 0.987, "p_value": 1e-9, "form": "cubic", "later": 1}}
     new = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
-    made = exporters.export(exporters.from_analysis_json(new), form)
+    exported = exporters.export(exporters.from_analysis_json(new), form)
     mark = "%" if form == "gyroparams" else "#"
-    [line] = [line for line in made.splitlines() if "WARNING" in line]
+    [line] = [line for line in exported.splitlines() if "WARNING" in line]
     assert line == (
         f"{mark} WARNING: gy follows its temperature, which explains 98 % of its slow variance: "
         "B and K of gy describe temperature as well as noise"

@@ -1,4 +1,4 @@
-"""Results that went through messages are those that went in, as far as they travel; what is no result is refused."""
+"""Tests that results survive encoding and decoding as messages, and that invalid results are refused."""
 
 import json
 
@@ -15,19 +15,19 @@ from monitor.publishing.messages.results import (
     StatusMessage,
     fitted_allan_variance,
 )
-from tests.monitor.publishing import made
+from tests.monitor.publishing import example_results
 
 
-def through_messages(estimate: Estimate, **changed: object) -> Estimate:
+def encode_and_decode(estimate: Estimate, **changed: object) -> Estimate:
     allan = json.loads(AllanMessage.from_result("a", 1.76e9, 0, estimate).encode()) | changed
     payload = CoefficientsMessage.from_result("a", 1.76e9, 0, estimate).encode()
     coefficients = decode_message(CoefficientsMessage, payload).to_coefficients()
     return decode_message(AllanMessage, json.dumps(allan).encode()).to_estimate(coefficients, frozenset())
 
 
-def test_an_estimate() -> None:
-    sent = made.estimate()
-    got = through_messages(sent)
+def test_decoded_estimate_equals_the_original() -> None:
+    sent = example_results.make_estimate()
+    got = encode_and_decode(sent)
     for name in ("tau_s", "factors", "avar", "lo", "hi", "n"):
         assert getattr(got.curve, name) == pytest.approx(getattr(sent.curve, name), rel=1e-9, nan_ok=True), name
     for name in ("value", "lo", "hi", "status"):
@@ -38,9 +38,9 @@ def test_an_estimate() -> None:
     assert got.fitted == pytest.approx(sent.fitted, rel=0.02)
 
 
-def test_the_fitted_curve_is_that_of_the_standard() -> None:
-    """N alone: σ² = N²/τ; B alone: (2 ln 2/π) B²."""
-    coefficients = made.estimate().coefficients
+def test_fitted_curve_follows_the_standard() -> None:
+    """N alone gives σ² = N²/τ, and B alone gives (2 ln 2/π) B²."""
+    coefficients = example_results.make_estimate().coefficients
     coefficients.value[:] = np.nan
     coefficients.value[1, 0] = 3.0
     coefficients.value[2, 1] = 2.0
@@ -54,17 +54,17 @@ def test_the_fitted_curve_is_that_of_the_standard() -> None:
     "changed",
     [{"tau": []}, {"tau": [2.0, 1.0]}, {"tau": [-1.0, 1.0]}, {"tau": [1.0]}, {"rate": 0.0}, {"tau": [1.0] * 2000}],
 )
-def test_what_is_no_curve_is_refused(changed: dict[str, object]) -> None:
-    with pytest.raises(ValueError):  # noqa: PT011 - whatever it says, it is counted
-        through_messages(made.estimate(), **changed)
+def test_invalid_curve_is_refused(changed: dict[str, object]) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - any message is acceptable
+        encode_and_decode(example_results.make_estimate(), **changed)
 
 
-def test_health_and_events() -> None:
-    sent = made.health(text="viewer is slow")
+def test_decoded_health_and_event_equal_the_originals() -> None:
+    sent = example_results.make_health(text="viewer is slow")
     got = StatusMessage.decode(StatusMessage.from_result("a", 1.0, 0, sent).encode()).to_health()
     assert got.text == "viewer is slow"
     assert (got.received, got.uptime_s, got.memory_bytes) == (sent.received, sent.uptime_s, sent.memory_bytes)
-    happened = Event("noise_changed", 10**18, "gz rose", "gz", {"N": {"before": 1.0, "after": 2.0}})
-    read = EventMessage.decode(EventMessage.from_result("a", 1e9, 5, happened).encode()).to_event()
-    assert (read.kind, read.axis, read.text, read.values) == ("noise_changed", "gz", "gz rose", happened.values)
+    event = Event("noise_changed", 10**18, "gz rose", "gz", {"N": {"before": 1.0, "after": 2.0}})
+    read = EventMessage.decode(EventMessage.from_result("a", 1e9, 5, event).encode()).to_event()
+    assert (read.kind, read.axis, read.text, read.values) == ("noise_changed", "gz", "gz rose", event.values)
     assert read.axis in AXES

@@ -1,4 +1,4 @@
-"""Changes are marked on their own axis, in words that do not touch; panels hold the courses and most of their bands."""
+"""Tests of the figure of dynamic curves: marks of changes, labels, value ranges and time axis."""
 
 from itertools import pairwise
 
@@ -20,12 +20,12 @@ from monitor.publishing.plots.style import COLOURS, DARK, select_time_unit
 
 
 @pytest.fixture(scope="module")
-def white() -> DynamicAllan:
-    """White noise of ten minutes, windows of one."""
+def white_noise() -> DynamicAllan:
+    """Compute dynamic curves of ten minutes of white noise with a window of one minute."""
     return compute_dynamic_allan(np.random.default_rng(1).standard_normal((6000, 6)), 10.0, 60.0, step_s=9.0)
 
 
-def panels(found: DynamicAllan, marks: list[ChangeMark], kind: str = "gyro"):
+def draw_panels(found: DynamicAllan, marks: list[ChangeMark], kind: str = "gyro"):
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=(7.2, 8.0), layout="constrained")
     draw_dynamic_panels(figure, found, kind, marks)
     figure.draw_without_rendering()
@@ -33,8 +33,8 @@ def panels(found: DynamicAllan, marks: list[ChangeMark], kind: str = "gyro"):
     return figure.axes[:count]
 
 
-def lines_at(panel, colour: str) -> list[float]:
-    """Times of the vertical marks of a colour, s: the axis is in minutes."""
+def list_mark_times_s(panel, colour: str) -> list[float]:
+    """Return the times of the vertical marks of a colour in seconds; the time axis is in minutes."""
     return [
         60.0 * float(line.get_xdata()[0])
         for line in panel.lines
@@ -43,64 +43,66 @@ def lines_at(panel, colour: str) -> list[float]:
 
 
 @pytest.mark.long
-def test_a_change_is_marked_in_its_surface_and_through_the_courses(white: DynamicAllan) -> None:
-    gx, gy, gz, *courses = panels(white, [ChangeMark(300.0, "gy"), ChangeMark(240.0, "az")])
-    assert [lines_at(panel, DARK) for panel in (gx, gy, gz)] == [[], [300.0], []]
+def test_change_is_marked_in_its_surface_and_in_all_coefficients(white_noise: DynamicAllan) -> None:
+    gx, gy, gz, *coefficients = draw_panels(white_noise, [ChangeMark(300.0, "gy"), ChangeMark(240.0, "az")])
+    assert [list_mark_times_s(panel, DARK) for panel in (gx, gy, gz)] == [[], [300.0], []]
     assert [[text.get_text() for text in panel.texts] for panel in (gx, gy, gz)] == [[], ["change"], []]
-    assert courses
-    assert all(lines_at(course, COLOURS[1]) == [300.0] for course in courses)
-    assert not any(lines_at(course, COLOURS[2]) for course in courses)  # az stands in the other figure
-    ax, ay, az, *_ = panels(white, [ChangeMark(300.0, "gy"), ChangeMark(240.0, "az")], "accel")
-    assert [lines_at(panel, DARK) for panel in (ax, ay, az)] == [[], [], [240.0]]
+    assert coefficients
+    assert all(list_mark_times_s(panel, COLOURS[1]) == [300.0] for panel in coefficients)
+    assert not any(list_mark_times_s(panel, COLOURS[2]) for panel in coefficients)  # az is in the other figure
+    ax, ay, az, *_ = draw_panels(white_noise, [ChangeMark(300.0, "gy"), ChangeMark(240.0, "az")], "accel")
+    assert [list_mark_times_s(panel, DARK) for panel in (ax, ay, az)] == [[], [], [240.0]]
 
 
-def test_marks_outside_the_time_axis_are_not_drawn(white: DynamicAllan) -> None:
-    drawn = panels(white, [ChangeMark(5.0, "gx"), ChangeMark(5000.0, "gx")])
-    assert not any(panel.texts or lines_at(panel, DARK) for panel in drawn)
-    assert drawn[0].get_xlim() == pytest.approx((55.5 / 60.0, (float(white.t_s[-1]) + 4.5) / 60.0))
+def test_marks_outside_the_time_axis_are_not_drawn(white_noise: DynamicAllan) -> None:
+    drawn = draw_panels(white_noise, [ChangeMark(5.0, "gx"), ChangeMark(5000.0, "gx")])
+    assert not any(panel.texts or list_mark_times_s(panel, DARK) for panel in drawn)
+    assert drawn[0].get_xlim() == pytest.approx((55.5 / 60.0, (float(white_noise.t_s[-1]) + 4.5) / 60.0))
 
 
-def test_words_stay_inside_and_apart(white: DynamicAllan) -> None:
-    """However many changes there are, and at the very end."""
-    end = float(white.t_s[-1])
+def test_labels_are_inside_the_panel_and_do_not_overlap(white_noise: DynamicAllan) -> None:
+    """This also holds for many changes and for changes at the very end."""
+    end = float(white_noise.t_s[-1])
     times = [60.0, 62.0, 200.0, 230.0, 231.0, 400.0, 470.0, end - 3.0, end]
-    gx, *_ = panels(white, [ChangeMark(time, "gx") for time in times])
-    assert len(lines_at(gx, DARK)) == len(times)
+    gx, *_ = draw_panels(white_noise, [ChangeMark(time, "gx") for time in times])
+    assert len(list_mark_times_s(gx, DARK)) == len(times)
     counted = [text.get_text().split() for text in gx.texts]
-    assert sum(int(words[0]) if len(words) == 2 else 1 for words in counted) == len(times)
+    assert sum(int(parts[0]) if len(parts) == 2 else 1 for parts in counted) == len(times)
     boxes = sorted((text.get_window_extent() for text in gx.texts), key=lambda box: box.x0)
     assert all(before.x1 < after.x0 for before, after in pairwise(boxes))
     inside = gx.get_window_extent()
     assert all(inside.x0 <= box.x0 and box.x1 <= inside.x1 and box.y1 <= inside.y1 for box in boxes)
 
 
-def test_heaps_lie_apart_whatever_the_times() -> None:
+def test_grouped_times_keep_their_distance() -> None:
     times = np.random.default_rng(2).random(60) * 100.0
-    heaps = _group_times(times.tolist(), 8.0)
-    assert sorted(time for heap in heaps for time in heap) == sorted(times.tolist())
-    middles = [np.mean(heap) for heap in heaps]
-    assert len(heaps) > 3
+    groups = _group_times(times.tolist(), 8.0)
+    assert sorted(time for group in groups for time in group) == sorted(times.tolist())
+    middles = [np.mean(group) for group in groups]
+    assert len(groups) > 3
     assert (np.diff(middles) >= 8.0).all()
     assert _group_times([], 1.0) == []
     assert MIN_LABEL_DISTANCE < 0.5
 
 
-def test_courses_hold_their_values_and_most_of_their_bands(white: DynamicAllan) -> None:
-    *_, n = panels(white, [])
+def test_coefficient_panel_shows_all_values_and_most_intervals(white_noise: DynamicAllan) -> None:
+    *_, n = draw_panels(white_noise, [])
     gyros = [AXES.index(axis) for axis in ("gx", "gy", "gz")]
-    assert _shown_coefficients(white, "gyro")[-1] == "N"
-    estimated = white.status[:, 1, gyros] == Status.ESTIMATED
+    assert _shown_coefficients(white_noise, "gyro")[-1] == "N"
+    estimated = white_noise.status[:, 1, gyros] == Status.ESTIMATED
     factor = np.degrees(1.0) * 60.0
     low, high = n.get_ylim()
-    values = white.value[:, 1, gyros][estimated] * factor
+    values = white_noise.value[:, 1, gyros][estimated] * factor
     assert low < values.min()
     assert values.max() < high
-    ends = np.stack([white.value_lo[:, 1, gyros][estimated], white.value_hi[:, 1, gyros][estimated]]) * factor
+    ends = (
+        np.stack([white_noise.value_lo[:, 1, gyros][estimated], white_noise.value_hi[:, 1, gyros][estimated]]) * factor
+    )
     assert ((ends >= low) & (ends <= high)).mean() > 2.0 * BAND_ENDS_INSIDE - 1.0
 
 
 @pytest.mark.parametrize(
     ("span_s", "name"), [(599.0, "s"), (600.0, "min"), (10_800.0, "h"), (259_200.0, "d"), (1e9, "d")]
 )
-def test_the_time_axis_has_the_unit_of_its_span(span_s: float, name: str) -> None:
+def test_time_axis_has_the_unit_of_its_span(span_s: float, name: str) -> None:
     assert select_time_unit(span_s)[0] == name

@@ -1,4 +1,4 @@
-"""The analysis as a page: complete in itself, small, and in words and units that people know."""
+"""Tests of the HTML report of an analysis: self-contained, small, and with units."""
 
 import re
 import sys
@@ -11,27 +11,29 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
+from monitor.common.unit_formatting import DEFAULT_UNITS, UNIT_SYSTEMS
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.analysis import RecordingAnalysis
-from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publishing.plots.analysis_plot import AnalysisPlotData
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from monitor.publishing.reports import analysis_report
-from tests.monitor.publishing import made
+from tests.monitor.publishing import example_results
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
 
-def analysis(**changed: object) -> RecordingAnalysis:
-    return made.analysis(replace(made.estimate(), **changed), notes=("3 samples < 4 & more",))
+def make_analysis(**changed: object) -> RecordingAnalysis:
+    return example_results.make_analysis(
+        replace(example_results.make_estimate(), **changed), notes=("3 samples < 4 & more",)
+    )
 
 
 @pytest.fixture(scope="module")
-def long() -> DynamicAllan:
-    """As many steps as there can be, and many letters in."""
+def long_dynamic_curves() -> DynamicAllan:
+    """Return the largest number of time steps, with several coefficients estimated."""
     sources = (
         QuantizationNoise(Q=2e-4),
         AngleRandomWalk(N=1.5e-4),
@@ -49,8 +51,8 @@ def long() -> DynamicAllan:
     )  # fmt: skip
 
 
-class Page(HTMLParser):
-    """Text of the page by tag, and every address that it refers to."""
+class ReportPage(HTMLParser):
+    """The table cells of the page and all addresses to which it refers."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -75,10 +77,10 @@ class Page(HTMLParser):
 
 
 @pytest.mark.long
-def test_numbers_stand_with_unit_interval_or_word() -> None:
-    result = analysis()
-    page = Page(analysis_report.render_page(AnalysisPlotData(result), "bench-1"))
-    value, lo, hi = (part[1, 2] * np.degrees(1) * 60 for part in vars_of(result))
+def test_cells_have_value_unit_and_interval() -> None:
+    result = make_analysis()
+    page = ReportPage(analysis_report.render_page(AnalysisPlotData(result), "bench-1"))
+    value, lo, hi = (part[1, 2] * np.degrees(1) * 60 for part in get_coefficient_arrays(result))
     cells = [" ".join(cell.split()) for cell in page.cells]
     assert f"{value:.3f} °/√h {lo:.3f} … {hi:.3f}" in cells
     bound = result.estimate.coefficients.hi[4, 0] * np.degrees(1) * 3600**2
@@ -86,27 +88,43 @@ def test_numbers_stand_with_unit_interval_or_word() -> None:
     assert len(cells) == 2 * 5 * 4
 
 
-def vars_of(result: RecordingAnalysis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def get_coefficient_arrays(result: RecordingAnalysis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     known = result.estimate.coefficients
     return known.value, known.lo, known.hi
 
 
-def test_what_is_not_known_is_said_in_words() -> None:
-    few = made.analysis(seconds=200.0)
-    few.estimate.curve.avar[:, 3:] = np.nan
-    text = analysis_report.render_page(AnalysisPlotData(few))
-    assert text.count("(too few data)") == 3  # R, on three axes
+@pytest.mark.parametrize("units", ["datasheet", "si"])
+def test_page_can_use_other_units(units: str) -> None:
+    result = make_analysis()
+    page = ReportPage(analysis_report.render_page(AnalysisPlotData(result, units=UNIT_SYSTEMS[units])))
+    cells = [" ".join(cell.split()) for cell in page.cells]
+    n = result.estimate.coefficients.value[1, 2]
+    if units == "datasheet":
+        assert any(f"{n * np.degrees(1) * 60:.3f} °/√h " in cell for cell in cells)
+        assert any(f"{n * np.degrees(1) * 1000 * np.sqrt(2):.2f} m°/s/√Hz " in cell for cell in cells)
+        assert len(cells) == 2 * 6 * 4
+    else:
+        assert any(f"{n:.6f} rad/s/√Hz " in cell for cell in cells)
+        assert len(cells) == 2 * 5 * 4
+
+
+def test_unknown_values_are_described_in_words() -> None:
+    short = example_results.make_analysis(seconds=200.0)
+    short.estimate.curve.avar[:, 3:] = np.nan
+    text = analysis_report.render_page(AnalysisPlotData(short))
+    assert text.count("(too few data)") == 3  # R on three axes
     assert "— <small>(too few data)</small>" in " ".join(text.split())
     assert "<h2>Notes</h2>" not in text
-    drifting = replace(made.estimate(seconds=1000.0), k_or_r=np.array([True] + [False] * 5))
-    small = {letter: analysis_report.format_value_and_interval(drifting, letter, "gx")[1] for letter in SYMBOLS}
+    drifting = replace(example_results.make_estimate(seconds=1000.0), k_or_r=np.array([True] + [False] * 5))
+    columns = DEFAULT_UNITS.columns("gyro")
+    small = {column.symbol: analysis_report.format_value_and_interval(drifting, column, "gx")[1] for column in columns}
     assert small["K"] == "(upper bound; K or R)"
     assert small["R"] == "(too few data)"
     assert "…" in small["N"]
 
 
-def test_the_facts_of_the_recording_are_on_the_page() -> None:
-    facts = dict(analysis_report.recording_facts(analysis(samples=359_640)))
+def test_page_shows_the_facts_of_the_recording() -> None:
+    facts = dict(analysis_report.recording_facts(make_analysis(samples=359_640)))
     assert facts == {
         "rate": "100 Hz",
         "samples": "359,640",
@@ -114,17 +132,17 @@ def test_the_facts_of_the_recording_are_on_the_page() -> None:
         "missing samples": "360 (0.10 %)",
         "averaging times": "0.0100 … 655 s",
     }
-    assert dict(analysis_report.recording_facts(analysis()))["missing samples"] == "none"
+    assert dict(analysis_report.recording_facts(make_analysis()))["missing samples"] == "none"
 
 
 @pytest.mark.long
-def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: DynamicAllan) -> None:
+def test_page_is_self_contained_and_below_a_megabyte(tmp_path: Path, long_dynamic_curves: DynamicAllan) -> None:
     path = tmp_path / "report.html"
-    drawn = AnalysisPlotData(analysis(), dynamic=long, marks=[ChangeMark(1500.0, "gz")])
+    drawn = AnalysisPlotData(make_analysis(), dynamic=long_dynamic_curves, marks=[ChangeMark(1500.0, "gz")])
     analysis_report.write_html_report(drawn, path, "a <b> & c")
     text = path.read_text("utf-8")
     assert path.stat().st_size < 1_000_000
-    page = Page(text)
+    page = ReportPage(text)
     assert all(address.startswith(("#", "data:image/png;base64,")) for address in page.addresses)
     assert not re.search(r"<script|<link|@import|url\((?!#)", text)
     assert "a &lt;b&gt; &amp; c" in text
@@ -139,11 +157,11 @@ def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, lon
     for drawing in drawings:
         root = ElementTree.fromstring(drawing)
         assert "viewBox" in root.attrib
-        assert not {"width", "height"} & root.attrib.keys()  # as wide as its column
+        assert not {"width", "height"} & root.attrib.keys()  # the drawing fills its column
 
 
-def test_a_recording_without_accelerometers_has_one_column() -> None:
-    result = analysis()
+def test_recording_without_accelerometers_has_one_column() -> None:
+    result = make_analysis()
     result.estimate.curve.avar[:, 3:] = np.nan
     text = analysis_report.render_page(AnalysisPlotData(result))
     assert text.count("<svg") == 1
@@ -151,21 +169,21 @@ def test_a_recording_without_accelerometers_has_one_column() -> None:
 
 
 @pytest.mark.long
-def test_the_same_analysis_gives_the_same_page() -> None:
-    result = analysis()
+def test_same_analysis_gives_the_same_page() -> None:
+    result = make_analysis()
     result.estimate.curve.avar[:, 3:] = np.nan
     first, second = (analysis_report.render_page(AnalysisPlotData(result), "x") for _ in range(2))
     assert first == second
 
 
 @pytest.mark.parametrize("name", ["matplotlib.figure", "jinja2"])
-def test_without_its_libraries_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_missing_library_is_reported_with_the_package_to_install(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
-        analysis_report.render_page(AnalysisPlotData(analysis()))
+        analysis_report.render_page(AnalysisPlotData(make_analysis()))
 
 
 @pytest.mark.long
-def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
+def test_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot write the report"):
-        analysis_report.write_html_report(AnalysisPlotData(analysis()), tmp_path / "absent" / "report.html")
+        analysis_report.write_html_report(AnalysisPlotData(make_analysis()), tmp_path / "absent" / "report.html")

@@ -1,4 +1,4 @@
-"""The report for people: complete in itself, small, quick, and with every word that it must have."""
+"""Tests of the HTML report of a reconciliation: content, order, size and escaping."""
 
 import functools
 import re
@@ -16,8 +16,8 @@ from tests.monitor.reconcile import samples
 pytest.importorskip("jinja2")
 
 
-class Text(HTMLParser):
-    """Words of the page, without those of drawings; rows of its tables; tags that were left open."""
+class PageText(HTMLParser):
+    """Text of the page without its drawings, the rows of its tables, and the tags that are still open."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -46,26 +46,28 @@ class Text(HTMLParser):
 
 
 @functools.cache
-def page(name: str) -> str:
+def render_example(name: str) -> str:
     return render_page(getattr(samples, name)(), "bench-1")
 
 
-def read(name: str) -> Text:
-    return Text(page(name))
+def parse_example(name: str) -> PageText:
+    return PageText(render_example(name))
 
 
-def test_the_summary_the_figures_and_the_findings_stand_on_top() -> None:
-    text = page("explained")
-    words = read("explained").words
+def test_summary_figures_and_findings_come_first() -> None:
+    text = render_example("explained")
+    words = parse_example("explained").words
     first = words.index("Line at 17.3 Hz on gz (96 %) and 1 smaller finding (4.3 %).")
     assert first < words.index("added line at 17.3 Hz on gz") < words.index("Every axis, step and diagnostic")
     assert text.index("Allan deviation before and after") < text.index("<details>") < text.index("</details>")
-    assert text.count("Allan deviation before and after") == 1  # the other axes agree
-    assert ["1", "96 %", "added line at 17.3 Hz on gz", "99.8 %", "× 1.05 at τ = 0.02 s (gz)"] in read("explained").rows
+    assert text.count("Allan deviation before and after") == 1  # the other axes agree and have no figure
+    assert ["1", "96 %", "added line at 17.3 Hz on gz", "99.8 %", "× 1.05 at τ = 0.02 s (gz)"] in parse_example(
+        "explained"
+    ).rows
 
 
-def test_a_table_of_the_axes_follows() -> None:
-    text = read("explained")
+def test_axis_table_has_verdict_steps_and_remaining_gaps() -> None:
+    text = parse_example("explained")
     table = {row[0]: row[1:] for row in text.rows if row}
     assert table["gx"] == ["agrees", "nothing", "nothing"]
     assert table["gz"] == [
@@ -76,50 +78,52 @@ def test_a_table_of_the_axes_follows() -> None:
     ]
 
 
-def test_a_step_says_where_what_why_and_how_sure() -> None:
-    words = read("explained").words
+def test_step_states_location_effect_reason_and_confidence() -> None:
+    words = parse_example("explained").words
     step = samples.explained().axes["gz"].steps[0]
-    for said in (
+    for text in (
         "Step 1: added sinusoidal", EFFECTS["sinusoidal"].description, step.because,
         "Where: spectrum, 17.1 … 17.5 Hz: gap 41.2, threshold 2.60", "99.8 %",
         "Less likely explanations of the same gap: narrowband (0.2 %)", "39.7 → 1.00, threshold 2.60",
         "Step 2: retuned angle random walk", "None: a known term of another size is not held out.",
     ):  # fmt: skip
-        assert said in words
+        assert text in words
 
 
-def test_parameters_have_intervals_units_and_what_the_model_had() -> None:
-    rows = read("explained").rows
+def test_parameters_have_intervals_units_and_the_value_of_the_model() -> None:
+    rows = parse_example("explained").rows
     assert ["frequency", "17.300012", "17.299912 … 17.300112", "Hz"] in rows
     assert ["N", "0.6188", "0.6174 … 0.6202", "°/√h", "0.516 °/√h"] in rows
 
 
-def test_every_diagnostic_stands_before_and_after_each_step() -> None:
-    made = samples.explained()
-    rows = read("explained").rows
+def test_every_significant_diagnostic_is_drawn_before_and_after_each_step() -> None:
+    reconciliation = samples.explained()
+    rows = parse_example("explained").rows
     assert ["spectrum", "17.1 … 17.5 Hz", "41.2", "4.60", "2.60", "1.90"] in rows
     assert ["Allan deviation", "τ = 0.01 … 0.64 s", "8.70", "0.70", "2.40", "1.60"] in rows
-    text = page("explained")
-    gz = made.axes["gz"]
+    text = render_example("explained")
+    gz = reconciliation.axes["gz"]
     snapshots = [gz.start, *(step.snapshot_after for step in gz.steps[:-1])]
-    drawn = [{gap.diagnostic for gap in one.gaps if gap.is_significant} - {"allan"} for one in snapshots]
-    pairs = sum(view.diagnostic in names for one, names in zip(snapshots, drawn, strict=True) for view in one.plots)
+    drawn = [{gap.diagnostic for gap in snapshot.gaps if gap.is_significant} - {"allan"} for snapshot in snapshots]
+    pairs = sum(
+        view.diagnostic in names for snapshot, names in zip(snapshots, drawn, strict=True) for view in snapshot.plots
+    )
     assert pairs > 1
     assert text.count(">before</text>") == text.count(">after</text>") == pairs
 
 
-def test_axes_that_agree_have_one_figure_each() -> None:
-    text = page("agrees")
+def test_agreeing_axes_have_one_figure_each() -> None:
+    text = render_example("agrees")
     assert text.count("<svg ") == 6
     assert "Step" not in text
     assert "Left over" not in text
-    diagnostics = {row[0]: row[1:] for row in Text(text).rows[7:]}
+    diagnostics = {row[0]: row[1:] for row in PageText(text).rows[7:]}
     assert diagnostics["spectrum"] == ["0.60 of 2.60"] * 6
     assert diagnostics["diagnostic"] == ["gx", "gy", "gz", "ax", "ay", "az"]
 
 
-def test_what_is_unexplained_has_its_place_and_no_name() -> None:
-    text = read("unexplained")
+def test_unexplained_gap_has_a_location_and_no_effect() -> None:
+    text = parse_example("unexplained")
     assert "No known effect explains the difference, so no effect is named." in text.words
     assert "spectrum, 6 … 11 Hz: gap 7.90, threshold 2.60" in text.words
     assert not [
@@ -128,30 +132,30 @@ def test_what_is_unexplained_has_its_place_and_no_name() -> None:
     assert "five classic terms, fitted first" in text.words
 
 
-def test_what_is_left_over_stands_after_the_steps() -> None:
-    words = read("partly_explained").words
+def test_remaining_gap_follows_the_steps() -> None:
+    words = parse_example("partly_explained").words
     assert words.index("Step 1") < words.index("Left over") < words.index("Axes that agree")
     assert "Allan deviation, τ = 0.01 … 0.64 s: gap 8.70, threshold 2.40" in words[words.index("Left over") :]
 
 
-def test_the_page_is_complete_in_itself_and_escaped() -> None:
+def test_page_is_self_contained_and_escaped() -> None:
     text = render_page(samples.explained(), "a <b> & c")
     assert not re.search(r"<script|<link|@import|url\((?!#)|\bsrc=|\bhref=.(?!#)|http(?!://www.w3.org)", text)
     assert "a &lt;b&gt; &amp; c" in text
     assert "12 missing samples &lt;in 1 gap&gt; &amp; filled" in text
-    assert unescape(Text(text).words).count("sinusoidal") > 2
-    assert not [one for one in re.findall(r"<svg.*?</svg>", text, flags=re.S) if "nan" in one]
+    assert unescape(PageText(text).words).count("sinusoidal") > 2
+    assert not [svg for svg in re.findall(r"<svg.*?</svg>", text, flags=re.S) if "nan" in svg]
 
 
-def test_two_steps_stay_small() -> None:
-    assert len(page("explained").encode()) < 1_000_000
+def test_report_with_two_steps_is_below_a_megabyte() -> None:
+    assert len(render_example("explained").encode()) < 1_000_000
 
 
-def test_the_same_reconciliation_gives_the_same_page() -> None:
-    assert render_page(samples.explained(), "bench-1") == page("explained")
+def test_same_reconciliation_gives_the_same_page() -> None:
+    assert render_page(samples.explained(), "bench-1") == render_example("explained")
 
 
-def test_without_its_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_reported_with_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
         render_page(samples.agrees())

@@ -1,4 +1,4 @@
-"""The log-log box, and what the eye is given of fast samples."""
+"""Tests of the logarithmic chart and of the decimation of fast samples."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from monitor.publishing.rerun.allan_chart import (
 from monitor.publishing.rerun.panels.decimation import ROWS_PER_FLUSH, ROWS_PER_S, average_buckets, decimate_extremes
 
 
-def test_decades_become_the_corners_of_the_box():
+def test_decade_limits_are_the_corners_of_the_chart():
     scale = ChartDecadeRange((-2, 3), (0, 3))
     at = scale.to_chart_positions(np.array([0.01, 1000.0, 1.0]), np.array([1000.0, 1.0, 0.0]))
     assert at[0] == pytest.approx([0.0, 0.0])
@@ -25,14 +25,14 @@ def test_decades_become_the_corners_of_the_box():
     assert np.isnan(at[2, 1])
 
 
-def test_white_noise_falls_by_half_a_decade_a_decade():
+def test_white_noise_has_slope_minus_one_half():
     scale = ChartDecadeRange((0, 4), (0, 4))
     tau = np.array([1.0, 10.0, 100.0])
     at = scale.to_chart_positions(tau, 1000.0 / np.sqrt(tau))
     assert np.diff(at[:, 1]) / HEIGHT * 4 == pytest.approx(0.5)
 
 
-def test_the_scale_holds_its_data_and_no_decade_more():
+def test_decade_range_contains_the_data_tightly():
     assert decade_range([np.array([0.01, 655.0])]) == (-2, 3)
     assert decade_range([np.array([10.0, 1000.0])]) == (1, 3)
     assert decade_range([np.array([np.nan, 3.0, -1.0])]) == (0, 2)
@@ -47,12 +47,12 @@ def test_every_decade_has_a_labelled_tick():
     assert all((line >= 0).all() and (line <= [WIDTH, HEIGHT]).all() for line in drawn.minor + drawn.major)
 
 
-def test_a_missing_point_breaks_a_line():
+def test_missing_point_interrupts_a_line():
     line = np.array([[0.0, 1], [1, 1], [2, np.nan], [3, 1], [4, 1], [5, 1], [6, np.nan], [7, 1]])
     assert [part[:, 0].tolist() for part in finite_sections(line)] == [[0, 1], [3, 4, 5]]
 
 
-def test_a_band_fills_between_its_edges_and_stays_in_the_box():
+def test_band_lies_between_its_edges_and_inside_the_chart():
     low = np.array([[0.0, 5.0], [8.0, HEIGHT + 30.0]])
     high = np.array([[0.0, 4.0], [8.0, 2.0]])
     strokes = band_strokes(low, high)
@@ -62,7 +62,7 @@ def test_a_band_fills_between_its_edges_and_stays_in_the_box():
     assert interval_strokes(low, high)[1, :, 1].tolist() == [HEIGHT, 2.0]
 
 
-def test_a_slow_device_is_drawn_sample_by_sample():
+def test_slow_samples_are_all_drawn():
     t = 1.76e9 + np.arange(50) / 100
     y = np.sin(t)
     drawn_t, drawn = decimate_extremes(t, y)
@@ -70,7 +70,7 @@ def test_a_slow_device_is_drawn_sample_by_sample():
     assert (drawn == y).all()
 
 
-def test_a_fast_device_keeps_its_outlier_and_few_rows():
+def test_decimated_samples_keep_the_outlier():
     rng = np.random.default_rng(3)
     t = 1.76e9 + np.arange(20_000) / 4000
     y = rng.standard_normal(t.size)
@@ -83,7 +83,7 @@ def test_a_fast_device_keeps_its_outlier_and_few_rows():
     assert drawn.min() == np.nanmin(y)
 
 
-def test_the_cost_of_a_flush_is_bounded_whatever_it_brings():
+def test_number_of_drawn_rows_is_bounded():
     t = 1.76e9 + np.arange(400_000) / 100
     drawn_t, _ = decimate_extremes(t, np.random.default_rng(1).standard_normal(t.size))
     assert drawn_t.size <= ROWS_PER_FLUSH + 4

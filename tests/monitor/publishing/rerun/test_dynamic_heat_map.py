@@ -1,4 +1,4 @@
-"""The live surface as Rerun gets it: the picture's pixels, and what stands in a recording."""
+"""Tests of the live surface: pixels of the heat map, recorded entities and tabs."""
 
 import io
 import warnings
@@ -9,7 +9,7 @@ import pytest
 
 from drivers.data_types import AXES, Event
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
-from tests.monitor.publishing import made
+from tests.monitor.publishing import example_results
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
@@ -23,29 +23,29 @@ from monitor.publishing.rerun.viewer_scene import Scene
 T0 = 1.76e9
 
 
-def pixels(png: bytes) -> np.ndarray:
+def decode_pixels(png: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
 
-def test_time_goes_right_and_averaging_time_goes_up() -> None:
+def test_time_is_to_the_right_and_tau_upwards() -> None:
     relative = np.zeros((6, 15))
-    relative[0, 0] = np.log(5.0)  # oldest, shortest τ: bottom left, far above the median
-    relative[5, 14] = -np.log(5.0)  # newest, longest τ: top right
+    relative[0, 0] = np.log(5.0)  # the oldest, shortest τ is at the bottom left
+    relative[5, 14] = -np.log(5.0)  # the newest, longest τ is at the top right
     relative[2, 7] = np.nan
-    image = pixels(dynamic_heat_map.encode_heat_map(relative))
+    image = decode_pixels(dynamic_heat_map.encode_heat_map(relative))
     rows = round(dynamic_heat_map.HEIGHT / 15)
     assert image.shape == (15 * rows, COLUMNS, 3)
     palette = dynamic_heat_map.PALETTE
     assert (image[-rows:, 0] == palette[2 * dynamic_heat_map.SHADES]).all()
     assert (image[:rows, -1] == palette[0]).all()
-    sixth = COLUMNS // 6  # few columns are wide ones: they fill the picture
+    sixth = COLUMNS // 6  # few columns are drawn wide to fill the image
     assert (image[7 * rows : 8 * rows, 2 * sixth + 2 : 3 * sixth - 2] == palette[dynamic_heat_map.NO_VALUE_INDEX]).all()
     assert (image[: 7 * rows, : 5 * sixth - 2] == palette[dynamic_heat_map.SHADES]).all()
     assert (image[:rows, 5 * sixth + 6 :] == palette[0]).all()
 
 
-def test_twice_and_half_the_median_are_the_ends_of_the_scale() -> None:
-    image = pixels(dynamic_heat_map.encode_heat_map(np.log([[2.0, 4.0], [0.5, 0.1], [1.4, 0.7]])))
+def test_colour_scale_ends_at_twice_and_half_the_median() -> None:
+    image = decode_pixels(dynamic_heat_map.encode_heat_map(np.log([[2.0, 4.0], [0.5, 0.1], [1.4, 0.7]])))
     bottom, top = image[-1, [0, COLUMNS // 2, COLUMNS - 1]], image[0, [0, COLUMNS // 2, COLUMNS - 1]]
     assert (bottom[0] == top[0]).all()
     assert (bottom[1] == top[1]).all()
@@ -54,14 +54,14 @@ def test_twice_and_half_the_median_are_the_ends_of_the_scale() -> None:
     assert blue[2] > blue[0]
 
 
-def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
+def test_recording_has_surfaces_labels_and_marks(tmp_path: Path) -> None:
     path = tmp_path / "scene.rrd"
     stream = rr.RecordingStream("imu-monitor")
     stream.save(path)
     scene = Scene(stream)
     scene.set_detailed_devices([ViewerDeviceDescription("bench-1")])
     for i in range(12):
-        scene.draw("bench-1", "AllanAndCoefficientPanel", [(T0 + i, made.estimate(T0 + i, seed=i))])
+        scene.draw("bench-1", "AllanAndCoefficientPanel", [(T0 + i, example_results.make_estimate(T0 + i, seed=i))])
     what = {"N": {"before": 1.5e-4, "after": 3.0e-4}, "floor": {"after": 1.0}}
     event = Event("noise_changed", 0, "gz is louder", axis="gz", values=what)
     scene.draw("bench-1", "EventsPanel", [(T0 + 9, event)])
@@ -75,12 +75,12 @@ def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
         for chunk in RrdReader(str(path)).stream():
             batch = chunk.to_record_batch()
             for name, column in zip(batch.schema.names, batch.columns, strict=True):
-                if ":" in name:  # a component; the others are times and row numbers
+                if ":" in name:  # only components, no times or row numbers
                     cells.setdefault(f"{chunk.entity_path} {name}", []).extend(column.to_pylist())
     for axis in AXES:
         blobs = cells[f"/bench-1/dynamic/{axis} EncodedImage:blob"]
-        assert len(blobs) == 2  # after 8 s and 10 s: columns of 2 s, the first LEAST at once
-        assert pixels(bytes(np.array(blobs[-1], np.uint8).ravel())).shape[1] == COLUMNS
+        assert len(blobs) == 2  # after 8 s and 10 s, with columns of 2 s
+        assert decode_pixels(bytes(np.array(blobs[-1], np.uint8).ravel())).shape[1] == COLUMNS
     labels = cells["/bench-1/dynamic/gz/labels Points2D:labels"][-1]
     assert {"0.01", "1", "100", "τ, s", "× 2", "08:53:22"} <= set(labels)
     (mark,) = [c for c in cells["/bench-1/coefficients/N/gz/changed Scalars:scalars"] if c]
@@ -88,7 +88,7 @@ def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
     assert not any("floor" in name for name in cells)
 
 
-def test_a_device_has_a_tab_for_now_and_one_for_the_time() -> None:
+def test_device_has_tabs_for_the_present_and_the_history() -> None:
     tabs = blueprint.blueprint([ViewerDeviceDescription("bench-1")]).root_container
     assert [page.name for page in tabs.contents] == ["Now", "Dynamic"]
     assert tabs.active_tab == 0
@@ -96,7 +96,7 @@ def test_a_device_has_a_tab_for_now_and_one_for_the_time() -> None:
     assert [page.name for page in fleet.contents] == ["Overview", "nose", "tail"]
 
 
-def test_the_tab_of_temperature_is_there_only_where_bias_is_held_against_it() -> None:
+def test_temperature_tab_needs_a_thermal_model() -> None:
     fleet = blueprint.blueprint(
         [ViewerDeviceDescription("a"), ViewerDeviceDescription("b", has_thermal=True)]
     ).root_container
@@ -106,27 +106,29 @@ def test_the_tab_of_temperature_is_there_only_where_bias_is_held_against_it() ->
     assert second.active_tab == 0
 
 
-def test_gaps_have_their_row_only_where_there_is_a_model() -> None:
-    def views(page: object) -> list[str]:
+def test_gap_panels_need_a_model() -> None:
+    def list_view_names(page: object) -> list[str]:
         return [getattr(page, "name", None) or ""] + [
-            name for one in getattr(page, "contents", []) for name in views(one)
+            name for child in getattr(page, "contents", []) for name in list_view_names(child)
         ]
 
     assert not [
-        name for name in views(blueprint.blueprint([ViewerDeviceDescription("a")]).root_container) if "gap" in str(name)
+        name
+        for name in list_view_names(blueprint.blueprint([ViewerDeviceDescription("a")]).root_container)
+        if "gap" in str(name)
     ]
     fleet = blueprint.blueprint(
         [ViewerDeviceDescription("a"), ViewerDeviceDescription("b", has_model=True)]
     ).root_container
     (_, first, second) = fleet.contents
-    assert not [name for name in views(first) if "gap" in str(name)]
-    assert [name for name in views(second) if "gap" in str(name)] == [
+    assert not [name for name in list_view_names(first) if "gap" in str(name)]
+    assert [name for name in list_view_names(second) if "gap" in str(name)] == [
         "Gyroscopes: gap to the model, σ, and its threshold",
         "Accelerometers: gap to the model, σ, and its threshold",
     ]
 
 
-def test_the_view_holds_picture_and_labels() -> None:
+def test_view_contains_image_and_labels() -> None:
     (left, right), (top, bottom) = dynamic_heat_map.heat_map_bounds(17)
     assert left < -11.0
     assert right > dynamic_heat_map.BAR_X + 11.0

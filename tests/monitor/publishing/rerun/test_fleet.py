@@ -1,4 +1,4 @@
-"""One viewer for many daemons: what reaches it of devices in detail and of all others, and hostile messages."""
+"""Tests of the viewer for several daemons: detailed devices, table of other devices and hostile messages."""
 
 import contextlib
 import threading
@@ -18,70 +18,78 @@ from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDesc
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import ReceivedMessageOrLiveliness, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
-from tests.monitor.publishing import made
+from tests.monitor.publishing import example_results
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import router
+from tests.support.zenoh_sessions import open_router
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
 from monitor.publishing.rerun.queued_view import RerunView
-from tests.monitor.publishing.rerun.test_queued_view import read
+from tests.monitor.publishing.rerun.test_queued_view import read_entities
 
 
-def test_the_keys_of_devices_in_detail() -> None:
+def test_keys_of_detailed_devices_are_completed() -> None:
     assert full_device_key("nose", "**") == "nose"
     assert full_device_key("imu/nose", "imu/**") == "imu/nose"
     assert full_device_key("nose", "fleet/*/**") == "fleet/nose"
     assert full_device_key("nose", "imu/nose") == "imu/nose"
 
 
-def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_detailed_devices_are_drawn_and_others_are_in_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     endpoint, path = free_endpoint(), tmp_path / "fleet.rrd"
-    stop, told = threading.Event(), []
+    stop, messages = threading.Event(), []
     viewer = RerunView(ViewerSettings(mode=str(path)), [ViewerDeviceDescription("imu/nose", "over zenoh")], fleet=True)
     out = ZenohPublisher(ZenohTable(listen=(), connect=(endpoint,)), ["nose", "tail"])
     with (
-        router(endpoint),
+        open_router(endpoint),
         contextlib.closing(out),
-        contextlib.closing(ZenohSubscriber("imu/**", [endpoint], None, ["imu/nose"])) as arriving,
+        contextlib.closing(ZenohSubscriber("imu/**", [endpoint], None, ["imu/nose"])) as subscriber,
         contextlib.closing(viewer),
     ):
-        fleet = FleetView(arriving, viewer, ["imu/nose"])
+        fleet = FleetView(subscriber, viewer, ["imu/nose"])
         take, draw = fleet.process_message, fleet.draw_device_table
         taken: set[str] = set()
         drawn: list[float] = []
-        monkeypatch.setattr(fleet, "process_message", lambda one: take(one) or taken.add(one.key))
+        monkeypatch.setattr(fleet, "process_message", lambda message: take(message) or taken.add(message.key))
         monkeypatch.setattr(
             fleet, "draw_device_table", lambda wall_s, now_s: draw(wall_s, now_s) or drawn.append(now_s)
         )
-        looking = threading.Thread(target=fleet.run, args=(stop, told.append))
+        fleet_thread = threading.Thread(target=fleet.run, args=(stop, messages.append))
         out.start()
-        arriving.start()
+        subscriber.start()
         viewer.start()
-        looking.start()
-        wait_for(lambda: out.state == arriving.state == viewer.state == "ok")
-        t_s, values, temperature_c = made.samples(1.76e9, 0.1)
+        fleet_thread.start()
+        wait_for(lambda: out.state == subscriber.state == viewer.state == "ok")
+        t_s, values, temperature_c = example_results.simulate_samples(1.76e9, 0.1)
         rows = make_block((t_s * 1e9).astype("int64"), values, temperature_c)
 
         def publish() -> None:
             for device in ("nose", "tail"):
                 out.set_alive(device, True)
                 out.put(
-                    topics.STATUS, device, StatusMessage.from_result(device, time.time(), 0, made.health()).encode()
+                    topics.STATUS,
+                    device,
+                    StatusMessage.from_result(device, time.time(), 0, example_results.make_health()).encode(),
                 )
                 out.put(
                     topics.COEFFICIENTS,
                     device,
-                    CoefficientsMessage.from_result(device, 1.76e9, 0, made.estimate()).encode(),
+                    CoefficientsMessage.from_result(device, 1.76e9, 0, example_results.make_estimate()).encode(),
                 )
-                out.put(topics.ALLAN, device, AllanMessage.from_result(device, 1.76e9, 0, made.estimate()).encode())
+                out.put(
+                    topics.ALLAN,
+                    device,
+                    AllanMessage.from_result(device, 1.76e9, 0, example_results.make_estimate()).encode(),
+                )
                 out.put(topics.SAMPLES, device, encode_samples(device, 10, rows))
             stop.wait(0.2)
 
         topics_shown = ("samples", "coefficients", "allan", "status")
         wait_for(lambda: publish() or taken >= {f"imu/nose/{topic}" for topic in topics_shown} | {"imu/tail/status"})
-        publish()  # an Allan curve that comes before any coefficients is not drawn
+        publish()  # an Allan curve before the first coefficients is not drawn
         out.put(
             topics.EVENT,
             "tail",
@@ -93,8 +101,8 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
         tables = len(drawn)
         wait_for(lambda: len(drawn) >= tables + 2, "two more tables")
         stop.set()
-        looking.join(PATIENCE_S)
-    entities = read(path)
+        fleet_thread.join(PATIENCE_S)
+    entities = read_entities(path)
     assert {"/imu/nose/samples/gz", "/imu/nose/allan/gx", "/imu/nose/coefficients/N/gz", "/overview"} <= entities.keys()
     assert not [name for name in entities if name.startswith("/imu/tail")]
     table = str(entities["/overview"])
@@ -104,33 +112,36 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
     assert fleet.malformed == 0
 
 
-def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_without_a_time_is_in_the_table_but_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [ViewerDeviceDescription("imu/a")], fleet=True)
     drawn: list[float] = []
     monkeypatch.setattr(viewer, "put", lambda _device, unix_s, _health: drawn.append(unix_s))
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
     fleet.process_message(
         ReceivedMessageOrLiveliness(
-            "imu/a/status", StatusMessage.from_result("a", None, 0, made.health(state="waiting")).encode()
+            "imu/a/status",
+            StatusMessage.from_result("a", None, 0, example_results.make_health(state="waiting")).encode(),
         )
     )
-    (known,) = fleet.board.devices_with_problems_first(time.monotonic())
-    assert known.status is not None
-    assert known.status.state == "waiting"
+    (device,) = fleet.board.devices_with_problems_first(time.monotonic())
+    assert device.status is not None
+    assert device.status.state == "waiting"
     assert drawn == []
     fleet.process_message(
-        ReceivedMessageOrLiveliness("imu/a/status", StatusMessage.from_result("a", 5.0, 0, made.health()).encode())
+        ReceivedMessageOrLiveliness(
+            "imu/a/status", StatusMessage.from_result("a", 5.0, 0, example_results.make_health()).encode()
+        )
     )
     assert drawn == [5.0]
     assert fleet.malformed == fleet.board.malformed == 0
 
 
-def test_hostile_messages_change_nothing_and_are_counted() -> None:
+def test_hostile_messages_are_counted_and_change_nothing() -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [ViewerDeviceDescription("imu/a")], fleet=True)
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
     fleet.process_message(
         ReceivedMessageOrLiveliness(
-            "imu/a/coefficients", CoefficientsMessage.from_result("a", 1.0, 0, made.estimate()).encode()
+            "imu/a/coefficients", CoefficientsMessage.from_result("a", 1.0, 0, example_results.make_estimate()).encode()
         )
     )
     for key, payload in {
@@ -141,22 +152,24 @@ def test_hostile_messages_change_nothing_and_are_counted() -> None:
     }.items():
         fleet.process_message(ReceivedMessageOrLiveliness(key, payload))
     assert (fleet.malformed, fleet.board.malformed) == (2, 1)
-    assert [one.key for one in fleet.board.devices_with_problems_first(time.monotonic())] == ["imu/a"]
+    assert [device.key for device in fleet.board.devices_with_problems_first(time.monotonic())] == ["imu/a"]
 
 
-def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell() -> None:
-    board = RemoteDeviceRegistry(lambda: 10.0)
+def test_table_shows_problems_first_and_escapes_texts() -> None:
+    registry = RemoteDeviceRegistry(lambda: 10.0)
     for device, changed in {
         "well": {},
         "bad": {"state": "lost", "text": "gone | <img src=x> [a](http://b)\n\n# head"},
     }.items():
-        board.process_message(
-            f"imu/{device}/status", StatusMessage.from_result(device, 1.0, 0, made.health(**changed)).encode()
+        registry.process_message(
+            f"imu/{device}/status",
+            StatusMessage.from_result(device, 1.0, 0, example_results.make_health(**changed)).encode(),
         )
-        board.process_message(
-            f"imu/{device}/coefficients", CoefficientsMessage.from_result(device, 1.0, 0, made.estimate()).encode()
+        registry.process_message(
+            f"imu/{device}/coefficients",
+            CoefficientsMessage.from_result(device, 1.0, 0, example_results.make_estimate()).encode(),
         )
-    text = fleet_text(board.devices_with_problems_first(10.0), 10.0, 40, "1 of 2 there")
+    text = fleet_text(registry.devices_with_problems_first(10.0), 10.0, 40, "1 of 2 there")
     lines = text.splitlines()
     assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"
     assert "**1 of 2 there**" in lines
@@ -164,4 +177,4 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
     assert table[2].startswith("| **imu/bad** | **LOST** |")
     assert table[3].startswith("| **imu/well** | running | 99.98 Hz | 360,000 | 3 | 1 | 0.515 |")
     assert r"gone \| \<img src=x\> \[a\](http://b)  \# head" in table[2]
-    assert "… and 1 more with fewer problems" in fleet_text(board.devices_with_problems_first(10.0), 10.0, 1)
+    assert "… and 1 more with fewer problems" in fleet_text(registry.devices_with_problems_first(10.0), 10.0, 1)

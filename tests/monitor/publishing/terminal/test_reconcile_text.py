@@ -1,4 +1,4 @@
-"""The table on a terminal, at the widths that people have."""
+"""Tests of the reconciliation tables on a terminal of several widths."""
 
 import io
 
@@ -13,29 +13,29 @@ from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import line, run, step, with_axes
 
 
-def told(r: Reconciliation, width: int = 140, details: bool = True) -> list[str]:
+def render_reconciliation(r: Reconciliation, width: int = 140, details: bool = True) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
     print_reconciliation(r, console, details=details)
     return console.export_text().splitlines()
 
 
-def joined(line: str) -> str:
+def collapse_whitespace(line: str) -> str:
     return " ".join(line.split())
 
 
-def test_every_step_is_a_line_with_gap_and_confidence() -> None:
-    lines = told(samples.explained())
+def test_each_step_has_a_line_with_gap_and_confidence() -> None:
+    lines = render_reconciliation(samples.explained())
     assert lines[0].startswith("● explained The model differs from the recording on gz, and 2 findings explain all")
     (first,) = [line for line in lines if line.startswith("gz")]
-    said = "added sinusoidal: amplitude 30.94 ± 0.54 °/h, frequency 17.300012 ± 0.000100 Hz"
-    assert joined(first) == f"gz ● explained 41.2 → 4.60 99.8 % {said}"
+    step_text = "added sinusoidal: amplitude 30.94 ± 0.54 °/h, frequency 17.300012 ± 0.000100 Hz"
+    assert collapse_whitespace(first) == f"gz ● explained 41.2 → 4.60 99.8 % {step_text}"
     second = lines[lines.index(first) + 1]
-    assert joined(second) == "8.70 → 0.70 > 99.9 % retuned angle random walk: N 0.6188 ± 0.0014 °/√h"
+    assert collapse_whitespace(second) == "8.70 → 0.70 > 99.9 % retuned angle random walk: N 0.6188 ± 0.0014 °/√h"
     assert lines[-1] == "note: 12 missing samples <in 1 gap> & filled"
 
 
-def test_without_details_only_the_summary_is_told() -> None:
-    text = joined(" ".join(told(samples.explained(), details=False)))
+def test_summary_is_printed_without_details() -> None:
+    text = collapse_whitespace(" ".join(render_reconciliation(samples.explained(), details=False)))
     assert text == (
         "● explained The model differs from the recording on gz, and 2 findings explain all of the difference. "
         "Line at 17.3 Hz on gz (96 %) and 1 smaller finding (4.3 %). "
@@ -44,53 +44,53 @@ def test_without_details_only_the_summary_is_told() -> None:
     )
 
 
-def test_the_findings_stand_in_the_order_of_their_share() -> None:
-    lines = [joined(line) for line in told(samples.explained())]
+def test_findings_are_ordered_by_their_share() -> None:
+    lines = [collapse_whitespace(line) for line in render_reconciliation(samples.explained())]
     at = lines.index("share finding conf. Allan deviation")
     assert lines[at + 1] == "96 % added line at 17.3 Hz on gz 99.8 % × 1.05 at τ = 0.02 s (gz)"
     assert lines[at + 2] == "4.3 % retuned white noise N times 1.2 on gz > 99.9 % × 1.2 at τ = 0.01 s (gz)"
-    left = [joined(line) for line in told(samples.partly_explained())]
+    left = [collapse_whitespace(line) for line in render_reconciliation(samples.partly_explained())]
     assert "4.3 % left over: a difference in the spectrum from 6 to 11 Hz on gz" in left
 
 
-def test_an_axis_that_agrees_tells_its_largest_gap() -> None:
-    lines = told(samples.agrees())
+def test_agreeing_axis_shows_its_largest_gap() -> None:
+    lines = render_reconciliation(samples.agrees())
     rows = [line for line in lines if line.split(" ")[0] in samples.agrees().axes]
     assert len(rows) == 6
-    assert joined(rows[0]) == "gx ● agrees largest: level, t = 1200 … 1320 s: gap 1.10, threshold 2.50"
+    assert collapse_whitespace(rows[0]) == "gx ● agrees largest: level, t = 1200 … 1320 s: gap 1.10, threshold 2.50"
 
 
-def test_what_is_left_over_is_told() -> None:
-    text = "\n".join(told(samples.partly_explained()))
+def test_remaining_gap_is_shown() -> None:
+    text = "\n".join(render_reconciliation(samples.partly_explained()))
     assert "◐ partly explained" in text
     assert "left over: Allan deviation, τ = 0.01 … 0.64 s: gap 8.70, threshold 2.40" in text
-    text = "\n".join(told(samples.unexplained()))
+    text = "\n".join(render_reconciliation(samples.unexplained()))
     assert "✖ unexplained" in text
     assert "left over: spectrum, 6 … 11 Hz: gap 7.90, threshold 2.60" in text
 
 
 @pytest.mark.parametrize("width", [60, 80, 110])
 def test_long_lines_wrap_inside_their_column(width: int) -> None:
-    lines = told(samples.partly_explained(), width)
+    lines = render_reconciliation(samples.partly_explained(), width)
     assert all(cell_len(line) <= width for line in lines if not line.startswith("note"))
     words = " ".join(" ".join(lines).split())
     for word in ("17.300012", "0.000100", "Hz", "left", "over:", "threshold"):
         assert word in words
 
 
-def told_runs(c: Comparison, width: int = 140) -> list[str]:
+def render_comparison(c: Comparison, width: int = 140) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
     print_comparison(c, console)
     return console.export_text().splitlines()
 
 
-def runs() -> Comparison:
+def make_comparison() -> Comparison:
     both = with_axes(run("warm", line(), step("bias_step", time=350.0, height=1e-3)), run("warm", axis="gx"))
     return compare_results([run("cold", line(3e-4)), both], None, {"short": "200 samples"})
 
 
-def test_several_recordings_stand_beside_each_other() -> None:
-    lines = [joined(one) for one in told_runs(runs())]
+def test_recordings_are_shown_side_by_side() -> None:
+    lines = [collapse_whitespace(line) for line in render_comparison(make_comparison())]
     assert lines[0] == (
         "● explained 2 recordings were compared with the model. Common to all: sinusoidal (gz). "
         "In some only: bias step (gz, warm)."
@@ -100,8 +100,8 @@ def test_several_recordings_stand_beside_each_other() -> None:
     assert lines[-1] == "note: short is left out: 200 samples"
 
 
-def test_common_effects_say_whether_they_agree_and_single_ones_where_they_are() -> None:
-    lines = [joined(one) for one in told_runs(runs())]
+def test_common_effects_state_agreement_and_single_effects_their_recording() -> None:
+    lines = [collapse_whitespace(line) for line in render_comparison(make_comparison())]
     common, single = lines.index("common to all"), lines.index("in some only")
     assert lines[common + 1].startswith(
         "gz added sinusoidal: amplitude 46 ± 30 °/h, frequency 17.30000 ± 0.00071 Hz; sizes differ"
@@ -114,6 +114,6 @@ def test_common_effects_say_whether_they_agree_and_single_ones_where_they_are() 
 
 @pytest.mark.parametrize("width", [60, 80])
 def test_long_lines_of_several_recordings_wrap(width: int) -> None:
-    lines = told_runs(runs(), width)
+    lines = render_comparison(make_comparison(), width)
     assert all(cell_len(line) <= width for line in lines if not line.startswith("note"))
     assert "17.30000" in " ".join(" ".join(lines).split())

@@ -15,7 +15,7 @@ from monitor.reconcile.likelihood.effect_roles import (
     with_effect_size,
     with_regressor_factors,
 )
-from tests.contracts.effect_examples import effect
+from tests.contracts.effect_examples import make_effect
 from tests.monitor.reconcile.axes import RATE_HZ, warmth
 
 NOISES = [kind for kind in NOISE_SIZE_PARAMETERS if issubclass(kind, Source)]
@@ -41,7 +41,7 @@ def test_every_source_has_its_place():
 
 @pytest.mark.parametrize("kind", NOISES, ids=lambda kind: kind.name)
 def test_a_spectrum_grows_with_the_square_of_the_size(kind):
-    one = effect(kind.name)
+    one = make_effect(kind.name)
     f_hz, tau0_s = np.geomspace(0.01, 0.5 * RATE_HZ, 40), 1.0 / RATE_HZ
     np.testing.assert_allclose(
         effect_size(one) ** 2 * with_effect_size(one, 1.0).two_sided_psd(f_hz, tau0_s),
@@ -57,7 +57,7 @@ def test_a_spectrum_grows_with_the_square_of_the_size(kind):
 
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)
 def test_columns_times_factors_are_the_series(kind):
-    one = effect(kind.name)
+    one = make_effect(kind.name)
     if kind.name == "pulse_train":  # a delay that is not given is drawn
         one = replace(one, delay=0.03)
     made = build_unit_regressors(one, n, RATE_HZ, warmth(n))
@@ -91,9 +91,9 @@ def test_a_curve_over_temperature_has_two_columns_and_a_line_one():
 
 
 def test_size_keeps_its_sign_where_it_has_one():
-    assert effect_size(with_effect_size(effect("bias_step"), -2.0)) == -2.0
-    assert effect_size(with_effect_size(effect("sinusoidal"), -2.0)) == 2.0
-    assert effect_size(with_effect_size(effect("rate_ramp"), -2.0)) == 2.0
+    assert effect_size(with_effect_size(make_effect("bias_step"), -2.0)) == -2.0
+    assert effect_size(with_effect_size(make_effect("sinusoidal"), -2.0)) == 2.0
+    assert effect_size(with_effect_size(make_effect("rate_ramp"), -2.0)) == 2.0
 
 
 def test_a_leak_has_no_series_of_its_own():

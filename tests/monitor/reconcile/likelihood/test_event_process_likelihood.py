@@ -8,12 +8,12 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
     MAX_LOG_PARAMETER_RANGE,
     BackgroundNoise,
     _flicker_processes,
-    _log_interval,
     build_state_space_noise,
     compute_block_means,
     correlated_noise_of_block_means,
     fit_event_process,
     kalman_log_likelihood,
+    log_interval,
     maximise_over_log_parameters,
     prior_level_variance,
 )
@@ -81,7 +81,7 @@ def test_maximum_and_its_width():
 def test_no_interval_without_a_peak():
     flat = fit_event_process(lambda a, b, _odds: -0.0 * a * b, {"a": 1.0, "b": 1.0})
     assert flat.parameters["a"].lo is None
-    assert _log_interval(1.0, MAX_LOG_PARAMETER_RANGE).hi is None
+    assert log_interval(1.0, MAX_LOG_PARAMETER_RANGE).hi is None
 
 
 def test_search_does_not_leave_the_neighbourhood_of_its_start():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from monitor.reconcile.preparation.sample_repair import fill_missing_samples, restore_clipped_samples
 
@@ -84,6 +85,28 @@ def test_a_bridge_wanders_as_the_recording_does():
         middle = new[101_500:102_500].mean()
         spreads.append(middle - 0.5 * (walk[100_000] + walk[104_000]))
     assert np.std(spreads) == pytest.approx(0.02 * 1000.0**0.5, rel=0.6)  # √(L/4) of the walk in the middle
+
+
+@pytest.mark.parametrize("hole", [slice(0, 6_000), slice(500, 6_500), slice(60_000, 66_000), slice(94_000, 100_000)])
+def test_a_long_hole_continues_the_spectrum_at_all_frequencies(hole):
+    sos = signal.butter(2, 0.1, output="sos")
+    y = signal.sosfilt(sos, rng().standard_normal(100_000)) + 1e-3 * rng(1).standard_normal(100_000)
+    mask = np.zeros(y.size, dtype=bool)
+    mask[hole] = True
+    _, filled = signal.welch(fill_missing_samples(y, mask, rng(2))[hole], nperseg=256)
+    _, truth = signal.welch(y, nperseg=256)
+    bands = np.array_split(filled[1:] / truth[1:], 8)
+    assert [band.mean() for band in bands] == pytest.approx(np.ones(8), abs=0.25)
+
+
+def test_long_holes_close_together_are_not_filled_with_a_period():
+    y = rng().standard_normal(20_000)
+    mask = np.zeros(y.size, dtype=bool)
+    mask[5_000:8_000] = mask[8_005:11_000] = True
+    filled = fill_missing_samples(y, mask, rng(1))[5_000:11_000]
+    power = np.abs(np.fft.rfft(filled - filled.mean())) ** 2 / filled.size
+    assert power.max() < 20.0
+    assert filled.std() == pytest.approx(1.0, abs=0.05)
 
 
 def test_holes_at_the_ends_take_the_level_next_to_them():

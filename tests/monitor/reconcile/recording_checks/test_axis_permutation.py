@@ -41,6 +41,18 @@ def test_another_noise_level_on_one_axis_is_no_other_order():
     assert check_recording(changed(recording, gx=1.3 * recording.values["gx"]), MODEL, 1).findings == ()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_slow_noise_on_one_of_two_similar_axes_is_no_other_order(seed):
+    """With the slow noise, gx is closer to the model of gy than to the model of gx, but fits neither model."""
+    densities = {"gx": 1.0e-4, "gy": 1.1e-4, "gz": 0.8e-4}
+    model = NoiseModel({axis: (AngleRandomWalk(N=N),) for axis, N in densities.items()}, RATE_HZ)
+    recording = draw(model, seed)
+    n = recording.values["gx"].size
+    drift = np.cumsum(3e-3 * RATE_HZ**-0.5 * np.random.default_rng(seed).standard_normal(n) / RATE_HZ)
+    louder = 1.35 * recording.values["gx"] + drift
+    assert check_recording(changed(recording, gx=louder), model, seed).findings == ()
+
+
 def test_reordering_is_the_inverse_of_the_permutation():
     values = {axis: k for k, axis in enumerate(AXES)}
     assert reorder_axes(values, AXES[3:], (2, 0, 1)) == {**values, "az": 3, "ax": 4, "ay": 5}

@@ -9,7 +9,14 @@ from monitor.noise.effects import CommonVibration, CrossAxis
 from monitor.reconcile.diagnostics.whiteness_tests import diagnose_leaks_from_other_axes
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import whiten_axis
-from monitor.reconcile.search.common_vibration_search import name_common_vibrations
+from monitor.reconcile.search.common_vibration_search import (
+    _cross_spectra_of_halves,
+    _fit_gains_with_spectra,
+    _Vibration,
+    _without_weak_axes,
+    build_cross_spectra,
+    name_common_vibrations,
+)
 from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
 from tests.monitor.reconcile.axes import (
     GYRO_AXES,
@@ -125,3 +132,18 @@ def test_a_leak_beside_a_known_vibration_is_still_seen(leak):
     assert alone > 100.0
     assert (gain > 50.0) == (leak > 0.0)
     assert leak or gain < 8.0
+
+
+@pytest.mark.parametrize("shared", ["whole", "first half", "not at all"])
+def test_an_axis_belongs_to_a_vibration_with_evidence_in_both_halves(shared):
+    shape, unit = (17.3, 1.0), ringing(n, np.random.default_rng(7), 1.0, 17.3, 1.0)
+    values = vibrating(unit, 3, ("gx", "gy"))
+    part = {"whole": n, "first half": n // 2, "not at all": 0}[shared]
+    values["gz"] = values["gz"] + np.where(np.arange(n) < part, GAINS["gz"] * unit, 0.0)
+    hypotheses = [fit_with_fixed_noise(one, MODEL) for one in axes(values, MODEL).values()]
+    whitened = [whiten_axis(one.fit) for one in hypotheses]
+    spectra = build_cross_spectra(whitened, [shape])
+    vibration = _Vibration(shape, np.array(list(GAINS.values())), 0.0)
+    joint = _fit_gains_with_spectra(spectra, vibration, hypotheses)
+    left = _without_weak_axes(joint, spectra, _cross_spectra_of_halves(joint, whitened, [shape]))
+    assert (left.vibration.gains != 0.0).tolist() == [True, True, shared == "whole"]

@@ -66,6 +66,15 @@ REAL = {
 }
 
 
+def test_a_drift_of_one_half_does_not_outweigh_the_effect():
+    """The fitted random walk of the half with the drift is far too large for the other half."""
+    drift = np.where(HALF, 0.02 * np.exp(-time_s(n) / 20.0), 0.0)
+    one = axis(noise(4) + RINGING + drift, MODEL)
+    found = proven(one, Narrowband(sigma=1e-4, frequency=17.3, bandwidth=1.0), "psd")
+    assert found.reason == ""
+    assert found.kept
+
+
 @pytest.mark.parametrize("name", REAL)
 def test_what_is_there_in_both_halves_is_kept(name):
     hidden, effect, diagnostic = REAL[name]

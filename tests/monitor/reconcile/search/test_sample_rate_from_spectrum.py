@@ -8,7 +8,7 @@ from monitor.noise.effects import EFFECTS, AngleRandomWalk, Narrowband, SampleRa
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS
 from monitor.reconcile.search.sample_rate_from_spectrum import convert_effect_to_stated_time, detect_sample_rate_error
-from tests.contracts.effect_examples import effect
+from tests.contracts.effect_examples import make_effect
 from tests.monitor.reconcile.axes import GYRO_AXES, RATE_HZ, WALK, WHITE, axes, recording, warmth
 
 n = 24_000
@@ -21,7 +21,7 @@ NOISES = [kind for kind in NOISE_SIZE_PARAMETERS if issubclass(kind, Source) and
 @pytest.mark.parametrize("kind", NOISES, ids=lambda kind: kind.name)
 def test_a_spectrum_is_that_of_the_resampled_noise(kind):
     """In stated time f is f/r and a density r times as much: S'(f) = r S(rf), of samples τ0/r apart."""
-    one, tau0_s = effect(kind.name), 1.0 / RATE_HZ
+    one, tau0_s = make_effect(kind.name), 1.0 / RATE_HZ
     f_hz = np.geomspace(0.01, 0.499 * RATE_HZ, 50)
     expected = RATIO * one.two_sided_psd(RATIO * f_hz, tau0_s / RATIO)
     np.testing.assert_allclose(
@@ -47,18 +47,18 @@ def test_a_course_is_that_of_samples_at_the_true_rate(kind):
         )
         return values
 
-    one = effect(kind.name)
+    one = make_effect(kind.name)
     true, stated = drawn(one, RATIO * RATE_HZ), drawn(convert_effect_to_stated_time(one, RATIO), RATE_HZ)
     np.testing.assert_allclose(stated, true, atol=1e-6 * np.abs(true).max())
 
 
 def test_there_and_back():
     for name in sorted(set(EFFECTS) - {"bias", "sample_rate_error"}):
-        back = convert_effect_to_stated_time(convert_effect_to_stated_time(effect(name), RATIO), 1.0 / RATIO)
+        back = convert_effect_to_stated_time(convert_effect_to_stated_time(make_effect(name), RATIO), 1.0 / RATIO)
         for parameter in back.__dataclass_fields__:
-            want = getattr(effect(name), parameter)
+            want = getattr(make_effect(name), parameter)
             assert getattr(back, parameter) == (want if want is None or isinstance(want, str) else pytest.approx(want))
-        assert convert_effect_to_stated_time(effect(name), 1.0) == effect(name)
+        assert convert_effect_to_stated_time(make_effect(name), 1.0) == make_effect(name)
 
 
 LINE = Sinusoidal(amplitude=3e-4, frequency=17.3, phase=0.4)

@@ -315,3 +315,23 @@ def test_noise_behind_a_known_filter_is_its_floor():
     found = looked(y[:, 2].copy(), (WHITE, BandwidthLimit(cutoff=12.0, order=2, floor=0.0)))
     assert names(found) == []
     assert found.hypothesis.effects[1].floor == pytest.approx(0.15 * N, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_wandering_line_is_found_and_subtracted(seed):
+    rng = np.random.default_rng(seed)
+    hz = 17.3 + correlated(n, rng, 0.2, 30.0)
+    found = looked(noise(seed) + 4e-4 * np.sin(2.0 * np.pi * np.cumsum(hz) / RATE_HZ))
+    assert names(found) == ["wandering_line"]
+    line = found.hypothesis.effects[-1]
+    assert line.amplitude == pytest.approx(4e-4, rel=0.1)
+    assert not any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
+
+
+def test_a_wandering_line_of_varying_amplitude_gets_no_name():
+    rng = np.random.default_rng(8)
+    hz = 17.3 + correlated(n, rng, 0.2, 30.0)
+    swell = 1.0 + 0.9 * np.sin(2.0 * np.pi * T / 40.0)
+    assert "wandering_line" not in names(
+        looked(noise(8) + 1e-3 * swell * np.sin(2.0 * np.pi * np.cumsum(hz) / RATE_HZ))
+    )

@@ -77,6 +77,14 @@ def test_a_low_pass_stands_whatever_is_left_elsewhere():
     assert kept((BandwidthLimit(cutoff=20.0, order=2),), above, {BandwidthLimit: 200.0}) == []
 
 
+@pytest.mark.parametrize("left", [150.0, 50.0])
+def test_a_small_difference_at_a_strong_line_is_not_the_low_passs(left):
+    found = (BandwidthLimit(cutoff=20.0, order=2), Narrowband(sigma=1e-4, frequency=33.0, bandwidth=0.1))
+    seen = {**QUIET, "spectrogram": Finding(left, Location(frequency=(32.0, 34.0)))}
+    stands = kept(found, seen, {BandwidthLimit: 200.0, Narrowband: 1000.0})
+    assert stands == ([BandwidthLimit, Narrowband] if left < 100.0 else [])
+
+
 @pytest.mark.parametrize(("left", "stands"), [(150.0, False), (50.0, True)])
 def test_a_leak_stands_when_it_closed_most_of_what_other_axes_show(left, stands):
     seen = {**QUIET, "other_axes": Finding(left, Location(source="ay"))}

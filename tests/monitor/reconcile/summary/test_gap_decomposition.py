@@ -6,7 +6,7 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from monitor.noise.effects import AngleRandomWalk, Narrowband, Outliers, Resolution, Sinusoidal
+from monitor.noise.effects import AngleRandomWalk, Narrowband, Outliers, PoissonSteps, Resolution, Sinusoidal
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fixed_noise
 from monitor.reconcile.result import DiagnosticGap, Location
 from monitor.reconcile.search.cross_validation import accept_without_validation
@@ -76,6 +76,15 @@ def test_outliers_have_the_gain_of_their_test():
     trial = Trial("outliers", with_outliers.added[0], 200.0)
     gains = decompose_explained_gain(search(with_outliers, trial), fitted_first=True)
     assert gains == {2: pytest.approx(200.0)}
+
+
+def test_the_power_of_random_jumps_counts_once():
+    hypothesis = louder_with_line()
+    jumps = Hypothesis(MODEL, hypothesis.axis.fit((*MODEL, PoissonSteps(rate=0.1, height=1e-3)), frozenset({0, 1})))
+    trial = Trial("poisson_steps", jumps.added[0], 200.0, gain_over_same_spectrum=30.0)
+    spectrum = jumps.fit.log_likelihood - fit_without(jumps, {2}).log_likelihood
+    gains = decompose_explained_gain(search(jumps, trial), fitted_first=True)
+    assert gains == {2: pytest.approx(max(spectrum, 0.0) + 30.0)}
 
 
 @pytest.mark.parametrize(("step_to_noise", "share"), [(1.0, 1 / 13), (0.3, 0.0075)])

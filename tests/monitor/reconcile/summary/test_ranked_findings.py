@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from monitor.noise.effects import AngleRandomWalk, Narrowband
+from monitor.noise.effects import AngleRandomWalk, BandwidthLimit, Narrowband
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import (
     AllanInfluence,
@@ -90,6 +90,13 @@ def test_a_retuned_resonance_is_compared_with_the_same_resonance():
     (one,) = rank_findings(changed).findings
     assert (one.parameters["frequency"].value, one.size_ratio) == (20.0, pytest.approx(0.5))
     assert one.old_frequency is None
+
+
+def test_a_size_that_the_model_lacks_has_no_ratio():
+    effects = (BandwidthLimit(cutoff=20.0),)
+    r = made({"gx": [of("bandwidth_limit", 10.0, kind="retuned", floor=around(1e-4, 1e-6))]}, effects=effects)
+    (one,) = rank_findings(r).findings
+    assert one.size_ratio is None
 
 
 def test_a_moved_resonance_states_the_old_frequency():

@@ -1,51 +1,55 @@
-"""What a person reads in the panels."""
+"""Tests of the texts of the viewer panels."""
 
 from monitor.publishing.rerun.panels.panel_text import health_text, noise_text, overview_text
-from tests.monitor.publishing import made
+from tests.monitor.publishing import example_results
 
 
-def test_a_healthy_device():
-    text = health_text("bench-1", made.health(), "stim300 on serial")
+def test_health_text_of_a_running_device_has_all_numbers():
+    text = health_text("bench-1", example_results.make_health(), "stim300 on serial")
     for part in ("RUNNING", "bench-1", "stim300 on serial", "99.98 Hz", "1 h 00 min", "360,000", "2.10 ms"):
         assert part in text
     assert "zenoh **ok**" in text
 
 
-def test_a_lost_device_says_so_first():
-    text = health_text("b", made.health(state="lost", rate_hz=None, latency_p50_s=None, text="port is gone"))
+def test_health_text_of_a_lost_device_starts_with_its_state():
+    text = health_text(
+        "b", example_results.make_health(state="lost", rate_hz=None, latency_p50_s=None, text="port is gone")
+    )
     assert text.startswith("## LOST")
     assert "port is gone" in text
     assert "rate not known yet" in text
 
 
-def test_every_coefficient_stands_with_its_unit():
-    text = noise_text(made.estimate())
+def test_each_coefficient_has_its_unit():
+    text = noise_text(example_results.make_estimate())
     for unit in ("µrad", "°/√h", "°/h/√h", "°/h/h", "µm/s", "m/s/√h", "µg/√h", "µg/h"):
         assert unit in text
-    assert "≤ 2.23" in text  # R: 3e-9 rad/s² in °/h/h
+    assert "≤ 2.23" in text  # this is R, 3e-9 rad/s², in °/h/h
     assert "gx | gy | gz" in text
 
 
-def test_a_gyroscope_alone_has_one_table():
-    estimate = made.estimate()
+def test_gyroscope_alone_has_one_table():
+    estimate = example_results.make_estimate()
     estimate.curve.avar[:, 3:] = float("nan")
     text = noise_text(estimate)
     assert "gz" in text
     assert "az" not in text
 
 
-def test_a_device_that_has_just_started_has_no_numbers():
-    estimate = made.estimate()
+def test_device_without_samples_has_no_numbers():
+    estimate = example_results.make_estimate()
     estimate.curve.avar[:] = float("nan")
     assert noise_text(estimate) == "Too few samples yet."
 
 
-def test_the_overview_has_a_line_a_device():
-    text = overview_text({"a": made.health(), "b": made.health(state="waiting", rate_hz=None)})
+def test_overview_has_one_line_per_device():
+    text = overview_text(
+        {"a": example_results.make_health(), "b": example_results.make_health(state="waiting", rate_hz=None)}
+    )
     assert "| **a** | running | 99.98 Hz |" in text
     assert "| **b** | waiting | — |" in text
 
 
-def test_a_limit_that_is_passed_stands_in_the_health_panel() -> None:
-    assert "limits exceeded: **gz N, az B**" in health_text("b", made.health(crossed=("gz N", "az B")))
-    assert "limit" not in health_text("b", made.health())
+def test_exceeded_limit_is_in_the_health_panel() -> None:
+    assert "limits exceeded: **gz N, az B**" in health_text("b", example_results.make_health(crossed=("gz N", "az B")))
+    assert "limit" not in health_text("b", example_results.make_health())

@@ -1,4 +1,4 @@
-"""Biases that follow temperature, drawn apart from the room under test: heat flows minute by minute."""
+"""Simulated biases that depend on temperature, generated independently of the code under test."""
 
 from dataclasses import replace
 
@@ -8,11 +8,11 @@ from drivers.data_types import Floats
 from monitor.drift.thermal.interval_means import IntervalMeans
 
 HOUR_S = 3600.0
-COEFFICIENT = 2e-5  # rad/s per °C
+BIAS_SLOPE = 2e-5  # rad/s per °C
 
 
-def weather(hours: int, rng: np.random.Generator, swing_c: float = 3.0) -> Floats:
-    """Temperature of two days before and of ``hours``, °C by the minute: a daily swing and what clouds do."""
+def simulate_temperature(hours: int, rng: np.random.Generator, swing_c: float = 3.0) -> Floats:
+    """Return temperature in °C per minute, from 48 h before until ``hours``: a daily cycle and slow variations."""
     minutes = np.arange(-48 * 60, hours * 60)
     clouds = np.zeros(minutes.size)
     keep = np.exp(-1.0 / 180.0)
@@ -23,8 +23,8 @@ def weather(hours: int, rng: np.random.Generator, swing_c: float = 3.0) -> Float
     return np.asarray(26.5 + daily + clouds)
 
 
-def late(temperature_c: Floats, lag_h: float) -> Floats:
-    """What is ``lag_h`` behind."""
+def apply_lag(temperature_c: Floats, lag_h: float) -> Floats:
+    """Return the temperature after a first-order lag of ``lag_h`` hours."""
     if lag_h == 0.0:
         return temperature_c
     out, keep = np.empty(temperature_c.size), np.exp(-1.0 / (60.0 * lag_h))
@@ -35,19 +35,19 @@ def late(temperature_c: Floats, lag_h: float) -> Floats:
     return out
 
 
-def first_intervals(means: IntervalMeans, n: int) -> IntervalMeans:
+def select_first_intervals(means: IntervalMeans, n: int) -> IntervalMeans:
     return replace(means, bias=means.bias[:n], error=means.error[:n], temperature_c=means.temperature_c[:n])
 
 
-def hourly(seed: int, lag_h: float, noise: float, hours: int = 72) -> IntervalMeans:
-    """Means of the hour; ``noise`` of them over the swing of the bias."""
+def simulate_hourly_means(seed: int, lag_h: float, noise: float, hours: int = 72) -> IntervalMeans:
+    """Return hourly means with noise of ``noise`` times the range of the bias."""
     rng = np.random.default_rng(seed)
-    warmth = weather(hours, rng)
-    bias = COEFFICIENT * late(warmth, lag_h)[-60 * hours :].reshape(hours, 60).mean(axis=1)
+    temperature_c = simulate_temperature(hours, rng)
+    bias = BIAS_SLOPE * apply_lag(temperature_c, lag_h)[-60 * hours :].reshape(hours, 60).mean(axis=1)
     error = noise * np.ptp(bias)
     return IntervalMeans(
         HOUR_S,
         bias + error * rng.standard_normal(hours),
         np.full(hours, error),
-        warmth[-60 * hours :].reshape(hours, 60).mean(axis=1),
+        temperature_c[-60 * hours :].reshape(hours, 60).mean(axis=1),
     )

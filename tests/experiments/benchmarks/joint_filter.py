@@ -1,8 +1,8 @@
-"""One Kalman filter of a drift and a rate, as one writes it in NumPy: a step a sample, matrices of four states.
+"""Kalman filter of a drift and a rate in NumPy, with one step per sample and matrices of four states.
 
-The drift is an ARMA(2, 1) by Green's function, from sample to sample, the rate the "current" model with the one-step
-prediction as its mean, of one intensity. ``joint`` runs as it stands, or compiled by Numba, where its errors are wanted
-and not its time.
+The drift is an ARMA(2, 1) process in the form of Green's function. The rate is the "current" model with the one-step
+prediction as its mean and a constant intensity. ``filter_drift_and_rate`` is plain NumPy, and its time is measured.
+``compiled_filter`` is the same function compiled by Numba, and its errors are measured.
 """
 
 from collections.abc import Callable
@@ -14,16 +14,23 @@ import numpy as np
 from drivers.data_types import Floats
 
 
-def joint(
+def filter_drift_and_rate(
     z: Floats, step_s: float, phi1: float, phi2: float, theta: float, variance: float, white: float, intensity: float
 ) -> Floats:
-    """Rates [n] without drift.
+    """Return rates [n] without drift.
 
-    Args:
-        z: [n] measured, its mean at rest taken out
-        phi1, phi2, theta, variance: of the drift
-        white: variance of z at rest
-        intensity: of white noise in ω̈, (rad/s³)²/Hz
+    Parameters
+    ----------
+    z : ndarray, shape (n,)
+        Measured rate in rad/s, less its mean at rest.
+    step_s : float
+        Sample period in seconds.
+    phi1, phi2, theta, variance : float
+        Parameters of the drift.
+    white : float
+        Variance of z at rest.
+    intensity : float
+        Intensity of the white noise in ω̈, in (rad/s³)²/Hz.
     """
     x, p, f, q = np.zeros(4), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4))
     f[0, 1], f[1, 0], f[1, 1] = 1.0, phi2, phi1
@@ -46,4 +53,4 @@ def joint(
     return out
 
 
-compiled_joint = cast("Callable[..., Floats]", cast("Any", numba).njit(joint))
+compiled_filter = cast("Callable[..., Floats]", cast("Any", numba).njit(filter_drift_and_rate))

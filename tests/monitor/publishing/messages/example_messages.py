@@ -1,4 +1,4 @@
-"""One message of each kind, from plain numbers: square roots and products give the same digits on every machine."""
+"""Example messages of each kind, built with operations that give the same digits on every machine."""
 
 from pathlib import Path
 
@@ -47,8 +47,8 @@ TAU_S = np.array([0.01, 0.02, 0.04])
 SIX = np.arange(1.0, 7.0)
 
 
-def estimate() -> Estimate:
-    """Three gyroscopes; gz has one value less; K or R on gy; Q is a bound and R is not estimated."""
+def make_estimate() -> Estimate:
+    """Three gyroscopes: gz has one value less, gy has K or R, Q is a bound, and R is not estimated."""
     avar = np.outer(1.0 / TAU_S, SIX) * 1e-10
     avar[:, 3:] = np.nan
     avar[2, 2] = np.nan
@@ -58,11 +58,11 @@ def estimate() -> Estimate:
     )
     shorter = AllanCurve(TAU_S, curve.factors, 4.0 * avar, curve.terms, curve.edf, 0.25 * sigma, 4.0 * sigma, 500)
     return Estimate(
-        10**18, 100.0, 60.0, 360_000, curve, avar, coefficients(), np.array([False, True, *[False] * 4]), shorter
+        10**18, 100.0, 60.0, 360_000, curve, avar, make_coefficients(), np.array([False, True, *[False] * 4]), shorter
     )
 
 
-def coefficients(scale: float = 1.0) -> Coefficients:
+def make_coefficients(scale: float = 1.0) -> Coefficients:
     value = scale * np.outer([1e-6, 1e-4, 1e-5, 1e-7, 1e-9], SIX)
     lo, hi, status = 0.5 * value, 2.0 * value, np.full((5, 6), Status.ESTIMATED, np.int8)
     value[0], lo[0], status[0] = np.nan, 0.0, Status.UPPER_BOUND
@@ -70,19 +70,26 @@ def coefficients(scale: float = 1.0) -> Coefficients:
     return Coefficients(value, lo, hi, status)
 
 
-def gap() -> ModelComparison:
-    def axis(name: str) -> AxisModelComparison:
+def make_comparison() -> ModelComparison:
+    def make_axis_comparison(name: str) -> AxisModelComparison:
         return AxisModelComparison(
             name, np.array([3e-4, 2e-4, np.nan]), np.array([2e-4, 2.5e-4, 1e-4]), np.array([6.5, -1.25, np.nan]),
             6.5, (0.01, 0.02), 0, 2.5, 3.5, 4.5, 1500,
         )  # fmt: skip
 
     return ModelComparison(
-        10**18, 100.0, 60.0, 360_000, 1500, TAU_S, {"gx": axis("gx"), "gz": axis("gz")}, {"gz": False}
+        10**18,
+        100.0,
+        60.0,
+        360_000,
+        1500,
+        TAU_S,
+        {"gx": make_axis_comparison("gx"), "gz": make_axis_comparison("gz")},
+        {"gz": False},
     )
 
 
-def thermal() -> ThermalIntervalResult:
+def make_thermal_result() -> ThermalIntervalResult:
     gz = MeasuredAndPredictedMean(
         3e-4, 1e-6, PredictionInterval(2e-4, 1e-4, 3e-4), PredictionInterval(2.2e-4, 1.8e-4, 2.6e-4), "linear", 2e-5, ""
     )
@@ -90,8 +97,8 @@ def thermal() -> ThermalIntervalResult:
     return ThermalIntervalResult(0, 600.0, 25.5, {"gz": gz, "az": az})
 
 
-def slow_curves() -> tuple[TotalVarianceCurve, HadamardCurve]:
-    found = estimate().curve
+def make_total_and_hadamard_curves() -> tuple[TotalVarianceCurve, HadamardCurve]:
+    found = make_estimate().curve
     lo = found.lo.copy()
     lo[1:] = np.nan
     total = TotalVarianceCurve(TAU_S, found.factors, found.avar, found.terms, found.edf, lo, found.hi)
@@ -102,51 +109,51 @@ def slow_curves() -> tuple[TotalVarianceCurve, HadamardCurve]:
     return total, hadamard
 
 
-def event() -> Event:
+def make_event() -> Event:
     return Event(
         "noise_changed", 5_000_000_000, "gz rose; tcp://user:secret@host", "gz",
         {"N": {"before": 1.5e-4, "after": 2.5e-4}, "B": {"before": np.nan, "after": 1e-5}}, 1_000_000_000, 9.5,
     )  # fmt: skip
 
 
-def health() -> Health:
+def make_health() -> Health:
     return Health(
         "running", 99.98, 360_000, 3, 1, 2, 0.0025, None, 182_000_000,
         {"zenoh": "ok", "viewer": "stalled (3 dropped)"}, "too slow", 3600.5, 4, 5, True, 6, ("gz N", "ax B"),
     )  # fmt: skip
 
 
-def analysis() -> RecordingAnalysis:
+def make_analysis() -> RecordingAnalysis:
     motion = MotionEpisode("knock", 250, 400, 0.5, "gx", 0.25, "knocked")
     noise = Change("noise_changed", 2, 25_000, 25_100, 9.5, {"N": (1.5e-4, 2.5e-4)}, "gz rose")
     line = Change("noise_changed", 0, 30_000, 30_100, 12.0, {"band": (10.0, 20.0), "rms": (1e-3, 2e-3)}, "gx line")
-    found = estimate()
+    found = make_estimate()
     return RecordingAnalysis(
         found, 15.0, ("a note",), np.zeros((1, 6)), empty_fit(found.curve.avar),
         np.array([np.nan, 33.5, *[np.nan] * 4]), (motion,), (noise, line), False, ("gz",),
     )  # fmt: skip
 
 
-def dynamic() -> DynamicAllan:
+def make_dynamic_curves() -> DynamicAllan:
     deviation = np.multiply.outer(np.array([1.0, 2.0]), np.outer(TAU_S, SIX))
     deviation[0, 2] = np.nan
-    value = np.multiply.outer(np.array([1.0, 2.0]), coefficients().value)
-    status = np.stack([coefficients().status] * 2)
+    value = np.multiply.outer(np.array([1.0, 2.0]), make_coefficients().value)
+    status = np.stack([make_coefficients().status] * 2)
     return DynamicAllan(
         np.array([10.0, 15.0]), 10.0, 100.0, TAU_S, deviation, 0.5 * deviation, 2.0 * deviation,
         value, 0.5 * value, 2.0 * value, status,
     )  # fmt: skip
 
 
-def without_temperature() -> TemperatureRemovalComparison:
+def make_temperature_removal() -> TemperatureRemovalComparison:
     return TemperatureRemovalComparison(
-        {"gz": "cubic"}, coefficients(), coefficients(0.5), (False,) * 6,
+        {"gz": "cubic"}, make_coefficients(), make_coefficients(0.5), (False,) * 6,
         {"gz": TemperatureDependence(0.75, 1e-6, "cubic", True, 60.0)},
     )  # fmt: skip
 
 
-def past() -> HistoryTable:
-    """Two buckets: N is estimated in the first and bounded in the second."""
+def make_history() -> HistoryTable:
+    """Return two buckets: N is estimated in the first and bounded in the second."""
     names = (
         "gz.N", "gz.N.lo", "gz.N.hi", "gz.N.bound", "gz.sigma.0.1", "gz.sigma.1", "rate", "latency",
         "memory", "temperature",
@@ -170,28 +177,30 @@ def past() -> HistoryTable:
     )  # fmt: skip
 
 
-def messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
-    """Message of each kind by the name of its example."""
+def make_messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
+    """Return a message of each kind by the name of its stored payload."""
     device, query = "bench-1", HistoryQuery(what=PARTS)
     waiting = Health("waiting", None, 0, 0, 0, 0, None, None, 1, {}, "", 0.5)
     return {
-        "allan": AllanMessage.from_result(device, UNIX_S, 0, estimate()),
-        "coefficients": CoefficientsMessage.from_result(device, UNIX_S, 0, estimate()),
-        "total": TotalAndHadamardMessage.from_result(device, UNIX_S, 360_000, TotalAndHadamardCurves(*slow_curves())),
-        "gap": ModelGapMessage.from_result(device, UNIX_S, 0, gap()),
-        "thermal": ThermalPredictionMessage.from_result(device, UNIX_S, 360_000, thermal()),
-        "event": EventMessage.from_result(device, UNIX_S, 7, event()),
+        "allan": AllanMessage.from_result(device, UNIX_S, 0, make_estimate()),
+        "coefficients": CoefficientsMessage.from_result(device, UNIX_S, 0, make_estimate()),
+        "total": TotalAndHadamardMessage.from_result(
+            device, UNIX_S, 360_000, TotalAndHadamardCurves(*make_total_and_hadamard_curves())
+        ),
+        "gap": ModelGapMessage.from_result(device, UNIX_S, 0, make_comparison()),
+        "thermal": ThermalPredictionMessage.from_result(device, UNIX_S, 360_000, make_thermal_result()),
+        "event": EventMessage.from_result(device, UNIX_S, 7, make_event()),
         "event_plain": EventMessage.from_result(device, UNIX_S, 7, Event("link_back", 0, "back")),
-        "status": StatusMessage.from_result(device, UNIX_S, 0, health()),
+        "status": StatusMessage.from_result(device, UNIX_S, 0, make_health()),
         "status_before_the_first_sample": StatusMessage.from_result(device, None, 0, waiting),
         "reset": ResetReply.from_result(device, UNIX_S, 7, "the window is empty"),
-        "history": HistoryMessage.build_reply(past(), query, UNIX_S, 7),
+        "history": HistoryMessage.build_reply(make_history(), query, UNIX_S, 7),
         "history_of_one_coefficient": HistoryMessage.build_reply(
-            past(), HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N")), UNIX_S, 7
+            make_history(), HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N")), UNIX_S, 7
         ),
-        "analyze": AnalysisMessage.from_analysis(analysis()),
+        "analyze": AnalysisMessage.from_analysis(make_analysis()),
         "analyze_with_all_curves": AnalysisMessage.from_analysis(
-            analysis(), *slow_curves(), dynamic(), without_temperature()
+            make_analysis(), *make_total_and_hadamard_curves(), make_dynamic_curves(), make_temperature_removal()
         ),
         "analyze_failed": FailedAnalysisMessage(3, ["too few samples"]),
     }
