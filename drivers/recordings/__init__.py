@@ -1,6 +1,6 @@
 """Reading and writing of recordings in CSV, .npz, Parquet and Arrow files, or in a folder of segments.
 
-Logs of robots and of autopilots (ROS bags, MCAP, PX4 logs) are only read.
+Logs of robots and of autopilots (ROS bags, MCAP, logs of PX4 and ArduPilot) are only read.
 
 ``load_samples`` reads a file or a folder and returns a ``Recording``, which includes notes about irregularities of the
 file, such as missing values.
