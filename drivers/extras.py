@@ -11,6 +11,7 @@ EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
     "reconcile": {"scipy": "SciPy"},
     "ros": {"rosbags": "rosbags"},
     "px4": {"pyulog": "pyulog"},
+    "ardupilot": {"pymavlink": "pymavlink"},
 }
 """Modules that each extra provides, with the name of the package that contains each module."""
 

@@ -26,7 +26,7 @@ from tests.support.zenoh_sessions import open_session
 ROOT = Path(__file__).parents[1]
 OPTIONAL = {
     "scipy", "can", "cantools", "rerun", "matplotlib", "jinja2", "pyarrow", "PyEMD", "pywt", "prometheus_client",
-    "msgpack", "rosbags", "pyulog",
+    "msgpack", "rosbags", "pyulog", "pymavlink",
 }  # fmt: skip
 """Modules that only extras install."""
 SERVICES = {"http.server", "socketserver"}
@@ -207,7 +207,11 @@ def test_reconcile_without_scipy_names_the_missing_extra(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("name", "line"),
-    [("x.bag", 'rosbags: pip install "imu-monitor[ros]"'), ("x.ulg", 'pyulog: pip install "imu-monitor[px4]"')],
+    [
+        ("x.bag", 'rosbags: pip install "imu-monitor[ros]"'),
+        ("x.ulg", 'pyulog: pip install "imu-monitor[px4]"'),
+        ("x.bin", 'pymavlink: pip install "imu-monitor[ardupilot]"'),
+    ],
 )
 def test_a_recording_without_its_extra_is_refused_in_one_line(tmp_path: Path, name: str, line: str) -> None:
     (tmp_path / name).write_bytes(b"x")

@@ -2,11 +2,11 @@
 
 The chunks depend on the type of the file:
 
-- A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, ROS bag, log of an autopilot, or a folder)
-  becomes messages for the decoder
-  ``samples``.
+- A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, ROS bag, log of an autopilot, or a folder) becomes
+  messages for the decoder ``samples``.
 - A CAN log (``drivers.links.can_log_reader``) becomes CAN frames.
-- A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes.
+- A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes. A .bin file that begins like an ArduPilot
+  log is a recording.
 - Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages,
   depending on the original link.
 
@@ -40,6 +40,7 @@ from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, require_packages_of_format, segment_file
+from drivers.recordings.ardupilot_log_format import is_ardupilot_log
 from drivers.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
@@ -268,7 +269,7 @@ def _detect_kind(path: Path) -> Kind:
         raise ConfigError("path: empty; it is a recording, a CAN log, captured bytes, or a folder of segments")
     if suffix in CAN_LOGS:
         return "log"
-    if suffix in CAPTURES:
+    if suffix in CAPTURES and not (suffix in FORMATS and is_ardupilot_log(path)):
         return "capture"
     if _is_raw(path):
         return "raw"

@@ -1,6 +1,6 @@
 """Reading and writing of recordings in CSV, .npz, Parquet and Arrow files, or in a folder of segments.
 
-Logs of robots and of autopilots (ROS bags, MCAP, PX4 logs) are only read.
+Logs of robots and of autopilots (ROS bags, MCAP, logs of PX4 and ArduPilot) are only read.
 
 ``load_samples`` reads a file or a folder and returns a ``Recording``, which includes notes about irregularities of the
 file, such as missing values.
@@ -37,6 +37,7 @@ __all__ = [
     "FORMATS",
     "WRITABLE",
     "Recording",
+    "create_recording",
     "is_recording",
     "iter_blocks",
     "load_samples",
@@ -108,6 +109,30 @@ def load_samples(
             f"{path}: does not fit into the memory that is free; read a part of the recording with --last"
         ) from error
     return found if last_s is None else _take_last(found, last_s)
+
+
+def create_recording(columns: Mapping[str, Floats], rate_hz: float | None = None, source: str = "values") -> Recording:
+    """Create a recording from columns in memory, in the same way as from the columns of a file.
+
+    Parameters
+    ----------
+    columns
+        float64 arrays [n] by name: ``t`` in s, the axes in rad/s and m/s², and ``temperature`` in °C. NaN means
+        missing. The recording contains copies.
+    rate_hz
+        Sample rate in Hz, which takes precedence over the times.
+    source
+        Name of the source in error messages.
+
+    Raises
+    ------
+    RecordingError
+        If the columns are empty or have different lengths, or if no time is usable.
+    ConfigError
+        If there are neither times nor a sample rate.
+    """
+    copies = {name: np.array(column, np.float64) for name, column in columns.items()}
+    return _assemble(Path(source), Table(copies, None, []), rate_hz)
 
 
 def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]:

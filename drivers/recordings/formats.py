@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.recordings import csv_format, npz_format, px4_ulog_format, ros_bag_format
+from drivers.recordings import ardupilot_log_format, csv_format, npz_format, px4_ulog_format, ros_bag_format
 from drivers.recordings import parquet_and_arrow_format as arrow_format
 from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 
@@ -64,6 +64,9 @@ FORMATS: Final[Mapping[str, Format]] = {
     ".db3": _ROS_BAG,
     ".mcap": _ROS_BAG,
     ".ulg": Format(px4_ulog_format.read_ulog, px4_ulog_format.count_ulog_rows, extra="px4"),
+    ".bin": Format(
+        ardupilot_log_format.read_ardupilot_log, ardupilot_log_format.count_ardupilot_rows, extra="ardupilot"
+    ),
 }
 """Recording format for each file suffix."""
 

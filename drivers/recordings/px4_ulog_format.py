@@ -190,6 +190,6 @@ def _read_columns(data: Any) -> dict[str, Floats]:
                 interval_s = np.where(interval_us > 0, interval_us, np.nan) * 1e-6
                 columns[column] /= interval_s
     if ACCEL_TIME in fields:
-        for axis in AXES[3:]:
+        for axis in set(AXES[3:]) & columns.keys():
             columns[axis][fields[ACCEL_TIME] == INVALID_ACCEL_TIME] = np.nan
     return columns

@@ -114,6 +114,7 @@ CONTENTS: Final = (
     (b"SQLite format 3", "an SQLite database", (".db3",)),
     (b"\x89MCAP", "MCAP", (".mcap",)),
     (b"ULog\x01\x12\x35", "a PX4 log", (".ulg",)),
+    (b"\xa3\x95\x80", "an ArduPilot log", (".bin",)),
     (b"\x89HDF", "HDF5", ()),
     (b"MATLAB", "a MATLAB file", ()),
     (b"\x89PNG", "a picture", ()),

@@ -68,6 +68,9 @@ def analyze(
     if plot is not None:
         offline.save_plot_or_report(results, plot, recording.name, UNIT_SYSTEMS[units])
     if json != Path("-"):
-        output.print_analysis(results.analysis, UNIT_SYSTEMS[units])
+        from monitor.publishing.terminal.coefficient_tables import print_analysis
+
+        found = results.analysis
+        print_analysis(found.estimate, found.axes_of_temperature, found.notes, UNIT_SYSTEMS[units])
     if results.lacking:
         raise NotReady(results.lacking)

@@ -47,19 +47,19 @@ def export(
     """Write noise parameters in the file formats of other programs: estimators, calibration programs, simulators."""
     from monitor.publishing import exporters
 
-    keys = {"dt_s": dt, "correlation_time_s": correlation_time, "rostopic": rostopic}
-    given = {name: value for name, value in keys.items() if value is not None}
-    for name in given:
-        belong = [one for one, exporter in exporters.FORMATS.items() if name in exporter.options]
-        if target_format in exporters.FORMATS and target_format not in belong:
-            raise ConfigError(f"{OPTION_NAMES[name]}: belongs to --format {', '.join(belong)}, not {target_format}")
     live = connect is not None or zenoh is not None
     if live == (source is not None):
         raise ConfigError("give either a model or the JSON of analyze, or --connect ENDPOINT for a running daemon")
     noise = (
         options.read_noise_coefficients(source) if source is not None else _from_daemon(connect, zenoh, prefix, device)
     )
-    text = exporters.export(noise, target_format, inflation, **given)
+    try:
+        text = exporters.export(
+            noise, target_format, inflation, dt_s=dt, correlation_time_s=correlation_time, rostopic=rostopic
+        )
+    except ConfigError as error:
+        name, colon, rest = str(error).partition(": ")
+        raise ConfigError(f"{OPTION_NAMES.get(name, name)}{colon}{rest}") from None
     output.write_file_or_stdout("--out", out or Path("-"), text.encode())
 
 

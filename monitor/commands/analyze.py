@@ -10,12 +10,14 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
-from drivers.recordings import iter_blocks, load_samples
+from drivers.number_ranges import AVERAGING_TIME_S
+from drivers.recordings import Recording, iter_blocks, load_samples
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
@@ -32,6 +34,9 @@ from monitor.estimation.regular_grid import place_samples_and_temperature_on_gri
 from monitor.publishing.plots.allan_figure import additional_deviations
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from monitor.publishing.terminal.thermal_output import notes_on_temperature_dependence
+
+MAX_AVERAGING_TIMES: Final = 1000
+"""Largest number of averaging times that a user may list."""
 
 
 class TooFewSamples(NotReady):
@@ -97,7 +102,16 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
         If the recording has too few samples for any result.
     """
     try:
-        return _make(request, report_progress)
+        report_progress("reading", None)
+        recording = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
+        return analyze_recording(
+            recording,
+            request.tau,
+            request.window_s,
+            request.exclude_motion,
+            request.total_and_hadamard,
+            report_progress,
+        )
     except MemoryError as error:
         raise ConfigError(
             f"{request.recording}: the analysis needs more memory than is free; use only the end with --last, or "
@@ -105,22 +119,67 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
         ) from error
 
 
-def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
-    tell("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
-    blocks = list(iter_blocks(found))
+def check_averaging_times(tau: TauGrid) -> None:
+    """Check the averaging times that a user has listed.
+
+    Parameters
+    ----------
+    tau : TauGrid
+        Name of a grid, which is not checked, or averaging times in seconds.
+
+    Raises
+    ------
+    ConfigError
+        If there are too many averaging times, or if one is outside the supported range.
+    """
+    if isinstance(tau, str):
+        return
+    if len(tau) > MAX_AVERAGING_TIMES:
+        raise ConfigError(f"{len(tau)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
+    for tau_s in tau:
+        AVERAGING_TIME_S.check(tau_s)
+
+
+def analyze_recording(
+    recording: Recording,
+    tau: TauGrid = "octave",
+    window_s: float | None = None,
+    exclude_motion: bool = False,
+    total_and_hadamard: bool = False,
+    report_progress: ProgressCallback = ignore_progress,
+) -> AnalysisResults:
+    """Analyze a recording that has been read.
+
+    Parameters
+    ----------
+    recording : Recording
+        Samples to analyse.
+    tau, window_s, exclude_motion, total_and_hadamard
+        See ``AnalysisRequest``.
+    report_progress : callable, optional
+        Function that receives the progress.
+
+    Raises
+    ------
+    ConfigError
+        If the recording is too short for a requested averaging time or window.
+    TooFewSamples
+        If the recording has too few samples for any result.
+    """
+    blocks = list(iter_blocks(recording))
     pool = ThreadPoolExecutor(os.cpu_count())
     try:
-        tell("curve and fit", None)
+        report_progress("curve and fit", None)
         try:
-            result = analyze(blocks, found.rate_hz, request.tau, found.notes, pool.map, request.exclude_motion)
+            result = analyze(blocks, recording.rate_hz, tau, recording.notes, pool.map, exclude_motion)
         except NotReady as error:
-            raise TooFewSamples(str(error), len(found)) from error
-        tell("motion and changes" + (", total and Hadamard deviations" if request.total_and_hadamard else ""), None)
+            raise TooFewSamples(str(error), len(recording)) from error
+        stage = "motion and changes" + (", total and Hadamard deviations" if total_and_hadamard else "")
+        report_progress(stage, None)
         events = pool.submit(detect_disturbances, result)
-        others = pool.submit(_total_and_hadamard, result, request.tau) if request.total_and_hadamard else None
-        warmth = pool.submit(_without_temperature, result, blocks, found.rate_hz)
-        courses, lacking = _dynamic_curves(result, request, tell)
+        others = pool.submit(_total_and_hadamard, result, tau) if total_and_hadamard else None
+        warmth = pool.submit(_without_temperature, result, blocks, recording.rate_hz)
+        courses, lacking = _dynamic_curves(result, tau, window_s, report_progress)
         total, hadamard = others.result() if others else (None, None)
         found_all = events.result()
         without = warmth.result()
@@ -179,14 +238,14 @@ def _without_temperature(
 
 
 def _dynamic_curves(
-    result: RecordingAnalysis, request: AnalysisRequest, tell: ProgressCallback
+    result: RecordingAnalysis, tau: TauGrid, window_s: float | None, tell: ProgressCallback
 ) -> tuple[DynamicAllan | None, str]:
-    if request.window_s is None:
+    if window_s is None:
         return None, ""
     rate_hz = result.estimate.rate_hz
     try:
         shown = compute_dynamic_allan(
-            result.values, rate_hz, request.window_s, request.tau, progress=lambda share: tell("dynamic curves", share)
+            result.values, rate_hz, window_s, tau, progress=lambda share: tell("dynamic curves", share)
         )
     except NotReady as error:
         return None, f"no dynamic curves: {error}"

@@ -84,16 +84,46 @@ def reconcile_and_write_report(
     found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
     create_report_folder(request.out)
     try:
-        recording, notes = _to_regular_grid(found)
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            result = reconcile(recording, request.model, request.seed, pool.map, report_progress)
+        result = reconcile_recording(found, request.model, request.seed, request.notes, report_progress)
     except NotReady as error:
         _write(request.out / REPORT, _encode_failure(str(error), len(found)))
         raise
-    result = replace(result, notes=(*request.notes, *found.notes, *notes, *result.notes))
     report_progress("writing", None)
-    _write_report(result, request.out, request.recording.name)
+    write_report(result, request.out, request.recording.name)
     return result
+
+
+def reconcile_recording(
+    found: Samples,
+    model: NoiseModel | None,
+    seed: int = 1,
+    notes: Sequence[str] = (),
+    report_progress: ProgressCallback = ignore_progress,
+) -> Reconciliation:
+    """Compare a recording that has been read with a noise model.
+
+    Parameters
+    ----------
+    found : drivers.recordings.Recording
+        Recorded samples.
+    model : NoiseModel or None
+        Noise model to test. None fits the five noise terms to the recording.
+    seed : int, optional
+        Seed of the random numbers.
+    notes : sequence of str, optional
+        Notes that precede the notes of the result.
+    report_progress : callable, optional
+        Progress callback.
+
+    Raises
+    ------
+    NotReady
+        If the data do not support an answer.
+    """
+    recording, grid_notes = _to_regular_grid(found)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        result = reconcile(recording, model, seed, pool.map, report_progress)
+    return replace(result, notes=(*notes, *found.notes, *grid_notes, *result.notes))
 
 
 def compare_recordings(
@@ -198,7 +228,23 @@ def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
     return lambda what, share: tell(f"{which}: {what}", share)
 
 
-def _write_report(result: Reconciliation, folder: Path, title: str) -> None:
+def write_report(result: Reconciliation, folder: Path, title: str) -> None:
+    """Write ``report.json``, ``model.toml``, ``report.html`` and, if Rerun is installed, ``reconcile.rrd``.
+
+    Parameters
+    ----------
+    result : Reconciliation
+        Result of the comparison of one recording with a noise model.
+    folder : Path
+        Existing folder of the report.
+    title : str
+        Title of the page ``report.html``.
+
+    Raises
+    ------
+    ConfigError
+        If a file cannot be written.
+    """
     from monitor.publishing.reports.reconcile_page import render_page
 
     _write(folder / REPORT, encode_report(result))

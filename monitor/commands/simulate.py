@@ -5,11 +5,10 @@ recording contains only the axes of the noise model. The truth file contains the
 values such as the times of events.
 """
 
-import tomllib
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -86,6 +85,72 @@ class SimulationResult:
         )
 
 
+class SampleGrid(NamedTuple):
+    """Sample rate, number of samples and axes of a simulated recording."""
+
+    rate_hz: float
+    samples: int
+    axes: tuple[str, ...]
+
+
+def choose_sample_grid(
+    model: NoiseModel, duration_s: float, rate_hz: float | None = None, name: str = "the model"
+) -> SampleGrid:
+    """Return the sample rate, the number of samples and the axes of a simulated recording.
+
+    Parameters
+    ----------
+    model : NoiseModel
+        Noise model to simulate.
+    duration_s : float
+        Length of the recording, s.
+    rate_hz : float or None, optional
+        Sample rate, Hz. None for the rate of the model.
+    name : str, optional
+        Name of the model in error messages.
+
+    Raises
+    ------
+    ConfigError
+        If the sample rate is unknown, if the recording has no or too many samples, or if the model has no axis.
+    """
+    rate_hz = rate_hz or model.sample_rate_hz
+    if rate_hz is None:
+        raise ConfigError(f"{name}: the model has no sample_rate; set the rate with --rate HZ")
+    samples = round(duration_s * rate_hz)
+    try:
+        SAMPLE_COUNT.check(samples)
+    except ConfigError as error:
+        raise ConfigError(f"{duration_s:g} s at {rate_hz:g} Hz: {error}") from None
+    axes = tuple(axis for axis in AXES if axis in model.effects)
+    if not axes:
+        raise ConfigError(f"{name}: the model has no axis; possible are {' '.join(AXES)}")
+    return SampleGrid(rate_hz, samples, axes)
+
+
+def start_stream(
+    model: NoiseModel, rate_hz: float, seed: int, temperature_c: Floats | None = None, name: str = "the model"
+) -> ModelStream:
+    """Start a simulation, and name the model in the text of an error.
+
+    Parameters
+    ----------
+    model, rate_hz, seed, temperature_c
+        See ``NoiseModel.start_stream``.
+    name : str, optional
+        Name of the model in error messages.
+
+    Raises
+    ------
+    ConfigError
+        If the model cannot be simulated.
+    """
+    try:
+        return model.start_stream(rate_hz, seed, temperature_c)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from error
+
+
 def run_simulation(request: SimulationRequest, report_progress: ProgressCallback = ignore_progress) -> SimulationResult:
     """Simulate a recording and write the recording to a file.
 
@@ -108,21 +173,10 @@ def run_simulation(request: SimulationRequest, report_progress: ProgressCallback
     RecordingError
         If the recording with the temperature cannot be read.
     """
-    rate_hz = _rate_hz(request)
-    n = round(request.seconds * rate_hz)
-    try:
-        SAMPLE_COUNT.check(n)
-    except ConfigError as error:
-        raise ConfigError(f"{request.seconds:g} s at {rate_hz:g} Hz: {error}") from None
-    axes = tuple(axis for axis in AXES if axis in request.model.effects)
-    if not axes:
-        raise ConfigError(f"{request.name}: the model has no axis; possible are {' '.join(AXES)}")
+    grid = choose_sample_grid(request.model, request.seconds, request.rate_hz, request.name)
+    rate_hz, n, axes = grid.rate_hz, grid.samples, grid.axes
     report_progress("preparing", None)
-    temperature_c = _temperature(request, rate_hz, n)
-    try:
-        stream = request.model.start_stream(rate_hz, request.seed, temperature_c)
-    except ConfigError as error:
-        raise ConfigError(f"{request.name}: {error}") from error
+    stream = start_stream(request.model, rate_hz, request.seed, _temperature(request, rate_hz, n), request.name)
     first = stream.draw_samples_with_temperature(min(n, CHUNK_ROWS))
     temperature = not bool(np.isnan(first.temperature_c).all())
     truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
@@ -147,13 +201,6 @@ def _write(result: SimulationResult, stream: ModelStream, first: SimulatedSample
                 break
             block = stream.draw_samples_with_temperature(min(CHUNK_ROWS, result.samples - written))
         tell("finishing the file", None)  # some formats are compressed only at the end
-
-
-def _rate_hz(request: SimulationRequest) -> float:
-    rate_hz = request.rate_hz or request.model.sample_rate_hz
-    if rate_hz is None:
-        raise ConfigError(f"{request.name}: the model has no sample_rate; set the rate with --rate HZ")
-    return rate_hz
 
 
 def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats | None:
@@ -189,7 +236,7 @@ def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> 
         {
             "schema": TRUTH_SCHEMA,
             "version": _version(),
-            "model": tomllib.loads(model.to_toml()),
+            "model": model.to_dict(),
             "seed": result.seed,
             "rate": result.rate_hz,
             "seconds": result.duration_s,

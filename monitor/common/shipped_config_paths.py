@@ -8,6 +8,12 @@ from drivers import file_access, module_lookup
 from drivers.errors import ConfigError
 
 CONFIG_FOLDER: Final = Path(__file__).resolve().parents[2] / "config"
+MODELS_FOLDER: Final = CONFIG_FOLDER / "models"
+
+
+def list_shipped_models() -> list[str]:
+    """Return the names of the shipped noise models in alphabetical order."""
+    return sorted(file.stem for file in MODELS_FOLDER.glob("*.toml"))
 
 
 def resolve_model_path(name: str, folder: Path) -> Path:
@@ -25,12 +31,9 @@ def resolve_model_path(name: str, folder: Path) -> Path:
     ConfigError
         If no such noise model exists. The message suggests the most similar name.
     """
-    models = CONFIG_FOLDER / "models"
-    shipped = models / f"{name}.toml"
+    shipped = MODELS_FOLDER / f"{name}.toml"
     path = shipped if file_access.is_file(shipped) else folder / file_access.expand_user(name)
     if os.path.exists(path) and not path.is_dir():
         return path
-    names = sorted(file.stem for file in models.glob("*.toml"))
-    raise ConfigError(
-        f'no model "{name}", neither a file nor one of those shipped{module_lookup.format_suggestion(name, names)}'
-    )
+    suggestion = module_lookup.format_suggestion(name, list_shipped_models())
+    raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{suggestion}')

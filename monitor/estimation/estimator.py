@@ -192,8 +192,7 @@ class Estimator:
         """
         self._entered, self._theta = terms_in_fit.copy(), theta.copy()
         if self._window.samples_in_window >= MIN_SAMPLES:
-            for _ in range(SETTLING_FITS):
-                self.get_estimate()
+            self.get_converged_estimate()
 
     def refine_rate(self, rate_hz: float) -> None:
         """Set a more accurate value of the sample rate.
@@ -233,6 +232,18 @@ class Estimator:
             self._newest_ns, self.rate_hz, self.window_s, self._samples, curve, result.fitted, result.coefficients,
             result.k_or_r, quick, history,
         )  # fmt: skip
+
+    def get_converged_estimate(self) -> Estimate:
+        """Repeat the fit until it has converged, and return the estimate.
+
+        Raises
+        ------
+        NotReady
+            If the window contains fewer than ``MIN_SAMPLES`` samples.
+        """
+        for _ in range(SETTLING_FITS - 1):
+            self.get_estimate()
+        return self.get_estimate()
 
     def step_slow_statistics(self) -> tuple[TotalVarianceCurve, HadamardCurve] | None:
         """Run one step of the slow computations: total deviation, Hadamard deviation and search for a low-pass filter.

@@ -5,8 +5,11 @@ variance and the power spectral density include linear transforms and leaks betw
 the temperature or on the length of the recording.
 """
 
+import html
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -249,3 +252,10 @@ class NoiseModel:
     def to_toml(self) -> str:
         """Return the noise model as the text of a model file, from which ``from_toml`` creates an equal model."""
         return format_model_toml(self.effects, self.sample_rate_hz, self.temperature)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the tables and values of the model file as a dictionary."""
+        return tomllib.loads(self.to_toml())
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(str(self))}</pre>"

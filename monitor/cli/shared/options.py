@@ -3,13 +3,12 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, overload
+from typing import TYPE_CHECKING, Annotated, overload
 
 import typer
 
 from drivers.errors import ConfigError, make_printable_and_shorten
 from drivers.number_ranges import (
-    AVERAGING_TIME_S,
     DURATION_S,
     INFLATION,
     RATE_HZ,
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
     from monitor.drift.compensation.arma import Order
     from monitor.estimation.allan.batch import TauGrid
     from monitor.publishing.exporters import NoiseCoefficients
-
-MAX_AVERAGING_TIMES: Final = 1000
 
 
 def make_range_callback(allowed_range: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
@@ -129,6 +126,8 @@ def parse_averaging_times(text: str) -> "TauGrid":
     ConfigError
         If the text is neither the name of a grid nor a list of seconds, or if a time is outside the supported range.
     """
+    from monitor.commands.analyze import check_averaging_times
+
     if text in ("octave", "decade10"):
         return text  # type: ignore[return-value]
     try:
@@ -137,11 +136,8 @@ def parse_averaging_times(text: str) -> "TauGrid":
         raise ConfigError(
             f'--tau: "{make_printable_and_shorten(text)[:60]}"; possible are octave, decade10, or seconds with commas'
         ) from None
-    if len(listed) > MAX_AVERAGING_TIMES:
-        raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
     with name_option_in_config_errors("--tau"):
-        for tau_s in listed:
-            AVERAGING_TIME_S.check(tau_s)
+        check_averaging_times(listed)
     return listed
 
 

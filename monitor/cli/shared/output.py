@@ -4,14 +4,9 @@ import contextlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from drivers.errors import ConfigError
 from monitor.commands.progress import ProgressCallback, ignore_progress
-
-if TYPE_CHECKING:
-    from monitor.common.unit_formatting import UnitSystem
-    from monitor.estimation.analysis import RecordingAnalysis
 
 
 def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
@@ -94,25 +89,3 @@ def compile_analysis_kernels(report_progress: ProgressCallback) -> None:
                     group, lambda progress: report_progress(str(progress), progress.compiled_share)
                 ):
                     pass
-
-
-def print_analysis(result: "RecordingAnalysis", units: "UnitSystem") -> None:
-    """Print the number of samples, the coefficients and the notes of an analysis.
-
-    Parameters
-    ----------
-    result : RecordingAnalysis
-        Analysis of a recording.
-    units : UnitSystem
-        Units of the table.
-    """
-    from rich.console import Console
-
-    from monitor.publishing.terminal.coefficient_tables import analysis_table
-
-    console = Console()
-    estimate = result.estimate
-    console.print(f"{estimate.curve.n} samples at {estimate.rate_hz:g} Hz, {result.seconds:.6g} s")
-    console.print(analysis_table(estimate, result.axes_of_temperature, units))
-    for note in result.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)

@@ -59,17 +59,23 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
     inflation
         Factor that multiplies N, B and K, at least 1.
     options
-        Options of the file format, whose names ``FORMATS`` lists.
+        Options of the file format, whose names ``FORMATS`` lists. None means that an option is not given.
 
     Raises
     ------
     ConfigError
-        If the format is unknown, the inflation factor is below 1, or the noise model lacks a required coefficient.
+        If the format is unknown, an option does not belong to the format, the inflation factor is below 1, or the noise
+        model lacks a required coefficient.
     NotReady
         If the recording is too short to determine a required coefficient.
     """
     if format_name not in FORMATS:
         raise ConfigError(f'unknown format "{format_name}"; possible are {", ".join(FORMATS)}')
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in given:
+        formats = [one for one, exporter in FORMATS.items() if name in exporter.options]
+        if format_name not in formats:
+            raise ConfigError(f"{name}: is an option of {', '.join(formats)}, not of {format_name}")
     try:
         INFLATION.check(inflation)
     except ConfigError as error:
@@ -80,4 +86,4 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
         for letter, term in terms.items():
             if term.value and not COEFFICIENT.supports(term.value):
                 raise ConfigError(f"{axis}: {letter} = {term.value:g}; no sensor has that")
-    return FORMATS[format_name].write(noise, inflation, **options)
+    return FORMATS[format_name].write(noise, inflation, **given)

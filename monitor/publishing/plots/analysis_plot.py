@@ -4,7 +4,7 @@ The figure shows Allan plots, tables of coefficients, and Allan deviations over 
 separate columns.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -30,6 +30,7 @@ from monitor.publishing.plots.style import COLOURS, GREY, create_figure, figure_
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INCHES: Final = (7.2, 7.6)  # width and height of one Allan plot with table
 CURVES_RATIO: Final = 3.6  # height of the Allan plot
@@ -68,10 +69,45 @@ def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "")
     ConfigError
         If matplotlib is not installed or the file cannot be written.
     """
-    estimate, dynamic = plot_data.analysis.estimate, plot_data.dynamic
+    analysis = plot_data.analysis
+    with figure_style():
+        figure = draw_analysis_figure(
+            analysis.estimate, analysis.axes_of_temperature, plot_data.others, plot_data.dynamic, plot_data.marks,
+            plot_data.units, title,
+        )  # fmt: skip
+        save_figure(figure, path)
+
+
+def draw_analysis_figure(
+    estimate: Estimate,
+    axes_of_temperature: Collection[str] = (),
+    others: Sequence[AdditionalDeviation] = (),
+    dynamic: DynamicAllan | None = None,
+    marks: Sequence[ChangeMark] = (),
+    units: UnitSystem = DEFAULT_UNITS,
+    title: str = "",
+) -> "Figure":
+    """Draw Allan plots and tables of coefficients, for a whole recording or for a sliding window.
+
+    Parameters
+    ----------
+    estimate
+        Allan deviations and coefficients.
+    axes_of_temperature
+        Axes to mark, on which temperature explains most of the slow variance.
+    others, dynamic, marks, units
+        See ``AnalysisPlotData``.
+    title
+        Title of the figure.
+
+    Raises
+    ------
+    ConfigError
+        If matplotlib is not installed.
+    """
     with figure_style():
         kinds = measured_kinds(estimate)
-        table_ratio = ROW_RATIO * (1 + max(len(plot_data.units.columns(kind)) for kind in kinds))
+        table_ratio = ROW_RATIO * (1 + max(len(units.columns(kind)) for kind in kinds))
         heights = [INCHES[1] * (CURVES_RATIO + table_ratio) / (CURVES_RATIO + ROW_RATIO * (1 + len(SYMBOLS)))]
         if dynamic is not None:
             heights.append(max(dynamic_figure_height_inches(dynamic, kind) for kind in kinds))
@@ -79,12 +115,12 @@ def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "")
         parts = figure.subfigures(len(heights), len(kinds), squeeze=False, height_ratios=heights)
         for column, kind in enumerate(kinds):
             curves, table = parts[0, column].subplots(2, 1, height_ratios=[CURVES_RATIO, table_ratio])
-            draw_allan_panel(curves, estimate, kind, plot_data.others, plot_data.units)
-            _draw_table(table, plot_data.analysis, kind, plot_data.units)
+            draw_allan_panel(curves, estimate, kind, others, units)
+            _draw_table(table, estimate, axes_of_temperature, kind, units)
             if dynamic is not None:
-                draw_dynamic_panels(parts[1, column], dynamic, kind, plot_data.marks, plot_data.units)
+                draw_dynamic_panels(parts[1, column], dynamic, kind, marks, units)
         figure.suptitle("\n".join([*([title] if title else []), describe_recording(estimate)]))
-        save_figure(figure, path)
+        return figure
 
 
 def measured_kinds(estimate: Estimate) -> list[Kind]:
@@ -118,14 +154,15 @@ def is_k_r_ambiguous(estimate: Estimate, letter: str, axis: str) -> bool:
     return letter in ("K", "R") and bool(estimate.k_or_r[i] and bounded)
 
 
-def _draw_table(panel: "Axes", analysis: RecordingAnalysis, kind: Kind, units: UnitSystem) -> None:
-    estimate = analysis.estimate
+def _draw_table(
+    panel: "Axes", estimate: Estimate, axes_of_temperature: Collection[str], kind: Kind, units: UnitSystem
+) -> None:
     panel.axis("off")
     coefficients = units.columns(kind)
     rows = np.linspace(0.97, 0.19, len(coefficients) + 1)
     columns = list(zip(axes_of(kind), COLUMNS[1:], COLOURS, strict=True))
     for axis, x, colour in columns:
-        name = mark_temperature_axis(axis, analysis.axes_of_temperature)
+        name = mark_temperature_axis(axis, axes_of_temperature)
         panel.text(x, rows[0], name, color=colour, fontweight="bold", va="center")
     for (letter, name, unit), y in zip(coefficients, rows[1:], strict=True):
         panel.text(COLUMNS[0], y, f"{letter}  {name}, {unit.name}", va="center")
@@ -134,7 +171,7 @@ def _draw_table(panel: "Axes", analysis: RecordingAnalysis, kind: Kind, units: U
             panel.text(x, y + 0.02, cell.value, va="center")
             small = "K or R" if is_k_r_ambiguous(estimate, letter, axis) else cell.interval
             panel.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
-    temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if analysis.axes_of_temperature else ""
+    temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
     for y, text in ((0.03, TABLE_LEGEND + temperature), (-0.04, LEGEND_TEXT)):
         panel.text(COLUMNS[0], y, text, va="center", fontsize=7.5, color=GREY)
     panel.set(xlim=(0, 1), ylim=(-0.06, 1))

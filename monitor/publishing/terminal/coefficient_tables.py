@@ -1,9 +1,9 @@
 """Tables of the noise coefficients of one device with intervals, for ``analyze`` and ``watch``."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Final
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -30,6 +30,36 @@ from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
 
 K_OR_R: Final = "K or R"
 """Text that the tables show for K and R if the data cannot distinguish K from R."""
+
+
+def print_analysis(
+    estimate: Estimate,
+    axes_of_temperature: Collection[str] = (),
+    notes: Sequence[str] = (),
+    units: UnitSystem = DEFAULT_UNITS,
+    console: Console | None = None,
+) -> None:
+    """Print the number of samples, the coefficients and the notes of an analysis.
+
+    Parameters
+    ----------
+    estimate
+        Estimate of the noise coefficients.
+    axes_of_temperature
+        Axes to mark, on which temperature explains most of the slow variance.
+    notes
+        Notes of the analysis.
+    units
+        Units of the table.
+    console
+        Console that receives the output. By default, standard output.
+    """
+    console = console or Console()
+    curve = estimate.curve
+    console.print(f"{curve.n} samples at {estimate.rate_hz:g} Hz, {curve.n / estimate.rate_hz:.6g} s")
+    console.print(analysis_table(estimate, axes_of_temperature, units))
+    for note in notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
 def analysis_table(

@@ -22,7 +22,7 @@ from drivers.data_types import AXES
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.operations import reconcile_on_request
 
-ROOT: Final = Path(imu_monitor.__file__).resolve().parent
+ROOT: Final = Path(imu_monitor.__file__).resolve().parents[1]
 SCRIPT: Final = "import sys\nfrom imu_monitor import main\nsys.exit(main())\n"
 DEMO: Final = str(CONFIG_FOLDER / "demo.toml")
 FOREIGN_SOURCE: Final = 'raise RuntimeError("a foreign package was imported")\n'
@@ -154,9 +154,9 @@ def test_missing_or_foreign_package_folder_is_named(missing: str, tmp_path: Path
             file = tmp_path / name / imu_monitor.REQUIRED[name]
             file.parent.mkdir(exist_ok=True)
             file.touch()
-    shutil.copy(imu_monitor.__file__, tmp_path)
-    command = [sys.executable, str(tmp_path / "imu_monitor.py"), "check", DEMO]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    shutil.copytree(ROOT / "imu_monitor", tmp_path / "imu_monitor")
+    command = [sys.executable, "-m", "imu_monitor", "check", DEMO]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     assert f"{tmp_path / missing}: is missing or belongs to another package" in check_one_line_error(done, 1)
 
 

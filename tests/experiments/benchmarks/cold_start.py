@@ -53,7 +53,7 @@ def measure_start(cache: Path) -> dict[str, float]:
     """Start the program once; return the seconds until each result, and how many samples were lost."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     environment["NUMBA_CACHE_DIR"] = str(cache)
-    command = [sys.executable, "-P", str(ROOT / "imu_monitor.py"), "demo", "--viewer", "none"]
+    command = [sys.executable, "-P", str(ROOT / "imu_monitor" / "__init__.py"), "demo", "--viewer", "none"]
     found: dict[str, float] = {}
     with tempfile.TemporaryFile() as log:
         began_s = time.monotonic()

@@ -326,6 +326,15 @@ def test_check_prints_the_keys_of_one_link_and_one_decoder(run_program: RunProgr
     assert run_program("check", "--decoder", "text").status == 2
 
 
+def test_completion_lists_commands_and_options() -> None:
+    for words, number, expected in (("imu-monitor an", 1, "analyze"), ("imu-monitor export --fo", 2, "--format")):
+        variables = {"_IMU_MONITOR_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(number)}
+        done = subprocess.run(
+            [*PROGRAM], env=os.environ | variables, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+        )
+        assert done.stdout.split() == [expected]
+
+
 def test_version_option_prints_the_package_version(run_program: RunProgram) -> None:
     run = run_program("--version")
     assert (run.status, run.out, run.err) == (0, f"imu-monitor {metadata.version('imu-monitor')}\n", "")
@@ -394,16 +403,16 @@ WRONG_ARGUMENTS = {
     ),
     "option of another format": (
         ("export", MODEL, "--format", "kalibr", "--dt", "0.01"),
-        "--dt: belongs to --format vins_fusion, fast_lio, px4_ekf2, ardupilot_ekf3, robot_localization, imu_utils, "
-        "kalman, not kalibr",
+        "--dt: is an option of vins_fusion, fast_lio, px4_ekf2, ardupilot_ekf3, robot_localization, imu_utils, kalman, "
+        "not of kalibr",
     ),
     "correlation time of another format": (
         ("export", MODEL, "--format", "gyroparams", "--correlation-time", "9"),
-        "--correlation-time: belongs to --format gnss_ins_sim, kalman, not gyroparams",
+        "--correlation-time: is an option of gnss_ins_sim, kalman, not of gyroparams",
     ),
     "topic of another format": (
         ("export", MODEL, "--format", "kalman", "--rostopic", "/imu"),
-        "--rostopic: belongs to --format kalibr, allan_variance_ros, openvins, not kalman",
+        "--rostopic: is an option of kalibr, allan_variance_ros, openvins, not of kalman",
     ),
     "zero time step": (
         ("export", MODEL, "--format", "kalman", "--dt", "0"),

@@ -106,20 +106,22 @@ def recording_seeds(suffix: str) -> Iterator[bytes]:
 
 
 def robot_log_seeds(suffix: str) -> Iterator[bytes]:
-    """Logs that the libraries of their formats write."""
+    """Logs that the libraries of their formats write or read."""
+    from tests.support.dataflash import dataflash_bytes, imu, raw_sensor
     from tests.support.ros_bags import imu_topic, storage_file, write_bag
     from tests.support.ulog import sensor_combined, ulog_bytes, vehicle_imu
 
+    t_us, values = 1_000_000 + 10_000 * np.arange(4), np.ones((4, 6))
     if suffix == ".ulg":
-        t_us = 1_000_000 + 10_000 * np.arange(4)
-        yield ulog_bytes([sensor_combined(t_us, np.ones((4, 6))), vehicle_imu(t_us, np.ones((4, 6)), 10_000)])
+        yield ulog_bytes([sensor_combined(t_us, values), vehicle_imu(t_us, values, 10_000)])
         return
-
+    if suffix == ".bin":
+        yield dataflash_bytes([imu(t_us, values), raw_sensor("GYR", t_us, values[:, :3], 1)])
+        return
     kinds = {".bag": ("ros1", "ros1-bz2", "ros1-lz4"), ".db3": ("sqlite",), ".mcap": ("mcap", "mcap-chunk")}
-    t_ns = 1_763_700_000_000_000_000 + 10_000_000 * np.arange(4)
     for kind in kinds[suffix]:
         with tempfile.TemporaryDirectory() as place:
-            path = write_bag(Path(place), kind, {"/imu": imu_topic(t_ns, np.ones((4, 6)))})
+            path = write_bag(Path(place), kind, {"/imu": imu_topic(1000 * t_us, values)})
             yield storage_file(path).read_bytes()
 
 

@@ -600,9 +600,9 @@ def test_changed_segment_file_is_noticed_and_a_new_file_is_started(tmp_path: Pat
     wait_for(lambda: "ok, but" in sample_recorder.state)
     assert f"{path} was " in sample_recorder.state
     assert "with 100 rows in it; a new file is begun" in sample_recorder.state
-    assert [path.kind for path in sample_recorder.take_events()] == ["recording_stopped", "recording_back"]
+    assert [event.kind for event in sample_recorder.take_events()] == ["recording_stopped", "recording_back"]
     sample_recorder.queue_samples("bench", make_rows(100, 100), 0)
-    wait_for(lambda: any(path != path and path.stat().st_size > 9000 for path in segment_file.list_segments(folder)))
+    wait_for(lambda: any(other != path and other.stat().st_size > 9000 for other in segment_file.list_segments(folder)))
     sample_recorder.close()
     newest = segment_file.list_segments(folder)[-1]
     np.testing.assert_array_equal(

@@ -24,7 +24,7 @@ def simulate_recording(seed: int, n: int, missing_share: float) -> tuple[np.ndar
 @given(
     length=st.integers(8, 300),
     seed=st.integers(0, 99),
-    holes=st.sampled_from([0.0, 0.3, 0.55]),
+    missing_share=st.sampled_from([0.0, 0.3, 0.55]),
     cuts=st.lists(st.integers(0, 1500), max_size=12),
     hole=st.tuples(st.integers(0, 1500), st.integers(0, 700)),
 )

@@ -32,7 +32,8 @@ def drawn(one):
 
 
 def test_every_source_has_its_place():
-    beside = {"bias", "outliers"}  # a mean is always free; outliers are single samples
+    # a mean is always free; outliers are single samples; a wandering line is subtracted before the fit
+    beside = {"bias", "outliers", "wandering_line"}
     kinds = {kind for name, kind in EFFECTS.items() if issubclass(kind, Source | AxisLeak) and name not in beside}
     # the noise of a filter is its floor
     assert set(NOISE_SIZE_PARAMETERS) | set(DETERMINISTIC_SIZE_PARAMETERS) == kinds | {BandwidthLimit}

@@ -1,0 +1,250 @@
+"""Reading of ArduPilot logs (DataFlash, ``.bin``), by the library pymavlink.
+
+The layout of each message is part of the log (messages ``FMT``). These messages contain samples of an IMU, in rad/s,
+m/s² and °C (ArduPilot, page "Onboard Message Log Messages"):
+
+- ``IMU`` contains the gyroscope, the accelerometer and the temperature.
+- ``GYR`` and ``ACC`` contain raw samples of one sensor. Their field ``SampleUS`` is the time of the sample.
+
+The field ``I`` is the number of the sensor. Logs of older versions use other names instead, such as ``IMU2`` or
+``GYR1``.
+
+pymavlink finds the messages, and this module decodes them block by block.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.data_types import AXES, Floats, Ints
+from drivers.errors import ImuError, RecordingError, describe_error
+from drivers.file_access import open_regular_file
+from drivers.recordings import memory_check, table
+from drivers.recordings.topics import BLOCK_ROWS, JOIN, Topic, join_topics, select_topics
+
+MAGIC: Final = b"\xa3\x95\x80"
+"""First bytes of a log: the start of a message, and the number of the message FMT."""
+HEAD_BYTES: Final = 3
+NAME: Final = re.compile(r"(IMU|GYR|ACC)\d?")
+FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
+    **{axis: (f"Gyr{name}",) for axis, name in zip(AXES[:3], "XYZ", strict=True)},
+    **{axis: (f"Acc{name}",) for axis, name in zip(AXES[3:], "XYZ", strict=True)},
+    "temperature": ("T", "Temp"),
+}
+"""For each column of a recording: the names of the field in new and in old logs."""
+TIMES: Final = {"SampleUS": 1e-6, "TimeUS": 1e-6, "TimeMS": 1e-3}
+"""Fields that contain the time since the start of the autopilot, with the unit in s. The first known field is used."""
+INSTANCE: Final = "I"
+INDEX_BYTES_PER_MESSAGE: Final = 40
+"""Memory in bytes that pymavlink needs for the position of a message."""
+MIN_MESSAGE_BYTES: Final = 20
+"""Size of a typical short message in bytes, from which the number of messages is estimated."""
+MAX_TRAILING_BYTES: Final = 528
+"""Maximum size of the unused end of a log. pymavlink uses the same limit, which is more than two flash pages."""
+EXPECTED: Final = "messages IMU, or GYR and ACC"
+
+
+def is_ardupilot_log(path: Path) -> bool:
+    """Return True if a file begins like an ArduPilot log. Return False if the file cannot be read."""
+    try:
+        with open_regular_file(path) as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def read_ardupilot_log(path: Path, topic: str | None) -> table.Table:
+    """Read the samples of an IMU from an ArduPilot log. A log that is cut off is read up to the cut.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    topic
+        Name of the messages, with the number of the sensor, such as ``IMU:1``, or several topics joined by ``+``. None
+        selects the only IMU of the log.
+
+    Raises
+    ------
+    RecordingError
+        If the file is no ArduPilot log or contains no IMU.
+    ConfigError
+        If the topic is unknown, or the samples do not fit into memory.
+    """
+    notes: list[str] = []
+    limit = memory_check.measure_read_limit(path)
+    with _pymavlink_errors(path), _open_log(path, limit) as log:
+        messages = _list_messages(log)
+        names = _select(path, messages, topic, notes)
+        limit.check_row_count(sum(messages[name].offsets.size for name in names))
+        tables = {name: _read_columns(log, messages[name]) for name in names}
+        if (end := _end_of_messages(log)) < log.data_len - MAX_TRAILING_BYTES:
+            notes.append(f"The log is damaged at byte {end} of {log.data_len} and was read up to there.")
+    return table.Table(join_topics(path, tables), None, notes)
+
+
+def count_ardupilot_rows(path: Path, topic: str | None) -> int:
+    """Return the number of messages of the topic in an ArduPilot log."""
+    with _pymavlink_errors(path), _open_log(path, memory_check.measure_read_limit(path)) as log:
+        messages = _list_messages(log)
+        return messages[_select(path, messages, topic, [])[0]].offsets.size
+
+
+@contextmanager
+def _open_log(path: Path, limit: memory_check.RecordingSizeLimits) -> Iterator[Any]:
+    """Open a log and find its messages."""
+    from pymavlink import DFReader
+
+    class Log(DFReader.DFReader_binary):  # type: ignore[misc]
+        def init_clock(self) -> None:
+            """Skip the search for GPS times, because the times of the messages are used."""
+
+        def init_arrays_fast(self, progress_callback: Any = None) -> None:
+            """Find the messages in Python, because the compiled function prints a line for each damaged byte."""
+            self.formats = _Formats(vars(self)["formats"])
+            self.init_arrays(progress_callback)
+
+    if not is_ardupilot_log(path):
+        raise RecordingError(
+            f"{path}: is no ArduPilot log, which begins with a message FMT{table.describe_suffix_mismatch(path)}; "
+            "captured bytes are decoded by the link replay"
+        )
+    limit.check_needed_memory(INDEX_BYTES_PER_MESSAGE * limit.size_bytes / MIN_MESSAGE_BYTES)
+    vars(DFReader)["print"] = _discard  # pymavlink prints warnings about each damaged byte
+    log: Any = Log.__new__(Log)
+    try:
+        log.__init__(str(path))
+        yield log
+    finally:
+        for name in ("data_map", "filehandle"):
+            if name in vars(log):
+                with suppress(BufferError):  # arrays that refer to the file are still in use
+                    getattr(log, name).close()
+
+
+class _Formats(dict[int, Any]):
+    """Layouts of messages by their number. pymavlink would not end if a message had no bytes."""
+
+    def __setitem__(self, number: int, form: Any) -> None:
+        if form.len > HEAD_BYTES:
+            super().__setitem__(number, form)
+
+
+def _discard(*_: object, **__: object) -> None:
+    """Ignore text that a library prints."""
+
+
+@contextmanager
+def _pymavlink_errors(path: Path) -> Iterator[None]:
+    """Convert the exceptions of pymavlink to RecordingError."""
+    try:
+        yield
+    except (ImuError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        what = (describe_error(error) or type(error).__name__).rstrip(".")
+        raise RecordingError(f"{path}: the log is damaged ({what}); copy it from the autopilot again") from error
+
+
+# --- topics --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Messages:
+    """Messages of one sensor."""
+
+    name: str
+    offsets: Ints  # [n] positions in the file
+    layout: np.dtype[Any]
+    factors: Mapping[str, float]  # factor of each field that is a fixed-point number
+
+
+def _list_messages(log: Any) -> dict[str, _Messages]:
+    """Return the messages of each sensor of a log by the name of the topic."""
+    found: dict[str, _Messages] = {}
+    for form in log.formats.values():
+        offsets = np.array(log.offsets[form.type], np.int64)
+        offsets = offsets[offsets + form.len <= log.data_len]
+        if not NAME.fullmatch(form.name) or not offsets.size:
+            continue
+        one = _Messages(form.name, offsets, _layout(form), _factors(form))
+        if INSTANCE not in form.columns:
+            found[form.name] = one
+            continue
+        numbers = np.concatenate([block[INSTANCE] for block in _iter_blocks(log, one)])
+        for number in np.unique(numbers):
+            name = f"{form.name}:{number}" if number else form.name
+            found[name] = _Messages(form.name, offsets[numbers == number], one.layout, one.factors)
+    return dict(sorted(found.items()))
+
+
+def _end_of_messages(log: Any) -> int:
+    """Return the position after the last message that pymavlink has found. It stops at an unknown message."""
+    return int(max(log.offsets[form.type][-1] + form.len for form in log.formats.values() if log.offsets[form.type]))
+
+
+def _layout(form: Any) -> np.dtype[Any]:
+    """Return the layout of a message. The codes of ``struct`` are those of NumPy, except for text."""
+    from pymavlink.DFReader import FORMAT_TO_STRUCT
+
+    codes = [FORMAT_TO_STRUCT[kind][0] for kind in form.format]
+    types = [f"S{code[:-1]}" if code.endswith("s") else f"<{code}" for code in codes]
+    layout = np.dtype(list(zip(form.columns, types, strict=True)))
+    if layout.itemsize != form.len - HEAD_BYTES:
+        raise ValueError(f"{form.name} has {form.len - HEAD_BYTES} bytes, expected {layout.itemsize}")
+    return layout
+
+
+def _factors(form: Any) -> dict[str, float]:
+    return {name: factor for name, factor in zip(form.columns, form.msg_mults, strict=True) if factor is not None}
+
+
+def _select(path: Path, messages: Mapping[str, _Messages], topic: str | None, notes: list[str]) -> list[str]:
+    """Return the names of the topics to read."""
+    topics = [Topic(name, one.name, tuple(_known_fields(one)), one.offsets.size) for name, one in messages.items()]
+    return select_topics(path, topics, _list_imus(messages), topic, EXPECTED, notes)
+
+
+def _known_fields(messages: _Messages) -> dict[str, str]:
+    """Return the name of the field that contains each column."""
+    names = messages.layout.names or ()
+    return {column: field for column, fields in FIELDS.items() for field in fields if field in names}
+
+
+def _list_imus(messages: Mapping[str, _Messages]) -> Sequence[Sequence[str]]:
+    """Return the IMUs of a log. A gyroscope and an accelerometer of the same number are an IMU."""
+    imus, gyros, accels = ([name for name in messages if name.startswith(kind)] for kind in ("IMU", "GYR", "ACC"))
+    pairs = [f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if gyro[3:] == accel[3:]]
+    return [group for group in (imus, *([pairs] if pairs else [gyros, accels])) if group]
+
+
+# --- messages ------------------------------------------------------------------------------------
+
+
+def _iter_blocks(log: Any, messages: _Messages) -> Iterator[np.ndarray[Any, np.dtype[np.void]]]:
+    """Yield messages as structured arrays [n] of up to BLOCK_ROWS messages."""
+    data = np.frombuffer(log.data_map, np.uint8)
+    within = np.arange(HEAD_BYTES, HEAD_BYTES + messages.layout.itemsize)
+    for start in range(0, messages.offsets.size, BLOCK_ROWS):
+        rows = data[messages.offsets[start : start + BLOCK_ROWS, None] + within]
+        yield rows.view(messages.layout)[:, 0]
+
+
+def _read_columns(log: Any, messages: _Messages) -> dict[str, Floats]:
+    """Return the columns of a topic in SI units."""
+    time = next((name for name in TIMES if name in (messages.layout.names or ())), None)
+    if time is None:
+        raise ValueError(f"{messages.name} has no time")
+    fields = {"t": time, **_known_fields(messages)}
+    columns: dict[str, list[Floats]] = {name: [] for name in fields}
+    with np.errstate(invalid="ignore"):  # a damaged log may contain signalling NaN
+        for block in _iter_blocks(log, messages):
+            for column, field in fields.items():
+                factor = TIMES[time] if column == "t" else messages.factors.get(field, 1.0)
+                columns[column].append(block[field].astype(np.float64) * factor)
+    return {name: np.concatenate(parts) for name, parts in columns.items()}

@@ -1,0 +1,206 @@
+"""Python interface of imu-monitor, and the entry point of the command ``imu-monitor``.
+
+The names in ``__all__`` are the public interface (docs/python-api.md). They are imported at their first use, so that
+``import imu_monitor`` and the start of the command stay fast.
+
+``monitor`` and ``drivers`` are common names. Another package or module of such a name on ``PYTHONPATH`` (every ROS
+shell sets it), in the current folder or imported by a ``sitecustomize`` would be found first. This package has a name
+of its own. It stands beside the folders ``monitor``, ``drivers`` and ``config``. When it is imported, it binds the
+names ``monitor`` and ``drivers`` to these folders. The order of ``sys.path`` stays as it is, so that a module in
+``site-packages`` cannot take the place of a module of the standard library. ``config`` holds data only and is found
+beside ``monitor`` by its path.
+
+``imu-monitor``, ``python -m imu_monitor`` and ``python -m monitor.cli`` end in ``main``.
+"""
+
+import contextlib
+import importlib
+import io
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+if TYPE_CHECKING:
+    from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
+    from imu_monitor import effects
+    from imu_monitor._analysis import Analysis, analyze
+    from imu_monitor._estimates import AllanEstimate, AxisEstimate, Coefficient, Deviations, plot_allan
+    from imu_monitor._models import export_parameters, list_models, load_model, simulate
+    from imu_monitor._reconciliation import Reconciliation, reconcile
+    from imu_monitor._recordings import Recording, read_recording
+    from imu_monitor._window import AllanWindow
+    from monitor.noise.model import NoiseModel
+
+    __version__: str
+
+__all__ = [
+    "AllanEstimate",
+    "AllanWindow",
+    "Analysis",
+    "AxisEstimate",
+    "Coefficient",
+    "ConfigError",
+    "Deviations",
+    "ImuError",
+    "NoiseModel",
+    "NotReady",
+    "Reconciliation",
+    "Recording",
+    "RecordingError",
+    "analyze",
+    "effects",
+    "export_parameters",
+    "list_models",
+    "load_model",
+    "plot_allan",
+    "read_recording",
+    "reconcile",
+    "simulate",
+]
+_MODULES: Final = {
+    "drivers.errors": ("ConfigError", "ImuError", "NotReady", "RecordingError"),
+    "imu_monitor._analysis": ("Analysis", "analyze"),
+    "imu_monitor._estimates": ("AllanEstimate", "AxisEstimate", "Coefficient", "Deviations", "plot_allan"),
+    "imu_monitor._models": ("export_parameters", "list_models", "load_model", "simulate"),
+    "imu_monitor._reconciliation": ("Reconciliation", "reconcile"),
+    "imu_monitor._recordings": ("Recording", "read_recording"),
+    "imu_monitor._window": ("AllanWindow",),
+    "monitor.noise.model": ("NoiseModel",),
+}
+"""Modules that define the public names, which are imported at their first use."""
+
+FOLDER: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+PACKAGES: Final = ("monitor", "drivers")
+REQUIRED: Final = {"monitor": "cli/__init__.py", "drivers": "errors.py", "config": "demo.toml"}
+"""A file of each folder that a foreign folder of that name does not have."""
+DEBUG: Final = "--debug"
+FAILED: Final = 1
+
+
+class OwnPackages(MetaPathFinder):
+    """Finds ``monitor`` and ``drivers`` beside this package, and nothing else."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return where a package of the program is; None for every other module."""
+        return PathFinder.find_spec(fullname, [FOLDER], target) if fullname in PACKAGES else None
+
+
+def bind_own_packages() -> None:
+    """Make ``monitor`` and ``drivers`` mean the folders beside this package, from now on and in this process.
+
+    Foreign modules of these names that are already imported are dropped from ``sys.modules``.
+
+    Raises
+    ------
+    ImportError
+        A folder beside this package is missing or belongs to another package. The text names the folder.
+    """
+    for name, file in REQUIRED.items():
+        folder = os.path.join(FOLDER, name)
+        if not os.path.isfile(os.path.join(folder, file)):
+            raise ImportError(
+                f"{folder}: is missing or belongs to another package; install imu-monitor again, in an environment of "
+                "its own"
+            )
+    if not any(isinstance(finder, OwnPackages) for finder in sys.meta_path):
+        sys.meta_path.insert(0, OwnPackages())
+    for name in PACKAGES:
+        if name in sys.modules and not _is_own(sys.modules[name], name):
+            for module in [one for one in sys.modules if one == name or one.startswith(f"{name}.")]:
+                del sys.modules[module]
+
+
+def open_standard_streams() -> None:
+    """Give closed standard streams a file descriptor, so that no file that is opened later takes their numbers.
+
+    Standard input is empty and standard error goes nowhere. Writing to standard output fails, as with a closed one.
+    """
+    for number, flags in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, flags)  # the lowest free number, which is this one
+    if sys.stdin is None:
+        sys.stdin = os.fdopen(0, encoding="utf-8", closefd=False)
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    if sys.stderr is None:
+        sys.stderr = os.fdopen(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # a character that the locale lacks, or a file name that is no text, is written by its number
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def main() -> None:
+    """Run the program; it ends with ``SystemExit``."""
+    open_standard_streams()
+    debug = DEBUG in sys.argv[1:]
+    if not debug:
+        warnings.simplefilter("ignore")  # they are for developers; the environment may even make errors of them
+    try:
+        bind_own_packages()
+        from monitor.cli import main as run
+    except ImportError as error:
+        if debug:
+            raise
+        _fail(f"cannot be started: {' '.join(str(error).split())}")
+    run()
+
+
+def _is_own(module: ModuleType, name: str) -> bool:
+    file = getattr(module, "__file__", None)  # None of a namespace package
+    own = os.path.join(FOLDER, name, "__init__.py")
+    with contextlib.suppress(OSError):
+        return file is not None and os.path.samefile(file, own)
+    return False
+
+
+def _fail(line: str) -> NoReturn:
+    with contextlib.suppress(OSError):
+        print(f"imu-monitor: {line}", file=sys.stderr, flush=True)  # noqa: T201 - the program's message
+    sys.exit(FAILED)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name at its first use.
+
+    Raises
+    ------
+    AttributeError
+        If there is no public name ``name``.
+    ImportError
+        If the folder ``monitor`` or ``drivers`` is missing or belongs to another package.
+    """
+    value: Any
+    if name == "__version__":
+        from importlib import metadata
+
+        value = metadata.version("imu-monitor")
+    elif name == "effects":
+        value = importlib.import_module("imu_monitor.effects")
+    else:
+        module = next((module for module, names in _MODULES.items() if name in names), None)
+        if module is None:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        bind_own_packages()
+        value = getattr(importlib.import_module(module), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, "__version__"})
+
+
+if __name__ == "__main__":
+    main()
+else:
+    with contextlib.suppress(ImportError):  # ``main`` and the first use of a public name report the missing folder
+        bind_own_packages()

@@ -1,0 +1,59 @@
+"""Text and HTML of results, and conversion to pandas."""
+
+import html
+import io
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from drivers.errors import ConfigError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Console
+
+WIDTH: Final = 120
+"""Width of printed results in characters."""
+
+
+def render_text(print_result: "Callable[[Console], None]") -> str:
+    """Return the text that a function prints to a console, without colours.
+
+    Parameters
+    ----------
+    print_result
+        Function that prints to the console that it receives.
+    """
+    from rich.console import Console
+
+    text = io.StringIO()
+    print_result(Console(file=text, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False))
+    return "\n".join(line.rstrip() for line in text.getvalue().rstrip().splitlines())
+
+
+def render_html(text: str, figures: Sequence[str] = ()) -> str:
+    """Return HTML for a notebook that shows a text in a fixed-width font, followed by SVG elements.
+
+    Parameters
+    ----------
+    text
+        Text of the result.
+    figures
+        SVG elements.
+    """
+    drawn = "".join(f'<div style="max-width:60em;background:white">{figure}</div>' for figure in figures)
+    return f'<pre style="line-height:1.3">{html.escape(text)}</pre>{drawn}'
+
+
+def build_dataframe(columns: Mapping[str, Any]) -> "pd.DataFrame":
+    """Return a pandas DataFrame with the given columns.
+
+    Raises
+    ------
+    ConfigError
+        If pandas is not installed.
+    """
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise ConfigError("a DataFrame needs pandas: pip install pandas") from error
+    return pd.DataFrame(dict(columns))
