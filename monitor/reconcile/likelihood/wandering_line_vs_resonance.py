@@ -51,6 +51,9 @@ HALF_POWER_DEVIATIONS: Final = sqrt(8.0 * log(2.0))
 MIN_POWER: Final = 1e-3
 MIN_MODULATION_GAIN_NATS: Final = 3.0
 """Log-likelihood gain of a modulated line over both other processes, in nats, above which neither is named."""
+MAX_SWEEP_RESIDUAL: Final = 1e-3
+"""Variance of the phase that a linear change of the frequency leaves, below which the line is a sweep. The variance is
+relative to the variance that a constant frequency leaves. For a random frequency, it is near 1."""
 CARRIER_PADDING: Final = 4
 """Zero padding of the periodogram that determines the frequency of a modulated line."""
 
@@ -62,12 +65,18 @@ class WanderingLineComparison:
     line: WanderingLine
     gain: float  # log-likelihood of the wandering line less the log-likelihood of the resonance, nats
     modulation_gain: float  # log-likelihood of a modulated line less the log-likelihood of the resonance, nats
+    sweep_residual: float  # relative variance of the phase that a linear change of the frequency leaves
     parameters: dict[str, ParameterInterval]  # of the wandering line, 95 %
 
     @property
     def is_modulated(self) -> bool:
         """True if a line with a constant phase and a varying amplitude is the most likely process."""
         return self.modulation_gain > max(self.gain, 0.0) + MIN_MODULATION_GAIN_NATS
+
+    @property
+    def is_sweep(self) -> bool:
+        """True if the frequency changes linearly in time, and not at random."""
+        return self.sweep_residual < MAX_SWEEP_RESIDUAL
 
 
 def compare_wandering_line_with_resonance(
@@ -116,7 +125,17 @@ def compare_wandering_line_with_resonance(
         "frequency_deviation": log_interval(state.deviation_hz, float(deviations[1])),
         "correlation_time": log_interval(state.time_s, float(deviations[2])),
     }
-    return WanderingLineComparison(line, as_line - as_resonance, as_modulated - as_resonance, parameters)
+    drawn = draw_line(z, band.rate_hz, state, np.random.default_rng(0))
+    return WanderingLineComparison(
+        line, as_line - as_resonance, as_modulated - as_resonance, _sweep_residual(drawn), parameters
+    )
+
+
+def _sweep_residual(line: Complexes) -> float:
+    """Return the variance of the phase around a parabola, relative to the variance around a straight line."""
+    phase, t = np.unwrap(np.angle(line)), np.linspace(-1.0, 1.0, line.size)
+    straight, parabola = (float(np.var(phase - np.polyval(np.polyfit(t, phase, k), t))) for k in (1, 2))
+    return parabola / straight if straight > 0.0 else 1.0
 
 
 def draw_wandering_line(series: Floats, rate_hz: float, line: WanderingLine, rng: np.random.Generator) -> Floats:

@@ -243,7 +243,7 @@ def _select_trial(
             continue
         tried = [trial, *trials[:at], *trials[at + 1 :]]  # a rejected trial still reduces the confidence
         lines = compare_resonance_with_lines(after) if isinstance(added, Narrowband) else None
-        if lines is not None and lines.is_modulated:
+        if lines is not None and (lines.is_modulated or (lines.is_sweep and lines.gain > MIN_LINE_GAIN_NATS)):
             continue
         if lines is not None:
             line = wandering_line_trial(lines, trial)

@@ -72,7 +72,7 @@ SINGLE_SIZE_MARGIN_NATS: Final = 1.5
 SCALE_SEARCH_ITERATIONS: Final = 16
 FREQUENCY_BANDS: Final = 8
 """Number of frequency bands in the test for a constant leak coefficient."""
-MIN_LEAK_PROBABILITY: Final = 1e-3
+MIN_LEAK_PROBABILITY: Final = 1e-5
 """A leak is rejected if the scatter of its coefficient between frequency bands is less probable than this value."""
 COEFFICIENT_PENALTY_NATS: Final = 3.3
 """Penalty for each further coefficient of a polynomial, in nats.

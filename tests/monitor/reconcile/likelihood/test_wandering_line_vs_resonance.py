@@ -34,6 +34,7 @@ def test_a_wandering_line_is_no_resonance(amplitude, seed):
     assert found is not None
     assert found.gain > 20.0
     assert not found.is_modulated
+    assert not found.is_sweep
     assert found.line.amplitude == pytest.approx(amplitude, rel=0.1)
     assert found.line.frequency == pytest.approx(13.0, abs=0.15)
     assert found.line.frequency_deviation == pytest.approx(0.2, rel=0.6)
@@ -59,6 +60,15 @@ def test_a_line_of_varying_amplitude_is_neither(depth):
     found = compare_wandering_line_with_resonance(y, RATE_HZ, Narrowband(0.2, 13.0, 0.02))
     assert found is not None
     assert found.is_modulated
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_line_whose_frequency_rises_linearly_is_a_sweep(seed):
+    rng = np.random.default_rng(seed)
+    y = noisy(rng, 0.5 * np.sin(2.0 * np.pi * (12.0 * T + 0.5 * 2.0 * T**2 / T[-1])))
+    found = compare_wandering_line_with_resonance(y, RATE_HZ, Narrowband(0.35, 13.0, 2.0))
+    assert found is not None
+    assert found.is_sweep
 
 
 def test_a_short_series_is_not_compared():
