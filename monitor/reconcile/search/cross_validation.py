@@ -1,8 +1,9 @@
 """Cross-validation of a new effect on the two halves of a recording.
 
 The hypotheses with and without the effect are fitted to one half and tested on the other half. The effect is kept if
-the likelihood of the other half increases and the gap of the diagnostic decreases. One-time effects, and effects with
-too little evidence in one half, are kept without cross-validation.
+the likelihood of the other half increases and the gap of the diagnostic decreases. It is enough if both hold after the
+sizes of all other noise have been fitted to the other half. One-time effects, and effects with too little evidence in
+one half, are kept without cross-validation.
 """
 
 from collections.abc import Collection
@@ -108,7 +109,12 @@ def cross_validate(
         gains = [_expected_gain(_fit_half(half, after), after.effects[-1]) for half in repaired]
         if min(gains) < MIN_HALF_GAIN_NATS:
             return accept_without_validation(TOO_LITTLE_EVIDENCE)
-    return _exchange_halves(repaired, before, after, added_effect, diagnostic, null)
+    learned = _exchange_halves(repaired, before, after, frozenset(), diagnostic, null)
+    if learned.kept or added_effect is None:
+        return learned
+    # a drift that differs between the halves must not outweigh the effect, so the other noise is fitted to each half
+    others = frozenset(range(len(after.effects) - 1)) - after.fit.fixed_noise
+    return _exchange_halves(repaired, before, after, others, diagnostic, null)
 
 
 def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
@@ -124,22 +130,15 @@ def _exchange_halves(
     halves: list[Axis],
     before: Hypothesis,
     after: Hypothesis,
-    added_effect: Effect | None,
+    fitted: frozenset[int],
     diagnostic: str,
     null: NullDistribution,
 ) -> CrossValidationResult:
-    """Test each half with the effect that the other half has.
-
-    If an effect was added, only this effect is predicted. The sizes of all other noise are fitted to each half, and the
-    fitted sizes are the same in both hypotheses. A drift that differs between the halves then cannot outweigh the
-    effect.
-    """
+    """Test each half with the noise sizes of the other half, except for the effects with the indices ``fitted``."""
     gaps = np.zeros(2)
     better = 0.0
-    others = (range(len(before.effects)), range(len(after.effects) - 1))
     for learn, test in ((0, 1), (1, 0)):
         for at, hypothesis in enumerate((before, after)):
-            fitted = frozenset(others[at] if added_effect is not None else ()) - after.fit.fixed_noise
             predicted = _predict_half(halves[test], _fit_half(halves[learn], hypothesis), fitted)
             gaps[at] += DIAGNOSTICS[diagnostic](whiten_axis(predicted)).gain
             better += predicted.log_likelihood * (2 * at - 1)

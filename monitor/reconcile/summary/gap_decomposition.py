@@ -6,11 +6,11 @@ sizes are fitted again, and the loss is the gain of this change. The gains are n
 explained gap.
 
 Outliers, heavy tails, changes of the variance, random jumps and wandering lines are not fully visible in the likelihood
-of the spectrum. The gain of the test that found them is added. For random jumps and wandering lines, only the gain over
-Gaussian noise with the same spectrum is added. The gain of a moved line is the score of its trial. The likelihood of
-quantized, clipped or repeated values is unbounded, because a continuous distribution never yields equal values. The
-gain of these effects is the gain of their influence on the noise (``value_artifact_gain``). If the model was fitted to
-the same recording, only added effects have a gain, because the sizes of the model cannot serve as a reference.
+of the spectrum. The gain of the test that found them is added. For random jumps, only the gain over Gaussian noise with
+the same spectrum is added. The gain of a moved line is the score of its trial. The likelihood of quantized, clipped or
+repeated values is unbounded, because a continuous distribution never yields equal values. The gain of these effects is
+the gain of their influence on the noise (``value_artifact_gain``). If the model was fitted to the same recording, only
+added effects have a gain, because the sizes of the model cannot serve as a reference.
 
 The **remaining gap** is the sum over the groups of diagnostics in ``GROUPS``. The diagnostics of a group detect the
 same difference, so the gain of a group is that of its strongest significant diagnostic. For the spectrum, the gain from
@@ -52,9 +52,9 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "values": ("values",),
 }
 """Diagnostics that detect the same difference, by the name of the group."""
-NON_GAUSSIAN_EFFECTS: Final = (PoissonSteps, RandomTelegraph, WanderingLine)
-"""Effects for which Gaussian noise with the same spectrum exists."""
-EFFECTS_OUTSIDE_SPECTRUM: Final = (Outliers, HeavyTails, NoiseStep, VarianceModulation, *NON_GAUSSIAN_EFFECTS)
+JUMP_PROCESSES: Final = (PoissonSteps, RandomTelegraph)
+"""Effects that have the same spectrum as Gaussian noise."""
+EFFECTS_OUTSIDE_SPECTRUM: Final = (Outliers, HeavyTails, NoiseStep, VarianceModulation, WanderingLine, *JUMP_PROCESSES)
 """Effects that are not fully visible in the likelihood of the spectrum."""
 SATURATED_BANDS: Final = 64
 """Number of frequency bands with a separately fitted power, equally wide on a logarithmic scale."""
@@ -121,8 +121,8 @@ def _gains_outside_spectrum(search: AxisSearchResult) -> dict[int, float]:
             found[at] = value_artifact_gain(hypothesis.fit, type(effect))
         elif isinstance(effect, EFFECTS_OUTSIDE_SPECTRUM):
             trials = [one.trials[0] for one in search.rounds if one.trials[0].name == effect.name]
-            # the likelihood of the spectrum already contains the power of non-Gaussian effects
-            has_spectrum = isinstance(effect, NON_GAUSSIAN_EFFECTS)
+            # the likelihood of the spectrum already contains the power of jumps
+            has_spectrum = isinstance(effect, JUMP_PROCESSES)
             found[at] = max((one.gain_over_same_spectrum if has_spectrum else one.score for one in trials), default=0.0)
         elif isinstance(effect, CommonVibration):
             trials = [one.trials[0] for one in search.rounds]

@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 Parameters = Mapping[str, Any]
 
 PAD: Final = 8  # flicker is cut out of a series so many times longer: its spectrum reaches down to 1/(8T)
+SUBSTEPS: Final = 8  # steps of the frequency of a wandering line for each sample
 SETTLING: Final = 8192  # samples of constant input before a filter
 
 
@@ -124,10 +125,11 @@ def wandering_line(
     correlation_time: float,
     phase: float,
 ) -> Floats:
-    """A line of constant amplitude: its frequency is correlated noise about the centre, summed up sample by sample."""
-    hz = frequency + exponentially_correlated(clock, rng, frequency_deviation, correlation_time)
-    turns = np.concatenate([[0.0], np.cumsum(0.5 * (hz[1:] + hz[:-1]))]) / clock.rate_hz
-    return amplitude * np.sin(2.0 * np.pi * turns + phase)
+    """A line of constant amplitude: its frequency is correlated noise about the centre, summed up in fine steps."""
+    fine = Clock(clock.n * SUBSTEPS, clock.rate_hz * SUBSTEPS)
+    hz = frequency + exponentially_correlated(fine, rng, frequency_deviation, correlation_time)
+    turns = np.concatenate([[0.0], np.cumsum(0.5 * (hz[1:] + hz[:-1]))]) / fine.rate_hz
+    return amplitude * np.sin(2.0 * np.pi * turns[::SUBSTEPS] + phase)
 
 
 def power_law(clock: Clock, rng: np.random.Generator, density: float, exponent: float) -> Floats:
