@@ -174,12 +174,13 @@ class FailingSegmentFileWriter(SegmentFileWriter):
 
     def write_samples(self, blocks, state) -> None:
         assert FailingSegmentFileWriter.released.wait(PATIENCE_S)
-        if FailingSegmentFileWriter.error_number is not None:
+        error_number = FailingSegmentFileWriter.error_number  # read once: the test clears it in another thread
+        if error_number is not None:
             FailingSegmentFileWriter.refused += 1
             self._file.write(b"half a batch")
             self._file.truncate(self._valid_bytes)
             self._file.seek(self._valid_bytes)
-            raise OSError(FailingSegmentFileWriter.error_number, os.strerror(FailingSegmentFileWriter.error_number))
+            raise OSError(error_number, os.strerror(error_number))
         super().write_samples(blocks, state)
 
 
