@@ -83,9 +83,9 @@ MIN_STUDENT_GAIN_NATS: Final = 2.0
 """Smallest log-likelihood gain of outliers over Student's t, in nats."""
 MAX_OUTLIER_Z: Final = 4.0
 """Largest accepted z value, both for the clustering of large samples and for the misfit."""
-MIN_DISTANT_SCALE: Final = 4.0
+MIN_DISTANT_SCALE: Final = 3.5
 """Smallest standard deviation of distant outliers, relative to the noise. Other heavy tails have a smaller ratio."""
-MAX_MISFIT_SHARE: Final = 0.1
+MAX_MISFIT_SHARE: Final = 0.2
 """Largest accepted misfit of distant outliers, relative to the gain."""
 MAX_VARIANCE_SHARE: Final = 0.3
 """Largest gain of a variance change after heavy tails are removed, relative to the gain of the heavy tails."""
@@ -316,7 +316,10 @@ def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
 
 
 def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try noise effects, new sizes of the noise model, and a common factor."""
+    """Try noise effects, new sizes of the noise model, and a common factor.
+
+    The sizes of a model that was fitted to this recording have no common factor.
+    """
     resized = hypothesis.refit_with_other_added_effects(hypothesis.added)
     found = [
         Trial(
@@ -325,7 +328,9 @@ def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]
     ]
     found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
     found += _moved_feature_trials(hypothesis, found)
-    found = _best_first([*found, _scale_factor_trial(hypothesis, resized)])
+    if not hypothesis.axis.is_model_fitted:
+        found.append(_scale_factor_trial(hypothesis, resized))
+    found = _best_first(found)
     return _prefer_single_size(found) if resized.resized_model_effect_count == 1 else found
 
 
