@@ -47,7 +47,10 @@ MAX_EPISODES: Final = 3
 MAX_WIDTH: Final = 0.15
 """Largest width of the band, relative to half the sample rate."""
 NEIGHBOUR_WIDTHS: Final = 3
-"""Number of widths on each side of the band that must be quiet at other times. A moving resonance is not quiet there."""
+"""Number of widths on each side of the band that must be quiet at other times.
+
+A moving resonance is not quiet there.
+"""
 MIN_NEIGHBOUR_BINS: Final = 12
 MAX_QUIET_RATIO: Final = 1.5
 """Largest mean power of a quiet bin, relative to the background, for many blocks. During the vibration, this limit
@@ -106,14 +109,12 @@ def check_temporary_vibration(
     if vibrations and simulated is not None:
         drawn = {axis: _block_spectra(simulated[axis], rate_hz) for axis in {one.axis for one in vibrations}}
         false = [one for axis, spectrum in drawn.items() if spectrum for one in _find_vibrations(axis, spectrum)]
-        vibrations = [one for one in vibrations if not any(_same_band(one, other) for other in false)]
+        vibrations = [one for one in vibrations if not any(_have_common_band(one, other) for other in false)]
     corrected = dict(values)
     findings = []
     while vibrations:
         largest = max(vibrations, key=lambda one: one.contrast)
-        vibrations = [
-            one for one in vibrations if not (_same_band(one, largest) and (one.active & largest.active).any())
-        ]
+        vibrations = [one for one in vibrations if not _is_same_vibration(one, largest)]
         axes = tuple(axis for axis in AXES if axis in spectra and _is_affected(spectra[axis], largest))
         amplitude = 0.0
         for axis in axes:
@@ -231,8 +232,12 @@ def _widen(active: Mask) -> Mask:
     return wide
 
 
-def _same_band(one: TemporaryVibration, other: TemporaryVibration) -> bool:
+def _have_common_band(one: TemporaryVibration, other: TemporaryVibration) -> bool:
     return one.first_hz <= other.last_hz and other.first_hz <= one.last_hz
+
+
+def _is_same_vibration(one: TemporaryVibration, other: TemporaryVibration) -> bool:
+    return _have_common_band(one, other) and bool((one.active & other.active).any())
 
 
 def _is_affected(spectra: _BlockSpectra, found: TemporaryVibration) -> bool:
