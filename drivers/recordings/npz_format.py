@@ -59,7 +59,7 @@ The header is matched by a regular expression and never evaluated as Python code
 """
 
 
-class _BoundedFile(FileIO):
+class _IndexSizeLimitedFile(FileIO):
     """File that raises an error if more than MAX_INDEX_BYTES are read at once.
 
     ``zipfile`` reads the whole index at once and uses about ten times as much memory as the size of the index.
@@ -88,7 +88,7 @@ class _Header:
 
 def count_npz_rows(path: Path) -> int:
     """Return the number of rows of a .npz file according to the array headers, or 0 if the file is truncated."""
-    with _BoundedFile(path) as file:
+    with _IndexSizeLimitedFile(path) as file:
         if not _has_index(path, file):
             return 0  # the reader checks the number of rows of a truncated archive
         with _open_archive(path, file) as archive:
@@ -106,7 +106,7 @@ def read_npz(path: Path) -> table.Table:
         If the samples do not fit into memory.
     """
     notes: list[str] = []
-    with _BoundedFile(path) as file:
+    with _IndexSizeLimitedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
                 chosen = table.select_known_columns(path, _array_names(archive), notes)

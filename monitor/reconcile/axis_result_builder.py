@@ -217,7 +217,7 @@ def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[fl
     """
     best: dict[str, float] = {"": 0.0}
     for trial in trials:
-        best[trial.name] = max(best.get(trial.name, -inf), trial.total_score)
+        best[trial.name] = max(best.get(trial.name, -inf), trial.score_with_slow_noise)
     top = max(best.values())
     whole = sum(exp(value - top) for value in best.values())
     chances = {other: exp(value - top) / whole for other, value in best.items()}

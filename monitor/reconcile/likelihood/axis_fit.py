@@ -36,9 +36,9 @@ from monitor.reconcile.likelihood.effect_roles import (
     is_noise_effect,
     regressor_count,
     with_effect_size,
-    with_regressor_factors,
+    with_regression_coefficients,
 )
-from monitor.reconcile.likelihood.whittle_fit import BinnedProductSums, WhittleFit, maximise_whittle_likelihood
+from monitor.reconcile.likelihood.whittle_fit import BinnedRegressionSums, WhittleFit, maximise_whittle_likelihood
 from monitor.reconcile.preparation.cosine_bins import (
     MAX_SMOOTH_COEFFICIENTS,
     FrequencyBins,
@@ -127,8 +127,8 @@ class RegressorCache:
         """
         time_constant_s = getattr(effect, "time_constant", None) or np.inf
         if isinstance(effect, SMOOTH_EFFECTS) and time_constant_s >= self._min_time_constant_s:
-            return self._transform_smooth(with_regressor_factors(effect, np.ones(MAX_REGRESSORS)))
-        return self._transform(with_regressor_factors(effect, np.ones(MAX_REGRESSORS)))
+            return self._transform_smooth(with_regression_coefficients(effect, np.ones(MAX_REGRESSORS)))
+        return self._transform(with_regression_coefficients(effect, np.ones(MAX_REGRESSORS)))
 
 
 class _NoiseVariances(NamedTuple):
@@ -269,7 +269,7 @@ class Axis:
                 found.start.append(min(max(effect_size(effect) ** 2, least), whole))
         return found
 
-    def sum_products_over_bins(self, regressors: Sequence[Regressor]) -> BinnedProductSums:
+    def sum_products_over_bins(self, regressors: Sequence[Regressor]) -> BinnedRegressionSums:
         """Sum the products of axis and regressors over each frequency bin."""
         q, m = len(regressors), self.bins.count.size
         cross, gram = np.empty((q, m)), np.empty((q, q, m))
@@ -278,7 +278,7 @@ class Axis:
             cross[i] = self._binned_product(column, None)
             for j in range(i + 1):
                 gram[i, j] = gram[j, i] = self._binned_product(column, unit[j])
-        return BinnedProductSums(self._binned_product(None, None), cross, gram)
+        return BinnedRegressionSums(self._binned_product(None, None), cross, gram)
 
     def _regressors_of(self, effects: Sequence[Effect]) -> tuple[tuple[tuple[int, slice], ...], list[Regressor]]:
         slices: list[tuple[int, slice]] = []
@@ -446,7 +446,7 @@ def _with_fitted_sizes(
     for theta, at in zip(fitted.theta, noises, strict=True):
         found[at] = with_effect_size(found[at], float(theta) ** 0.5)
     for at, place in slices:
-        found[at] = with_regressor_factors(found[at], fitted.beta[place])
+        found[at] = with_regression_coefficients(found[at], fitted.beta[place])
     return tuple(found)
 
 
@@ -475,4 +475,4 @@ def _with_unit_noise_size(effect: Effect) -> Effect:
 def _with_unit_size(regressor: Regressor) -> Regressor:
     """Return the regressor with an effect of size one, for use as a cache key."""
     effect, at = regressor
-    return with_regressor_factors(effect, np.ones(MAX_REGRESSORS)), at
+    return with_regression_coefficients(effect, np.ones(MAX_REGRESSORS)), at

@@ -120,7 +120,7 @@ class Trial:
     moved: int | None = None  # index of the model effect that ``effect`` replaces; None for an additional effect
 
     @property
-    def total_score(self) -> float:
+    def score_with_slow_noise(self) -> float:
         """Score relative to the hypothesis before the round, in nats. Scores of the same round are comparable."""
         return self.score + self.slow_noise_score
 
@@ -161,7 +161,7 @@ def _is_deterministic_first(deterministic: Sequence[Trial], noises: Sequence[Tri
     best, noise = deterministic[0], noises[0]
     if best.score_without_slow_noise > noise.score - NOISE_PRIORITY_NATS:
         return True
-    return noise.name == RETUNE and best.score > 0.0 and best.total_score > noise.score
+    return noise.name == RETUNE and best.score > 0.0 and best.score_with_slow_noise > noise.score
 
 
 def try_alternatives_to_slow_noise(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
@@ -407,7 +407,7 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     axis, small = hypothesis.axis, initial_effect_size(hypothesis.axis)
     fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
 
-    def make_noise_score(noise: Effect) -> Callable[[Effects], float]:
+    def make_score_with_added_noise(noise: Effect) -> Callable[[Effects], float]:
         return lambda effects: axis.fit((*effects, noise), fixed_noise).log_likelihood - cost - PENALTY_NATS[noise.name]
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
@@ -415,7 +415,7 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     if not any(isinstance(effect, RateRandomWalk) for effect in hypothesis.effects):
         noises.append(RateRandomWalk(K=small))
     noises += [PowerLaw(density=small, exponent=exponent) for exponent in SLOW_NOISE_EXPONENTS]
-    return [make_noise_score(one) for one in noises]
+    return [make_score_with_added_noise(one) for one in noises]
 
 
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
@@ -426,17 +426,19 @@ def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     """
     effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_effect_indices(hypothesis.model)
 
-    def log_likelihood_with_factor(log_factor: float) -> float:
+    def log_likelihood_with_axis_scale_factor(log_factor: float) -> float:
         return hypothesis.axis.fit(
             (*effects, ScaleFactor(factor=float(np.exp(log_factor)))), fixed_noise
         ).log_likelihood
 
-    start = float(max(np.linspace(-3.0, 3.0, 13), key=log_likelihood_with_factor))
-    x = find_maximum_by_golden_section(log_likelihood_with_factor, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS)
-    gain = log_likelihood_with_factor(x) - hypothesis.penalised_log_likelihood - PENALTY_NATS["scale_factor"]
+    start = float(max(np.linspace(-3.0, 3.0, 13), key=log_likelihood_with_axis_scale_factor))
+    x = find_maximum_by_golden_section(
+        log_likelihood_with_axis_scale_factor, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS
+    )
+    gain = log_likelihood_with_axis_scale_factor(x) - hypothesis.penalised_log_likelihood - PENALTY_NATS["scale_factor"]
     if (
         resized.resized_model_effect_count > 1
-        and log_likelihood_with_factor(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS
+        and log_likelihood_with_axis_scale_factor(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS
     ):
         gain = max(gain, resized.penalised_log_likelihood - hypothesis.penalised_log_likelihood)
     return Trial("scale_factor", ScaleFactor(factor=float(np.exp(x))), gain)
