@@ -20,14 +20,18 @@ def convert(
     rate: options.Rate = None,
     last: options.Last = None,
     topic: options.Topic = None,
+    decoder: options.DecoderName = None,
+    option: options.DecoderOptions = None,
 ) -> None:
     """Write a recording in another format, without a change of times and values."""
     from monitor.commands import convert as conversion
 
     last_s = options.parse_duration("--last", last)
     service_in_terminal.exit_on_sigterm()
+    choice = options.parse_decoder(decoder, option)
+    request = conversion.ConversionRequest(recording, out, rate, last_s, topic, choice)
     with output.show_progress_bar() as tell:
-        result = conversion.run_conversion(conversion.ConversionRequest(recording, out, rate, last_s, topic), tell)
+        result = conversion.run_conversion(request, tell)
     temperature = ", temperature" if result.has_temperature else ""
     typer.echo(f"{out}: {len(result)} samples of {' '.join(result.axes)}{temperature}")
     for note in result.notes:

@@ -9,11 +9,12 @@ import numpy as np
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.file_access import real_path
-from drivers.recordings import Recording, load_samples, open_recording_writer
+from drivers.recordings import Recording, open_recording_writer
 from drivers.recordings.formats import find_writer
 from drivers.recordings.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
 from drivers.recordings.topics import JOIN
 from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.recording_decoding import DecoderChoice, load_recording
 
 BLOCK_ROWS: Final = 1 << 16
 
@@ -27,6 +28,7 @@ class ConversionRequest:
     rate_hz: float | None = None
     last_s: float | None = None  # duration at the end of the recording to use; None = all
     topic: str | None = None  # topic to read; None = the only IMU of the recording
+    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
 
 
 def run_conversion(request: ConversionRequest, report_progress: ProgressCallback = ignore_progress) -> Recording:
@@ -50,8 +52,9 @@ def run_conversion(request: ConversionRequest, report_progress: ProgressCallback
     find_writer(request.out)
     if real_path(request.recording) == real_path(request.out):
         raise ConfigError(f"{request.out}: is the recording itself; choose another name")
-    report_progress("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
+    found = load_recording(
+        request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+    )
     axes = [axis for axis in found.axes if not np.isnan(found.values[:, AXES.index(axis)]).all()] or found.axes
     with open_recording_writer(request.out, axes, found.has_temperature) as append_samples:
         for start in range(0, len(found), BLOCK_ROWS):
