@@ -13,8 +13,9 @@ from drivers.data_types import AXES, EXTENDED_ID, Chunk, Floats, SampleBlock, ma
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recordings import load_samples, save_samples
 from monitor.commands.recording_decoding import DecoderChoice, load_recording
-from tests.contracts.decoder_examples import CAN_SIGNALS, STIM300, VECTORNAV, Example
+from tests.contracts.decoder_examples import CAN_SIGNALS, DEGREE, STIM300, VECTORNAV, Example
 from tests.support.program import exit_status
+from tests.support.recordings import recordings
 
 RATE_HZ = 200.0
 N = 4000
@@ -303,3 +304,28 @@ class TestCommands:
     def test_wrong_options(self, options: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert exit_status("analyze", "x.raw", *options) == 2
         assert capsys.readouterr().err.startswith(f"imu-monitor: {line}")
+
+
+@pytest.mark.data
+class TestRealRecordings:
+    def test_captured_sentences_give_the_recorded_samples(self) -> None:
+        folder = recordings() / "vn100-serial"
+        found = load_recording(folder / "vnymr-sentences.txt.gz", 40.0, decoder=DecoderChoice("vectornav_ascii"))
+        expected = load_samples(folder / "static-12min.npz")
+        np.testing.assert_allclose(found.values, expected.values, rtol=1e-6, atol=1e-9)
+        assert found.t_s is not None
+        np.testing.assert_allclose(found.t_s, np.arange(len(found)) / 40.0, atol=1e-6)
+
+    def test_can_frames_give_the_recorded_samples(self) -> None:
+        folder = recordings() / "can-car"
+        signals = {f"g{axis.lower()}": f"ImuData.AngularRate{axis}" for axis in "XYZ"}
+        signals |= {f"a{axis.lower()}": f"ImuData.Acceleration{axis}" for axis in "XYZ"}
+        choice = DecoderChoice("dbc", {"file": "canmod_gps", "signals": signals})
+        found = load_recording(folder / "drive-a-frames.csv.gz", decoder=choice)
+        expected = load_samples(folder / "drive-a.npz")
+        assert len(found) == len(expected)
+        half_a_bit = np.repeat([0.125 * DEGREE, 0.0625], 3)
+        assert (np.abs(found.values - expected.values) < half_a_bit).all()
+        assert found.t_s is not None
+        assert expected.t_s is not None
+        assert np.abs(found.t_s - expected.t_s).max() < 0.05  # the clock removes the jitter of the bus
