@@ -151,6 +151,7 @@ class Axis:
     temperature_c: Floats | None  # [n] °C
     value_artifacts: ValueArtifacts
     regressors: RegressorCache  # shared by all axes of a recording and of its simulations
+    is_model_fitted: bool = False  # True if the model under test was fitted to this recording
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     cosine_transform_rms: float = field(init=False)  # root mean square of the coefficients, in the unit of the axis
     _products: dict[frozenset[Regressor | None], Floats] = field(init=False, default_factory=dict)
