@@ -19,13 +19,13 @@ from drivers import module_lookup
 from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Timing, make_block, ns_to_seconds
 from drivers.decoders.base import Decoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
-from drivers.links.replay_link import ReplayLink, detect_file_kind
+from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
 from drivers.settings_model import TableError
 from drivers.timing.sample_clock import SampleClock
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.common.unit_formatting import format_count
-from monitor.settings.driver_settings import build_link_and_decoder
+from monitor.settings.driver_settings import build_link_and_decoder, list_decoders
 
 LINK_KEYS: Final = ("bytes_per_second", "channel")
 """Keys of the link ``replay`` that can be set in addition to the keys of the decoder."""
@@ -83,8 +83,8 @@ def load_recording(
         kind = detect_file_kind(path) if path.exists() else None
     if decoder is None:
         if kind in CONTENTS:
-            names = ", ".join(module_lookup.list_modules(drivers.decoders))
-            raise ConfigError(f"{path}: contains {CONTENTS[kind]}; name the decoder with --decoder: {names}")
+            names = list_decoders(CARRIERS[kind]) if kind in CARRIERS else module_lookup.list_modules(drivers.decoders)
+            raise ConfigError(f"{path}: contains {CONTENTS[kind]}; name the decoder with --decoder: {', '.join(names)}")
         return load_samples(path, rate_hz, last_s, topic)
     if kind == "recording":
         raise ConfigError(f"{path}: contains samples, which need no decoder; leave out --decoder")

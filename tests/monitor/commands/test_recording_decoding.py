@@ -215,9 +215,11 @@ def refusal(path: Path, **keys: Any) -> str:
 class TestRefusals:
     def test_file_in_a_wire_format_needs_a_decoder(self, tmp_path: Path) -> None:
         write_can_log(tmp_path / "drive.blf")
-        assert refusal(tmp_path / "drive.blf").startswith("contains CAN frames; name the decoder with --decoder: dbc, ")
+        assert refusal(tmp_path / "drive.blf") == "contains CAN frames; name the decoder with --decoder: dbc"
         (tmp_path / "x.raw").write_bytes(b"abc")
-        assert refusal(tmp_path / "x.raw").startswith("contains captured bytes; name the decoder with --decoder: dbc, ")
+        assert refusal(tmp_path / "x.raw").startswith(
+            "contains captured bytes; name the decoder with --decoder: stim300, "
+        )
 
     def test_wrong_decoder_and_options(self, tmp_path: Path) -> None:
         log, capture = tmp_path / "drive.blf", tmp_path / "capture.raw"
