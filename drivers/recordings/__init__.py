@@ -67,11 +67,6 @@ class Recording:
     def __len__(self) -> int:
         return int(self.values.shape[0])
 
-    @property
-    def has_temperature(self) -> bool:
-        """True if at least one sample has a temperature."""
-        return not np.isnan(self.temperature_c).all()
-
 
 def load_samples(
     path: Path, rate_hz: float | None = None, last_s: float | None = None, topic: str | None = None

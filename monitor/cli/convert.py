@@ -32,7 +32,7 @@ def convert(
     request = conversion.ConversionRequest(recording, out, rate, last_s, topic, choice)
     with output.show_progress_bar() as tell:
         result = conversion.run_conversion(request, tell)
-    temperature = ", temperature" if result.has_temperature else ""
+    temperature = ", temperature" if conversion.has_temperature(result) else ""
     typer.echo(f"{out}: {len(result)} samples of {' '.join(result.axes)}{temperature}")
     for note in result.notes:
         typer.echo(f"note: {note}")

@@ -56,7 +56,7 @@ def run_conversion(request: ConversionRequest, report_progress: ProgressCallback
         request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
     )
     axes = [axis for axis in found.axes if not np.isnan(found.values[:, AXES.index(axis)]).all()] or found.axes
-    with open_recording_writer(request.out, axes, found.has_temperature) as append_samples:
+    with open_recording_writer(request.out, axes, has_temperature(found)) as append_samples:
         for start in range(0, len(found), BLOCK_ROWS):
             report_progress("writing", start / len(found))
             part = slice(start, min(start + BLOCK_ROWS, len(found)))
@@ -67,8 +67,13 @@ def run_conversion(request: ConversionRequest, report_progress: ProgressCallback
                 t_s = np.arange(part.start, part.stop) / found.rate_hz
             append_samples(t_s, found.values[part], found.temperature_c[part])
         report_progress("finishing the file", None)  # some formats are compressed only at the end
-    if found.has_temperature and request.out.suffix.lower() == ".mcap":
+    if has_temperature(found) and request.out.suffix.lower() == ".mcap":
         topic = JOIN.join((IMU_TOPIC, TEMPERATURE_TOPIC))
         note = f"The temperature has a topic of its own; read both with --topic {topic}."
         return replace(found, notes=(*found.notes, note))
     return found
+
+
+def has_temperature(recording: Recording) -> bool:
+    """Return True if at least one sample has a temperature."""
+    return not np.isnan(recording.temperature_c).all()
