@@ -1,4 +1,4 @@
-"""Conversion of estimates to the column values of a history row.
+"""Convert estimates to the column values of a history row.
 
 Each noise coefficient of a measured axis has four columns. For example, the column ``gz.N`` contains the estimated
 value of N on axis gz. The columns ``gz.N.lo`` and ``gz.N.hi`` contain the ends of the confidence interval. If only an

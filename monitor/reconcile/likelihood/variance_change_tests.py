@@ -371,7 +371,7 @@ def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:
 
 @compiled
 def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]:
-    """Return the minimum and maximum of each column, the positions, and the sum of the logarithms.
+    """Return the minimum, the maximum, their rows, and the sum of the logarithms of each column.
 
     For speed, the logarithm is computed for products of eight values.
     """
@@ -434,6 +434,6 @@ def _bartlett_test(total: Floats, logs: Floats, count: int, squares: int) -> tup
 
 @lru_cache(maxsize=1024)
 def _bartlett_moments(count: int, half: float) -> tuple[float, float]:
-    """Return the mean and variance of Bartlett's statistic for ``count`` sums of 2·``half`` squares."""
+    """Return the mean and variance of Bartlett's statistic for ``count`` sums, each of ``2 * half`` squared values."""
     expected = half * count * (float(psi(count * half)) - float(np.log(count)) - float(psi(half)))
     return expected, half**2 * (count * float(polygamma(1, half)) - count**2 * float(polygamma(1, count * half)))

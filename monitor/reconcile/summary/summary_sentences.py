@@ -207,7 +207,7 @@ def _recommend(r: Reconciliation, ranking: GapRanking) -> str:
 
 
 def format_share(share: float) -> str:
-    """Format a share of the gap in percent.
+    """Format a share of the gap as a percentage.
 
     >>> format_share(0.5432), format_share(0.00321), format_share(0.00003), format_share(0.9996), format_share(1.0)
     ('54 %', '0.3 %', '< 0.1 %', '> 99.9 %', '100 %')
