@@ -99,7 +99,7 @@ class Recording(recordings.Recording):
         Parameters
         ----------
         path : str or path-like
-            File that ends in .csv, .csv.gz, .npz, .parquet, .arrow or .feather.
+            File that ends in .csv, .csv.gz, .npz, .parquet, .arrow, .feather or .mcap.
 
         Raises
         ------

@@ -214,7 +214,7 @@ def test_reconcile_without_scipy_names_the_missing_extra(tmp_path: Path) -> None
     ],
 )
 def test_a_recording_without_its_extra_is_refused_in_one_line(tmp_path: Path, name: str, line: str) -> None:
-    (tmp_path / name).write_bytes(b"x")
+    (tmp_path / name).write_bytes(b"\xa3\x95\x80\x80")  # other .bin files contain captured bytes
     refused = (2, f"imu-monitor: {name}: this recording needs {line}\n")
     assert run_program(tmp_path, "analyze", name, absent=tuple(sorted(OPTIONAL))) == refused
 

@@ -262,7 +262,7 @@ def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[Timed
 # --- kind of file --------------------------------------------------------------------------------
 
 
-def _detect_kind(path: Path) -> Kind:
+def detect_file_kind(path: Path) -> Kind:
     """Detect the type of a file from its suffix and content. Raise ConfigError if the type is unknown."""
     suffix = _plain_suffix(path)
     if path == Path():
@@ -323,7 +323,7 @@ def build(settings: Settings) -> Link:
     """
     path = file_access.expand_user(settings.path)
     _check_path(path)
-    kind = _detect_kind(path)
+    kind = detect_file_kind(path)
     if kind == "log":
         require_extra("can", "a CAN log")
     if kind == "recording":

@@ -44,6 +44,7 @@ __all__ = [
     "open_recording_writer",
     "require_packages_of_format",
     "save_samples",
+    "take_last",
 ]
 
 MAX_VALUE: Final = 1e100
@@ -108,7 +109,7 @@ def load_samples(
         raise ConfigError(
             f"{path}: does not fit into the memory that is free; read a part of the recording with --last"
         ) from error
-    return found if last_s is None else _take_last(found, last_s)
+    return found if last_s is None else take_last(found, last_s)
 
 
 def create_recording(columns: Mapping[str, Floats], rate_hz: float | None = None, source: str = "values") -> Recording:
@@ -359,7 +360,8 @@ def _duration_s(parts: Sequence[Recording]) -> float:
     return sum(len(one) / one.rate_hz for one in parts if one.rate_hz)
 
 
-def _take_last(found: Recording, last_s: float) -> Recording:
+def take_last(found: Recording, last_s: float) -> Recording:
+    """Return the last ``last_s`` seconds of a recording, and at least the newest sample."""
     if found.t_s is not None:
         older = np.flatnonzero(found.t_s <= found.t_s[-1] - last_s + TIME_RESOLUTION_S)
         # The newest sample is always included.

@@ -1,13 +1,20 @@
 """Table of the recording formats: the reader and the writer for each file suffix."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.recordings import ardupilot_log_format, csv_format, npz_format, px4_ulog_format, ros_bag_format
+from drivers.recordings import (
+    ardupilot_log_format,
+    csv_format,
+    mcap_writer,
+    npz_format,
+    px4_ulog_format,
+    ros_bag_format,
+)
 from drivers.recordings import parquet_and_arrow_format as arrow_format
 from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 
@@ -22,6 +29,8 @@ class Format:
     """Function that returns the number of rows without keeping the samples."""
     open_writer: OpenWriter | None = None
     """Function that writes a file; None if the program does not write the format."""
+    any_columns: bool = False
+    """True if the writer accepts columns of any names, and not only those of a recording."""
     extra: str = ""
     """Extra whose packages read the format; "" if no extra is needed or if the functions check it."""
 
@@ -41,7 +50,7 @@ def _table_format(read: Callable[[Path], Table], open_writer: OpenWriter, count_
         refuse_topic(path, topic)
         return count_rows(path)
 
-    return Format(read_table, count_table_rows, open_writer)
+    return Format(read_table, count_table_rows, open_writer, any_columns=True)
 
 
 _ROS_BAG: Final = Format(ros_bag_format.read_ros_bag, ros_bag_format.count_ros_bag_rows, extra="ros")
@@ -62,7 +71,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     ".bag": _ROS_BAG,
     ".db3": _ROS_BAG,
-    ".mcap": _ROS_BAG,
+    ".mcap": replace(_ROS_BAG, open_writer=mcap_writer.open_mcap_writer),
     ".ulg": Format(px4_ulog_format.read_ulog, px4_ulog_format.count_ulog_rows, extra="px4"),
     ".bin": Format(
         ardupilot_log_format.read_ardupilot_log, ardupilot_log_format.count_ardupilot_rows, extra="ardupilot"
@@ -71,7 +80,9 @@ FORMATS: Final[Mapping[str, Format]] = {
 """Recording format for each file suffix."""
 
 WRITABLE: Final = tuple(suffix for suffix, one in FORMATS.items() if one.open_writer is not None)
-"""Suffixes of the files that the program writes."""
+"""Suffixes of the recordings that the program writes."""
+WRITABLE_TABLES: Final = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].any_columns)
+"""Suffixes of the tables with any columns that the program writes."""
 
 
 def find_format(path: Path) -> Format:
@@ -93,12 +104,27 @@ def find_format(path: Path) -> Format:
     return FORMATS[suffix]
 
 
-def find_writer(path: Path) -> OpenWriter:
-    """Return the function that writes files with a suffix. Raise ConfigError if such files are not written."""
-    open_writer = find_format(path).open_writer
-    if open_writer is None:
+def find_writer(path: Path, any_columns: bool = False) -> OpenWriter:
+    """Return the function that writes files with a suffix.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    any_columns
+        True if the columns are not those of a recording.
+
+    Raises
+    ------
+    ConfigError
+        If such files are not written.
+    """
+    found = find_format(path)
+    if any_columns and not found.any_columns:
+        raise ConfigError(f"{path}: tables are written as {' '.join(WRITABLE_TABLES)}")
+    if found.open_writer is None:
         raise ConfigError(f"{path}: this format is only read; recordings are written as {' '.join(WRITABLE)}")
-    return open_writer
+    return found.open_writer
 
 
 def is_recording(path: Path) -> bool:

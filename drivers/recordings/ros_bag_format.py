@@ -27,11 +27,14 @@ METADATA: Final = "metadata.yaml"
 """File that a folder with a ROS 2 bag contains."""
 STORAGE_SUFFIXES: Final = (".db3", ".mcap", ".zstd")
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
+TEMPERATURE_TYPE: Final = "sensor_msgs/msg/Temperature"
 COLUMNS_OF_TYPES: Final[Mapping[str, tuple[str, ...]]] = {
     IMU_TYPE: AXES,
-    "sensor_msgs/msg/Temperature": ("temperature",),
+    TEMPERATURE_TYPE: ("temperature",),
 }
 NOT_PROVIDED: Final = -1.0
+MIN_LOG_S: Final = 1.0
+"""Time of the log in s from which on a stamp of 0 is missing. The times of a simulation begin at 0."""
 MISSING: Final = (float("nan"),) * 3
 MAX_METADATA_BYTES: Final = 4_000_000
 EXPECTED: Final = "messages of type sensor_msgs/Imu"
@@ -177,19 +180,20 @@ def _read_topic(bag: _Bag, name: str, limit: memory_check.RecordingSizeLimits, n
     )
     columns = collect_columns(rows, ("log", "t", *COLUMNS_OF_TYPES[kind]), limit)
     log_s, stamps = columns.pop("log"), columns["t"]
-    unstamped = int(np.count_nonzero(stamps == 0.0))
+    missing = (stamps == 0.0) & (log_s >= MIN_LOG_S)
+    unstamped = int(np.count_nonzero(missing))
     if 2 * unstamped > stamps.size:
         what = f"{unstamped} of {stamps.size} messages of {name} have no header stamp"
         notes.append(f"{what}; the times of the log are used.")
         columns["t"] = log_s
     elif unstamped:
-        columns["t"] = np.where(stamps == 0.0, np.nan, stamps)
+        columns["t"] = np.where(missing, np.nan, stamps)
     if kind == IMU_TYPE:
-        for axes in (AXES[:3], AXES[3:]):
-            if all(np.isnan(columns[axis]).all() for axis in axes):
-                notes.append(f"The messages of {name} do not provide {' '.join(axes)}.")
-                for axis in axes:
-                    del columns[axis]
+        absent = [axis for axis in AXES if np.isnan(columns[axis]).all()]
+        if absent:
+            notes.append(f"The messages of {name} do not provide {' '.join(absent)}.")
+        for axis in absent:
+            del columns[axis]
     return columns
 
 

@@ -20,6 +20,7 @@ from monitor.cli import (
     analyze,
     check,
     compensate,
+    convert,
     demo,
     doctor,
     export,
@@ -82,6 +83,7 @@ for _command in (
     simulate.simulate,
     reconcile.reconcile,
     compensate.compensate,
+    convert.convert,
     history.history,
     export.export,
 ):

@@ -14,6 +14,8 @@ def analyze(
     rate: options.Rate = None,
     last: options.Last = None,
     topic: options.Topic = None,
+    decoder: options.DecoderName = None,
+    option: options.DecoderOptions = None,
     tau: Annotated[
         str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or a list of seconds.")
     ] = "octave",
@@ -48,7 +50,15 @@ def analyze(
     window_s = options.parse_duration("--window", window)
     last_s = options.parse_duration("--last", last)
     wanted = offline.AnalysisRequest(
-        recording, rate, options.parse_averaging_times(tau), window_s, rest, bool(json or plot), last_s, topic
+        recording,
+        rate,
+        options.parse_averaging_times(tau),
+        window_s,
+        rest,
+        bool(json or plot),
+        last_s,
+        topic,
+        options.parse_decoder(decoder, option),
     )
     try:
         with output.show_progress_bar() as tell:

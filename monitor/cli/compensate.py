@@ -26,6 +26,8 @@ def compensate(
     rate: options.Rate = None,
     last: options.Last = None,
     topic: options.Topic = None,
+    decoder: options.DecoderName = None,
+    option: options.DecoderOptions = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
@@ -40,13 +42,15 @@ def compensate(
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--out", out)
     output.check_output_file("--json", json)
-    for option, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
+    for name, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
         if place is not None and real_path(place) == real_path(out):
-            raise ConfigError(f"{option}: {place} is also the output file of --out; choose another name")
+            raise ConfigError(f"{name}: {place} is also the output file of --out; choose another name")
     service_in_terminal.exit_on_sigterm()
     last_s = options.parse_duration("--last", last)
     arma_order = options.parse_arma_order(order)
-    wanted = compensating.CompensationRequest(recording, out, method, rate, arma_order, last_s, topic)
+    wanted = compensating.CompensationRequest(
+        recording, out, method, rate, arma_order, last_s, topic, options.parse_decoder(decoder, option)
+    )
     with output.show_progress_bar() as tell:
         output.compile_analysis_kernels(tell)
         result = compensating.run_compensation(wanted, tell)

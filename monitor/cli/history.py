@@ -66,7 +66,7 @@ def history(
     output.check_output_file("--json", json)
     output.check_output_file("--out", out)
     if out is not None:
-        find_writer(out)
+        find_writer(out, any_columns=True)
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: give either a file or --connect, not both")

@@ -30,6 +30,8 @@ def reconcile(
     rate: options.Rate = None,
     last: options.Last = None,
     topic: options.Topic = None,
+    decoder: options.DecoderName = None,
+    option: options.DecoderOptions = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
 ) -> None:
@@ -44,6 +46,7 @@ def reconcile(
     from monitor.reconcile.several_recordings import comparison_json
 
     last_s = options.parse_duration("--last", last)
+    choice = options.parse_decoder(decoder, option)
     output.check_output_file("--json", json)
     tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
@@ -53,14 +56,14 @@ def reconcile(
             output.compile_analysis_kernels(tell)
             if several:
                 every = reconciling.RecordingsComparisonRequest(
-                    tuple(recordings), tested, out, seed, rate, last_s, topic
+                    tuple(recordings), tested, out, seed, rate, last_s, topic, choice
                 )
                 runs = reconciling.compare_recordings(every, tell)
                 data, show = comparison_json.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
                 one = reconciling.reconcile_and_write_report(
                     reconciling.ReconciliationRequest(
-                        recordings[0], tested, out, seed, rate, last_s=last_s, topic=topic
+                        recordings[0], tested, out, seed, rate, last_s=last_s, topic=topic, decoder=choice
                     ),
                     tell,
                 )

@@ -14,7 +14,7 @@ def simulate(
     model: Annotated[str, typer.Argument(metavar="MODEL.toml|NAME", help="Model file, or name of a shipped model.")],
     seconds: Annotated[str, typer.Option(metavar="S", help="Length in seconds; also 30min, 1h, 2d.")],
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Recording to write: .csv, .csv.gz, .npz, .parquet, .arrow, .feather.")
+        Path, typer.Option(metavar="FILE", help="Recording to write: .csv, .csv.gz, .npz, .parquet, .arrow, .mcap, ….")
     ],
     seed: options.SimulationSeed = 1,
     rate: options.ModelRate = None,

@@ -25,6 +25,8 @@ def thermal_fit(
     rate: options.Rate = None,
     last: options.Last = None,
     topic: options.Topic = None,
+    decoder: options.DecoderName = None,
+    option: options.DecoderOptions = None,
     json: JsonPath = None,
     plot: PlotPath = None,
 ) -> None:
@@ -38,7 +40,9 @@ def thermal_fit(
     output.check_output_file("--json", json)
     output.check_output_file("--out", out)
     interval_s, last_s = options.parse_duration("--interval", interval), options.parse_duration("--last", last)
-    study = thermal.fit_thermal_models(recording, interval_s, rate, last_s, topic)
+    study = thermal.fit_thermal_models(
+        recording, interval_s, rate, last_s, topic, options.parse_decoder(decoder, option)
+    )
     if json is not None:
         output.write_file_or_stdout("--json", json, text.encode_thermal_fit(study) + b"\n")
     if not study.fits:
@@ -59,6 +63,8 @@ def thermal_predict(
     rate: options.Rate = None,
     last: options.Last = None,
     topic: options.Topic = None,
+    decoder: options.DecoderName = None,
+    option: options.DecoderOptions = None,
     json: JsonPath = None,
     plot: PlotPath = None,
 ) -> None:
@@ -71,7 +77,12 @@ def thermal_predict(
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--json", json)
     outlook = thermal.predict_bias_of_recording(
-        recording, thermal.read_model_file(model), rate, options.parse_duration("--last", last), topic
+        recording,
+        thermal.read_model_file(model),
+        rate,
+        options.parse_duration("--last", last),
+        topic,
+        options.parse_decoder(decoder, option),
     )
     if json is not None:
         output.write_file_or_stdout("--json", json, text.encode_thermal_prediction(outlook) + b"\n")

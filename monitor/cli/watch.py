@@ -1,6 +1,10 @@
-"""Command ``watch``: shows a live table of the devices of several daemons."""
+"""Command ``watch``: shows a live table of the devices of several daemons, or prints their messages as JSON."""
 
+import sys
 import threading
+from typing import Annotated
+
+import typer
 
 from monitor.cli.shared import options, service_in_terminal
 
@@ -10,12 +14,18 @@ def watch(
     connect: options.Connect = None,
     zenoh: options.ZenohFile = None,
     seconds: options.Seconds = None,
+    json: Annotated[bool, typer.Option("--json", help="Print each message as one line of JSON.")] = False,
 ) -> None:
     """Show a live table of several daemons, whose results are received over zenoh."""
+    stop = threading.Event()
+    service_in_terminal.install_signal_handlers(stop.set)
+    if json:
+        from monitor.publishing.terminal.json_lines import print_messages_as_json
+
+        print_messages_as_json(keyexpr, connect or (), stop, sys.stdout, sys.stderr, seconds, zenoh)
+        return
     from rich.console import Console
 
     from monitor.publishing.terminal.watch import watch as show
 
-    stop = threading.Event()
-    service_in_terminal.install_signal_handlers(stop.set)
     show(keyexpr, connect or (), stop, Console(), seconds, zenoh)

@@ -17,8 +17,9 @@ import numpy as np
 from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import AVERAGING_TIME_S
-from drivers.recordings import Recording, iter_blocks, load_samples
+from drivers.recordings import Recording, iter_blocks
 from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.recording_decoding import DecoderChoice, load_recording
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
     TemperatureRemovalComparison,
@@ -67,6 +68,7 @@ class AnalysisRequest:
     total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
     last_s: float | None = None  # duration at the end of the recording to use; None = all
     topic: str | None = None  # topic to read; None = the only IMU of the recording
+    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +104,9 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
         If the recording has too few samples for any result.
     """
     try:
-        report_progress("reading", None)
-        recording = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
+        recording = load_recording(
+            request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+        )
         return analyze_recording(
             recording,
             request.tau,

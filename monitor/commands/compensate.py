@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, NotReady
 from drivers.module_lookup import format_suggestion
-from drivers.recordings import iter_blocks, load_samples
+from drivers.recordings import iter_blocks
 from drivers.recordings.writing import open_recording_writer
 from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.recording_decoding import DecoderChoice, load_recording
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
 from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.compensation_score import score_at_rest
@@ -44,6 +45,7 @@ class CompensationRequest:
     order: Order | None = None  # order of the ARMA drift model; None = selected by a criterion
     last_s: float | None = None  # duration at the end of the recording to use; None = all
     topic: str | None = None  # topic to read; None = the only IMU of the recording
+    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
 
 
 def run_compensation(
@@ -72,8 +74,9 @@ def run_compensation(
     """
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
-    report_progress("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
+    found = load_recording(
+        request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+    )
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
         raise ConfigError(f"{request.recording}: there is no gyro axis; columns gx, gy, gz in rad/s are needed")

@@ -18,10 +18,11 @@ import numpy as np
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.file_access import real_path
-from drivers.recordings import FORMATS, iter_blocks, load_samples
+from drivers.recordings import FORMATS, iter_blocks
 from drivers.recordings import Recording as Samples
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.recording_decoding import DecoderChoice, load_recording
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.json_report import SCHEMA, encode_report
@@ -46,6 +47,7 @@ class ReconciliationRequest:
     notes: tuple[str, ...] = ()  # additional notes for the report
     last_s: float | None = None  # length of the end of the recording that is used; None for all
     topic: str | None = None  # topic to read; None for the only IMU of the recording
+    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +61,7 @@ class RecordingsComparisonRequest:
     rate_hz: float | None = None
     last_s: float | None = None  # length of the end of each recording that is used; None for all
     topic: str | None = None  # topic to read from each recording; None for the only IMU
+    decoder: DecoderChoice | None = None  # decoder of CAN logs or of captured bytes
 
 
 def reconcile_and_write_report(
@@ -80,8 +83,9 @@ def reconcile_and_write_report(
     NotReady
         If the data do not support an answer.
     """
-    report_progress("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
+    found = load_recording(
+        request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+    )
     create_report_folder(request.out)
     try:
         result = reconcile_recording(found, request.model, request.seed, request.notes, report_progress)
@@ -155,7 +159,15 @@ def compare_recordings(
             (f"The model under test consists of the five noise terms of {fitted_to}.",) if fitted_to and at > 1 else ()
         )
         one = ReconciliationRequest(
-            path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s, request.topic
+            path,
+            model,
+            request.out / name,
+            request.seed,
+            request.rate_hz,
+            notes,
+            request.last_s,
+            request.topic,
+            request.decoder,
         )
         try:
             result = reconcile_and_write_report(one, _tell_for(report_progress, f"{name}, {at} of {len(named)}"))

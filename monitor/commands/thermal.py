@@ -15,7 +15,8 @@ from drivers import file_access
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import DURATION_S, FIT_NUMBER
-from drivers.recordings import iter_blocks, load_samples
+from drivers.recordings import iter_blocks
+from monitor.commands.recording_decoding import DecoderChoice, load_recording
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel
@@ -61,6 +62,7 @@ def fit_thermal_models(
     rate_hz: float | None = None,
     last_s: float | None = None,
     topic: str | None = None,
+    decoder: DecoderChoice | None = None,
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
 
@@ -76,13 +78,15 @@ def fit_thermal_models(
         Length in seconds of the end of the recording that is used. By default the whole recording is used.
     topic : str, optional
         Topic to read. By default the only IMU of the recording is read.
+    decoder : DecoderChoice, optional
+        Decoder of a CAN log or of captured bytes.
 
     Raises
     ------
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, topic)
+    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, topic, decoder)
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -99,6 +103,7 @@ def predict_bias_of_recording(
     rate_hz: float | None = None,
     last_s: float | None = None,
     topic: str | None = None,
+    decoder: DecoderChoice | None = None,
 ) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models that were fitted to an earlier recording.
 
@@ -114,6 +119,8 @@ def predict_bias_of_recording(
         Length in seconds of the end of the recording that is used. By default the whole recording is used.
     topic : str, optional
         Topic to read. By default the only IMU of the recording is read.
+    decoder : DecoderChoice, optional
+        Decoder of a CAN log or of captured bytes.
 
     Raises
     ------
@@ -121,7 +128,7 @@ def predict_bias_of_recording(
         If the recording cannot be read, or if it has no temperature.
     """
     interval = next(iter(models.values())).interval_s
-    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, topic)
+    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, topic, decoder)
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
@@ -223,10 +230,15 @@ def _model(path: Path, axis: str, row: _AxisModelRecord, interval_s: float) -> T
 
 
 def _read_interval_means(
-    recording: Path, interval_s: float | None, rate_hz: float | None, last_s: float | None, topic: str | None
+    recording: Path,
+    interval_s: float | None,
+    rate_hz: float | None,
+    last_s: float | None,
+    topic: str | None,
+    decoder: DecoderChoice | None,
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
     """Return the interval means of each recorded axis, and notes about the recording."""
-    found = load_samples(recording, rate_hz, last_s, topic)
+    found = load_recording(recording, rate_hz, last_s, topic, decoder)
     values, temperature_c, rate, notes = place_samples_and_temperature_on_grid(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")

@@ -125,6 +125,12 @@ def list_link_names() -> tuple[str, ...]:
     return tuple(sorted({*module_lookup.list_modules(drivers.links, "_link"), VIRTUAL}))
 
 
+def list_decoders(carrier: str) -> tuple[str, ...]:
+    """Return the names of the decoders that read one kind of chunks, such as ``frames``."""
+    known = module_lookup.list_modules(drivers.decoders)
+    return tuple(one for one in known if _carrier_of(module_lookup.import_module(drivers.decoders, one)) == carrier)
+
+
 def default_decoder(link: str) -> str:
     """Return the default decoder of a link, or an empty string if a configuration must name the decoder."""
     if link == VIRTUAL:
@@ -193,9 +199,7 @@ def _read_decoder(
     problems += (problem.nest_under("decoder_options") for problem in checked.problems)
     link_name, carrier = link
     if carrier and _carrier_of(module) not in ("", carrier):
-        fitting = ", ".join(
-            one for one in known if _carrier_of(module_lookup.import_module(drivers.decoders, one)) == carrier
-        )
+        fitting = ", ".join(list_decoders(carrier))
         text = f"{name} reads {_carrier_of(module)}, link {link_name} provides {carrier}: possible are {fitting}"
         problems.append(Problem("decoder", text))
     return decoder

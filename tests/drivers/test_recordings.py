@@ -22,7 +22,6 @@ from drivers.data_types import AXES, concatenate_blocks
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recordings import (
     MAX_VALUE,
-    WRITABLE,
     Recording,
     is_recording,
     iter_blocks,
@@ -34,10 +33,11 @@ from drivers.recordings import (
 from drivers.recordings import parquet_and_arrow_format as arrow_format
 from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
 from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
+from drivers.recordings.formats import WRITABLE_TABLES
 from drivers.recordings.writing import atomic_write_path
 from tests.support.recordings import recordings
 
-SUFFIXES = WRITABLE
+SUFFIXES = WRITABLE_TABLES
 TEXTS = (".csv", ".csv.gz")
 ROWS = "t,gx,az\n0.0,1.5,9.8\n0.1,2.5,9.7\n0.2,3.5,9.6\n"
 

@@ -1,9 +1,10 @@
 """Command-line options that several commands share, and functions that parse option values."""
 
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, overload
+from typing import TYPE_CHECKING, Annotated, Any, overload
 
 import typer
 
@@ -20,6 +21,7 @@ from drivers.number_ranges import (
 from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
+    from monitor.commands.recording_decoding import DecoderChoice
     from monitor.drift.compensation.arma import Order
     from monitor.estimation.allan.batch import TauGrid
     from monitor.publishing.exporters import NoiseCoefficients
@@ -116,6 +118,67 @@ Topic = Annotated[
         "accelerometer.",
     ),
 ]
+
+DecoderName = Annotated[
+    str | None,
+    typer.Option(
+        "--decoder", metavar="NAME", help="Decoder of a CAN log or of captured bytes: dbc, vectornav_binary, …."
+    ),
+]
+DecoderOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option", metavar="KEY=VALUE", help="Key of the decoder, e.g. file=imu.dbc, signals.gz=Rates.Z; repeatable."
+    ),
+]
+
+
+def parse_decoder(name: str | None, options: list[str] | None) -> "DecoderChoice | None":
+    """Parse the options ``--decoder`` and ``--option``.
+
+    A value is read as in TOML. Text needs no quotes.
+
+    >>> parse_decoder("dbc", ["file=imu.dbc", "signals.gz=Rates.Z", "tick=1e-4"]).options
+    {'file': 'imu.dbc', 'signals': {'gz': 'Rates.Z'}, 'tick': 0.0001}
+
+    Parameters
+    ----------
+    name : str or None
+        Name of the decoder.
+    options : list of str or None
+        Keys and values, separated by ``=``. Dots separate a table from its keys.
+
+    Raises
+    ------
+    ConfigError
+        If there are options without a decoder, or if an option is not a key with a value.
+    """
+    from monitor.commands.recording_decoding import DecoderChoice
+
+    if name is None:
+        if options:
+            raise ConfigError(f"--option: {make_printable_and_shorten(options[0])}: name the decoder with --decoder")
+        return None
+    tables: dict[str, Any] = {}
+    for text in options or ():
+        path, separator, value = text.partition("=")
+        *parents, key = path.strip().split(".")
+        table: Any = tables
+        for parent in parents:
+            table = table.setdefault(parent, {}) if isinstance(table, dict) else None
+        if not separator or not key or not isinstance(table, dict) or key in table:
+            shown = make_printable_and_shorten(text)
+            raise ConfigError(f'--option: "{shown}": expected KEY=VALUE once per key, such as file=imu.dbc')
+        table[key] = _parse_toml_value(value.strip()) if path != "channel" else value.strip()
+    return DecoderChoice(name, tables)
+
+
+def _parse_toml_value(text: str) -> Any:
+    """Return a value of TOML, or the text itself if it is not a value of TOML."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
 
 
 def parse_averaging_times(text: str) -> "TauGrid":

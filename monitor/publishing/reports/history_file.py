@@ -38,7 +38,7 @@ def save_history(past: HistoryTable, path: Path) -> None:
         If the suffix is unknown or the file cannot be written.
     """
     columns = history_columns(past)
-    begin = find_writer(path)
+    begin = find_writer(path, any_columns=True)
     with atomic_write_path(path) as part, begin(part, list(columns)) as append:
         append(columns)
 

@@ -99,7 +99,7 @@ class QueuedWriter:
         """``ok`` or a description of the problem, with the number of lines and frames dropped since the start."""
         blocked_s = self._blocked_s()
         frames = self._lost_frames + self._frames_in(blocked_s)
-        counts = ((frames, "frame"), (self._dropped_lines(), "log line"))
+        counts = ((frames, "frame"), (self.dropped_lines, "log line"))
         dropped = " and ".join(format_count(count, name) for count, name in counts if count)
         if blocked_s:
             wrong = f"blocked for {blocked_s:.0f} s: nobody reads {self._place}"
@@ -108,6 +108,11 @@ class QueuedWriter:
         else:
             return f"ok, but {dropped} dropped" if dropped else "ok"
         return f"{wrong}; {dropped} dropped" if dropped else wrong
+
+    @property
+    def dropped_lines(self) -> int:
+        """Number of lines that were not written."""
+        return self._queue.dropped + self._lost_lines
 
     def start(self) -> None:
         """Start the thread that writes the queued text."""
@@ -158,7 +163,7 @@ class QueuedWriter:
     def _process_batch(self, lines: list[str], last: bool) -> None:
         if not lines and not last and self._period_s is None:
             return
-        dropped = self._dropped_lines()
+        dropped = self.dropped_lines
         text, failed = self._rendered(lines, last)
         try:
             self._write(text)
@@ -220,9 +225,6 @@ class QueuedWriter:
 
     def _frames_in(self, blocked_s: float) -> int:
         return 0 if self._period_s is None else int(blocked_s / self._period_s)
-
-    def _dropped_lines(self) -> int:
-        return self._queue.dropped + self._lost_lines
 
     def _begin_closing(self) -> None:
         self._closing.set()
@@ -288,6 +290,16 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
     poll = select.poll()
     poll.register(descriptor, select.POLLOUT)
     return bool(poll.poll(1000.0 * timeout_s))
+
+
+def reader_is_gone(stream: TextIO) -> bool:
+    """Return True if the stream is a pipe or a socket whose reader has closed it."""
+    descriptor = descriptor_of(stream)
+    if descriptor is None:
+        return False
+    poll = select.poll()
+    poll.register(descriptor, 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def _reason(error: Exception) -> str:

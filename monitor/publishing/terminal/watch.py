@@ -92,7 +92,7 @@ def _receive_messages(states: RemoteDeviceRegistry, subscriber: ZenohSubscriber)
 
 
 def connection_note(states: RemoteDeviceRegistry, subscriber: ZenohSubscriber) -> str:
-    """Describe problems of the connection to the daemons, or return an empty string if there are none.
+    """Describe problems of the connection and lost messages, or return an empty string if there are none.
 
     Parameters
     ----------
@@ -101,13 +101,24 @@ def connection_note(states: RemoteDeviceRegistry, subscriber: ZenohSubscriber) -
     subscriber
         Subscriber that receives the messages.
     """
-    state, dropped = subscriber.state, subscriber.dropped
-    notes = [state] if state != "ok" else []
-    if (
-        state == "ok"
-        and subscriber.all_connected_duration_s > SILENCE_NOTE_S
-        and not states.devices_with_problems_first(time.monotonic())
-    ):
-        notes.append("connected, but no messages: no daemon is there, or access control refuses them")
-    notes += [f"{dropped:,} messages dropped: this computer is too slow"] if dropped else []
-    return "; ".join(notes)
+    problem = connection_problem(subscriber, bool(states.devices_with_problems_first(time.monotonic())))
+    dropped = subscriber.dropped
+    notes = [problem, f"{dropped:,} messages dropped: this computer is too slow" if dropped else ""]
+    return "; ".join(filter(None, notes))
+
+
+def connection_problem(subscriber: ZenohSubscriber, any_message: bool) -> str:
+    """Describe the problem of the connection to the daemons, or return an empty string if there is none.
+
+    Parameters
+    ----------
+    subscriber
+        Subscriber that receives the messages.
+    any_message
+        True if a message has been received.
+    """
+    if subscriber.state != "ok":
+        return subscriber.state
+    if subscriber.all_connected_duration_s > SILENCE_NOTE_S and not any_message:
+        return "connected, but no messages: no daemon is there, or access control refuses them"
+    return ""

@@ -9,6 +9,7 @@ receives the events that it has missed. Memory use is bounded, because zenoh rej
 ``MAX_MESSAGE_BYTES`` and the queue drops the oldest messages.
 """
 
+import itertools
 import threading
 import time
 from collections import OrderedDict
@@ -73,6 +74,8 @@ class ZenohSubscriber:
         zenoh configuration file with certificates or a password.
     detail
         Keys of devices whose samples and Allan deviations are received, such as ``imu/bench-1``.
+    received
+        Topics that are received from all selected devices, in addition to the liveliness tokens.
 
     Raises
     ------
@@ -86,10 +89,12 @@ class ZenohSubscriber:
         connect: Sequence[str] = (),
         file: Path | None = None,
         detail: Sequence[str] = (),
+        received: Sequence[topics.Topic] = TOPICS,
     ) -> None:
-        keys = {topic: topic_keys(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
-        _check_keys(keyexpr, [key for part in keys.values() for key in part])
-        keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL_TOPICS}
+        keys = {topic: topic_keys(keyexpr, topic) for topic in (*received, topics.ALIVE)}
+        _check_keys(keyexpr, keys)
+        for topic in DETAIL_TOPICS:
+            keys[topic] = (*keys.get(topic, ()), *(f"{device}/{topic.name}" for device in detail))
         self._backlog: BoundedQueue[ReceivedMessageOrLiveliness] = BoundedQueue(BACKLOG_BYTES)
         found = client_configurations(connect, file)
         self._duplicate_filter = _DuplicateFilter() if len(found) > 1 else None
@@ -308,17 +313,17 @@ def _declare_subscriber(session: "zenoh.Session", topic: topics.Topic, key: str)
     return ext.declare_advanced_subscriber(session, key, ring, history=history)
 
 
-def _check_keys(keyexpr: str, keys: list[str]) -> None:
+def _check_keys(keyexpr: str, keys: Mapping[topics.Topic, Sequence[str]]) -> None:
     """Raise ConfigError if a key expression is invalid or matches no topic."""
     import zenoh
 
     try:
-        for key in keys:
+        for key in itertools.chain(*keys.values()):
             zenoh.KeyExpr(key)
     except UnicodeEncodeError as error:
         raise ConfigError(f'key expression "{keyexpr!a}": not valid UTF-8') from error
     except zenoh.ZError as error:
         raise ConfigError(f'key expression "{keyexpr}": {format_zenoh_error(error)}') from error
-    if not keys:
-        shown = ", ".join(topic.name for topic in (*TOPICS, topics.ALIVE))
+    if not any(keys.values()):
+        shown = ", ".join(topic.name for topic in keys)
         raise ConfigError(f'key expression "{keyexpr}": no topic to show; possible topics are {shown}')

@@ -1580,7 +1580,7 @@ def test_failed_thread_is_reported_in_one_line(
         (("analyze", "a.csv", "--rte", "1"), "No such option: --rte of imu-monitor analyze; did you mean --rate?"),
         (
             ("analyze", "a.csv", "--xyz"),
-            "No such option: --xyz of imu-monitor analyze; known are --rate, --last, --topic, --tau,",
+            "No such option: --xyz of imu-monitor analyze; known are --rate, --last, --topic, --decoder, --option,",
         ),
         (("thermal", "fitt", "a.csv"), "Did you mean 'fit'?"),
         (("quux",), "known are demo, run, check, "),

@@ -10,7 +10,8 @@ import pytest
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.recordings import WRITABLE, load_samples, save_samples
+from drivers.recordings import load_samples, save_samples
+from drivers.recordings.formats import WRITABLE_TABLES
 from monitor.commands import analyze
 from monitor.commands.simulate import CHUNK_ROWS, SimulationRequest, run_simulation
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
@@ -49,7 +50,7 @@ height = 1.0
 )
 
 
-@pytest.fixture(params=WRITABLE)
+@pytest.fixture(params=WRITABLE_TABLES)
 def output_path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / f"simulated{request.param}"
 

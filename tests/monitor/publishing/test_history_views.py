@@ -10,7 +10,7 @@ from rich.console import Console
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
-from drivers.recordings.formats import WRITABLE
+from drivers.recordings.formats import WRITABLE_TABLES
 from monitor.common.unit_formatting import coefficient_unit
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.history.history_row import STATES, HistoryRow
@@ -92,7 +92,7 @@ def test_events_without_rows_are_printed() -> None:
     assert "gz noisier" in text
 
 
-@pytest.mark.parametrize("suffix", WRITABLE)
+@pytest.mark.parametrize("suffix", WRITABLE_TABLES)
 def test_file_has_every_column_with_its_unit(tmp_path: Path, suffix: str) -> None:
     history, path = make_history(), tmp_path / f"h{suffix}"
     history_file.save_history(history, path)

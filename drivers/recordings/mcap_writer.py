@@ -1,0 +1,153 @@
+"""Writing of recordings to MCAP files with ROS 2 messages of type ``sensor_msgs/Imu``, by the library rosbags.
+
+The header stamps are the times of the samples, rounded to 1 ns. The log times increase strictly, because readers return
+messages in the order of the log times, and a recording may contain equal times and backward steps.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.data_types import AXES, Floats, Ints
+from drivers.errors import RecordingError
+from drivers.extras import require_extra
+from drivers.recordings import table
+from drivers.recordings.ros_bag_format import IMU_TYPE, NOT_PROVIDED, TEMPERATURE_TYPE
+
+IMU_TOPIC: Final = "/imu/data"
+TEMPERATURE_TOPIC: Final = "/imu/temperature"
+FRAME: Final = "imu"
+MAX_TIME_S: Final = (1 << 31) - 1
+"""Largest time in s of ``builtin_interfaces/Time``, whose seconds are int32."""
+SECOND_NS: Final = 1_000_000_000
+
+
+@contextmanager
+def open_mcap_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
+    """Open an MCAP file for writing. Temperatures are written to the topic ``/imu/temperature``.
+
+    A quantity that is missing from a sample has the covariance -1 (sensor_msgs/Imu.msg). The other covariances are 0,
+    which means that they are unknown.
+
+    Raises
+    ------
+    ConfigError
+        If the packages of the extra ``ros`` are not installed.
+    RecordingError
+        If a time is out of the range of ROS.
+    """
+    whole = Path(str(path).removesuffix(table.PARTIAL_SUFFIX))
+    require_extra("ros", f"{whole}: .mcap")
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    messages = _MessageFactory(store.types)
+    with TemporaryDirectory(dir=path.parent, prefix=f".{whole.name}-") as folder:
+        bag = Path(folder) / "bag"  # rosbags writes a folder with the MCAP file and its metadata
+        writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        with writer:
+            imu = writer.add_connection(IMU_TOPIC, IMU_TYPE, typestore=store)
+            thermometer = None
+            if "temperature" in names:
+                thermometer = writer.add_connection(TEMPERATURE_TOPIC, TEMPERATURE_TYPE, typestore=store)
+            newest_ns = -1
+
+            def append_rows(columns: table.Columns) -> None:
+                nonlocal newest_ns
+                stamps = split_times(whole, columns["t"])
+                log_ns = _increasing_times(stamps, newest_ns)
+                newest_ns = int(log_ns[-1])
+                absent = np.full(len(stamps), np.nan)
+                rows = np.column_stack([columns.get(axis, absent) for axis in AXES]).tolist()
+                for time_ns, stamp, row in zip(log_ns.tolist(), stamps.tolist(), rows, strict=True):
+                    writer.write(imu, time_ns, store.serialize_cdr(messages.imu(stamp, row), IMU_TYPE))
+                if thermometer is not None:
+                    values = columns["temperature"].tolist()
+                    for time_ns, stamp, value in zip(log_ns.tolist(), stamps.tolist(), values, strict=True):
+                        data = store.serialize_cdr(messages.temperature(stamp, value), TEMPERATURE_TYPE)
+                        writer.write(thermometer, time_ns, data)
+
+            yield append_rows
+        os.replace(bag / f"{bag.name}.mcap", path)
+
+
+def split_times(path: Path, t_s: Floats) -> Ints:
+    """Return times as seconds and nanoseconds of ``builtin_interfaces/Time``, shape [n, 2].
+
+    The whole seconds are split off first, because the product ``t_s * 1e9`` would round Unix times to 256 ns.
+
+    Parameters
+    ----------
+    path
+        Path of the file, used in error messages.
+    t_s
+        [n] times in s.
+
+    Raises
+    ------
+    RecordingError
+        If a time is negative or too large.
+    """
+    outside = t_s[~((t_s >= 0.0) & (t_s <= MAX_TIME_S))]
+    if outside.size:
+        raise RecordingError(
+            f"{path}: t = {outside[0]:.9g} s cannot be stored in a ROS 2 message, whose times are 0 to {MAX_TIME_S} s; "
+            "write another format"
+        )
+    whole_s = np.floor(t_s)
+    nanoseconds = np.rint((t_s - whole_s) * SECOND_NS).astype(np.int64)
+    carried, nanoseconds = np.divmod(nanoseconds, SECOND_NS)
+    return np.column_stack((whole_s.astype(np.int64) + carried, nanoseconds))
+
+
+def _increasing_times(stamps: Ints, newest_ns: int) -> Ints:
+    """Return strictly increasing times in ns that are at least the stamps and later than ``newest_ns``."""
+    index = np.arange(len(stamps))
+    times_ns: Ints = stamps[:, 0] * SECOND_NS + stamps[:, 1]
+    times_ns[0] = max(int(times_ns[0]), newest_ns + 1)
+    result: Ints = np.maximum.accumulate(times_ns - index) + index
+    return result
+
+
+class _MessageFactory:
+    """Factory of ROS 2 messages."""
+
+    def __init__(self, types: Any) -> None:
+        self._time = types["builtin_interfaces/msg/Time"]
+        self._header = types["std_msgs/msg/Header"]
+        self._imu = types[IMU_TYPE]
+        self._temperature = types[TEMPERATURE_TYPE]
+        self._vector = types["geometry_msgs/msg/Vector3"]
+        self._orientation = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        self._not_provided = np.array([NOT_PROVIDED, *[0.0] * 8])
+        self._unknown = np.zeros(9)
+
+    def imu(self, stamp: Sequence[int], values: Sequence[float]) -> Any:
+        """Return a message of type ``sensor_msgs/Imu`` with six values in the order of AXES."""
+        gyro, accel = values[:3], values[3:]
+        return self._imu(
+            self._make_header(stamp),
+            self._orientation,
+            self._not_provided,
+            self._vector(*gyro),
+            self._covariance(gyro),
+            self._vector(*accel),
+            self._covariance(accel),
+        )
+
+    def temperature(self, stamp: Sequence[int], value: float) -> Any:
+        """Return a message of type ``sensor_msgs/Temperature``."""
+        return self._temperature(self._make_header(stamp), value, 0.0)
+
+    def _make_header(self, stamp: Sequence[int]) -> Any:
+        return self._header(self._time(*stamp), FRAME)
+
+    def _covariance(self, values: Sequence[float]) -> Any:
+        return self._not_provided if all(value != value for value in values) else self._unknown

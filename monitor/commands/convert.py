@@ -1,0 +1,79 @@
+"""Command ``convert``: reads a recording in any format and writes the samples in another format."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import AXES
+from drivers.errors import ConfigError
+from drivers.file_access import real_path
+from drivers.recordings import Recording, open_recording_writer
+from drivers.recordings.formats import find_writer
+from drivers.recordings.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
+from drivers.recordings.topics import JOIN
+from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.recording_decoding import DecoderChoice, load_recording
+
+BLOCK_ROWS: Final = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class ConversionRequest:
+    """Recording to read and file to write."""
+
+    recording: Path
+    out: Path
+    rate_hz: float | None = None
+    last_s: float | None = None  # duration at the end of the recording to use; None = all
+    topic: str | None = None  # topic to read; None = the only IMU of the recording
+    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
+
+
+def run_conversion(request: ConversionRequest, report_progress: ProgressCallback = ignore_progress) -> Recording:
+    """Read a recording, write its samples, and return the recording.
+
+    Times and values are written without rounding if the format stores 64-bit floats. If the recording has no times, the
+    times begin at 0 and follow from the sample rate.
+
+    Parameters
+    ----------
+    request : ConversionRequest
+        Recording to read and file to write.
+    report_progress : callable, optional
+        Function that receives the progress.
+
+    Raises
+    ------
+    ConfigError, RecordingError
+        If the recording cannot be read, or if the file cannot be written.
+    """
+    find_writer(request.out)
+    if real_path(request.recording) == real_path(request.out):
+        raise ConfigError(f"{request.out}: is the recording itself; choose another name")
+    found = load_recording(
+        request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+    )
+    axes = [axis for axis in found.axes if not np.isnan(found.values[:, AXES.index(axis)]).all()] or found.axes
+    with open_recording_writer(request.out, axes, has_temperature(found)) as append_samples:
+        for start in range(0, len(found), BLOCK_ROWS):
+            report_progress("writing", start / len(found))
+            part = slice(start, min(start + BLOCK_ROWS, len(found)))
+            if found.t_s is not None:
+                t_s = found.t_s[part]
+            else:
+                assert found.rate_hz is not None
+                t_s = np.arange(part.start, part.stop) / found.rate_hz
+            append_samples(t_s, found.values[part], found.temperature_c[part])
+        report_progress("finishing the file", None)  # some formats are compressed only at the end
+    if has_temperature(found) and request.out.suffix.lower() == ".mcap":
+        topic = JOIN.join((IMU_TOPIC, TEMPERATURE_TOPIC))
+        note = f"The temperature has a topic of its own; read both with --topic {topic}."
+        return replace(found, notes=(*found.notes, note))
+    return found
+
+
+def has_temperature(recording: Recording) -> bool:
+    """Return True if at least one sample has a temperature."""
+    return not np.isnan(recording.temperature_c).all()
