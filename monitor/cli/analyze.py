@@ -9,11 +9,12 @@ from drivers.errors import ConfigError, NotReady, make_printable_and_shorten
 from monitor.cli.shared import options, output
 
 
+@options.with_reading_options
 def analyze(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
     rate: options.Rate = None,
     last: options.Last = None,
-    topic: options.Topic = None,
+    reading: options.Reading = None,
     tau: Annotated[
         str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or a list of seconds.")
     ] = "octave",
@@ -48,7 +49,7 @@ def analyze(
     window_s = options.parse_duration("--window", window)
     last_s = options.parse_duration("--last", last)
     wanted = offline.AnalysisRequest(
-        recording, rate, options.parse_averaging_times(tau), window_s, rest, bool(json or plot), last_s, topic
+        recording, rate, options.parse_averaging_times(tau), window_s, rest, bool(json or plot), last_s, reading
     )
     try:
         with output.show_progress_bar() as tell:

@@ -18,6 +18,7 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import AVERAGING_TIME_S
 from drivers.recordings import Recording, iter_blocks, load_samples
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
@@ -66,7 +67,7 @@ class AnalysisRequest:
     exclude_motion: bool = False  # True to exclude samples during motion
     total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
     last_s: float | None = None  # duration at the end of the recording to use; None = all
-    topic: str | None = None  # topic to read; None = the only IMU of the recording
+    reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
     """
     try:
         report_progress("reading", None)
-        recording = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
+        recording = load_samples(request.recording, request.rate_hz, request.last_s, request.reading)
         return analyze_recording(
             recording,
             request.tau,

@@ -20,6 +20,7 @@ from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.file_access import real_path
 from drivers.recordings import FORMATS, iter_blocks, load_samples
 from drivers.recordings import Recording as Samples
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
@@ -45,7 +46,7 @@ class ReconciliationRequest:
     rate_hz: float | None = None
     notes: tuple[str, ...] = ()  # additional notes for the report
     last_s: float | None = None  # length of the end of the recording that is used; None for all
-    topic: str | None = None  # topic to read; None for the only IMU of the recording
+    reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ class RecordingsComparisonRequest:
     seed: int = 1
     rate_hz: float | None = None
     last_s: float | None = None  # length of the end of each recording that is used; None for all
-    topic: str | None = None  # topic to read from each recording; None for the only IMU
+    reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
 
 
 def reconcile_and_write_report(
@@ -81,7 +82,7 @@ def reconcile_and_write_report(
         If the data do not support an answer.
     """
     report_progress("reading", None)
-    found = load_samples(request.recording, request.rate_hz, request.last_s, request.topic)
+    found = load_samples(request.recording, request.rate_hz, request.last_s, request.reading)
     create_report_folder(request.out)
     try:
         result = reconcile_recording(found, request.model, request.seed, request.notes, report_progress)
@@ -155,7 +156,7 @@ def compare_recordings(
             (f"The model under test consists of the five noise terms of {fitted_to}.",) if fitted_to and at > 1 else ()
         )
         one = ReconciliationRequest(
-            path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s, request.topic
+            path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s, request.reading
         )
         try:
             result = reconcile_and_write_report(one, _tell_for(report_progress, f"{name}, {at} of {len(named)}"))

@@ -16,6 +16,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks, load_samples
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel
@@ -60,7 +61,7 @@ def fit_thermal_models(
     interval_s: float | None = None,
     rate_hz: float | None = None,
     last_s: float | None = None,
-    topic: str | None = None,
+    reading: ReadingOptions = DEFAULT_OPTIONS,
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
 
@@ -74,15 +75,15 @@ def fit_thermal_models(
         Sample rate, if the recording has none.
     last_s : float, optional
         Length in seconds of the end of the recording that is used. By default the whole recording is used.
-    topic : str, optional
-        Topic to read. By default the only IMU of the recording is read.
+    reading : ReadingOptions, optional
+        Topic, columns and units to read.
 
     Raises
     ------
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, topic)
+    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, reading)
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -98,7 +99,7 @@ def predict_bias_of_recording(
     models: Mapping[str, ThermalModel],
     rate_hz: float | None = None,
     last_s: float | None = None,
-    topic: str | None = None,
+    reading: ReadingOptions = DEFAULT_OPTIONS,
 ) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models that were fitted to an earlier recording.
 
@@ -112,8 +113,8 @@ def predict_bias_of_recording(
         Sample rate, if the recording has none.
     last_s : float, optional
         Length in seconds of the end of the recording that is used. By default the whole recording is used.
-    topic : str, optional
-        Topic to read. By default the only IMU of the recording is read.
+    reading : ReadingOptions, optional
+        Topic, columns and units to read.
 
     Raises
     ------
@@ -121,7 +122,7 @@ def predict_bias_of_recording(
         If the recording cannot be read, or if it has no temperature.
     """
     interval = next(iter(models.values())).interval_s
-    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, topic)
+    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, reading)
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
@@ -223,10 +224,10 @@ def _model(path: Path, axis: str, row: _AxisModelRecord, interval_s: float) -> T
 
 
 def _read_interval_means(
-    recording: Path, interval_s: float | None, rate_hz: float | None, last_s: float | None, topic: str | None
+    recording: Path, interval_s: float | None, rate_hz: float | None, last_s: float | None, reading: ReadingOptions
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
     """Return the interval means of each recorded axis, and notes about the recording."""
-    found = load_samples(recording, rate_hz, last_s, topic)
+    found = load_samples(recording, rate_hz, last_s, reading)
     values, temperature_c, rate, notes = place_samples_and_temperature_on_grid(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")
