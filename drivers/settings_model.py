@@ -349,12 +349,12 @@ class KeywordOrType:
 def one_of(words: Sequence[str]) -> AfterValidator:
     """Return a pydantic validator that accepts only the given words."""
 
-    def check_word(value: str) -> str:
+    def check_is_allowed_word(value: str) -> str:
         if value not in words:
             raise ConfigError(f'"{value}"{format_choices_by_similarity(value, words)}')
         return value
 
-    return AfterValidator(check_word)
+    return AfterValidator(check_is_allowed_word)
 
 
 def checked_by(check: Callable[[T], object]) -> AfterValidator:

@@ -117,7 +117,7 @@ def test_the_tables_of_exports_list_every_format_and_parameter() -> None:
         written = {parameter.name for parameter in file.parameters}
         assert written <= names or "kalibr" in names
         for letter in {parameter.letter for parameter in file.parameters}:
-            formula = file.quantity.formula(letter).replace("^2", "²").replace("sqrt(dt)", "√dt")
+            formula = file.form.formula(letter).replace("^2", "²").replace("sqrt(dt)", "√dt")
             assert formula in rows[file.name].split("|")[3]
 
 

@@ -67,7 +67,7 @@ class AddressFilteringDecoder(Protocol):
     """Interface of a decoder that accepts only chunks with certain addresses."""
 
     @property
-    def addresses(self) -> tuple[int, ...]:
+    def accepted_addresses(self) -> tuple[int, ...]:
         """Addresses of the chunks to receive, encoded as in ``Chunk.address``."""
 
 
@@ -192,7 +192,7 @@ def _valid_temperatures(temperature_c: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class RawFrames:
     """Valid frames in order of arrival."""
 
     data: list[bytes]
@@ -201,7 +201,7 @@ class Frames:
     adjacent: NDArray[np.bool_]  # [n] True if no other bytes lie between the previous frame and this frame
     bad_after: int = 0  # number of frames rejected after the last frame
 
-    def select_frames(self, indices: Sequence[int]) -> "Frames":
+    def select_frames(self, indices: Sequence[int]) -> "RawFrames":
         """Return the frames at the given indices.
 
         The number of rejected frames before an omitted frame is added to ``bad_before`` of the next selected frame, or
@@ -214,7 +214,7 @@ class Frames:
         rejected_at = rejected[at]
         after = int(rejected[-1] if rejected.size else 0) - int(rejected_at[-1] if rejected_at.size else 0)
         bad_before = np.diff(rejected_at, prepend=0)
-        return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
+        return RawFrames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 
     def stack_frames(self, indices: Ints) -> Bytes:
         """Return frames of equal length as a uint8 array [n, length]."""
@@ -291,7 +291,7 @@ class FrameBuffer:
             return f"{self._skipped_bytes} bytes without a valid frame: is the baud rate right, and the decoder?"
         return self._rejection.rejection_reason
 
-    def feed(self, chunks: Sequence[Chunk]) -> Frames:
+    def feed(self, chunks: Sequence[Chunk]) -> RawFrames:
         """Return all frames that are complete after the given chunks."""
         buffer = self._append_chunks(chunks)
         found: list[bytes] = []
@@ -315,7 +315,9 @@ class FrameBuffer:
             bad_before.append(self._take_lost_frames() if self._skipped_bytes else 0)
             self._frame_length = length
             self._synchronized = True
-        frames = Frames(found, self._arrival_times(ends), np.array(bad_before, np.int64), np.array(adjacent, np.bool_))
+        frames = RawFrames(
+            found, self._arrival_times(ends), np.array(bad_before, np.int64), np.array(adjacent, np.bool_)
+        )
         self._buffer = buffer[at:]
         self._buffer_offset += at
         while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._buffer_offset:
@@ -423,7 +425,7 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
         return self._decode(frames) if frames.data else []
 
     def _build_measured_blocks(
-        self, frames: Frames, values: Floats, temperature_c: Floats, ticks: Ints
+        self, frames: RawFrames, values: Floats, temperature_c: Floats, ticks: Ints
     ) -> tuple[list[SampleBlock], int | None]:
         rows = np.flatnonzero(~np.isnan(values).all(axis=1))
         if rows.size < len(values):
@@ -435,7 +437,7 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
         return blocks, int(rows[-1]) if rows.size else None
 
     @abstractmethod
-    def _decode(self, frames: Frames) -> list[SampleBlock]:
+    def _decode(self, frames: RawFrames) -> list[SampleBlock]:
         """Decode the samples in the given frames."""
 
 

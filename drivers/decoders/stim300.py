@@ -127,7 +127,7 @@ class Stim300Decoder(base.FrameStreamDecoder):
             return f"the sensor reports an error: status 0x{self._status:02X}"
         return super().recent_problem
 
-    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+    def _decode(self, frames: base.RawFrames) -> list[SampleBlock]:
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)

@@ -67,7 +67,7 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
         super().forget_stream_state()
         self._sentence = self._wanted
 
-    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+    def _decode(self, frames: base.RawFrames) -> list[SampleBlock]:
         if not self._sentence:
             self._sentence = next((f[:7] for f in frames.data if f[:7] in COLUMNS), b"")
         wanted = self._sentence or b"none yet"

@@ -142,7 +142,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
             return 'messages contain no TimeStartup: enable it in the sensor, or set clock = "arrival"'
         return super().recent_problem
 
-    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+    def _decode(self, frames: base.RawFrames) -> list[SampleBlock]:
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)

@@ -92,16 +92,16 @@ class WitmotionDecoder(base.FrameStreamDecoder):
         super().forget_stream_state()
         self._pairs = PacketPairFinder()
 
-    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+    def _decode(self, frames: base.RawFrames) -> list[SampleBlock]:
         return self._decode_bluetooth(frames) if self._bluetooth else self._decode_uart(frames)
 
-    def _decode_bluetooth(self, frames: base.Frames) -> list[SampleBlock]:
+    def _decode_bluetooth(self, frames: base.RawFrames) -> list[SampleBlock]:
         kept = frames.select_frames([i for i, f in enumerate(frames.data) if f[1] == HEADERS[0][1]])
         words = np.frombuffer(b"".join(kept.data), "<i2").reshape(-1, BLUETOOTH_LENGTH // 2)
         values = self._to_si(words[:, 4:7], words[:, 1:4])
         return self._builder.build_plausible_blocks(kept.t_ns, values, None, None, kept.bad_before, kept.bad_after)
 
-    def _decode_uart(self, frames: base.Frames) -> list[SampleBlock]:
+    def _decode_uart(self, frames: base.RawFrames) -> list[SampleBlock]:
         at, packets, missing, harmless = self._pairs.find_pairs(frames)
         self._harmless_rejects += harmless
         words = np.ascontiguousarray(packets[:, :, 2:10]).view("<i2")  # [n, 0x51 and 0x52, 4]
@@ -144,7 +144,7 @@ class PacketPairFinder:
         self._recent_cycles: list[int] = []  # packets per sample of the last samples without a rejected packet
         self._first = True
 
-    def find_pairs(self, frames: base.Frames) -> tuple[Ints, base.Bytes, Ints, int]:
+    def find_pairs(self, frames: base.RawFrames) -> tuple[Ints, base.Bytes, Ints, int]:
         """Find pairs of 0x51 and 0x52 packets in the received packets.
 
         Returns

@@ -143,7 +143,7 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         super().forget_stream_state()
         self._temperature_c = np.nan
 
-    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+    def _decode(self, frames: base.RawFrames) -> list[SampleBlock]:
         """Return the samples of packets with angular rates or accelerations.
 
         Packets with an invalid layout are rejected.
@@ -194,7 +194,7 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         return base.make_chunks(frames, samples.t_ns)
 
 
-def _group_by_layout(frames: base.Frames) -> Iterator[tuple[PacketLayout | None, Ints, base.Bytes]]:
+def _group_by_layout(frames: base.RawFrames) -> Iterator[tuple[PacketLayout | None, Ints, base.Bytes]]:
     """Yield each layout with the indices and bytes [k, length] of its packets.
 
     The layout is None for invalid packets.

@@ -31,7 +31,7 @@ from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import TableLayout, find_layout, is_known_column
-from drivers.recordings.zip_index import BoundedFile
+from drivers.recordings.zip_index import IndexSizeLimitedFile
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # local file header, PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
@@ -74,7 +74,7 @@ class _Header:
 
 def count_npz_rows(path: Path, options: ReadingOptions) -> int:
     """Return the number of rows of a .npz file according to the array headers, or 0 if the file is truncated."""
-    with BoundedFile(path) as file:
+    with IndexSizeLimitedFile(path) as file:
         if not _has_index(path, file):
             return 0  # the reader checks the number of rows of a truncated archive
         with _open_archive(path, file) as archive:
@@ -93,7 +93,7 @@ def read_npz(path: Path, options: ReadingOptions) -> table.Table:
         If the samples do not fit into memory.
     """
     notes: list[str] = []
-    with BoundedFile(path) as file:
+    with IndexSizeLimitedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
                 names = _array_names(archive)

@@ -23,7 +23,7 @@ from drivers.recordings.csv_format import CsvSource, count_csv_source_rows, read
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import convert_to_si, find_layout
 from drivers.recordings.topics import GYROS, JOIN, Topic, join_topics, select_topics
-from drivers.recordings.zip_index import BoundedFile
+from drivers.recordings.zip_index import IndexSizeLimitedFile
 
 GYROSCOPES: Final = ("Gyroscope", "GyroscopeUncalibrated")
 ACCELEROMETERS: Final = ("TotalAcceleration", "Accelerometer", "AccelerometerUncalibrated", "Linear Acceleration")
@@ -103,7 +103,7 @@ def _open_sources(path: Path) -> Iterator[dict[str, CsvSource]]:
         files = sorted(one for one in path.iterdir() if one.suffix.lower() == ".csv")[:MAX_FILES]
         yield {one.stem: CsvSource(one, str(one), one.stem, partial(open_regular_file, one)) for one in files}
         return
-    with BoundedFile(path) as file:
+    with IndexSizeLimitedFile(path) as file:
         try:
             archive = zipfile.ZipFile(file)
         except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:

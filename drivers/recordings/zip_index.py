@@ -8,7 +8,7 @@ MAX_INDEX_BYTES: Final = 4_000_000
 """Maximum size in bytes of the index of an archive, enough for about 50 000 files."""
 
 
-class BoundedFile(FileIO):
+class IndexSizeLimitedFile(FileIO):
     """File that raises an error if more than MAX_INDEX_BYTES are read at once.
 
     ``zipfile`` reads the whole index at once and uses about ten times as much memory as the size of the index.

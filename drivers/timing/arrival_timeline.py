@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.data_types import NS_PER_S, Ints, SampleBlock, make_block
 from drivers.timing.arrival_regression import ArrivalRegression
-from drivers.timing.sample_time_lower_bound import NewestSampleTimeLowerBound
+from drivers.timing.newest_sample_time_lower_bound import NewestSampleTimeLowerBound
 
 CATCH_UP_S: Final = 3.0
 """Time in s after which a persistent delay of the arrivals means that samples are missing."""

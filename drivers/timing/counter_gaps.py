@@ -4,8 +4,8 @@ Counter values give the exact number of missing samples. If a counter may have w
 wraps is estimated from arrival times (``drivers.timing.arrival_timeline``).
 
 A counter step that is larger than the elapsed time allows is a counter jump
-(``drivers.timing.sample_time_lower_bound``). After a counter jump, the number of missing samples is estimated from
-arrival times.
+(``drivers.timing.newest_sample_time_lower_bound``). After a counter jump, the number of missing samples is estimated
+from arrival times.
 """
 
 from collections import deque

@@ -46,6 +46,6 @@ def simulate(
     with output.show_progress_bar() as tell:
         result = simulation.run_simulation(request, tell)
     if json is not None:
-        output.write_file_or_stdout("--json", json, result.to_json() + b"\n")
+        output.write_file_or_stdout("--json", json, result.encode_recording_summary_as_json() + b"\n")
     if json != Path("-"):
         typer.echo(result.describe_in_one_line())

@@ -44,8 +44,8 @@ def _problems(use: ModelDependentSettings) -> Iterator[str]:
         yield from error.mistake_lines
     try:
         if use.virtual is not None:
-            from monitor.simulator.encoding_sensor import check_sensor_settings
+            from monitor.simulator.encoding_sensor import check_noise_model_and_effects
 
-            check_sensor_settings(use.virtual)
+            check_noise_model_and_effects(use.virtual)
     except ConfigError as error:
         yield from error.mistake_lines

@@ -30,7 +30,7 @@ from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings import comparison_json
-from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare_results
+from monitor.reconcile.several_recordings.comparison import NamedResult, RecordingsComparison, compare_results
 
 REPORT: Final = "report.json"
 
@@ -129,7 +129,7 @@ def reconcile_recording(
 
 def compare_recordings(
     request: RecordingsComparisonRequest, report_progress: ProgressCallback = ignore_progress
-) -> Comparison:
+) -> RecordingsComparison:
     """Compare several recordings with a noise model and with each other, and write the reports.
 
     Parameters
@@ -178,7 +178,7 @@ def compare_recordings(
     return comparison
 
 
-def _write_comparison(result: Comparison, folder: Path) -> None:
+def _write_comparison(result: RecordingsComparison, folder: Path) -> None:
     from monitor.publishing.reports.comparison_page import render_page
 
     _write(folder / REPORT, comparison_json.encode_comparison(result))

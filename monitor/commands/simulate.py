@@ -69,7 +69,7 @@ class SimulationResult:
             f"seed {self.seed}: {columns}{beside}"
         )
 
-    def to_json(self) -> bytes:
+    def encode_recording_summary_as_json(self) -> bytes:
         """Return the description of the recording as JSON."""
         return msgspec.json.encode(
             {

@@ -110,8 +110,8 @@ class ResultPublisher:
             return False
         self._refitted = False
         self._result(self.latest.t_ns, self.latest)
-        if self.pipeline.model_in_force is not None:
-            self._model_gap(self.pipeline.model_in_force.compare_with_estimate(self.latest))
+        if self.pipeline.noise_model_comparator is not None:
+            self._model_gap(self.pipeline.noise_model_comparator.compare_with_estimate(self.latest))
         self.publish_events(self.limits.check_estimate(self.latest))
         return True
 
@@ -171,7 +171,7 @@ class ResultPublisher:
             latest = pipeline.estimator.get_estimate(fit_coefficients=fitted)
         except NotReady:
             return
-        if pipeline.fit_is_interpreted:
+        if pipeline.fit_kernels_run_uncompiled:
             self.schedule.postpone("refit", INTERPRETED_REFIT_S)
         self.latest = latest.without_coefficients() if self.withholds_coefficients else latest
         self._refitted = True

@@ -240,7 +240,7 @@ class Service:
     def _apply(self, change: ConfigChange, built: Sequence[DeviceWorker]) -> None:
         leaving = [worker for worker in self.workers if worker.name in change.removed]
         for worker in leaving:
-            worker.stop()  # all readers stop in parallel
+            worker.stop_reader_thread()  # all readers stop in parallel
         for worker in leaving:
             self._remove(worker)
         for device in change.limited:
@@ -258,7 +258,7 @@ class Service:
     def _start_added(self, worker: DeviceWorker) -> None:
         self.zenoh.add_device(worker.name)
         if self.recorder is not None:
-            self.recorder.add_recordings(_segment_origins(self.config.storage, worker.device))
+            self.recorder.start_recordings(_segment_origins(self.config.storage, worker.device))
         worker.start_reader_and_resume_recording()
         if self.recorder is not None:
             threading.Thread(target=self._rebuild_windows, args=([worker],), name="rebuild", daemon=True).start()
@@ -338,7 +338,7 @@ class Service:
 
     def _drain(self) -> None:
         for worker in self.workers:
-            worker.stop()
+            worker.stop_reader_thread()
         if any(worker.waits_for_all for worker in self.workers):
             self._ready.all.wait()  # the samples are still in the ring buffer
         for worker in self.workers:

@@ -170,7 +170,7 @@ class Estimator:
         if self._refit is not None:
             self._refit.restart_fit_of_axis(axis)
 
-    def fit_state(self) -> tuple[NDArray[np.bool_], Floats]:
+    def copy_terms_and_squared_coefficients(self) -> tuple[NDArray[np.bool_], Floats]:
         """Return the noise terms in the fit, and the squared coefficients in SI units.
 
         Both arrays have the shape (5, 6) and can be passed to ``restore_fit``.

@@ -302,7 +302,7 @@ class HistoryFileWriter:
         if version != self._version:
             self._version = version
             self._devices.clear()
-            self._layouts.clear()
+            self._layouts.forget_column_layouts()
 
     def _committed_by_others(self) -> bool:
         try:
@@ -323,7 +323,7 @@ class HistoryFileWriter:
             self._db.execute("COMMIT")
         except BaseException:
             self._devices.clear()  # Identifiers that were created in this transaction may no longer exist.
-            self._layouts.clear()
+            self._layouts.forget_column_layouts()
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
             raise
@@ -464,7 +464,7 @@ class _LayoutCache:
         self._ids: dict[tuple[str, ...], int] = {}
         self._names: dict[int, tuple[str, ...]] = {}
 
-    def clear(self) -> None:
+    def forget_column_layouts(self) -> None:
         """Remove all column layouts from the cache."""
         self._ids.clear()
         self._names.clear()

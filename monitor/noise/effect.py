@@ -234,7 +234,7 @@ class Source(Effect):
         return self.spectrum(tau0_s).density(f_hz)
 
 
-class NonstationaryBias(Source):
+class BiasWithoutSpectrum(Source):
     """Bias whose spectrum is not defined, because it depends on the temperature or on the length of the recording."""
 
     __slots__ = ()

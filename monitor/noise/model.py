@@ -22,7 +22,12 @@ from monitor.noise.effects.coupling.axis_permutation import AxisPermutation
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
-from monitor.noise.model_toml import format_display_table, format_model_toml, parse_model_toml, prefix_config_errors
+from monitor.noise.model_toml import (
+    format_model_as_text_table,
+    format_model_toml,
+    parse_model_toml,
+    prefix_config_errors,
+)
 from monitor.noise.simulation import ModelStream, check_effects_can_be_simulated
 from monitor.noise.spectrum import Spectrum, nan_spectrum, zero_spectrum
 from monitor.noise.temperature import Temperature
@@ -95,7 +100,7 @@ class NoiseModel:
         return NoiseModel(added, self.sample_rate_hz or other.sample_rate_hz, self.temperature or other.temperature)
 
     def __str__(self) -> str:
-        return format_display_table(self.effects, self.sample_rate_hz, self.temperature)
+        return format_model_as_text_table(self.effects, self.sample_rate_hz, self.temperature)
 
     @property
     def true_to_stated_rate_ratio(self) -> float:

@@ -87,7 +87,7 @@ def format_model_toml(
     return "\n".join(lines).lstrip() + "\n"
 
 
-def format_display_table(
+def format_model_as_text_table(
     axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
 ) -> str:
     """Format a noise model as a table for display, with one line for each effect.

@@ -113,7 +113,7 @@ class RemoteDevice:
         troubled = status.text or status.overflowed or status.crossed or self.disagreements
         return 2 if outputs_work and not troubled else 1
 
-    def describe_problems(self) -> str:
+    def describe_device_problems(self) -> str:
         """Describe all problems of the device, or return an empty string if the device has none."""
         if self.status is None:
             return ""

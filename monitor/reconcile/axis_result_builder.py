@@ -64,6 +64,8 @@ SHAPE_PARAMETERS: Final[dict[type[Effect], tuple[str, ...]]] = {
 }
 """For each effect, the shape parameters that are reported with an interval."""
 MAX_RUNNERS_UP: Final = 3
+MAX_FREQUENCY_DIFFERENCE: Final = 0.05
+"""Largest relative difference of the frequencies of two candidates for the same oscillation."""
 MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence with which an alternative effect is reported."""
 
@@ -163,7 +165,8 @@ def _describe_step(
     moved = trial.moved == index
     gap = _triggering_gap(effect, "added" if moved else kind, before)
     later = _gap_of(gap.diagnostic, after)
-    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" or moved else RETUNE, done.trials)
+    trials = _trials_not_added_too(search.hypothesis, index, done.trials)
+    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" or moved else RETUNE, trials)
     if kind != "added" and trial.name != RETUNE and not moved:  # an effect was added in the same round
         confidence, others = _resize_confidence(search.hypothesis, index), ()
     held_out_before, held_out_after = _held_out_gaps(done, gap, later)
@@ -209,6 +212,24 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics
     return max(significant, key=lambda gap: gap.gap / max(gap.threshold, 1e-9))
 
 
+def _trials_not_added_too(hypothesis: Hypothesis, index: int, trials: tuple[Trial, ...]) -> tuple[Trial, ...]:
+    """Return the selected trial and the trials of effects that were not added in other rounds.
+
+    An effect that was added too is no alternative, because it explains another difference.
+    """
+    added = [effect for at, effect in enumerate(hypothesis.effects) if at >= hypothesis.given_count and at != index]
+    alternatives = [one for one in trials[1:] if not any(_is_same_effect(one.effect, effect) for effect in added)]
+    return (trials[0], *alternatives)
+
+
+def _is_same_effect(one: Effect | None, other: Effect) -> bool:
+    """Return True if both effects have the same type and, if they are oscillations, nearly the same frequency."""
+    if type(one) is not type(other):
+        return False
+    hz, other_hz = getattr(one, "frequency", None), getattr(other, "frequency", None)
+    return not (hz and other_hz) or abs(log(hz / other_hz)) < MAX_FREQUENCY_DIFFERENCE
+
+
 def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[AlternativeEffect, ...]]:
     """Return the probability of the selected effect, and the most probable alternative effects.
 
@@ -217,7 +238,7 @@ def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[fl
     """
     best: dict[str, float] = {"": 0.0}
     for trial in trials:
-        best[trial.name] = max(best.get(trial.name, -inf), trial.total_score)
+        best[trial.name] = max(best.get(trial.name, -inf), trial.score_with_slow_noise)
     top = max(best.values())
     whole = sum(exp(value - top) for value in best.values())
     chances = {other: exp(value - top) / whole for other, value in best.items()}

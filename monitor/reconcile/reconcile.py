@@ -136,7 +136,7 @@ def reconcile(
     report_stage("simulating the model", None)
     simulated = _diagnose_simulations(tested, run, seed, recording.values)
     null = estimate_null_distributions(simulated)
-    found = _search_all_axes(run, tested, null)
+    found = _search_all_axes(run, tested, null, fitted_first=model is None)
     report_stage("looking for common vibration", None)
     found = replace(found, searches=name_common_vibrations(found.searches, null))
     report_stage("looking for a simpler explanation", None)
@@ -256,7 +256,9 @@ def _simulate_axes(
     return build_repaired_axes(replace(template, values=values), effects, run.regressors, np.random.default_rng(seed))
 
 
-def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str, AxisNull]) -> _AxesSearchResult:
+def _search_all_axes(
+    run: RecordingContext, model: NoiseModel, null: Mapping[str, AxisNull], fitted_first: bool
+) -> _AxesSearchResult:
     """Search every axis for missing effects, after a test of the sample rate.
 
     If two axes appear to leak into each other, the search on one axis is repeated without this leak.
@@ -265,6 +267,7 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
     run.report_stage(stage, 0.0)
     effects = _effects_by_axis(model, run.recording)
     axes = build_repaired_axes(run.recording, effects, run.regressors, np.random.default_rng(run.seed))
+    axes = {name: replace(axis, is_model_fitted=fitted_first) for name, axis in axes.items()}
     error = estimate_sample_rate_error(
         {name: axis.coefficients for name, axis in axes.items()},
         run.recording.rate_hz,

@@ -20,6 +20,7 @@ FindingKind = Literal[
     "missing_rows",
     "corrupt_rows",
     "motion",
+    "temporary_vibration",
     "repeated_rows",
     "too_short",
 ]

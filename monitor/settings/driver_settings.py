@@ -171,7 +171,7 @@ def build_link_and_decoder(table: Mapping[str, Any], folder: Path | None) -> Bui
     if problems or link is None or decoder is None:
         raise TableError(problems, link if isinstance(link, VirtualTable) else None)
     if isinstance(link, AddressFilteringLink) and isinstance(decoder, AddressFilteringDecoder):
-        link.set_address_filter(decoder.addresses)
+        link.set_address_filter(decoder.accepted_addresses)
     return BuiltLinkAndDecoder(link, decoder, silence_s)
 
 

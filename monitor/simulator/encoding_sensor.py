@@ -31,7 +31,7 @@ WARM_UP_S: Final = 300.0
 _log = structlog.get_logger("imu-monitor")
 
 
-def check_sensor_settings(table: VirtualTable) -> None:
+def check_noise_model_and_effects(table: VirtualTable) -> None:
     """Check the noise model and the effects of a simulated sensor. An empty ``model`` is not checked.
 
     Raises

@@ -22,7 +22,7 @@ PROGRAM = """
     from monitor.common.compiled import Kernel
     from monitor.drift.compensation.compensator import Compensator
     from monitor.drift.thermal import thermal_response
-    from monitor.estimation.detection.signal_monitor import SignalMonitor
+    from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
     from monitor.estimation.estimator import Estimator
 
 
@@ -44,7 +44,7 @@ PROGRAM = """
     values = 1e-3 * rng.standard_normal((12_000, 6))
     values[6000:6400, 0] += np.sin(np.arange(400) / 20)  # motion
     values[9000:, 1] *= 3.0  # a change of noise
-    monitor = SignalMonitor(100.0, remove_motion=True)
+    monitor = MotionAndChangeMonitor(100.0, remove_motion=True)
     estimators = [Estimator(100.0, 60.0), Estimator(100.0, 60.0, every_sample=True)]
     gyro = Compensator(100.0)
     for start in range(0, len(values), 50):

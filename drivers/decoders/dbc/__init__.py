@@ -67,7 +67,7 @@ class DbcDecoder:
         self._source = settings.source
 
     @property
-    def addresses(self) -> tuple[int, ...]:
+    def accepted_addresses(self) -> tuple[int, ...]:
         """Addresses to receive from the CAN bus. The bit ``ANY_SOURCE`` marks J1939 parameter groups."""
         return tuple(m.address | (ANY_SOURCE if m.j1939 else 0) for _, m in self._numbered_messages())
 
@@ -223,4 +223,4 @@ def build(settings: Settings) -> Decoder:
         If the settings contain mistakes. The error has one line for each mistake.
     """
     database = ConfiguredDbcMessages(settings)
-    return DbcDecoder(database.messages, settings, database.timing)
+    return DbcDecoder(database.messages_with_configured_signals, settings, database.timing)

@@ -53,7 +53,7 @@ class ConfiguredDbcMessages:
             raise ConfigError(*self._errors)
 
     @property
-    def messages(self) -> list[CanMessage]:
+    def messages_with_configured_signals(self) -> list[CanMessage]:
         """CAN messages with the configured signals. A message that contains only the counter comes first."""
         return sorted(self._used.values(), key=lambda m: not m.contains_only_counter)
 

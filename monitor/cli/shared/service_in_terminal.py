@@ -165,7 +165,7 @@ def run_fleet_viewer(
     install_signal_handlers(stop.set)
 
     def say(text: str) -> None:
-        print(text, file=_ErrorStream(), flush=True)
+        print(text, file=_StderrIgnoringWriteErrors(), flush=True)
 
     log = QueuedWriter(sys.stderr, STDERR, tell=say)
     with _stderr_through(log), contextlib.closing(arriving), contextlib.closing(rerun):
@@ -248,7 +248,7 @@ def _warn(text: str) -> None:
     structlog.get_logger("imu-monitor").warning("log", text=text)
 
 
-class _ErrorStream(io.TextIOBase):
+class _StderrIgnoringWriteErrors(io.TextIOBase):
     """Text stream that writes to the current standard error and ignores write errors."""
 
     def write(self, text: str) -> int:
@@ -275,7 +275,7 @@ def _configure_logging(config: "Config") -> None:
             _without_secrets,
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
-        logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _ErrorStream())),
+        logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _StderrIgnoringWriteErrors())),
         cache_logger_on_first_use=False,  # reloading the configuration may change the log level
     )
     set_log_level(config.log.level)

@@ -41,7 +41,11 @@ class DeviceStatus:
         memory_bytes : int
             Resident memory of the process.
         """
-        driver, clock, signal_monitor = self._driver, self._driver.clock, self._pipeline.signal_monitor
+        driver, clock, motion_and_change_monitor = (
+            self._driver,
+            self._driver.clock,
+            self._pipeline.motion_and_change_monitor,
+        )
         median_s, high_s = self.latency.take_latency_quantiles()
         return Health(
             state=driver.state,
@@ -58,8 +62,8 @@ class DeviceStatus:
             uptime_s=time.monotonic() - self._started_s,
             repeated=clock.dropped_repeated_rows,
             late=clock.dropped_late_rows + driver.counts.late,
-            moving=signal_monitor is not None and signal_monitor.is_moving,
-            moved=signal_monitor.samples_in_motion if signal_monitor is not None else 0,
+            moving=motion_and_change_monitor is not None and motion_and_change_monitor.is_moving,
+            moved=motion_and_change_monitor.samples_in_motion if motion_and_change_monitor is not None else 0,
             crossed=self._publisher.limits.coefficients_beyond_limits,
         )
 

@@ -126,7 +126,7 @@ class DeviceWorker:
         self.restore.refill_window_from_recording()
         self._wake.set()
 
-    def stop(self) -> None:
+    def stop_reader_thread(self) -> None:
         """Stop the reader thread. Samples in the ring buffer are kept."""
         self.driver.stop()
         if self.simulated is not None:

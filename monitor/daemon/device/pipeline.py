@@ -1,8 +1,8 @@
 """Processing pipeline of one device: motion detection, noise estimation, thermal model and drift compensation.
 
 ``DevicePipeline.process_blocks`` processes blocks of samples in order of time. The newest results are in ``estimator``,
-``thermal``, ``compensation`` and ``signal_monitor``, and ``take_events`` returns the detected events. The pipeline
-publishes no results and reads no clock.
+``thermal``, ``compensation`` and ``motion_and_change_monitor``, and ``take_events`` returns the detected events. The
+pipeline publishes no results and reads no clock.
 """
 
 from collections import deque
@@ -19,8 +19,8 @@ from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.drift.thermal.live_thermal import LiveThermalModels, ThermalIntervalResult
-from monitor.estimation.detection.comparison_with_noise_model import ModelAllanVariances
-from monitor.estimation.detection.signal_monitor import SignalMonitor
+from monitor.estimation.detection.comparison_with_noise_model import NoiseModelComparator
+from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
 from monitor.estimation.estimator import Estimator
 from monitor.estimation.window_sample_snapshot import TemperatureRing, WindowSnapshot
 from monitor.noise.model import NoiseModel
@@ -59,10 +59,10 @@ class DevicePipeline:
         live: bool,
     ) -> None:
         self.estimator: Estimator | None = None
-        self.signal_monitor: SignalMonitor | None = None
+        self.motion_and_change_monitor: MotionAndChangeMonitor | None = None
         self.thermal: LiveThermalModels | None = None
         self.compensation: LiveDriftCompensation | None = None
-        self.model_in_force: ModelAllanVariances | None = None
+        self.noise_model_comparator: NoiseModelComparator | None = None
         self.refusal_reason = ""
         """Reason why an estimate is not possible, or ""."""
         self.advanced = False
@@ -81,7 +81,7 @@ class DevicePipeline:
         self._interprets = False
         self._temperatures: TemperatureRing | None = None  # of the samples in the window
         self._thermal_intervals: list[ThermalIntervalResult] = []  # thermal intervals that were not taken yet
-        self._handled = 0  # last seen value of ``signal_monitor.orientation_changes``
+        self._handled = 0  # last seen value of ``motion_and_change_monitor.orientation_changes``
         self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for a thermal model
         self._replaying = False
 
@@ -97,7 +97,7 @@ class DevicePipeline:
         return self._interprets or self.ready.fit.is_set()
 
     @property
-    def fit_is_interpreted(self) -> bool:
+    def fit_kernels_run_uncompiled(self) -> bool:
         """True if Python interprets the kernels of the fit, which then takes about 0.1 s."""
         return self._interprets and not self.ready.fit.is_set()
 
@@ -133,7 +133,7 @@ class DevicePipeline:
             self.newest_ns = int(blocks[-1].t_ns[-1])
         if self.estimator is None and (rate_hz is None or not self._create_estimator(rate_hz)):
             return
-        if self.signal_monitor is None and self.detection_kernels_ready:
+        if self.motion_and_change_monitor is None and self.detection_kernels_ready:
             self._create_detectors()
         self._pieces += [
             samples[at : at + MAX_PIECE_SAMPLES]
@@ -145,14 +145,18 @@ class DevicePipeline:
         ):
             piece = self._pieces.popleft()
             self._update_estimator(
-                self.signal_monitor.process_samples(piece) if self.signal_monitor is not None else [piece]
+                self.motion_and_change_monitor.process_samples(piece)
+                if self.motion_and_change_monitor is not None
+                else [piece]
             )
             self._restart_changed_axes()
             self._update_thermal()
 
     def process_samples_held_by_motion_detector(self) -> None:
         """After the last sample, process the samples that the motion detector still holds back."""
-        self._update_estimator(self.signal_monitor.flush_delayed_samples() if self.signal_monitor is not None else [])
+        self._update_estimator(
+            self.motion_and_change_monitor.flush_delayed_samples() if self.motion_and_change_monitor is not None else []
+        )
         self._restart_changed_axes()
         self._update_thermal()
 
@@ -199,7 +203,7 @@ class DevicePipeline:
         if self.estimator is None or rate_hz == self.estimator.rate_hz:
             return
         self.estimator.refine_rate(rate_hz)
-        for one in (self.signal_monitor, self.thermal, self.compensation):
+        for one in (self.motion_and_change_monitor, self.thermal, self.compensation):
             if one is not None:
                 one.set_rate(rate_hz)
 
@@ -213,7 +217,7 @@ class DevicePipeline:
         """Return the events that were detected since the last call."""
         found = [
             source.take_events()
-            for source in (self.signal_monitor, self.thermal, self.compensation)
+            for source in (self.motion_and_change_monitor, self.thermal, self.compensation)
             if source is not None
         ]
         return [event for events in found for event in events]
@@ -234,7 +238,7 @@ class DevicePipeline:
             self.estimator = Estimator(rate_hz, device.window_s, device.tau, every_sample=device.refit_s == 0.0)
             self._temperatures = TemperatureRing(self.estimator.window_length_samples)
             if self._model is not None:
-                self.model_in_force = ModelAllanVariances(self._model, self.estimator.window_length_samples)
+                self.noise_model_comparator = NoiseModelComparator(self._model, self.estimator.window_length_samples)
         except ConfigError as error:  # the averaging times do not fit the measured rate
             self.refusal_reason = f"no estimate: {error}"
             return False
@@ -245,7 +249,7 @@ class DevicePipeline:
             return
         device, rate_hz = self._device, self.estimator.rate_hz
         wanted = device.thermal_s is not None
-        self.signal_monitor = SignalMonitor(
+        self.motion_and_change_monitor = MotionAndChangeMonitor(
             rate_hz, device.leave_out_motion, device.alarms_per_day, keep_samples_at_rest=wanted
         )
         self.thermal = None if device.thermal_s is None else LiveThermalModels(rate_hz, device.thermal_s)
@@ -260,7 +264,9 @@ class DevicePipeline:
             self.advanced = True
 
     def _restart_changed_axes(self) -> None:
-        restarts = self.signal_monitor.take_restart_requests() if self.signal_monitor is not None else []
+        restarts = (
+            self.motion_and_change_monitor.take_restart_requests() if self.motion_and_change_monitor is not None else []
+        )
         if self.estimator is None or not self._device.restart or self._replaying:
             return
         for restart in restarts:
@@ -269,10 +275,10 @@ class DevicePipeline:
             self.since_ns[restart.axis] = self.newest_ns - back_ns
 
     def _update_thermal(self) -> None:
-        if self.signal_monitor is None or self.thermal is None:
+        if self.motion_and_change_monitor is None or self.thermal is None:
             return
-        if self.signal_monitor.orientation_changes != self._handled:
-            self._handled = self.signal_monitor.orientation_changes
+        if self.motion_and_change_monitor.orientation_changes != self._handled:
+            self._handled = self.motion_and_change_monitor.orientation_changes
             self.thermal.learn_new_offset()
-        for samples in self.signal_monitor.take_samples_with_motion_masked():
+        for samples in self.motion_and_change_monitor.take_samples_with_motion_masked():
             self._thermal_intervals += self.thermal.process_block(samples)

@@ -95,7 +95,7 @@ class WindowRestore:
                 before, rate=self._clock.configured_or_measured_rate_hz or before.rate, tick_step=tick_step
             )
         offset_ns = self._timeline.unix_offset_ns(self._pipeline.newest_ns)
-        entered, theta = estimator.fit_state()
+        entered, theta = estimator.copy_terms_and_squared_coefficients()
         since = tuple(None if t_ns is None else (t_ns + offset_ns) / 1e9 for t_ns in self._pipeline.since_ns)
         parameters = tuple(None if np.isnan(value) else float(value) for value in theta.ravel())
         return DaemonState(estimator.rate_hz, since, tick_step, parameters, tuple(entered.ravel().tolist()))

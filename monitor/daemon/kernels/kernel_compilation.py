@@ -43,7 +43,7 @@ class CompilationProgress:
 
     Examples
     --------
-    >>> print(CompilationProgress(2, 8, ("change detection",)), CompilationProgress(2, 8).progress_bar_text)
+    >>> print(CompilationProgress(2, 8, ("change detection",)), CompilationProgress(2, 8).bar_of_block_characters)
     compiling 3 of 8: change detection ███░░░░░░░░░
     """
 
@@ -61,7 +61,7 @@ class CompilationProgress:
         return self.done / self.of
 
     @property
-    def progress_bar_text(self) -> str:
+    def bar_of_block_characters(self) -> str:
         """Text of the progress bar."""
         filled = round(BAR_LENGTH * self.compiled_share)
         return "█" * filled + "░" * (BAR_LENGTH - filled)

@@ -48,16 +48,16 @@ def _call_fit() -> None:
 
 
 def _call_motion_detection() -> None:
-    from monitor.estimation.detection.signal_monitor import SignalMonitor
+    from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
 
-    SignalMonitor(100.0, alarms_per_day=0.0).process_samples(_samples(100))
+    MotionAndChangeMonitor(100.0, alarms_per_day=0.0).process_samples(_samples(100))
 
 
 def _call_change_detection() -> None:
     from monitor.estimation.detection.change_detection import NoiseAndBiasChangeDetector
-    from monitor.estimation.detection.signal_monitor import SignalMonitor
+    from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
 
-    SignalMonitor(100.0).process_samples(_samples(100))
+    MotionAndChangeMonitor(100.0).process_samples(_samples(100))
     NoiseAndBiasChangeDetector(100.0).restart_references()
 
 

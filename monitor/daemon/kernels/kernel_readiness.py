@@ -47,7 +47,7 @@ class KernelReadiness:
         def show_progress(progress: kernel_compilation.CompilationProgress) -> None:
             if not self.progress:
                 _log.info("compiling kernels, because this version has not run on this machine before")
-            self.progress = f"{progress} {progress.progress_bar_text}"
+            self.progress = f"{progress} {progress.bar_of_block_characters}"
             wake.set()
 
         try:

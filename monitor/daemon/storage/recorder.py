@@ -82,9 +82,9 @@ class Recorder:
         self._lock_failed_s = 0.0  # monotonic time of the last attempt to take the lock
         self._other_process = False  # True if another process holds the lock on the folder
         self._note = ""  # message about the last change of a file by another program
-        self.add_recordings(origins)
+        self.start_recordings(origins)
 
-    def add_recordings(self, origins: Sequence[SegmentMetadata]) -> None:
+    def start_recordings(self, origins: Sequence[SegmentMetadata]) -> None:
         """Start additional recordings."""
         more = [RecordingTrack(one, self._storage, self._opening, self._events, self._finished) for one in origins]
         with self._lock:

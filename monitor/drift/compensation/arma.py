@@ -365,7 +365,7 @@ def _profile_likelihood(
 ) -> tuple[float, Floats]:
     """Maximise the log-likelihood for a fixed coefficient, and return the maximum and its position."""
 
-    def insert_fixed_coefficient(free: Floats) -> Floats:
+    def insert_coefficient_held_at_value(free: Floats) -> Floats:
         u = np.insert(free, order[0] if which == 2 else which, 0.0)
         if which == 2:
             u[order[0]] = atanh(value)
@@ -385,8 +385,8 @@ def _profile_likelihood(
         return u
 
     if not near.size:
-        return _log_likelihood(z, white, order, insert_fixed_coefficient(near)), near
+        return _log_likelihood(z, white, order, insert_coefficient_held_at_value(near)), near
     least, place = minimize_bfgs(
-        lambda free: -_log_likelihood(z, white, order, insert_fixed_coefficient(free)), near, 1e-2
+        lambda free: -_log_likelihood(z, white, order, insert_coefficient_held_at_value(free)), near, 1e-2
     )
     return -least, place

@@ -15,7 +15,7 @@ from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensator import GYROS, Compensator, MeasuredAndPredictedDrift
 from monitor.drift.compensation.innovation_test import INTERVALS, InnovationTest
 from monitor.drift.compensation.sage_husa import STEPPED, USED
-from monitor.estimation.detection.signal_monitor import MAX_RATE_CHANGE
+from monitor.estimation.detection.motion_and_change_monitor import MAX_RATE_CHANGE
 
 EVENT_KIND: Final = "drift_unexplained"
 

@@ -205,14 +205,14 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
     # Single lags and play operators are also tested, because they leave more degrees of freedom than all four together.
     candidates = [*loops.values(), *loops["lag"].T[:, :, None], *loops["play"].T[:, :, None]]
 
-    def test_candidates(nuisance: Floats) -> list[_Regression]:
+    def fit_candidate_regressions(nuisance: Floats) -> list[_Regression]:
         tested = (_regression(pooled.bias, nuisance, each, pooled.both_known) for each in candidates)
         return [one for one in tested if one is not None]
 
-    tests = test_candidates(np.hstack([_linear_drift(x.size), curve]))
+    tests = fit_candidate_regressions(np.hstack([_linear_drift(x.size), curve]))
     # In a single temperature cycle, drift and hysteresis are nearly collinear, so the size of the hysteresis is fitted
     # without a drift term.
-    fits = test_candidates(curve)
+    fits = fit_candidate_regressions(curve)
     if not tests or not fits:
         return None
     best = max(fits, key=lambda one: one.likelihood)

@@ -16,7 +16,7 @@ from monitor.drift.thermal.interval_means import PARTS_PER_INTERVAL
 from monitor.drift.thermal.online_thermal_model import MAX_INTERVALS, MeasuredAndPredictedMean, OnlineThermalModel
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
 from monitor.drift.thermal.running_interval_means import IntervalMean, RunningIntervalMeans
-from monitor.estimation.detection.signal_monitor import MAX_RATE_CHANGE
+from monitor.estimation.detection.motion_and_change_monitor import MAX_RATE_CHANGE
 
 KIND: Final = "temperature_unexplained"
 

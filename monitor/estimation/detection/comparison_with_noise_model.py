@@ -81,8 +81,8 @@ class ModelComparison:
     agrees: Mapping[str, bool] = field(default_factory=dict)  # current decisions of ``ModelAgreementMonitor``
 
 
-class ModelAllanVariances:
-    """Noise model with precomputed Allan variances, which are compared with a sliding window.
+class NoiseModelComparator:
+    """Comparator of a sliding window with a noise model, whose Allan variances are precomputed.
 
     Parameters
     ----------

@@ -81,12 +81,12 @@ class LowPass:
     order: int
     cutoff: float  # cutoff frequency as a fraction of the sample rate
 
-    def avar(self, factors: Ints) -> Floats:
+    def filtered_white_noise_avar(self, factors: Ints) -> Floats:
         """Return the Allan variance [m] of filtered white noise with N = 1 in the passband and τ0 = 1.
 
         It is computed as (4 V(m) − V(2m)) / 2m², where V(m) is the variance of a sum of m samples.
 
-        >>> LowPass("digital", 2, 0.1).avar(np.array([1, 1000])).round(6).tolist()
+        >>> LowPass("digital", 2, 0.1).filtered_white_noise_avar(np.array([1, 1000])).round(6).tolist()
         [0.024355, 0.000998]
         """
         m = np.asarray(factors, np.int64)
@@ -110,7 +110,7 @@ def _squared_response(kind: Kind, order: int, cutoff: float, bins: int = SPECTRU
 @lru_cache(1024)
 def _column(low_pass: LowPass, factors: bytes) -> Floats:
     """Return the cached Allan variance of filtered white noise. The cluster sizes are the bytes of an int64 array."""
-    return low_pass.avar(np.frombuffer(factors, np.int64))
+    return low_pass.filtered_white_noise_avar(np.frombuffer(factors, np.int64))
 
 
 def _autocovariance_sums(kind: Kind, order: int, cutoff: float) -> tuple[Floats, Floats]:
@@ -277,7 +277,7 @@ def search_low_pass_in_steps(
         ends = np.log(CUTOFFS[[max(at - 1, 0), min(at + 1, CUTOFFS.size - 1)]])
 
         def scatter_at(log_cutoff: float, kind: Kind = kind, order: int = order) -> float:
-            column = LowPass(kind, order, float(np.exp(log_cutoff))).avar(design.factors)
+            column = LowPass(kind, order, float(np.exp(log_cutoff))).filtered_white_noise_avar(design.factors)
             return float(_fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
 
         least, log_cutoff = yield from _yield_after_several_steps(

@@ -1,14 +1,14 @@
 """Export of N and K as parameter files of state estimators and calibration programs.
 
 Each program reads one value of N and one value of K for each kind of sensor, so the value of the worst axis is
-exported. The programs differ in file syntax, parameter names, and in the quantity that a parameter stands for:
+exported. The programs differ in file syntax, parameter names, and in the form in which they state the noise:
 
 - a continuous-time density, which the program converts to its own time step,
 - the square of the density, as a covariance in continuous time,
 - the standard deviation of one time step, density/√dt,
 - the variance of one time step, density²/dt.
 
-The last two quantities hold for N and K alike. A program with discrete noise adds (dt σ)² to the variance of an angle
+The last two forms hold for N and K alike. A program with discrete noise adds (dt σ)² to the variance of an angle
 or a velocity in each step. This variance must be N² dt, so that σ = N/√dt. For a bias, it must be K² dt, so that σ =
 K/√dt. ``docs/export.md`` names the documentation or source code on which each entry is based.
 """
@@ -35,8 +35,8 @@ EKF2_STEP_S: Final = 0.01  # default of EKF2_PREDICT_US, 10 000 µs
 EKF3_STEP_S: Final = 0.012  # EKF_TARGET_DT of AP_NavEKF3
 
 
-class Quantity(Enum):
-    """Quantity that the parameters of a program stand for."""
+class NoiseParameterForm(Enum):
+    """Form in which the parameters of a program state the noise."""
 
     DENSITY = "continuous-time density"
     SQUARED_DENSITY = "continuous-time covariance"
@@ -45,18 +45,18 @@ class Quantity(Enum):
 
     @property
     def squared(self) -> bool:
-        """True if the quantity is proportional to the square of N or K."""
-        return self in (Quantity.SQUARED_DENSITY, Quantity.VARIANCE)
+        """True if the parameter is proportional to the square of N or K."""
+        return self in (NoiseParameterForm.SQUARED_DENSITY, NoiseParameterForm.VARIANCE)
 
     @property
     def discrete(self) -> bool:
-        """True if the quantity depends on the time step of the program."""
-        return self in (Quantity.SIGMA, Quantity.VARIANCE)
+        """True if the parameter depends on the time step of the program."""
+        return self in (NoiseParameterForm.SIGMA, NoiseParameterForm.VARIANCE)
 
     def convert(self, coefficient: float, dt_s: float) -> float:
-        """Convert a coefficient N or K to the quantity.
+        """Convert a coefficient N or K to the parameter.
 
-        >>> Quantity.SIGMA.convert(1e-3, 0.01), Quantity.SQUARED_DENSITY.convert(1e-3, 0.01)
+        >>> NoiseParameterForm.SIGMA.convert(1e-3, 0.01), NoiseParameterForm.SQUARED_DENSITY.convert(1e-3, 0.01)
         (0.01, 1e-06)
 
         Parameters
@@ -64,15 +64,15 @@ class Quantity(Enum):
         coefficient
             N or K, in SI units.
         dt_s
-            Time step [s], which only discrete quantities depend on.
+            Time step [s], which only discrete parameters depend on.
         """
         value = coefficient / math.sqrt(dt_s) if self.discrete else coefficient
         return value**2 if self.squared else value
 
     def unit(self, unit: str) -> str:
-        """Return the unit of the quantity in ASCII.
+        """Return the unit of the parameter in ASCII.
 
-        >>> Quantity.DENSITY.unit("rad/s"), Quantity.VARIANCE.unit("rad/s")
+        >>> NoiseParameterForm.DENSITY.unit("rad/s"), NoiseParameterForm.VARIANCE.unit("rad/s")
         ('rad/s/sqrt(Hz)', '(rad/s)^2')
 
         Parameters
@@ -85,7 +85,7 @@ class Quantity(Enum):
         return unit if self.discrete else f"{unit}/sqrt(Hz)"
 
     def formula(self, letter: str) -> str:
-        """Return the formula of the quantity, such as ``N^2/dt``."""
+        """Return the formula of the parameter, such as ``N^2/dt``."""
         if self.squared:
             return f"{letter}^2/dt" if self.discrete else f"{letter}^2"
         return f"{letter}/sqrt(dt)" if self.discrete else letter
@@ -110,7 +110,7 @@ class ParameterFile:
 
     name: str
     title: str  # first comment
-    quantity: Quantity
+    form: NoiseParameterForm
     parameters: tuple[Parameter, ...]
     line: str = "{name}: {value}"
     first_lines: tuple[str, ...] = ()  # lines that must precede the comments
@@ -124,7 +124,7 @@ class ParameterFile:
     def options(self) -> frozenset[str]:
         """Names of the options that ``export`` accepts."""
         topic = any("{rostopic}" in text for text in (*self.before, *self.after))
-        return frozenset(("dt_s",) * self.quantity.discrete + ("rostopic",) * topic)
+        return frozenset(("dt_s",) * self.form.discrete + ("rostopic",) * topic)
 
     def export(
         self, noise: NoiseCoefficients, inflation: float = 1.0, dt_s: float | None = None, rostopic: str = "/imu0"
@@ -169,11 +169,11 @@ class ParameterFile:
     def _parameter_lines(self, one: Parameter, noise: NoiseCoefficients, inflation: float, step_s: float) -> list[str]:
         """Return the line of a parameter, after comments on its unit and on the axis that it comes from."""
         worst, comment = find_worst_axis(noise, one.kind, one.letter, self.name)
-        value = self.quantity.convert(worst.value * inflation, step_s)
-        unit = self.quantity.unit(ascii_unit("B" if one.letter == "N" else "R", one.kind))
-        at = f", dt = {step_s:g} s ({1.0 / step_s:g} Hz)" if self.quantity.discrete else ""
+        value = self.form.convert(worst.value * inflation, step_s)
+        unit = self.form.unit(ascii_unit("B" if one.letter == "N" else "R", one.kind))
+        at = f", dt = {step_s:g} s ({1.0 / step_s:g} Hz)" if self.form.discrete else ""
         lines = [
-            f"# {one.name} [{unit}] = {self.quantity.formula(one.letter)}, {self.quantity.value}{at}",
+            f"# {one.name} [{unit}] = {self.form.formula(one.letter)}, {self.form.value}{at}",
             f"# {one.letter}: {comment}{'' if inflation == 1.0 else f'; times {inflation:g}'}",
         ]
         if one.documented_range and not one.documented_range[0] <= value <= one.documented_range[1]:
@@ -186,7 +186,7 @@ class ParameterFile:
             raise ConfigError(f"{self.name} needs an update_rate, and the model has no sample_rate")
         sample_period_s = None if rate_hz is None else 1.0 / rate_hz
         step_s = next((one for one in (dt_s, self.default_dt_s, sample_period_s) if one is not None), None)
-        if step_s is None and not self.quantity.discrete:
+        if step_s is None and not self.form.discrete:
             return 1.0
         if step_s is None or not DURATION_S.supports(step_s):
             raise ConfigError(
@@ -231,7 +231,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "kalibr",
         "imu.yaml for Kalibr: continuous-time noise; one value for each kind of sensor, from the worst axis",
-        Quantity.DENSITY,
+        NoiseParameterForm.DENSITY,
         KALIBR_PARAMETERS,
         notes=(
             "Kalibr's wiki, IMU Noise Model: a sensor at rest at constant temperature has less noise; for the",
@@ -242,14 +242,14 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "allan_variance_ros",
         "imu.yaml as allan_variance_ros writes it, for Kalibr",
-        Quantity.DENSITY,
+        NoiseParameterForm.DENSITY,
         KALIBR_PARAMETERS,
         before=("rostopic: '{rostopic}'", "update_rate: {rate}"),
     ),
     ParameterFile(
         "openvins",
         "kalibr_imu_chain.yaml for OpenVINS",
-        Quantity.DENSITY,
+        NoiseParameterForm.DENSITY,
         KALIBR_PARAMETERS,
         line="  {name}: {value}",
         first_lines=OPENCV_FIRST_LINES,
@@ -270,7 +270,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "vins_fusion",
         "IMU parameters for the configuration file of VINS-Fusion or VINS-Mono",
-        Quantity.SIGMA,
+        NoiseParameterForm.SIGMA,
         _noise_and_bias("gyr_n", "acc_n", "gyr_w", "acc_w"),
         first_lines=OPENCV_FIRST_LINES,
         is_fragment=True,
@@ -278,7 +278,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "orb_slam3",
         "IMU parameters for the settings file of ORB-SLAM3",
-        Quantity.DENSITY,
+        NoiseParameterForm.DENSITY,
         _noise_and_bias("IMU.NoiseGyro", "IMU.NoiseAcc", "IMU.GyroWalk", "IMU.AccWalk"),
         first_lines=OPENCV_FIRST_LINES,
         before=("IMU.Frequency: {rate}",),
@@ -287,7 +287,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "lio_sam",
         "IMU parameters for params.yaml of LIO-SAM; in the branch ros2, the first key is /**: with ros__parameters:",
-        Quantity.DENSITY,
+        NoiseParameterForm.DENSITY,
         _noise_and_bias("imuGyrNoise", "imuAccNoise", "imuGyrBiasN", "imuAccBiasN"),
         line="  {name}: {value}",
         before=("lio_sam:",),
@@ -296,7 +296,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "fast_lio",
         "IMU parameters for the configuration file of FAST-LIO",
-        Quantity.VARIANCE,
+        NoiseParameterForm.VARIANCE,
         _noise_and_bias("gyr_cov", "acc_cov", "b_gyr_cov", "b_acc_cov"),
         line="    {name}: {value}",
         before=("mapping:",),
@@ -305,7 +305,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "gtsam",
         "Parameters of GTSAM for PreintegratedCombinedMeasurements, in Python",
-        Quantity.SQUARED_DENSITY,
+        NoiseParameterForm.SQUARED_DENSITY,
         _noise_and_bias(
             "setGyroscopeCovariance", "setAccelerometerCovariance", "setBiasOmegaCovariance", "setBiasAccCovariance"
         ),
@@ -325,7 +325,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "px4_ekf2",
         "Parameters of EKF2 of PX4, for QGroundControl; --dt is EKF2_PREDICT_US in seconds",
-        Quantity.SIGMA,
+        NoiseParameterForm.SIGMA,
         (
             Parameter("EKF2_ACC_NOISE", "accel", "N", (0.01, 1.0)),
             Parameter("EKF2_ACC_B_NOISE", "accel", "K", (0.0, 0.01)),
@@ -343,7 +343,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "ardupilot_ekf3",
         "Parameters of EKF3 of ArduPilot; --dt is the time step of EKF3 in seconds",
-        Quantity.SIGMA,
+        NoiseParameterForm.SIGMA,
         (
             Parameter("EK3_ACC_P_NSE", "accel", "N", (0.01, 1.0)),
             Parameter("EK3_ABIAS_P_NSE", "accel", "K", (0.00001, 0.02)),
@@ -358,7 +358,7 @@ PARAMETER_FILES: Final = (
     ParameterFile(
         "robot_localization",
         "Covariances of sensor_msgs/Imu, from which robot_localization takes the noise of an IMU",
-        Quantity.VARIANCE,
+        NoiseParameterForm.VARIANCE,
         (
             Parameter("angular_velocity_covariance", "gyro", "N"),
             Parameter("linear_acceleration_covariance", "accel", "N"),

@@ -54,10 +54,10 @@ class AxisCoefficientOrBound:
     bound: bool = False  # True if the value is a one-sided 95 % upper bound
     interval: tuple[float, float] | None = None  # 95 % interval of the value, if it is known
 
-    def describe(self) -> str:
+    def format_value_or_bound(self) -> str:
         """Describe the value in ASCII, with its 95 % interval or as an upper bound.
 
-        >>> AxisCoefficientOrBound(1.5e-4, interval=(1.4e-4, 1.6e-4)).describe()
+        >>> AxisCoefficientOrBound(1.5e-4, interval=(1.4e-4, 1.6e-4)).format_value_or_bound()
         '0.00015 (95 % interval 0.00014 to 0.00016)'
         """
         if self.bound:
@@ -254,7 +254,7 @@ def find_worst_axis(
     alike = len(known) > 1 and len(set(rank.values())) == 1
     return known[
         axis
-    ], f"{'all axes alike' if alike else f'worst axis {axis}'}{only} ({listed}): {known[axis].describe()}"
+    ], f"{'all axes alike' if alike else f'worst axis {axis}'}{only} ({listed}): {known[axis].format_value_or_bound()}"
 
 
 def describe_coefficients(terms: Mapping[str, AxisCoefficientOrBound], letters: str) -> str:
@@ -270,7 +270,7 @@ def describe_coefficients(terms: Mapping[str, AxisCoefficientOrBound], letters: 
     letters
         Symbols to describe.
     """
-    return ", ".join(f"{one} {terms[one].describe() if one in terms else 'unknown'}" for one in letters)
+    return ", ".join(f"{one} {terms[one].format_value_or_bound() if one in terms else 'unknown'}" for one in letters)
 
 
 def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: str) -> list[str]:

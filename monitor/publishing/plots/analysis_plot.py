@@ -106,7 +106,7 @@ def draw_analysis_figure(
         If matplotlib is not installed.
     """
     with figure_style():
-        kinds = measured_kinds(estimate)
+        kinds = measured_sensor_kinds(estimate)
         table_ratio = ROW_RATIO * (1 + max(len(units.columns(kind)) for kind in kinds))
         heights = [INCHES[1] * (CURVES_RATIO + table_ratio) / (CURVES_RATIO + ROW_RATIO * (1 + len(SYMBOLS)))]
         if dynamic is not None:
@@ -123,7 +123,7 @@ def draw_analysis_figure(
         return figure
 
 
-def measured_kinds(estimate: Estimate) -> list[Kind]:
+def measured_sensor_kinds(estimate: Estimate) -> list[Kind]:
     """Return the kinds of sensor that have measured axes, or gyro and accel if no axis is measured."""
     present = {axis for _, axis in measured_axes(estimate.curve)}
     return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)

@@ -50,7 +50,7 @@ MIN_GAP_RATIO: Final = 0.05  # a smaller ratio of gap to threshold is drawn at t
 
 
 @dataclass(frozen=True, slots=True)
-class DiagnosticPlot:
+class DiagnosticPanelCurves:
     """Curves of one diagnostic panel in displayed units."""
 
     title: str
@@ -132,7 +132,9 @@ def _create_panels(count: int, width: float, height: float) -> "tuple[Figure, li
     return figure, [figure.add_axes(((i * share + left) / width, bottom / height, *size)) for i in range(count)]
 
 
-def _draw_comparison(figure: "Figure", panels: "Sequence[Axes]", plots: Sequence[DiagnosticPlot], axis: str) -> str:
+def _draw_comparison(
+    figure: "Figure", panels: "Sequence[Axes]", plots: Sequence[DiagnosticPanelCurves], axis: str
+) -> str:
     limits = common_y_limits(plots)
     for i, (panel, plot) in enumerate(zip(panels, plots, strict=True)):
         _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), style.axis_colour(axis), limits)
@@ -208,7 +210,9 @@ def zoomed_view(view: DiagnosticPlotData, where: Location) -> DiagnosticPlotData
     return replace(view, y_name="detail", **lines)
 
 
-def to_displayed_units(title: str, view: DiagnosticPlotData, axis: str, where: Location | None) -> DiagnosticPlot:
+def to_displayed_units(
+    title: str, view: DiagnosticPlotData, axis: str, where: Location | None
+) -> DiagnosticPanelCurves:
     """Convert the data of a diagnostic to displayed units.
 
     Parameters
@@ -234,7 +238,7 @@ def to_displayed_units(title: str, view: DiagnosticPlotData, axis: str, where: L
         factor = 1.0 / seconds
     mark = None if where is None else range_on_x_axis(view, where)
     measured, expected, lo, hi = (line * y_unit.factor for line in (view.measured, view.expected, view.lo, view.hi))
-    return DiagnosticPlot(
+    return DiagnosticPanelCurves(
         title=title,
         x_label=", ".join(part for part in (readable_name(view.x_name), x_name) if part),
         y_label=", ".join(part for part in (readable_name(view.y_name), y_unit.name) if part),
@@ -249,7 +253,7 @@ def to_displayed_units(title: str, view: DiagnosticPlotData, axis: str, where: L
     )
 
 
-def common_y_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
+def common_y_limits(plots: Sequence[DiagnosticPanelCurves]) -> tuple[float, float]:
     """Return common limits of the y axis for all panels."""
     log = plots[0].log
     curves = _finite([line for plot in plots for line in (plot.measured, plot.expected)], log)
@@ -272,7 +276,7 @@ def _finite(lines: Sequence[Floats], log: bool) -> Floats:
     return np.log10(values) if log else values
 
 
-def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[float, float]) -> None:
+def _draw_panel(panel: "Axes", plot: DiagnosticPanelCurves, colour: str, limits: tuple[float, float]) -> None:
     x = plot.x[np.isfinite(plot.x) & ((plot.x > 0) | (not plot.log))]
     left, right = (float(x.min()), float(x.max())) if np.ptp(x) > 0 else (0.5, 1.5)
     scale = "log" if plot.log else "linear"

@@ -26,7 +26,7 @@ from monitor.publishing.coefficient_cells import (
     mark_temperature_axis,
 )
 from monitor.publishing.plots.allan_figure import LEGEND_TEXT, draw_allan_panel
-from monitor.publishing.plots.analysis_plot import AnalysisPlotData, is_k_r_ambiguous, measured_kinds
+from monitor.publishing.plots.analysis_plot import AnalysisPlotData, is_k_r_ambiguous, measured_sensor_kinds
 from monitor.publishing.plots.dynamic_figure import draw_dynamic_panels, dynamic_figure_height_inches
 from monitor.publishing.plots.style import axis_colour, create_figure, figure_style, to_svg_element
 from monitor.publishing.reports.html_page import render_template
@@ -67,7 +67,7 @@ def render_page(plot_data: AnalysisPlotData, title: str = "") -> str:
         title=title or "Recording",
         facts=recording_facts(analysis),
         notes=analysis.notes,
-        parts=[_part(plot_data, kind) for kind in measured_kinds(analysis.estimate)],
+        parts=[_part(plot_data, kind) for kind in measured_sensor_kinds(analysis.estimate)],
         axis_colour=axis_colour,
         mark_axis=lambda axis: mark_temperature_axis(axis, analysis.axes_of_temperature),
         format_value_and_interval=lambda column, axis: format_value_and_interval(analysis.estimate, column, axis),

@@ -12,10 +12,10 @@ from monitor.publishing.reports import reconcile_sentences, recording_comparison
 from monitor.publishing.reports.html_page import render_template
 from monitor.publishing.reports.reconcile_sentences import FormattedParameter, parameter_unit, readable_name
 from monitor.reconcile.result import AddedOrResizedEffect
-from monitor.reconcile.several_recordings.comparison import Comparison, EffectInRecordings
+from monitor.reconcile.several_recordings.comparison import EffectInRecordings, RecordingsComparison
 
 
-def render_page(c: Comparison) -> str:
+def render_page(c: RecordingsComparison) -> str:
     """Return the HTML report on the comparison of several recordings as text.
 
     Raises
@@ -42,7 +42,9 @@ def _rows(seen: EffectInRecordings) -> list[tuple[str, AddedOrResizedEffect]]:
     return [*seen.steps.items(), ("all together", seen.step_with_pooled_parameters())]
 
 
-def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) -> dict[str, FormattedParameter]:
+def _parameters_by_name(
+    c: RecordingsComparison, step: AddedOrResizedEffect, axis: str
+) -> dict[str, FormattedParameter]:
     return {one.name: one for one in reconcile_sentences.format_parameters(step, axis, c.baseline)}
 
 

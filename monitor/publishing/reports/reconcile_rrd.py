@@ -21,7 +21,12 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from monitor.common.unit_formatting import format_duration
 from monitor.publishing.plots import axis_colours
-from monitor.publishing.plots.reconcile_figures import MAX_MARKERS, DiagnosticPlot, common_y_limits, to_displayed_units
+from monitor.publishing.plots.reconcile_figures import (
+    MAX_MARKERS,
+    DiagnosticPanelCurves,
+    common_y_limits,
+    to_displayed_units,
+)
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.rerun.allan_chart import (
     HEIGHT,
@@ -208,7 +213,7 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, diagnostic: 
 
 
 def _log_curves(
-    stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, plot: DiagnosticPlot, axis: str, static: bool
+    stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, plot: DiagnosticPanelCurves, axis: str, static: bool
 ) -> None:
     # A lower end of zero is drawn below the box, because zero has no logarithm.
     low, high = (scale.to_chart_positions(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
@@ -239,7 +244,9 @@ def _log_found_ranges(
     log_lines(partial(stream.log, static=True), f"{path}/place", frames, [RANGE_COLOUR], 0.75, -5.0)
 
 
-def _log_grid(stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, plot: DiagnosticPlot, axis: str) -> None:
+def _log_grid(
+    stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, plot: DiagnosticPanelCurves, axis: str
+) -> None:
     log = partial(stream.log, static=True)
     key = [("measured", axis_colours.AXIS_COLOURS[axis]), ("model", axis_colours.TEXT), ("95 %", BAND_COLOUR)]
     names = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]

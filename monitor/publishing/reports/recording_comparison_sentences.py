@@ -5,7 +5,7 @@ from typing import Final
 from monitor.common.unit_formatting import format_number
 from monitor.publishing.reports.reconcile_sentences import readable_name
 from monitor.reconcile.result import AxisResult
-from monitor.reconcile.several_recordings.comparison import Comparison, EffectInRecordings
+from monitor.reconcile.several_recordings.comparison import EffectInRecordings, RecordingsComparison
 
 ABSENCE_TEXTS: Final = {
     "contradiction": "contradicts it",
@@ -17,7 +17,7 @@ ABSENCE_TEXTS: Final = {
 """Text for each reason why an effect was not found in a recording."""
 
 
-def summarize(c: Comparison) -> str:
+def summarize(c: RecordingsComparison) -> str:
     """Return sentences that state which noise effects all recordings show and which only some recordings show."""
     model = "the model" if c.fitted_to is None else f"the five classic terms, fitted to {c.fitted_to}"
     compared = f"{len(c.runs)} recordings were compared with {model}."

@@ -29,7 +29,7 @@ from monitor.publishing.result_kinds import RESULT_KINDS, DrawingRule, TimedResu
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.sinks import RerunStreamWithSink, ViewerProcess
-    from monitor.publishing.rerun.viewer_scene import Scene
+    from monitor.publishing.rerun.viewer_scene import AllDevicesScene
 
 BACKLOG_BYTES: Final = 16_000_000  # enough for about 25 s of samples of 16 six-axis devices at 1 kHz
 CONFIRM_PERIOD_S: Final = 1.0  # interval between two checks that the viewer has received the drawn data
@@ -170,14 +170,14 @@ class RerunView:
         output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self.url = output.child, output.url
         try:
-            scene = rerun_scene.Scene(output.stream, self._fleet)
+            scene = rerun_scene.AllDevicesScene(output.stream, self._fleet)
             self._draw(output, scene)
         finally:
             self._child = None
             output.close()
 
     def _send_layout(
-        self, output: "RerunStreamWithSink", scene: "Scene", devices: Sequence[ViewerDeviceDescription]
+        self, output: "RerunStreamWithSink", scene: "AllDevicesScene", devices: Sequence[ViewerDeviceDescription]
     ) -> None:
         from monitor.publishing.rerun import blueprint
 
@@ -186,14 +186,14 @@ class RerunView:
         scene.set_detailed_devices(devices)
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
-    def _draw_history(self, scene: "Scene", device: str) -> None:
+    def _draw_history(self, scene: "AllDevicesScene", device: str) -> None:
         self._inside_since = None  # a slow disk must not count as a stalled viewer
         past = self._history_source(device)
         self._inside_since = time.monotonic()
         if past is not None:
             scene.draw_history(device, past)
 
-    def _draw(self, output: "RerunStreamWithSink", scene: "Scene") -> None:
+    def _draw(self, output: "RerunStreamWithSink", scene: "AllDevicesScene") -> None:
         waiting = _WaitingResults()
         shown: tuple[ViewerDeviceDescription, ...] | None = None
         begun: set[str] = set()
@@ -245,7 +245,7 @@ class _WaitingResults:
             for drawing in kind_of(result).drawings:
                 drawing.merge(self._waiting[drawing].setdefault(device, []), (unix_s, result))
 
-    def draw_due_results(self, scene: "Scene", draw_all: bool) -> None:
+    def draw_due_results(self, scene: "AllDevicesScene", draw_all: bool) -> None:
         for drawing, devices in self._waiting.items():
             period_s = drawing.period_s * (self.period_factor if drawing.shares_rate else 1.0)
             for device in list(devices):

@@ -26,7 +26,7 @@ PANELS: tuple[type[Panel], ...] = tuple(
 """Classes of all panels."""
 
 
-class Scene:
+class AllDevicesScene:
     """Panels of all devices in one Rerun stream. The class is not thread-safe, and its methods may block.
 
     Parameters

@@ -262,7 +262,7 @@ def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
     names = _display_names([one.key for one in devices])
     lines = []
     for one in devices:
-        if problems := one.describe_problems():
+        if problems := one.describe_device_problems():
             symbol, colour = STATES.get(one.state(now_s), UNKNOWN_STATE_STYLE)
             symbol = "!" if symbol == "●" else symbol
             lines.append(Text.assemble((f"{symbol} {names[one.key]}  ", colour), problems))

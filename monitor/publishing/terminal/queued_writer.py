@@ -121,7 +121,7 @@ class QueuedWriter:
         """Request that ``render`` be called before the current period ends."""
         self._queue.wake()
 
-    def finish_writing(self, stop: threading.Event) -> None:
+    def wait_until_written(self, stop: threading.Event) -> None:
         """Wait until the thread has written all queued text and ended, or until ``stop`` is set."""
         self._begin_closing()
         while self._thread.is_alive() and not stop.is_set():

@@ -18,7 +18,7 @@ from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.reports import recording_comparison_sentences
 from monitor.publishing.terminal.tables import plain_table, print_notes
 from monitor.reconcile.result import AddedOrResizedEffect, AxisResult, Reconciliation
-from monitor.reconcile.several_recordings.comparison import Comparison, EffectInRecordings
+from monitor.reconcile.several_recordings.comparison import EffectInRecordings, RecordingsComparison
 from monitor.reconcile.summary.ranked_findings import rank_findings
 from monitor.reconcile.summary.summary_sentences import (
     describe_finding,
@@ -110,7 +110,7 @@ def _verdict(verdict: str) -> Text:
     return Text(f"{sign} {words.RESULT_TEXTS[verdict]}", style=style)
 
 
-def print_comparison(c: Comparison, console: Console) -> None:
+def print_comparison(c: RecordingsComparison, console: Console) -> None:
     """Print the comparison of several recordings.
 
     Parameters
@@ -129,7 +129,7 @@ def print_comparison(c: Comparison, console: Console) -> None:
     print_notes([f"{name} is left out: {why}" for name, why in c.without_result.items()], console)
 
 
-def _axes_by_runs(c: Comparison) -> Table:
+def _axes_by_runs(c: RecordingsComparison) -> Table:
     rows = plain_table("axis")
     for run in c.runs:
         rows.add_column(Text(run.name), overflow="fold")
@@ -158,7 +158,7 @@ def _lines(found: list[tuple[str, Text]]) -> Table:
     return rows
 
 
-def _common(c: Comparison) -> list[tuple[str, Text]]:
+def _common(c: RecordingsComparison) -> list[tuple[str, Text]]:
     found = []
     for axis, one in c.axes.items():
         for seen in one.common:
@@ -171,7 +171,7 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
     return found
 
 
-def _single(c: Comparison) -> list[tuple[str, Text]]:
+def _single(c: RecordingsComparison) -> list[tuple[str, Text]]:
     found = []
     for axis, seen in [(axis, seen) for axis, one in c.axes.items() for seen in one.single]:
         said = _effect(c, axis, seen)
@@ -185,7 +185,7 @@ def _single(c: Comparison) -> list[tuple[str, Text]]:
     return found
 
 
-def _effect(c: Comparison, axis: str, seen: EffectInRecordings) -> Text:
+def _effect(c: RecordingsComparison, axis: str, seen: EffectInRecordings) -> Text:
     said = Text(f"{seen.kind} {words.describe_step(seen.step_with_pooled_parameters(), axis, c.baseline)}")
     said.highlight_words([words.readable_name(seen.effect)], "bold")
     return said

@@ -67,7 +67,7 @@ def watch(
             stop.wait(once_s)
             _receive_messages(states, subscriber)
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render) as writer:
-                writer.finish_writing(stop)
+                writer.wait_until_written(stop)
         elif console.is_terminal:
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render, REFRESH_PERIOD_S) as writer:
                 while not stop.wait(REFRESH_PERIOD_S) and writer.error is None:
@@ -105,7 +105,7 @@ def connection_note(states: RemoteDeviceRegistry, subscriber: ZenohSubscriber) -
     notes = [state] if state != "ok" else []
     if (
         state == "ok"
-        and subscriber.time_since_all_connected_s > SILENCE_NOTE_S
+        and subscriber.all_connected_duration_s > SILENCE_NOTE_S
         and not states.devices_with_problems_first(time.monotonic())
     ):
         notes.append("connected, but no messages: no daemon is there, or access control refuses them")

@@ -114,7 +114,7 @@ class ZenohSubscriber:
         return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
 
     @property
-    def time_since_all_connected_s(self) -> float:
+    def all_connected_duration_s(self) -> float:
         """Time [s] for which all endpoints have been connected, or 0 if any endpoint is not connected."""
         return min(session.connected_duration_s for session in self._sessions)
 

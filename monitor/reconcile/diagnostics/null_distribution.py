@@ -2,8 +2,8 @@
 
 The gap of a diagnostic is √(2 × gain), the size of the strongest departure in standard deviations. The gain is the
 maximum over many places, such as frequencies or times. If the noise is Gaussian and the noise model is true, the gain
-depends only on the effective number of independent places (``NULL_GAINS``). Let q be the upper quartile of the gain.
-Above q, the density of a gain g is modelled as exp(−(g − q)/s).
+depends only on the effective number of independent places (``NULL_GAIN_QUANTILE_PARAMETERS``). Let q be the upper
+quartile of the gain. Above q, the density of a gain g is modelled as exp(−(g − q)/s).
 
 One simulated recording is used to check that the noise model is Gaussian enough. If a gain is improbably large, more
 recordings are simulated. If a gain is improbably large in all ``SIMULATED_RECORDINGS`` recordings, the simulated gains
@@ -48,7 +48,7 @@ class NullDistribution:
     threshold: float  # gain above which a departure is significant, nats
 
     @property
-    def search_threshold(self) -> float:
+    def min_gain_to_test_effects(self) -> float:
         """Gain above which the search tests the effects one by one, in nats.
 
         With a true model, a gain exceeds the mean of both quantiles in about one of six recordings. The penalties of
@@ -57,7 +57,7 @@ class NullDistribution:
         return 0.5 * (self.null95 + self.threshold)
 
 
-class NullGains(NamedTuple):
+class NullGainQuantileParameters(NamedTuple):
     """Upper quartile and scale of the gain of a diagnostic under a true Gaussian noise model.
 
     The upper quartile is ``offset`` + ``slope`` × ln(places).
@@ -72,17 +72,17 @@ class NullGains(NamedTuple):
         return self.offset + self.slope * log(max(places, 1.0)) + self.scale * log(UPPER_QUANTILE / probability)
 
 
-NULL_GAINS: Final[Mapping[str, NullGains]] = {
-    "values": NullGains(0.0, 0.0, 1.0),
-    "psd": NullGains(0.9, 1.0, 1.1),
-    "lines": NullGains(2.4, 1.0, 1.2),
-    "autocorrelation": NullGains(4.0, 0.0, 1.0),
-    "level": NullGains(1.3, 0.95, 1.25),
-    "temperature": NullGains(1.5, 0.0, 1.0),
-    "other_axes": NullGains(0.65, 0.73, 1.0),
-    "tails": NullGains(0.4, 0.0, 1.0),
-    "variance": NullGains(1.75, 1.0, 1.1),
-    "spectrogram": NullGains(0.3, 1.0, 1.1),
+NULL_GAIN_QUANTILE_PARAMETERS: Final[Mapping[str, NullGainQuantileParameters]] = {
+    "values": NullGainQuantileParameters(0.0, 0.0, 1.0),
+    "psd": NullGainQuantileParameters(0.9, 1.0, 1.1),
+    "lines": NullGainQuantileParameters(2.4, 1.0, 1.2),
+    "autocorrelation": NullGainQuantileParameters(4.0, 0.0, 1.0),
+    "level": NullGainQuantileParameters(1.3, 0.95, 1.25),
+    "temperature": NullGainQuantileParameters(1.5, 0.0, 1.0),
+    "other_axes": NullGainQuantileParameters(0.65, 0.73, 1.0),
+    "tails": NullGainQuantileParameters(0.4, 0.0, 1.0),
+    "variance": NullGainQuantileParameters(1.75, 1.0, 1.1),
+    "spectrogram": NullGainQuantileParameters(0.3, 1.0, 1.1),
 }
 """Null distribution of each diagnostic, fitted to simulated recordings of five models with 8192 to 10⁶ samples.
 
@@ -101,7 +101,7 @@ def run_diagnostics(whitened: WhitenedAxis) -> Findings:
 def all_simulations_have_improbable_gain(findings: Sequence[Findings]) -> bool:
     """Return True if a diagnostic has an improbably large gain in all simulated recordings of an axis."""
     return any(
-        diagnostic not in NULL_GAINS
+        diagnostic not in NULL_GAIN_QUANTILE_PARAMETERS
         or all(one[diagnostic].gain > _quantile(diagnostic, one[diagnostic], IMPROBABLE) for one in findings)
         for diagnostic in DIAGNOSTICS
     )
@@ -123,7 +123,8 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
         pooled = [one[diagnostic].gain for axis in complete for one in simulated[axis]]
         for axis, of in simulated.items():
             expected = [
-                _quantile(diagnostic, of[0][diagnostic], p) if diagnostic in NULL_GAINS else 0.0 for p in (0.05, chance)
+                _quantile(diagnostic, of[0][diagnostic], p) if diagnostic in NULL_GAIN_QUANTILE_PARAMETERS else 0.0
+                for p in (0.05, chance)
             ]
             if axis in complete:
                 own = _simulated_null_distribution(pooled, max(one[diagnostic].gain for one in of), chance)
@@ -147,7 +148,7 @@ def _simulated_null_distribution(pooled: Sequence[float], largest: float, chance
 
 
 def _quantile(diagnostic: str, found: Finding, probability: float) -> float:
-    return NULL_GAINS[diagnostic].quantile(found.places, probability)
+    return NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].quantile(found.places, probability)
 
 
 def compute_diagnostic_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:

@@ -36,9 +36,9 @@ from monitor.reconcile.likelihood.effect_roles import (
     is_noise_effect,
     regressor_count,
     with_effect_size,
-    with_regressor_factors,
+    with_regression_coefficients,
 )
-from monitor.reconcile.likelihood.whittle_fit import BinnedProductSums, WhittleFit, maximise_whittle_likelihood
+from monitor.reconcile.likelihood.whittle_fit import BinnedRegressionSums, WhittleFit, maximise_whittle_likelihood
 from monitor.reconcile.preparation.cosine_bins import (
     MAX_SMOOTH_COEFFICIENTS,
     FrequencyBins,
@@ -127,8 +127,8 @@ class RegressorCache:
         """
         time_constant_s = getattr(effect, "time_constant", None) or np.inf
         if isinstance(effect, SMOOTH_EFFECTS) and time_constant_s >= self._min_time_constant_s:
-            return self._transform_smooth(with_regressor_factors(effect, np.ones(MAX_REGRESSORS)))
-        return self._transform(with_regressor_factors(effect, np.ones(MAX_REGRESSORS)))
+            return self._transform_smooth(with_regression_coefficients(effect, np.ones(MAX_REGRESSORS)))
+        return self._transform(with_regression_coefficients(effect, np.ones(MAX_REGRESSORS)))
 
 
 class _NoiseVariances(NamedTuple):
@@ -151,6 +151,7 @@ class Axis:
     temperature_c: Floats | None  # [n] °C
     value_artifacts: ValueArtifacts
     regressors: RegressorCache  # shared by all axes of a recording and of its simulations
+    is_model_fitted: bool = False  # True if the model under test was fitted to this recording
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     cosine_transform_rms: float = field(init=False)  # root mean square of the coefficients, in the unit of the axis
     _products: dict[frozenset[Regressor | None], Floats] = field(init=False, default_factory=dict)
@@ -269,7 +270,7 @@ class Axis:
                 found.start.append(min(max(effect_size(effect) ** 2, least), whole))
         return found
 
-    def sum_products_over_bins(self, regressors: Sequence[Regressor]) -> BinnedProductSums:
+    def sum_products_over_bins(self, regressors: Sequence[Regressor]) -> BinnedRegressionSums:
         """Sum the products of axis and regressors over each frequency bin."""
         q, m = len(regressors), self.bins.count.size
         cross, gram = np.empty((q, m)), np.empty((q, q, m))
@@ -278,7 +279,7 @@ class Axis:
             cross[i] = self._binned_product(column, None)
             for j in range(i + 1):
                 gram[i, j] = gram[j, i] = self._binned_product(column, unit[j])
-        return BinnedProductSums(self._binned_product(None, None), cross, gram)
+        return BinnedRegressionSums(self._binned_product(None, None), cross, gram)
 
     def _regressors_of(self, effects: Sequence[Effect]) -> tuple[tuple[tuple[int, slice], ...], list[Regressor]]:
         slices: list[tuple[int, slice]] = []
@@ -446,7 +447,7 @@ def _with_fitted_sizes(
     for theta, at in zip(fitted.theta, noises, strict=True):
         found[at] = with_effect_size(found[at], float(theta) ** 0.5)
     for at, place in slices:
-        found[at] = with_regressor_factors(found[at], fitted.beta[place])
+        found[at] = with_regression_coefficients(found[at], fitted.beta[place])
     return tuple(found)
 
 
@@ -475,4 +476,4 @@ def _with_unit_noise_size(effect: Effect) -> Effect:
 def _with_unit_size(regressor: Regressor) -> Regressor:
     """Return the regressor with an effect of size one, for use as a cache key."""
     effect, at = regressor
-    return with_regressor_factors(effect, np.ones(MAX_REGRESSORS)), at
+    return with_regression_coefficients(effect, np.ones(MAX_REGRESSORS)), at

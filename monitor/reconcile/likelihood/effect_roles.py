@@ -199,26 +199,28 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     if isinstance(effect, Sinusoidal):
         variants = [replace(effect, amplitude=1.0, phase=phase) for phase in (0.0, 0.5 * pi)]
     else:
-        variants = [with_regressor_factors(effect, unit) for unit in np.eye(regressor_count(effect))]
+        variants = [with_regression_coefficients(effect, unit) for unit in np.eye(regressor_count(effect))]
     return [_series_of(one, n, rate_hz, temperature_c) for one in variants]
 
 
-def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
-    """Return a copy of an effect whose series is the sum of the regressors multiplied by the given factors.
+def with_regression_coefficients(effect: Effect, coefficients: Floats) -> Effect:
+    """Return a copy of an effect whose series is the sum of the regressors multiplied by the given coefficients.
 
     Parameters
     ----------
     effect : Effect
         Deterministic effect.
-    factors : ndarray of float64, shape (q,)
-        Factor for each regressor. Further factors are ignored.
+    coefficients : ndarray of float64, shape (q,)
+        Coefficient of each regressor. Further coefficients are ignored.
     """
     if isinstance(effect, Sinusoidal):
-        return replace(effect, amplitude=hypot(*factors[:2]), phase=atan2(factors[1], factors[0]) % (2.0 * pi))
+        return replace(
+            effect, amplitude=hypot(*coefficients[:2]), phase=atan2(coefficients[1], coefficients[0]) % (2.0 * pi)
+        )
     if type(effect) in COEFFICIENTS:
-        changed: dict[str, Any] = dict(zip(linear_coefficient_names(effect), map(float, factors), strict=False))
+        changed: dict[str, Any] = dict(zip(linear_coefficient_names(effect), map(float, coefficients), strict=False))
         return replace(effect, **changed)  # type: ignore[type-var]
-    return with_effect_size(effect, float(factors[0]))
+    return with_effect_size(effect, float(coefficients[0]))
 
 
 def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:

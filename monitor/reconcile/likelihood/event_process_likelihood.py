@@ -265,14 +265,14 @@ def fit_event_process(
     start_values : mapping of str to float
         Names and starting values of the two parameters.
     """
-    height, at = maximise_over_log_parameters(lambda a, b: log_likelihood(a, b, 1.0), list(start_values.values()))
-    deviations = compute_log_deviations(
-        lambda x: log_likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height
+    maximum, at = maximise_over_log_parameters(lambda a, b: log_likelihood(a, b, 1.0), list(start_values.values()))
+    deviations = estimate_log_parameter_standard_deviations(
+        lambda x: log_likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, maximum
     )
     first, second = np.exp(at).tolist()
-    events = (log_likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
+    events = (log_likelihood(first, second, 1.0 + ODDS_STEP) - maximum) / ODDS_STEP
     bounds = [log_interval(*one) for one in zip((first, second), deviations.tolist(), strict=True)]
-    return EventProcessFit(height, dict(zip(start_values, bounds, strict=True)), events)
+    return EventProcessFit(maximum, dict(zip(start_values, bounds, strict=True)), events)
 
 
 def log_interval(value: float, deviation: float) -> ParameterInterval:
@@ -283,16 +283,18 @@ def log_interval(value: float, deviation: float) -> ParameterInterval:
     return ParameterInterval(value, value * exp(-wide), value * exp(wide))
 
 
-def compute_log_deviations(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
+def estimate_log_parameter_standard_deviations(
+    log_likelihood: Callable[[Floats], float], log_parameters: Floats, maximum_log_likelihood: float
+) -> Floats:
     """Return the standard deviations of log parameters from the curvature of a log-likelihood at its maximum.
 
     Parameters
     ----------
-    function : callable
+    log_likelihood : callable
         Log-likelihood as a function of the logarithms of the parameters.
-    at : ndarray of float64, shape (k,)
+    log_parameters : ndarray of float64, shape (k,)
         Logarithms of the parameters at the maximum.
-    height : float
+    maximum_log_likelihood : float
         Log-likelihood at the maximum.
 
     Returns
@@ -300,10 +302,10 @@ def compute_log_deviations(function: Callable[[Floats], float], at: Floats, heig
     ndarray of float64, shape (k,)
         Standard deviations, or NaN if the log-likelihood has no curvature.
     """
-    curvature = _curvature(function, at, height)
+    curvature = _curvature(log_likelihood, log_parameters, maximum_log_likelihood)
     if (np.linalg.eigvalsh(curvature) < 0.0).all():
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(-curvature))))
-    return np.full(at.size, np.nan)
+    return np.full(log_parameters.size, np.nan)
 
 
 def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:

@@ -12,10 +12,11 @@ Outliers must be replaced before these tests, because outliers change the null d
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.fft import fft
+from scipy.fft import dct, fft, idct
 from scipy.special import gammaincc, gammaln, polygamma, psi
 
 from drivers.data_types import Floats, Ints
@@ -126,6 +127,38 @@ def compare_variance_change_forms(residuals: Floats, tau0_s: float) -> VarianceC
         periodic=_fit_periodic_variation(energy, scores, length, tau0_s),
         slow_variation_gain=_slow_variation_gain(scores, length),
     )
+
+
+def gains_in_frequency_bands(residuals: Floats, variance: Floats, bands: int) -> Floats:
+    """Return the log-likelihood gain of a known change of the variance in each of several frequency bands, in nats.
+
+    Parameters
+    ----------
+    residuals : ndarray of float64, shape (n,)
+        White residuals without missing samples.
+    variance : ndarray of float64, shape (n,)
+        Variance over time, with the mean 1.
+    bands : int
+        Number of frequency bands of equal width.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> variance = np.repeat([0.5, 1.5], 30_000)
+    >>> gains = gains_in_frequency_bands(rng.standard_normal(60_000) * np.sqrt(variance), variance, 4)
+    >>> (gains > 0.2 * gains.sum()).all()
+    np.True_
+    """
+    coefficients = dct(residuals, norm="ortho")
+    edges = np.linspace(0, residuals.size, bands + 1).astype(np.int64)
+    gains = np.empty(bands)
+    for k, (first, last) in enumerate(pairwise(edges.tolist())):
+        band = np.zeros_like(coefficients)
+        band[first:last] = coefficients[first:last]
+        squares = idct(band, norm="ortho") ** 2
+        change = squares / squares.mean() * (1.0 - 1.0 / variance) - np.log(variance)
+        gains[k] = 0.5 * float(change.mean()) * (last - first)
+    return gains
 
 
 def count_variance_blocks(sample_count: int) -> int:

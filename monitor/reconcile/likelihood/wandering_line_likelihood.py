@@ -38,7 +38,7 @@ MIN_TANH_ARGUMENT: Final = 0.01
 """Smallest ratio x of sample interval and correlation time for which 2x − 4 tanh(x/2) is computed without a series."""
 
 
-class LineState(NamedTuple):
+class WanderingLineParameters(NamedTuple):
     """Parameters of a wandering line in a band."""
 
     power: float  # squared amplitude in z
@@ -101,9 +101,9 @@ def expand_band(band: FrequencyBand, z: Complexes, n: int) -> Floats:
     return np.asarray(np.fft.irfft(transform, n))
 
 
-def block_log_likelihood(z: Complexes, rate_hz: float, length: int, state: LineState) -> float:
+def block_log_likelihood(z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters) -> float:
     """Return the log-likelihood of a wandering line whose frequency is constant in blocks of ``length`` samples."""
-    return _filter_blocks(z, rate_hz, length, state).log_likelihood
+    return _filter_blocks(z, rate_hz, length, parameters).log_likelihood
 
 
 def possible_block_lengths(size: int) -> list[int]:
@@ -111,7 +111,9 @@ def possible_block_lengths(size: int) -> list[int]:
     return [length for length in BLOCK_LENGTHS if size >= MIN_BLOCKS * length]
 
 
-def phase_log_likelihood(z: Complexes, rate_hz: float, phase: Floats, state: LineState) -> tuple[float, Floats]:
+def phase_log_likelihood(
+    z: Complexes, rate_hz: float, phase: Floats, parameters: WanderingLineParameters
+) -> tuple[float, Floats]:
     """Return the log-likelihood of a wandering line with a tracked phase, and the smoothed phase.
 
     Parameters
@@ -122,15 +124,15 @@ def phase_log_likelihood(z: Complexes, rate_hz: float, phase: Floats, state: Lin
         Sample rate of z, Hz.
     phase : ndarray of float64, shape (m,)
         Starting value of the phase, rad.
-    state : LineState
+    parameters : WanderingLineParameters
         Parameters of the line.
     """
-    return _smooth_phase(z, phase, _phase_model(rate_hz, state), np.zeros((z.size, 2)), PHASE_ITERATIONS)
+    return _smooth_phase(z, phase, _phase_model(rate_hz, parameters), np.zeros((z.size, 2)), PHASE_ITERATIONS)
 
 
-def track_phase(z: Complexes, rate_hz: float, length: int, state: LineState) -> Floats:
+def track_phase(z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters) -> Floats:
     """Return the phase of a wandering line, shape (m,), from the most likely frequency and phase of each block."""
-    blocks = _filter_blocks(z, rate_hz, length, state)
+    blocks = _filter_blocks(z, rate_hz, length, parameters)
     at = _smoothed_states(blocks.forward, blocks.transition, blocks.emission)
     k = np.arange(at.size)
     offset_hz = blocks.offsets_hz[at]
@@ -145,7 +147,7 @@ def track_phase(z: Complexes, rate_hz: float, length: int, state: LineState) -> 
     return np.asarray(inside + 2.0 * pi * (offset_hz[0] * before + offset_hz[-1] * after))
 
 
-def draw_line(z: Complexes, rate_hz: float, state: LineState, rng: np.random.Generator) -> Complexes:
+def draw_line(z: Complexes, rate_hz: float, parameters: WanderingLineParameters, rng: np.random.Generator) -> Complexes:
     """Draw a wandering line from its distribution given the data.
 
     If the model is true, the series less the drawn line is white noise of variance 1.
@@ -156,7 +158,7 @@ def draw_line(z: Complexes, rate_hz: float, state: LineState, rng: np.random.Gen
         Series in a band.
     rate_hz : float
         Sample rate of z, Hz.
-    state : LineState
+    parameters : WanderingLineParameters
         Parameters of the line.
     rng : numpy.random.Generator
         Generator for the draw.
@@ -167,22 +169,22 @@ def draw_line(z: Complexes, rate_hz: float, state: LineState, rng: np.random.Gen
         Drawn line. The line is zero if z is too short.
     """
     lengths = possible_block_lengths(z.size)
-    if not lengths or not state.power > 0.0:
+    if not lengths or not parameters.power > 0.0:
         return np.zeros_like(z)
-    length = max(lengths, key=lambda one: block_log_likelihood(z, rate_hz, one, state))
-    tracked, phase = phase_log_likelihood(z, rate_hz, track_phase(z, rate_hz, length, state), state)
-    if tracked > block_log_likelihood(z, rate_hz, length, state):
+    length = max(lengths, key=lambda one: block_log_likelihood(z, rate_hz, one, parameters))
+    tracked, phase = phase_log_likelihood(z, rate_hz, track_phase(z, rate_hz, length, parameters), parameters)
+    if tracked > block_log_likelihood(z, rate_hz, length, parameters):
         draws = rng.standard_normal((z.size, 2))
-        _, phase = _smooth_phase(z, phase, _phase_model(rate_hz, state), draws, 1)
-        return np.asarray(sqrt(state.power) * np.exp(1j * phase))
+        _, phase = _smooth_phase(z, phase, _phase_model(rate_hz, parameters), draws, 1)
+        return np.asarray(sqrt(parameters.power) * np.exp(1j * phase))
     padded = np.concatenate([z, np.zeros(-z.size % length)])
-    blocks = _filter_blocks(padded, rate_hz, length, state)
+    blocks = _filter_blocks(padded, rate_hz, length, parameters)
     chances = np.asarray(rng.random(blocks.forward.shape[0]))
     at = _draw_states(blocks.forward, blocks.transition, chances)
     found = blocks.transforms[np.arange(at.size), at]
-    theta = rng.vonmises(np.angle(found), 2.0 * sqrt(state.power) * np.abs(found))
+    theta = rng.vonmises(np.angle(found), 2.0 * sqrt(parameters.power) * np.abs(found))
     turns = blocks.offsets_hz[at][:, None] * np.arange(length) / rate_hz
-    line = sqrt(state.power) * np.exp(1j * (theta[:, None] + 2.0 * pi * turns))
+    line = sqrt(parameters.power) * np.exp(1j * (theta[:, None] + 2.0 * pi * turns))
     return np.asarray(line.ravel()[: z.size])
 
 
@@ -197,19 +199,19 @@ class _FilteredBlocks(NamedTuple):
     forward: Floats  # [b, k] probability of the frequency given this block and all earlier blocks
 
 
-def _filter_blocks(z: Complexes, rate_hz: float, length: int, state: LineState) -> _FilteredBlocks:
+def _filter_blocks(z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters) -> _FilteredBlocks:
     """Run the forward algorithm. The likelihood of a block is averaged over the phase."""
     blocks = z[: z.size // length * length].reshape(-1, length)
     transforms = np.fft.fft(blocks, 2 * length, axis=1)
     offsets_hz = np.asarray(np.fft.fftfreq(2 * length, 1.0 / rate_hz), np.float64)
-    argument = 2.0 * sqrt(state.power) * np.abs(transforms)
-    log_emission = np.log(i0e(argument)) + argument - length * state.power
+    argument = 2.0 * sqrt(parameters.power) * np.abs(transforms)
+    log_emission = np.log(i0e(argument)) + argument - length * parameters.power
     largest = log_emission.max(axis=1)
     emission = np.exp(log_emission - largest[:, None])
-    decay = float(np.exp(-length / rate_hz / state.time_s))
-    from_centre = offsets_hz - state.centre_hz
+    decay = float(np.exp(-length / rate_hz / parameters.time_s))
+    from_centre = offsets_hz - parameters.centre_hz
     rounding = (offsets_hz[1] - offsets_hz[0]) ** 2 / 6.0  # of two frequencies to the grid
-    variance = state.deviation_hz**2
+    variance = parameters.deviation_hz**2
     transition = _normalised(from_centre - decay * from_centre[:, None], variance * (1.0 - decay**2) + rounding)
     first = _normalised(from_centre[None, :], variance + rounding)[0]
     value, forward = _forward(emission, transition, first)
@@ -271,16 +273,18 @@ class _PhaseModel(NamedTuple):
     prior: float  # variance of the first frequency offset, Hz²
 
 
-def _phase_model(rate_hz: float, state: LineState) -> _PhaseModel:
+def _phase_model(rate_hz: float, parameters: WanderingLineParameters) -> _PhaseModel:
     """Return the exact model of sampled frequency and phase (see ``WanderingLine``)."""
-    x = 1.0 / (rate_hz * state.time_s)
-    decay, half = float(np.exp(-x)), 2.0 * pi * state.time_s * tanh(0.5 * x)
-    driven = state.deviation_hz**2 * -float(np.expm1(-2.0 * x))
+    x = 1.0 / (rate_hz * parameters.time_s)
+    decay, half = float(np.exp(-x)), 2.0 * pi * parameters.time_s * tanh(0.5 * x)
+    driven = parameters.deviation_hz**2 * -float(np.expm1(-2.0 * x))
     scatter = x**3 / 6.0 if x < MIN_TANH_ARGUMENT else 2.0 * x - 4.0 * tanh(0.5 * x)
-    own = (2.0 * pi * state.deviation_hz * state.time_s) ** 2 * scatter
+    own = (2.0 * pi * parameters.deviation_hz * parameters.time_s) ** 2 * scatter
     variances = (half**2 * driven + own, half * driven, driven)
-    drift = 2.0 * pi * state.centre_hz / rate_hz
-    return _PhaseModel(sqrt(state.power), drift, half * (1.0 + decay), decay, variances, state.deviation_hz**2)
+    drift = 2.0 * pi * parameters.centre_hz / rate_hz
+    return _PhaseModel(
+        sqrt(parameters.power), drift, half * (1.0 + decay), decay, variances, parameters.deviation_hz**2
+    )
 
 
 @compiled

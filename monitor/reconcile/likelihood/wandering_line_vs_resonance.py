@@ -15,13 +15,13 @@ from drivers.data_types import Floats
 from monitor.common.distributions import Z95
 from monitor.noise.effects import Narrowband, WanderingLine
 from monitor.reconcile.likelihood.event_process_likelihood import (
-    compute_log_deviations,
+    estimate_log_parameter_standard_deviations,
     log_interval,
     maximise_over_log_parameters,
 )
 from monitor.reconcile.likelihood.wandering_line_likelihood import (
     Complexes,
-    LineState,
+    WanderingLineParameters,
     block_log_likelihood,
     draw_line,
     expand_band,
@@ -108,24 +108,24 @@ def compare_wandering_line_with_resonance(
     centre_hz = resonance.frequency - band.centre_hz
     as_resonance = _fit_resonance(z, band.rate_hz, start_power, resonance.bandwidth, centre_hz)
     as_modulated = _fit_modulated_line(z, band.rate_hz, start_power, resonance.bandwidth)
-    as_line, state, deviations = _fit_line(z, band.rate_hz, start_power, resonance.bandwidth, centre_hz)
+    as_line, fitted, deviations = _fit_line(z, band.rate_hz, start_power, resonance.bandwidth, centre_hz)
     line = WanderingLine(
-        amplitude=band.to_amplitude(state.power),
-        frequency=band.centre_hz + state.centre_hz,
-        frequency_deviation=state.deviation_hz,
-        correlation_time=state.time_s,
+        amplitude=band.to_amplitude(fitted.power),
+        frequency=band.centre_hz + fitted.centre_hz,
+        frequency_deviation=fitted.deviation_hz,
+        correlation_time=fitted.time_s,
     )
     # the mean of Gauss–Markov noise over a time far above T has the variance 2 s² T/time
-    error_hz = Z95 * state.deviation_hz * sqrt(min(2.0 * state.time_s * band.rate_hz / z.size, 1.0))
-    amplitude = log_interval(state.power, float(deviations[0]))
+    error_hz = Z95 * fitted.deviation_hz * sqrt(min(2.0 * fitted.time_s * band.rate_hz / z.size, 1.0))
+    amplitude = log_interval(fitted.power, float(deviations[0]))
     lo, hi = (None if end is None else band.to_amplitude(end) for end in (amplitude.lo, amplitude.hi))
     parameters = {
         "amplitude": ParameterInterval(line.amplitude, lo, hi),
         "frequency": ParameterInterval(line.frequency, line.frequency - error_hz, line.frequency + error_hz),
-        "frequency_deviation": log_interval(state.deviation_hz, float(deviations[1])),
-        "correlation_time": log_interval(state.time_s, float(deviations[2])),
+        "frequency_deviation": log_interval(fitted.deviation_hz, float(deviations[1])),
+        "correlation_time": log_interval(fitted.time_s, float(deviations[2])),
     }
-    drawn = draw_line(z, band.rate_hz, state, np.random.default_rng(0))
+    drawn = draw_line(z, band.rate_hz, fitted, np.random.default_rng(0))
     return WanderingLineComparison(
         line, as_line - as_resonance, as_modulated - as_resonance, _sweep_residual(drawn), parameters
     )
@@ -164,16 +164,21 @@ def draw_wandering_line(series: Floats, rate_hz: float, line: WanderingLine, rng
     if band is None:
         return np.zeros_like(series)
     power, centre_hz = line.amplitude**2 * band.power_per_square, line.frequency - band.centre_hz
-    state = LineState(power, line.frequency_deviation, line.correlation_time, centre_hz)
-    return expand_band(band, draw_line(band.z, band.rate_hz, state, rng), series.size)
+    parameters = WanderingLineParameters(power, line.frequency_deviation, line.correlation_time, centre_hz)
+    return expand_band(band, draw_line(band.z, band.rate_hz, parameters, rng), series.size)
 
 
 def _fit_line(
     z: Complexes, rate_hz: float, power: float, width_hz: float, centre_hz: float
-) -> tuple[float, LineState, Floats]:
+) -> tuple[float, WanderingLineParameters, Floats]:
     """Return the log-likelihood, the parameters and the standard deviations of the logarithms of the first three."""
     starts = [
-        (length, LineState(power * factor, _deviation(width_hz, float(time_s)) * other, float(time_s), centre_hz))
+        (
+            length,
+            WanderingLineParameters(
+                power * factor, _deviation(width_hz, float(time_s)) * other, float(time_s), centre_hz
+            ),
+        )
         for length in possible_block_lengths(z.size)
         for time_s in np.geomspace(1.0 / rate_hz, 0.25 * z.size / rate_hz, START_TIMES)
         for factor in START_FACTORS
@@ -181,27 +186,30 @@ def _fit_line(
     ]
     length, start = max(starts, key=lambda one: block_log_likelihood(z, rate_hz, one[0], one[1]))
 
-    def in_blocks(power: float, deviation_hz: float, time_s: float) -> float:
-        return block_log_likelihood(z, rate_hz, length, LineState(power, deviation_hz, time_s, centre_hz))
+    def log_likelihood_in_blocks(power: float, deviation_hz: float, time_s: float) -> float:
+        return block_log_likelihood(z, rate_hz, length, WanderingLineParameters(power, deviation_hz, time_s, centre_hz))
 
-    value, at = maximise_over_log_parameters(in_blocks, start[:3])
-    state = _line_state(at, centre_hz)
+    value, at = maximise_over_log_parameters(log_likelihood_in_blocks, start[:3])
+    fitted = _line_parameters(at, centre_hz)
     # the blocks do not resolve the deviation of a narrow line, so the phase is tracked with each start too
-    block_phase = track_phase(z, rate_hz, length, state)
-    states = [state, *(one._replace(power=state.power) for _, one in starts)]
+    block_phase = track_phase(z, rate_hz, length, fitted)
+    candidates = [fitted, *(one._replace(power=fitted.power) for _, one in starts)]
     tracked, phase, with_tracked = max(
-        ((*phase_log_likelihood(z, rate_hz, block_phase, one), one) for one in states), key=lambda one: one[0]
+        ((*phase_log_likelihood(z, rate_hz, block_phase, one), one) for one in candidates), key=lambda one: one[0]
     )
-    function = in_blocks
+    log_likelihood = log_likelihood_in_blocks
     if tracked > value:
 
-        def with_phase(power: float, deviation_hz: float, time_s: float) -> float:
-            return phase_log_likelihood(z, rate_hz, phase, LineState(power, deviation_hz, time_s, centre_hz))[0]
+        def log_likelihood_with_tracked_phase(power: float, deviation_hz: float, time_s: float) -> float:
+            return phase_log_likelihood(
+                z, rate_hz, phase, WanderingLineParameters(power, deviation_hz, time_s, centre_hz)
+            )[0]
 
-        function = with_phase
-        value, at = maximise_over_log_parameters(function, with_tracked[:3])
-        state = _line_state(at, centre_hz)
-    return value, state, compute_log_deviations(lambda x: function(*np.exp(x).tolist()), at, value)
+        log_likelihood = log_likelihood_with_tracked_phase
+        value, at = maximise_over_log_parameters(log_likelihood, with_tracked[:3])
+        fitted = _line_parameters(at, centre_hz)
+    deviations = estimate_log_parameter_standard_deviations(lambda x: log_likelihood(*np.exp(x).tolist()), at, value)
+    return value, fitted, deviations
 
 
 def _deviation(width_hz: float, time_s: float) -> float:
@@ -209,9 +217,9 @@ def _deviation(width_hz: float, time_s: float) -> float:
     return max(width_hz / HALF_POWER_DEVIATIONS, sqrt(width_hz / (4.0 * pi * time_s)))
 
 
-def _line_state(log_parameters: Floats, centre_hz: float) -> LineState:
+def _line_parameters(log_parameters: Floats, centre_hz: float) -> WanderingLineParameters:
     power, deviation_hz, time_s = np.exp(log_parameters).tolist()
-    return LineState(power, deviation_hz, time_s, centre_hz)
+    return WanderingLineParameters(power, deviation_hz, time_s, centre_hz)
 
 
 def _fit_resonance(z: Complexes, rate_hz: float, power: float, width_hz: float, centre_hz: float) -> float:
@@ -219,13 +227,14 @@ def _fit_resonance(z: Complexes, rate_hz: float, power: float, width_hz: float, 
     periodogram = np.abs(np.fft.fft(z)) ** 2 / z.size
     f_hz = np.asarray(np.fft.fftfreq(z.size, 1.0 / rate_hz), np.float64)
 
-    def log_likelihood(power: float, width: float, shift: float) -> float:
+    def resonance_log_likelihood(power: float, width: float, shift: float) -> float:
         centre = centre_hz + width_hz * log(shift)
         variance = 1.0 + power * rate_hz * _lorentzian(f_hz - centre, width)
         return float((periodogram - np.log(variance) - periodogram / variance).sum())
 
     return max(
-        maximise_over_log_parameters(log_likelihood, (power, factor * width_hz, 1.0))[0] for factor in START_WIDTHS
+        maximise_over_log_parameters(resonance_log_likelihood, (power, factor * width_hz, 1.0))[0]
+        for factor in START_WIDTHS
     )
 
 
@@ -251,12 +260,15 @@ def _fit_real_amplitude(amplitude: Floats, rate_hz: float, power: float, width_h
     periodogram = 2.0 * np.abs(np.fft.fft(amplitude)) ** 2 / amplitude.size
     f_hz = np.asarray(np.fft.fftfreq(amplitude.size, 1.0 / rate_hz), np.float64)
 
-    def log_likelihood(power: float, width: float) -> float:
+    def modulated_line_log_likelihood(power: float, width: float) -> float:
         variance = 1.0 + 2.0 * power * rate_hz * _lorentzian(f_hz, width)
         variance[0] = max(periodogram[0], variance[0])
         return 0.5 * float((periodogram - np.log(variance) - periodogram / variance).sum())
 
-    return max(maximise_over_log_parameters(log_likelihood, (power, factor * width_hz))[0] for factor in START_WIDTHS)
+    return max(
+        maximise_over_log_parameters(modulated_line_log_likelihood, (power, factor * width_hz))[0]
+        for factor in START_WIDTHS
+    )
 
 
 def _lorentzian(offset_hz: Floats, width_hz: float) -> Floats:

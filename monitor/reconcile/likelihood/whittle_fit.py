@@ -29,7 +29,7 @@ MIN_VARIANCE_RATIO: Final = 1e-20
 
 
 @dataclass(frozen=True, slots=True)
-class BinnedProductSums:
+class BinnedRegressionSums:
     """Sums of products of the axis Y and the regressors R over each frequency bin."""
 
     power: Floats  # [m] Σ Y²
@@ -51,7 +51,7 @@ class WhittleFit:
 
 
 def maximise_whittle_likelihood(
-    count: Floats, sums: BinnedProductSums, variance_bases: Floats, fixed_variance: Floats, start_theta: Floats
+    count: Floats, sums: BinnedRegressionSums, variance_bases: Floats, fixed_variance: Floats, start_theta: Floats
 ) -> WhittleFit:
     """Maximise the Whittle likelihood over the noise variances θ and the regressor sizes β.
 
@@ -59,7 +59,7 @@ def maximise_whittle_likelihood(
     ----------
     count : ndarray of float64, shape (m,)
         Number of coefficients in each bin.
-    sums : BinnedProductSums
+    sums : BinnedRegressionSums
         Sums over bins of the products of the axis and the regressors.
     variance_bases : ndarray of float64, shape (p, m)
         Variance of a coefficient for θ_j = 1.

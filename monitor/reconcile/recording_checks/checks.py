@@ -27,6 +27,7 @@ from monitor.reconcile.recording_checks.motion import check_motion
 from monitor.reconcile.recording_checks.repeated_rows import check_repeated_rows
 from monitor.reconcile.recording_checks.sample_rate_from_features import correct_impossible_sample_rate
 from monitor.reconcile.recording_checks.stuck_values import check_stuck_values
+from monitor.reconcile.recording_checks.temporary_vibration import check_temporary_vibration
 from monitor.reconcile.recording_checks.unit_error import collect_triad_evidence, find_unit_error
 from monitor.reconcile.recording_checks.untestable_slow_terms import check_slow_terms
 from monitor.reconcile.result import FindingKind, RecordingFinding
@@ -80,6 +81,8 @@ def check_recording(recording: Recording, model: NoiseModel | None, seed: int) -
     if found:  # large distances during the motion hid corrupt rows
         values, found = check_corrupt_rows(values, rate_hz, simulated, model)
         findings += found
+    values, found = check_temporary_vibration(values, rate_hz, simulated)
+    findings += found
     findings += check_repeated_rows(values, rate_hz, model)
     if model is not None:
         findings += check_slow_terms(tuple(values), recording.sample_count, rate_hz, model)

@@ -99,7 +99,7 @@ def _simplify_axis(search: AxisSearchResult, others: Sequence[Effect], null: Axi
     search = _accept_if_diagnostics_agree(search, _without_unneeded_effects(search.hypothesis, others), null)
     merged = _with_merged_peaks(search.hypothesis)
     search = _accept_if_diagnostics_agree(search, merged, null, "the resonance replaces effects that were validated")
-    return _accept_if_diagnostics_agree(search, with_significant_sizes(search.hypothesis), null)
+    return _accept_if_diagnostics_agree(search, revert_insignificant_size_changes(search.hypothesis), null)
 
 
 def _accept_if_diagnostics_agree(
@@ -209,7 +209,7 @@ def _merge_peaks(hypothesis: Hypothesis, low: Sinusoidal | Narrowband, high: Sin
     return hypothesis.refit_with_other_added_effects((*rest, merged))
 
 
-def with_significant_sizes(hypothesis: Hypothesis) -> Hypothesis:
+def revert_insignificant_size_changes(hypothesis: Hypothesis) -> Hypothesis:
     """Return a hypothesis in which each changed size of the noise model differs significantly from the old size.
 
     The interval of a changed size excludes the old size, and the gain of the change exceeds

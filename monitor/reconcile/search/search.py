@@ -58,8 +58,8 @@ from monitor.reconcile.search.sample_repair import repair_axis_again
 from monitor.reconcile.search.trials import Trial, generate_trial_groups, try_alternatives_to_slow_noise
 from monitor.reconcile.search.withdrawal_of_contradicted_effects import (
     SMOOTH_SPECTRA,
+    difference_remains_near_line,
     keep_uncontradicted_effects,
-    leaves_difference,
 )
 
 MAX_ROUNDS: Final = 8
@@ -167,7 +167,9 @@ def _next_round(
     better = (
         try_alternatives_to_slow_noise(hypothesis, whitened) if agrees and _has_fitted_slow_noise(hypothesis) else []
     )
-    conspicuous = any(one.gain > null[diagnostic].search_threshold for diagnostic, one in current.findings.items())
+    conspicuous = any(
+        one.gain > null[diagnostic].min_gain_to_test_effects for diagnostic, one in current.findings.items()
+    )
     completed = None
     if better or conspicuous:
         current, completed = _try_groups(current, better, agrees, null, rng)
@@ -252,7 +254,7 @@ def _select_trial(
                 tried[:2] = line, trial
                 after, added = _add_effect(current.hypothesis, line, rng), lines.line
                 whitened = whiten_axis(after.fit)
-                if leaves_difference(lines.line, findings, run_diagnostics(whitened), null):
+                if difference_remains_near_line(lines.line, findings, run_diagnostics(whitened), null):
                     continue
         if _is_gaussian_and_stationary(whitened, null):
             after, tried = replace_by_likelier_alternative(after, tried)

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc
 
-from monitor.noise.effect import AxisLeak, Effect
+from monitor.noise.effect import AxisLeak, Effect, WhiteNoiseGain
 from monitor.noise.effects import (
     AngleRandomWalk,
     ExponentiallyCorrelated,
@@ -47,8 +47,8 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     refit_correlation_times,
 )
 from monitor.reconcile.likelihood.outlier_fit import convert_student_to_gaussian, student_misfit_z
-from monitor.reconcile.likelihood.variance_change_tests import compare_variance_change_forms
-from monitor.reconcile.likelihood.whitening import WhitenedAxis
+from monitor.reconcile.likelihood.variance_change_tests import compare_variance_change_forms, gains_in_frequency_bands
+from monitor.reconcile.likelihood.whitening import MIN_NOISE_GAIN, WhitenedAxis
 from monitor.reconcile.preparation.value_artifacts import ValueWithInterval
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidate_effects import (
@@ -71,7 +71,7 @@ SINGLE_SIZE_MARGIN_NATS: Final = 1.5
 """Smallest advantage of a common factor over one new size, in nats. Often, only one size differs."""
 SCALE_SEARCH_ITERATIONS: Final = 16
 FREQUENCY_BANDS: Final = 8
-"""Number of frequency bands in the test for a constant leak coefficient."""
+"""Number of frequency bands in the tests of a leak coefficient and of a variance change."""
 MIN_LEAK_PROBABILITY: Final = 1e-5
 """A leak is rejected if the scatter of its coefficient between frequency bands is less probable than this value."""
 COEFFICIENT_PENALTY_NATS: Final = 3.3
@@ -83,10 +83,14 @@ MIN_STUDENT_GAIN_NATS: Final = 2.0
 """Smallest log-likelihood gain of outliers over Student's t, in nats."""
 MAX_OUTLIER_Z: Final = 4.0
 """Largest accepted z value, both for the clustering of large samples and for the misfit."""
-MIN_DISTANT_SCALE: Final = 4.0
+MIN_DISTANT_SCALE: Final = 3.5
 """Smallest standard deviation of distant outliers, relative to the noise. Other heavy tails have a smaller ratio."""
-MAX_MISFIT_SHARE: Final = 0.1
+MAX_MISFIT_SHARE: Final = 0.2
 """Largest accepted misfit of distant outliers, relative to the gain."""
+MAX_BAND_SHARE: Final = 0.5
+"""Largest share of one frequency band in the gain of a variance change of white noise."""
+BAND_MARGIN_NATS: Final = 3.0
+"""Chance variation of the gain in one frequency band, in nats."""
 MAX_VARIANCE_SHARE: Final = 0.3
 """Largest gain of a variance change after heavy tails are removed, relative to the gain of the heavy tails."""
 ALTERNATIVE_MARGIN_NATS: Final = 1.0
@@ -120,7 +124,7 @@ class Trial:
     moved: int | None = None  # index of the model effect that ``effect`` replaces; None for an additional effect
 
     @property
-    def total_score(self) -> float:
+    def score_with_slow_noise(self) -> float:
         """Score relative to the hypothesis before the round, in nats. Scores of the same round are comparable."""
         return self.score + self.slow_noise_score
 
@@ -161,7 +165,7 @@ def _is_deterministic_first(deterministic: Sequence[Trial], noises: Sequence[Tri
     best, noise = deterministic[0], noises[0]
     if best.score_without_slow_noise > noise.score - NOISE_PRIORITY_NATS:
         return True
-    return noise.name == RETUNE and best.score > 0.0 and best.total_score > noise.score
+    return noise.name == RETUNE and best.score > 0.0 and best.score_with_slow_noise > noise.score
 
 
 def try_alternatives_to_slow_noise(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
@@ -245,6 +249,8 @@ def _variance_modulation_trial(whitened: WhitenedAxis) -> list[Trial]:
     if found.gain <= max(changes.step.gain, changes.trend_gain, changes.slow_variation_gain, _band_gain(whitened)):
         return []
     effect = VarianceModulation(depth=found.depth.value, period=found.period.value, phase=found.phase)
+    if not _changes_all_frequencies(whitened, effect):
+        return []
     intervals = {
         "depth": _scaled_bounds(found.depth),
         "period": _scaled_bounds(found.period),
@@ -280,8 +286,21 @@ def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
         return []
     if step.gain <= max(changes.largest_gain_other_than_step, _band_gain(whitened)) - ALTERNATIVE_MARGIN_NATS:
         return []
+    effect = NoiseStep(time=step.time.value, ratio=step.ratio.value)
+    if not _changes_all_frequencies(whitened, effect):
+        return []
     intervals = {"time": _scaled_bounds(step.time), "ratio": _scaled_bounds(step.ratio)}
-    return [_penalised_trial(NoiseStep(time=step.time.value, ratio=step.ratio.value), step.gain, intervals)]
+    return [_penalised_trial(effect, step.gain, intervals)]
+
+
+def _changes_all_frequencies(whitened: WhitenedAxis, effect: WhiteNoiseGain) -> bool:
+    """Return True if the variance changes at most frequencies, and not only in one frequency band.
+
+    A resonance whose frequency or strength varies changes the variance in one band.
+    """
+    variance = np.maximum(whitened.axis.white_noise_gain_over_time((effect,)), MIN_NOISE_GAIN) ** 2
+    gains = gains_in_frequency_bands(whitened.flat_series, variance / variance.mean(), FREQUENCY_BANDS)
+    return bool(gains.max() < MAX_BAND_SHARE * gains.sum() + BAND_MARGIN_NATS)
 
 
 def _band_gain(whitened: WhitenedAxis) -> float:
@@ -316,7 +335,10 @@ def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
 
 
 def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try noise effects, new sizes of the noise model, and a common factor."""
+    """Try noise effects, new sizes of the noise model, and a common factor.
+
+    The sizes of a model that was fitted to this recording have no common factor.
+    """
     resized = hypothesis.refit_with_other_added_effects(hypothesis.added)
     found = [
         Trial(
@@ -325,7 +347,9 @@ def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]
     ]
     found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
     found += _moved_feature_trials(hypothesis, found)
-    found = _best_first([*found, _scale_factor_trial(hypothesis, resized)])
+    if not hypothesis.axis.is_model_fitted:
+        found.append(_scale_factor_trial(hypothesis, resized))
+    found = _best_first(found)
     return _prefer_single_size(found) if resized.resized_model_effect_count == 1 else found
 
 
@@ -407,7 +431,7 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     axis, small = hypothesis.axis, initial_effect_size(hypothesis.axis)
     fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
 
-    def make_noise_score(noise: Effect) -> Callable[[Effects], float]:
+    def make_score_with_added_noise(noise: Effect) -> Callable[[Effects], float]:
         return lambda effects: axis.fit((*effects, noise), fixed_noise).log_likelihood - cost - PENALTY_NATS[noise.name]
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
@@ -415,7 +439,7 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     if not any(isinstance(effect, RateRandomWalk) for effect in hypothesis.effects):
         noises.append(RateRandomWalk(K=small))
     noises += [PowerLaw(density=small, exponent=exponent) for exponent in SLOW_NOISE_EXPONENTS]
-    return [make_noise_score(one) for one in noises]
+    return [make_score_with_added_noise(one) for one in noises]
 
 
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
@@ -426,17 +450,19 @@ def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     """
     effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_effect_indices(hypothesis.model)
 
-    def log_likelihood_with_factor(log_factor: float) -> float:
+    def log_likelihood_with_axis_scale_factor(log_factor: float) -> float:
         return hypothesis.axis.fit(
             (*effects, ScaleFactor(factor=float(np.exp(log_factor)))), fixed_noise
         ).log_likelihood
 
-    start = float(max(np.linspace(-3.0, 3.0, 13), key=log_likelihood_with_factor))
-    x = find_maximum_by_golden_section(log_likelihood_with_factor, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS)
-    gain = log_likelihood_with_factor(x) - hypothesis.penalised_log_likelihood - PENALTY_NATS["scale_factor"]
+    start = float(max(np.linspace(-3.0, 3.0, 13), key=log_likelihood_with_axis_scale_factor))
+    x = find_maximum_by_golden_section(
+        log_likelihood_with_axis_scale_factor, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS
+    )
+    gain = log_likelihood_with_axis_scale_factor(x) - hypothesis.penalised_log_likelihood - PENALTY_NATS["scale_factor"]
     if (
         resized.resized_model_effect_count > 1
-        and log_likelihood_with_factor(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS
+        and log_likelihood_with_axis_scale_factor(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS
     ):
         gain = max(gain, resized.penalised_log_likelihood - hypothesis.penalised_log_likelihood)
     return Trial("scale_factor", ScaleFactor(factor=float(np.exp(x))), gain)

@@ -82,7 +82,7 @@ def keep_uncontradicted_effects(
         Null distribution of each diagnostic.
     """
 
-    def significant_gain(diagnostic: str) -> float:
+    def significant_gain_or_zero(diagnostic: str) -> float:
         gain = findings[diagnostic].gain
         return gain if gain > null[diagnostic].threshold else 0.0
 
@@ -97,21 +97,21 @@ def keep_uncontradicted_effects(
     for diagnostic in FREQUENCY_DIAGNOSTICS:
         place = findings[diagnostic].where.frequency
         if place is not None:
-            candidates = contradicted_effects(Effect, significant_gain(diagnostic), MAX_REMAINING_SHARE)
+            candidates = contradicted_effects(Effect, significant_gain_or_zero(diagnostic), MAX_REMAINING_SHARE)
             overlapping = {at for at, effect in enumerate(added) if _overlaps(effect, place)}
             peaks = {at for at in overlapping if isinstance(added[at], PEAKS)}
             # a small difference at a peak that is kept comes from this peak and not from the smooth spectrum below
             withdrawn |= candidates & (peaks if peaks - candidates else overlapping)
-    withdrawn |= contradicted_effects(AxisLeak, significant_gain("other_axes"), MAX_REMAINING_LEAK_SHARE)
-    withdrawn |= contradicted_effects(PulseTrain, significant_gain("lines"), MAX_REMAINING_SHARE)
-    withdrawn |= contradicted_effects((BiasStep, BiasCurve), significant_gain("level"), MAX_REMAINING_SHARE)
+    withdrawn |= contradicted_effects(AxisLeak, significant_gain_or_zero("other_axes"), MAX_REMAINING_LEAK_SHARE)
+    withdrawn |= contradicted_effects(PulseTrain, significant_gain_or_zero("lines"), MAX_REMAINING_SHARE)
+    withdrawn |= contradicted_effects((BiasStep, BiasCurve), significant_gain_or_zero("level"), MAX_REMAINING_SHARE)
     withdrawn |= contradicted_effects(
-        SMOOTH_SPECTRA, max(map(significant_gain, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO
+        SMOOTH_SPECTRA, max(map(significant_gain_or_zero, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO
     )
     return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)
 
 
-def leaves_difference(line: WanderingLine, before: Findings, after: Findings, null: AxisNull) -> bool:
+def difference_remains_near_line(line: WanderingLine, before: Findings, after: Findings, null: AxisNull) -> bool:
     """Return True if a significant difference remains in the frequency range of a wandering line.
 
     Parameters

@@ -86,7 +86,7 @@ class AxisComparison:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class RecordingsComparison:
     """Comparison of several recordings of one sensor."""
 
     verdict: Decision
@@ -101,7 +101,7 @@ class Comparison:
 
 def compare_results(
     runs: Sequence[NamedResult], fitted_to: str | None = None, without_result: Mapping[str, str] | None = None
-) -> Comparison:
+) -> RecordingsComparison:
     """Compare the results of several recordings that were reconciled with one noise model.
 
     Parameters
@@ -115,7 +115,7 @@ def compare_results(
     """
     baseline = runs[0].result.baseline
     axes = {axis: _compare_axis(axis, runs) for axis in AXES if any(axis in run.result.axes for run in runs)}
-    return Comparison(
+    return RecordingsComparison(
         combine_decisions([run.result.verdict for run in runs]),
         tuple(runs),
         dict(without_result or {}),

@@ -11,12 +11,17 @@ import msgspec
 
 from monitor.reconcile.json_report import finite_or_none, parameter_entry
 from monitor.reconcile.result import AddedOrResizedEffect
-from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, EffectInRecordings, NamedResult
+from monitor.reconcile.several_recordings.comparison import (
+    AxisComparison,
+    EffectInRecordings,
+    NamedResult,
+    RecordingsComparison,
+)
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
 
 
-def encode_comparison(comparison: Comparison) -> bytes:
+def encode_comparison(comparison: RecordingsComparison) -> bytes:
     """Encode a comparison of several recordings as JSON."""
     return msgspec.json.encode({
         "schema": SCHEMA,

@@ -56,6 +56,7 @@ FAULT_ADVICE: Final = (
     (UNIT_FAULTS, "Correct the unit, the axes or the sample rate where the data are recorded."),
     (frozenset({"too_short"}), "Record for longer to determine the slow terms."),
     (frozenset({"motion"}), "Repeat the recording without motion."),
+    (frozenset({"temporary_vibration"}), "Repeat the recording while the source of the vibration is off."),
     (frozenset({"stuck_axis", "frozen_rows", "missing_rows", "corrupt_rows"}), "Check the connection to the sensor."),
 )
 """Recommendation for each kind of fault, the most important kind first."""

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.data_types import Chunk
 from drivers.decoders import base
-from drivers.decoders.base import HINT_FRAMES, NEED_MORE, REJECT, BlockBuilder, FrameBuffer, Frames
+from drivers.decoders.base import HINT_FRAMES, NEED_MORE, REJECT, BlockBuilder, FrameBuffer, RawFrames
 
 
 def match_frame(buffer: bytes, at: int) -> int:
@@ -122,7 +122,7 @@ def test_recent_problem_gives_a_hint_until_frames_are_found() -> None:
 
 
 def test_deselected_frames_count_as_bad_before_the_next_selected_frame() -> None:
-    frames = Frames([b"0", b"1", b"2", b"3"], np.arange(4), np.array([1, 2, 4, 8]), np.zeros(4, np.bool_))
+    frames = RawFrames([b"0", b"1", b"2", b"3"], np.arange(4), np.array([1, 2, 4, 8]), np.zeros(4, np.bool_))
     kept = frames.select_frames([1, 2])
     assert (kept.data, kept.t_ns.tolist(), kept.bad_before.tolist(), kept.bad_after) == (
         [b"1", b"2"],

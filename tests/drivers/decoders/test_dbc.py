@@ -251,7 +251,7 @@ def test_last_temperature_is_repeated_until_the_next_one() -> None:
     sent = make_block(np.arange(5), make_samples(5).values.copy(), temperature)
     got = concatenate_blocks(decoder.feed(decoder.encode(sent)))
     np.testing.assert_array_equal(got.temperature_c, [np.nan, 20.0, 20.0, 20.0, 30.0])
-    assert 0x51 in decoder.addresses
+    assert 0x51 in decoder.accepted_addresses
 
 
 def test_sign_unit_and_factor_are_applied(tmp_path: Path) -> None:
@@ -529,11 +529,11 @@ def test_only_one_sender_is_decoded() -> None:
 
 
 def test_decoder_lists_the_addresses_of_its_messages() -> None:
-    assert build("canmod_gps", CANMOD_SIGNALS).addresses == (9,)
+    assert build("canmod_gps", CANMOD_SIGNALS).accepted_addresses == (9,)
     wanted = (0x0CF02AFE | EXTENDED_ID | ANY_SOURCE, 0x0CF02DFE | EXTENDED_ID | ANY_SOURCE)
-    assert build("j1939_imu", SAE_SIGNALS).addresses == wanted
+    assert build("j1939_imu", SAE_SIGNALS).accepted_addresses == wanted
     exact = build("j1939_imu", SAE_SIGNALS, j1939=False)
-    assert exact.addresses == (0x0CF02AFE | EXTENDED_ID, 0x0CF02DFE | EXTENDED_ID)
+    assert exact.accepted_addresses == (0x0CF02AFE | EXTENDED_ID, 0x0CF02DFE | EXTENDED_ID)
     assert exact.feed([make_chunk(RATE_ID, "007D007D007D0005")]) == []
     assert isinstance(exact.timing, ArrivalTimedFormat)
 

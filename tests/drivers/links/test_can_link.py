@@ -312,7 +312,7 @@ def test_frames_from_the_bus_are_decoded_to_samples(peer: can.BusABC, channel: s
     decoder = dbc.build(read_settings(dbc.Settings, {"file": "j1939_imu", "signals": signals}))
     assert isinstance(decoder, dbc.DbcDecoder)
     link = build(interface="virtual", channel=channel)
-    link.set_address_filter(decoder.addresses)
+    link.set_address_filter(decoder.accepted_addresses)
     link.open()
     for i in range(20):
         peer.send(make_message(0x18FEF100, True))  # other traffic of a truck

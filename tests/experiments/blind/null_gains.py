@@ -88,7 +88,7 @@ def compare_with_thresholds(model: NoiseModel, n: int, recordings: int) -> str:
         for at in range(SIMULATED_RECORDINGS):
             results = [(null[axis][name], after[axis][at][name].gain, name) for axis in after for name in DIAGNOSTICS]
             above.append(any(gain > limits.threshold for limits, gain, _ in results))
-            searched.append(any(gain > limits.search_threshold for limits, gain, _ in results))
+            searched.append(any(gain > limits.min_gain_to_test_effects for limits, gain, _ in results))
             for limits, gain, name in results:
                 gains[name].append(gain)
                 thresholds[name].append(limits.threshold)

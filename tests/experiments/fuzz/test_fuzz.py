@@ -9,7 +9,7 @@ import pytest
 import drivers.decoders
 from drivers import module_lookup
 from drivers.data_types import Chunk
-from drivers.decoders.base import FrameBuffer, Frames
+from drivers.decoders.base import FrameBuffer, RawFrames
 from drivers.recordings import FORMATS
 from tests.experiments.fuzz import limits
 from tests.experiments.fuzz.limits import enforce_limits, try_input
@@ -115,7 +115,7 @@ def test_sample_of_a_frame_with_wrong_checksum_is_a_finding(monkeypatch: pytest.
 def test_samples_that_depend_on_the_chunks_are_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     feed = FrameBuffer.feed
 
-    def feed_and_drop_buffer(self: FrameBuffer, chunks: Sequence[Chunk]) -> Frames:
+    def feed_and_drop_buffer(self: FrameBuffer, chunks: Sequence[Chunk]) -> RawFrames:
         frames = feed(self, chunks)
         self._buffer_offset += len(self._buffer)
         self._buffer = b""

@@ -21,6 +21,8 @@ MIN_SEGMENTS: Final = 16
 """Smallest number of segments of a coherence."""
 MIN_Z: Final = 4.5
 """Smallest number of standard deviations of a confirmed finding."""
+STEP_LENGTHS: Final = (20, 60, 200)
+"""Numbers of samples of the means before and after a step."""
 
 
 @dataclass(frozen=True)
@@ -194,18 +196,25 @@ def _regression(y: Floats, tested: Floats, others: Floats, text: str) -> Check:
 
 
 def _check_step(recording: CheckedRecording, axis: str, p: Parameters) -> Check:
+    """Compare the change of the mean at a step with the changes at all other times.
+
+    Other steps can hide a step in long means, and slow noise hides it less in short means, so several lengths are used.
+    """
     x, rate_hz = recording.values[axis], recording.rate_hz
-    at, size = int(p["time"] * rate_hz), int(max(20.0, 0.02 * x.size))
-    if not size // 2 < at < x.size - size // 2:
-        return Check(False, "too close to an end of the recording")
+    at = int(p["time"] * rate_hz)
     sums = np.concatenate([[0.0], np.cumsum(x)])
-    places = np.arange(size, x.size - size, max(size // 10, 1))
-    changes = (sums[places + size] - 2.0 * sums[places] + sums[places - size]) / size
-    away = np.abs(places - at) > size
-    left, right = max(at - size, 0), min(at + size, x.size)
-    found = float(x[at:right].mean() - x[left:at].mean())
-    scatter = 1.4826 * float(np.median(np.abs(changes[away] - np.median(changes[away]))))
-    return _z_check(found / scatter, "change of the mean beside other changes")
+    best = 0.0
+    for size in {*STEP_LENGTHS, int(max(STEP_LENGTHS[0], 0.02 * x.size))}:
+        if not size // 2 < at < x.size - size // 2:
+            continue
+        places = np.arange(size, x.size - size, max(size // 10, 1))
+        changes = (sums[places + size] - 2.0 * sums[places] + sums[places - size]) / size
+        away = np.abs(places - at) > size
+        left, right = max(at - size, 0), min(at + size, x.size)
+        found = float(x[at:right].mean() - x[left:at].mean())
+        scatter = 1.4826 * float(np.median(np.abs(changes[away] - np.median(changes[away]))))
+        best = max(best, found / scatter, key=abs)
+    return _z_check(best, "change of the mean beside other changes")
 
 
 def _check_jumps(recording: CheckedRecording, axis: str, p: Parameters) -> Check:
@@ -263,6 +272,7 @@ def _check_temperature(recording: CheckedRecording, axis: str, p: Parameters) ->
 def _check_leak(recording: CheckedRecording, axis: str, source: str, coefficient: float) -> Check:
     """Compare the regression coefficients of eight frequency bands.
 
+    The lowest hundredth of the frequencies is not used, because a drift would outweigh all other frequencies of a band.
     Knocks move both axes in any direction and can outweigh all other samples of a regression. Samples beyond
     ``MAX_KNOCK_DEVIATIONS`` robust standard deviations on one of the axes are therefore interpolated on both axes.
     """
@@ -276,7 +286,7 @@ def _check_leak(recording: CheckedRecording, axis: str, source: str, coefficient
     )
     at = np.arange(quiet.size)
     x, y = (np.fft.rfft(np.interp(at, at[quiet], one[quiet])) for one in both)
-    edges = np.linspace(1, x.size, 9).astype(int)
+    edges = np.linspace(max(x.size // 100, 1), x.size, 9).astype(int)
     bands, errors = [], []
     for first, last in pairwise(edges.tolist()):
         a, b = x[first:last], y[first:last]

@@ -15,7 +15,7 @@ from drivers.data_types import Floats, make_block
 from monitor.common.compiled import Kernel
 from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.drift.thermal.thermal_response import apply_first_order_lag
-from monitor.estimation.detection.signal_monitor import SignalMonitor
+from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
 from monitor.estimation.estimator import MIN_SAMPLES, Estimator
 from tests.support.waiting import PATIENCE_S
 
@@ -72,7 +72,7 @@ def process_random_samples(seed: int) -> list[Any]:
     values = draw_random_signal(rng, n)
     estimator = Estimator(RATE_HZ, float(rng.choice([2.0, 10.0, 60.0])), every_sample=seed % 4 == 0)
     monitor, compensation = (
-        SignalMonitor(RATE_HZ, bool(seed % 2), 10.0, keep_samples_at_rest=True),
+        MotionAndChangeMonitor(RATE_HZ, bool(seed % 2), 10.0, keep_samples_at_rest=True),
         LiveDriftCompensation(RATE_HZ),
     )
     found: list[Any] = []

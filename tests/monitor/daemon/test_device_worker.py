@@ -335,7 +335,7 @@ def test_replay_through_the_reader_thread_is_processed_to_the_end():
     harness.link.end()
     harness.worker.start_reader_and_resume_recording()
     wait_for(lambda: harness.process(time.monotonic()) or harness.worker.replay_finished, "the end of the replay")
-    harness.worker.stop()
+    harness.worker.stop_reader_thread()
     assert harness.worker.join_reader_thread(PATIENCE_S)
     harness.process(time.monotonic(), drain=True)
     assert sum(map(len, harness.output.blocks)) == 400
@@ -473,12 +473,12 @@ def test_replay_is_finished_only_when_its_samples_are_fitted():
     harness.ready.fit.set()
     harness.process(1002.0)
     assert harness.output.estimates[-1][1].coefficients.status.max() > 0
-    assert harness.worker.pipeline.signal_monitor is None
+    assert harness.worker.pipeline.motion_and_change_monitor is None
     harness.ready.all.set()
     assert harness.worker.replay_finished
     harness.push_samples(10)
     harness.process(1003.0)
-    assert harness.worker.pipeline.signal_monitor is not None
+    assert harness.worker.pipeline.motion_and_change_monitor is not None
 
 
 def test_low_rate_device_is_estimated_by_interpreted_kernels():
@@ -486,7 +486,7 @@ def test_low_rate_device_is_estimated_by_interpreted_kernels():
     harness.push_samples(300)
     harness.process(1000.0)
     assert harness.output.estimates[-1][1].coefficients.status.max() > 0
-    assert harness.worker.pipeline.signal_monitor is not None
+    assert harness.worker.pipeline.motion_and_change_monitor is not None
     harness.worker.driver.state = "running"
     harness.ready.progress = "compiling 2 of 8: fit"
     assert harness.worker.status.build_health({}, 0).text == "compiling 2 of 8: fit; no sample is lost"
@@ -649,7 +649,7 @@ def test_disabled_thermal_model_gives_no_predictions():
     harness = WorkerHarness(thermal_s=None)
     push_samples_with_thermal_bias(harness, 5.0)
     assert (harness.worker.pipeline.thermal, harness.output.thermals) == (None, [])
-    assert harness.worker.pipeline.signal_monitor.take_samples_with_motion_masked() == []
+    assert harness.worker.pipeline.motion_and_change_monitor.take_samples_with_motion_masked() == []
 
 
 def test_without_a_model_nothing_is_compared():

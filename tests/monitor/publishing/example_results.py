@@ -13,7 +13,7 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve, compute_hadamard_curve
 from monitor.estimation.allan.total import TotalVarianceCurve, compute_total_curve
 from monitor.estimation.analysis import RecordingAnalysis
-from monitor.estimation.detection.comparison_with_noise_model import ModelAllanVariances, ModelComparison
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison, NoiseModelComparator
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
 from monitor.estimation.fit.coefficient_values import Coefficients, Status
@@ -96,8 +96,8 @@ def make_comparison(found: Estimate | None = None, scale: float = 1.0, **agrees:
         f"[{axis}]\n" + "\n".join(f"{name} = {float(coefficients[row, i])}" for row, name in enumerate(names))
         for i, axis in enumerate(AXES)
     )
-    in_force = ModelAllanVariances(NoiseModel.from_toml(text), 360_000)
-    return replace(in_force.compare_with_estimate(found), agrees=agrees)
+    comparator = NoiseModelComparator(NoiseModel.from_toml(text), 360_000)
+    return replace(comparator.compare_with_estimate(found), agrees=agrees)
 
 
 def make_thermal_result(t_ns: int = 0, bias: float = 3e-4) -> ThermalIntervalResult:

@@ -117,13 +117,13 @@ def test_problems_determine_rank_and_description() -> None:
     assert make_device(state="waiting").problems_first_rank(100.0) == 1
     assert make_device().problems_first_rank(100.0) == 2
     assert make_device(state="ended").problems_first_rank(100.0) == 3
-    assert make_device().describe_problems() == ""
-    assert make_device(outputs={"zenoh": "off", "viewer": "ok"}).describe_problems() == ""
+    assert make_device().describe_device_problems() == ""
+    assert make_device(outputs={"zenoh": "off", "viewer": "ok"}).describe_device_problems() == ""
     stalled = make_device(outputs={"zenoh": "ok", "viewer": "stalled"}, text="odd", overflowed=1200)
     assert stalled.problems_first_rank(100.0) == 1
-    assert stalled.describe_problems().startswith("odd; viewer: stalled; 1,200 samples overwritten")
+    assert stalled.describe_device_problems().startswith("odd; viewer: stalled; 1,200 samples overwritten")
     other_port = make_device(outputs={"zenoh": "ok, but the port is busy"})
-    assert (other_port.problems_first_rank(100.0), other_port.describe_problems()) == (
+    assert (other_port.problems_first_rank(100.0), other_port.describe_device_problems()) == (
         2,
         "zenoh: ok, but the port is busy",
     )
@@ -151,7 +151,7 @@ def test_disagreement_with_the_model_is_a_problem() -> None:
     found = gap.axes["gz"]
     lo, hi = found.where.tau
     assert (
-        remote_device.describe_problems()
+        remote_device.describe_device_problems()
         == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
     )
     remote_device.update_from_message(
@@ -159,12 +159,12 @@ def test_disagreement_with_the_model_is_a_problem() -> None:
             ModelGapMessage, ModelGapMessage.from_result("a", 1.0, 0, example_results.make_comparison(gz=True)).encode()
         )
     )
-    assert (remote_device.problems_first_rank(0.0), remote_device.describe_problems()) == (2, "")
+    assert (remote_device.problems_first_rank(0.0), remote_device.describe_device_problems()) == (2, "")
 
 
 def test_exceeded_limit_is_a_problem() -> None:
     remote_device = make_device(crossed=("gz N",))
     assert remote_device.problems_first_rank(100.0) == 1
-    assert remote_device.describe_problems() == "limits exceeded: gz N"
+    assert remote_device.describe_device_problems() == "limits exceeded: gz N"
     many = make_device(crossed=tuple(f"gz {i}" for i in range(100)))
-    assert many.describe_problems() == "limits exceeded: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"
+    assert many.describe_device_problems() == "limits exceeded: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"

@@ -49,6 +49,7 @@ def hidden(name):
         "line": noise() + LINE,
         "louder": 1.15 * noise(),
         "outliers": noise() + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
+        "line and outliers": noise() + LINE + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
         "clustered outliers": noise() + np.repeat(rng.random(n // 4) < 1e-3, 4) * 1.5e-2 * rng.standard_normal(n),
         "correlated": noise() + correlated(n, rng, 3e-4, 0.5),
         "filtered and coarse": 4e-4 * np.rint(noise() / 4e-4),
@@ -148,6 +149,21 @@ def test_a_rival_of_another_group_reduces_the_confidence(rival_score, confidence
     (step,) = build_axis_result(changed, STRICT, STRICT).steps
     assert step.confidence == pytest.approx(confidence, abs=0.01)
     assert step.runners_up[0].effect == "narrowband"
+
+
+def test_effect_that_is_added_too_does_not_reduce_the_confidence():
+    search = found("line and outliers")
+    added = search.hypothesis.added
+    rounds = list(search.rounds)
+    at = next(k for k, one in enumerate(rounds) if one.trials[0].name == "sinusoidal")
+    other = next(effect for effect in added if effect.name == "outliers")
+    selected = rounds[at].trials[0]
+    for effect, confidence in ((other, 1.0), (None, 0.5)):
+        rival = Trial("outliers", effect, selected.score)
+        rounds[at] = replace(rounds[at], trials=(selected, rival))
+        steps = build_axis_result(replace(search, rounds=tuple(rounds)), STRICT, STRICT).steps
+        (line,) = (one for one in steps if one.effect == "sinusoidal")
+        assert line.confidence == pytest.approx(confidence, abs=0.01)
 
 
 def test_one_size_and_a_common_factor_of_white_noise_are_equally_likely():

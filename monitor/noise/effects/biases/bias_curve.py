@@ -7,11 +7,11 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import ConfigError
-from monitor.noise.effect import NoiseSeries, NonstationaryBias, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class BiasCurve(NonstationaryBias):
+class BiasCurve(BiasWithoutSpectrum):
     """Curved drift b = s t + c t² + a ln(1 + t/τ), which starts at zero.
 
     The logarithm describes the ageing of quartz resonators (MIL-PRF-55310).
@@ -28,7 +28,7 @@ class BiasCurve(NonstationaryBias):
     description: ClassVar[str] = "The bias drifts along a curve, for example while a sensor ages."
 
     def __post_init__(self) -> None:
-        NonstationaryBias.__post_init__(self)
+        BiasWithoutSpectrum.__post_init__(self)
         if (self.logarithmic is None) != (self.time_constant is None):
             raise ConfigError(f"{self.name}: logarithmic and time_constant need each other")
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.noise.effect import (
-    NonstationaryBias,
+    BiasWithoutSpectrum,
     SampleBlockContext,
     StatelessSeries,
     first_sample_at_or_after,
@@ -16,7 +16,7 @@ from monitor.noise.effect import (
 
 
 @dataclass(frozen=True, slots=True)
-class BiasStep(NonstationaryBias):
+class BiasStep(BiasWithoutSpectrum):
     """Bias step of size ``height`` at the first sample at or after ``time``.
 
     >>> bool(np.isnan(BiasStep(time=60.0, height=1e-3).avar(np.array([1.0]), 0.01)[0]))

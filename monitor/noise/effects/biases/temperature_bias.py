@@ -6,11 +6,11 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NonstationaryBias, SampleBlockContext, StatelessSeries, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, SampleBlockContext, StatelessSeries, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureBias(NonstationaryBias):
+class TemperatureBias(BiasWithoutSpectrum):
     """Bias that is a polynomial of the temperature: b = c (T − T_r) + q (T − T_r)² + k (T − T_r)³ (IEEE Std 952).
 
     >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).two_sided_psd(np.array([1.0]), 0.01)[0]))

@@ -7,11 +7,11 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, NonstationaryBias, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureHysteresis(NonstationaryBias):
+class TemperatureHysteresis(BiasWithoutSpectrum):
     """Hysteresis between the heating branch and the cooling branch (stop operator of Prandtl).
 
     The bias is b = h x. The state x follows dx = dT/r, limited to −½ … ½. It is ½ on the heating branch and −½ on the

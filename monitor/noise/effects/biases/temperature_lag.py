@@ -8,11 +8,11 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, NonstationaryBias, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureLag(NonstationaryBias):
+class TemperatureLag(BiasWithoutSpectrum):
     """Bias that follows the temperature with a first-order lag (Newton's law of cooling).
 
     The bias is b = c (T_l − T_r), where dT_l/dt = (T − T_l)/τ. The lagged temperature T_l starts at the first

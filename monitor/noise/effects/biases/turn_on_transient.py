@@ -8,11 +8,11 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, NonstationaryBias, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
-class TurnOnTransient(NonstationaryBias):
+class TurnOnTransient(BiasWithoutSpectrum):
     """Exponential transient A exp(−t/τ) that starts at the first sample (warm-up term of IEEE Std 952).
 
     >>> bool(np.isnan(TurnOnTransient(amplitude=1e-3, time_constant=60.0).avar(np.array([1.0]), 0.01)[0]))

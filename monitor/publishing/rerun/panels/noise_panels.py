@@ -27,7 +27,7 @@ from monitor.publishing.rerun.panels.panel import Panel
 from monitor.publishing.rerun.panels.panel_text import noise_text
 
 if TYPE_CHECKING:
-    from monitor.publishing.rerun.viewer_scene import Scene
+    from monitor.publishing.rerun.viewer_scene import AllDevicesScene
 
 MAX_INTERMEDIATE_POINTS: Final = 20
 """Largest number of points that are drawn between two estimates. More points would overload the viewer."""
@@ -58,7 +58,7 @@ class ModelDifferencePanel(Panel):
 class AllanAndCoefficientPanel(Panel):
     """Allan plots, tables of noise coefficients, and heat maps of the Allan deviation over time."""
 
-    def __init__(self, scene: "Scene", device: str) -> None:
+    def __init__(self, scene: "AllDevicesScene", device: str) -> None:
         super().__init__(scene, device)
         self._plot = allan_drawing.AllanPlotPair(scene.log, self.entity_path("allan"))
         self._history = AllanHistory()

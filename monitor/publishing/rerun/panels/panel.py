@@ -23,7 +23,7 @@ from monitor.publishing.rerun.shared_views import markdown_document
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 
 if TYPE_CHECKING:
-    from monitor.publishing.rerun.viewer_scene import Scene
+    from monitor.publishing.rerun.viewer_scene import AllDevicesScene
     from monitor.publishing.result_kinds import CompensatedRateBatch, SampleBatch
 
 
@@ -38,7 +38,7 @@ class Panel:
         Name of the device.
     """
 
-    def __init__(self, scene: "Scene", device: str) -> None:
+    def __init__(self, scene: "AllDevicesScene", device: str) -> None:
         self.scene = scene
         self.device = device
 

@@ -119,7 +119,7 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
     if status is None:
         return f"| **{name}** | {state_text} | | | | | {' | '.join(noise)} | no data yet |"
     rate = format_sample_rate(status.rate_hz)
-    problems = _escape_cell(one.describe_problems()) or (
+    problems = _escape_cell(one.describe_device_problems()) or (
         f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
     )
     counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"

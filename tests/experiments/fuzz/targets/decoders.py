@@ -233,7 +233,7 @@ def _can(i: int) -> tuple[Any, DbcSettings, Any]:
         path.write_text(text or "")
         settings = read_settings(DbcSettings, {"file": str(path) if text else file, **keys})
         database = ConfiguredDbcMessages(settings)
-        return database.messages, settings, database.timing
+        return database.messages_with_configured_signals, settings, database.timing
 
 
 def _can_decoder(i: int) -> DbcDecoder:
@@ -243,7 +243,7 @@ def _can_decoder(i: int) -> DbcDecoder:
 
 def _build_frames(reader: InputReader, decoder: DbcDecoder) -> list[Chunk]:
     """Return frames with addresses of the decoder and with other addresses."""
-    addresses = [address & ~(1 << 30) for address in decoder.addresses]
+    addresses = [address & ~(1 << 30) for address in decoder.accepted_addresses]
     t_ns = START_NS
     chunks = []
     while reader and len(chunks) < 40:
@@ -415,7 +415,7 @@ def _message_seeds(name: str) -> Iterator[bytes]:
 def wire_dbc(data: bytes) -> None:
     """Check frames of eight bytes. A byte before each frame selects its address."""
     decoder = _can_decoder(data[0] % len(CAN) if data else 0)
-    addresses = [address & ~(1 << 30) for address in decoder.addresses]
+    addresses = [address & ~(1 << 30) for address in decoder.accepted_addresses]
     cut = [data[at : at + 9] for at in range(1, min(len(data), 100), 9)]
     feed_and_check(decoder, [[Chunk(part[1:], START_NS, addresses[part[0] % len(addresses)]) for part in cut]])
 

@@ -326,5 +326,11 @@ def database(data: bytes) -> None:
     tail = data[-64:]
     feed_and_check(
         decoder,
-        [[Chunk(tail[: 8 + i % 2 * 56], 5, address & ~(1 << 30)) for i in range(3) for address in decoder.addresses]],
+        [
+            [
+                Chunk(tail[: 8 + i % 2 * 56], 5, address & ~(1 << 30))
+                for i in range(3)
+                for address in decoder.accepted_addresses
+            ]
+        ],
     )

@@ -352,7 +352,7 @@ def test_window_after_a_restart_equals_the_window_before(tmp_path: Path) -> None
     # bounds are computed to seven digits
     np.testing.assert_allclose(new.coefficients.hi, old.coefficients.hi, rtol=1e-6)
     np.testing.assert_array_equal(new.coefficients.status, old.coefficients.status)
-    assert after.pipeline.signal_monitor is not None
+    assert after.pipeline.motion_and_change_monitor is not None
     (event,) = after.timeline._events
     assert event.kind == "window_rebuilt"
     assert event.text == "30 s of the window were rebuilt from the recording"
@@ -409,7 +409,7 @@ def test_samples_missed_during_the_restart_are_counted_as_lost(tmp_path: Path, t
         )
         assert after.pipeline.estimator.samples_in_window == 3000
     finally:
-        after.stop()
+        after.stop_reader_thread()
         after.join_reader_thread(PATIENCE_S)
 
 

@@ -11,7 +11,7 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.comparison_with_noise_model import (
     MIN_EDF,
     MIN_SAMPLES,
-    ModelAllanVariances,
+    NoiseModelComparator,
     chi2_ratio_to_normal_score,
     count_axis_samples_in_window,
     max_abs_z_limit,
@@ -76,8 +76,8 @@ def simulate_estimate(model: NoiseModel, n: int, seed: int) -> Estimate:
 def test_scores_of_a_true_model_are_standard_normal(effects: tuple[Effect, ...]) -> None:
     """The test covers every τ; a wrong number of degrees of freedom would change the spread."""
     model = make_model(*effects)
-    in_force = ModelAllanVariances(model, 12_000)
-    comparisons = [in_force.compare_with_estimate(simulate_estimate(model, 12_000, seed)) for seed in range(40)]
+    comparator = NoiseModelComparator(model, 12_000)
+    comparisons = [comparator.compare_with_estimate(simulate_estimate(model, 12_000, seed)) for seed in range(40)]
     assert all(list(comparison.axes) == list(AXES) for comparison in comparisons)
     z = np.array([axis.z for comparison in comparisons for axis in comparison.axes.values()])
     valid = ~np.isnan(z).any(axis=0)
@@ -96,7 +96,7 @@ def test_scores_of_a_true_model_are_standard_normal(effects: tuple[Effect, ...])
 def test_unmodeled_line_is_found_at_its_averaging_time_with_its_size() -> None:
     true = make_model(*FIVE_TERMS)
     measured = true + NoiseModel({"gz": (Sinusoidal(amplitude=6e-4, frequency=5.0),)})
-    comparison = ModelAllanVariances(true, 30_000).compare_with_estimate(simulate_estimate(measured, 30_000, 5))
+    comparison = NoiseModelComparator(true, 30_000).compare_with_estimate(simulate_estimate(measured, 30_000, 5))
     gz = comparison.axes["gz"]
     assert gz.gap > gz.threshold
     lo, hi = gz.tau_s
@@ -110,7 +110,7 @@ def test_unmodeled_line_is_found_at_its_averaging_time_with_its_size() -> None:
 
 
 def test_too_little_noise_is_also_found() -> None:
-    comparison = ModelAllanVariances(make_model(WHITE), 10_000).compare_with_estimate(
+    comparison = NoiseModelComparator(make_model(WHITE), 10_000).compare_with_estimate(
         simulate_estimate(make_model(AngleRandomWalk(N=1.2e-4)), 10_000, 1)
     )
     for axis in comparison.axes.values():
@@ -122,7 +122,7 @@ def test_too_little_noise_is_also_found() -> None:
 def test_small_difference_is_found_in_a_long_window() -> None:
     """z is in standard deviations of the window, 1/√edf of the deviation at one sample."""
     n = 100_000
-    comparison = ModelAllanVariances(make_model(WHITE), n).compare_with_estimate(
+    comparison = NoiseModelComparator(make_model(WHITE), n).compare_with_estimate(
         simulate_estimate(make_model(AngleRandomWalk(N=1.5e-4 * 1.02)), n, 3)
     )
     shortest = [axis.z[0] for axis in comparison.axes.values()]
@@ -133,19 +133,19 @@ def test_axes_without_model_or_samples_are_not_compared() -> None:
     model = make_model(WHITE, axes=("gx", "gz")) + NoiseModel({"ay": (ConstantBias(value=1.0),)})
     heated = model + NoiseModel({"gx": (TemperatureBias(coefficient=1e-3, reference=20.0),)})
     values = make_model(WHITE).simulate(5000, RATE, 1)
-    assert list(ModelAllanVariances(model, 5000).compare_with_estimate(estimate_values(values)).axes) == ["gx", "gz"]
-    assert list(ModelAllanVariances(heated, 5000).compare_with_estimate(estimate_values(values)).axes) == [
+    assert list(NoiseModelComparator(model, 5000).compare_with_estimate(estimate_values(values)).axes) == ["gx", "gz"]
+    assert list(NoiseModelComparator(heated, 5000).compare_with_estimate(estimate_values(values)).axes) == [
         "gz"
     ]  # the temperature of gx is unknown
     values[:, 2] = np.nan
-    assert list(ModelAllanVariances(model, 5000).compare_with_estimate(estimate_values(values)).axes) == ["gx"]
+    assert list(NoiseModelComparator(model, 5000).compare_with_estimate(estimate_values(values)).axes) == ["gx"]
 
 
 def test_too_few_samples_give_no_comparison() -> None:
-    in_force = ModelAllanVariances(make_model(WHITE), 5000)
+    comparator = NoiseModelComparator(make_model(WHITE), 5000)
     values = make_model(WHITE).simulate(MIN_SAMPLES, RATE, 1)
-    assert in_force.compare_with_estimate(estimate_values(values[:-1], 5000)).axes == {}
-    assert list(in_force.compare_with_estimate(estimate_values(values, 5000)).axes) == list(AXES)
+    assert comparator.compare_with_estimate(estimate_values(values[:-1], 5000)).axes == {}
+    assert list(comparator.compare_with_estimate(estimate_values(values, 5000)).axes) == list(AXES)
 
 
 def test_restarted_axis_is_compared_by_its_own_samples() -> None:
@@ -154,11 +154,11 @@ def test_restarted_axis_is_compared_by_its_own_samples() -> None:
     values = model.simulate(20_000, RATE, 1)
     values[:17_000, 2] *= 3.0
     estimator.add_samples(make_block(np.arange(20_000) * 10_000_000, values.copy()))
-    in_force = ModelAllanVariances(model, estimator.window_length_samples)
-    gz = in_force.compare_with_estimate(estimator.get_estimate(fit_coefficients=False)).axes["gz"]
+    comparator = NoiseModelComparator(model, estimator.window_length_samples)
+    gz = comparator.compare_with_estimate(estimator.get_estimate(fit_coefficients=False)).axes["gz"]
     assert gz.gap > gz.threshold
     estimator.restart_axis(2, 3000)
-    comparison = in_force.compare_with_estimate(estimator.get_estimate(fit_coefficients=False))
+    comparison = comparator.compare_with_estimate(estimator.get_estimate(fit_coefficients=False))
     assert comparison.axes["gz"].gap <= comparison.axes["gz"].threshold
     assert (comparison.axes["gz"].samples, comparison.axes["gx"].samples) == (3000, 20_000)
     assert count_axis_samples_in_window(estimator.get_estimate(fit_coefficients=False).curve, 2) == 3000
@@ -170,20 +170,20 @@ def test_gaps_do_not_cause_disagreement() -> None:
     model = make_model(*FIVE_TERMS)
     values = model.simulate(30_000, RATE, 2)
     values[np.random.default_rng(1).random(30_000) < 0.01] = np.nan
-    comparison = ModelAllanVariances(model, 30_000).compare_with_estimate(estimate_values(values))
+    comparison = NoiseModelComparator(model, 30_000).compare_with_estimate(estimate_values(values))
     assert list(comparison.axes) == list(AXES)
     assert not any(axis.gap > axis.threshold for axis in comparison.axes.values())
 
 
 def test_refined_rate_rescales_the_model_but_not_the_gap() -> None:
     model = make_model(WHITE)
-    in_force = ModelAllanVariances(model, 10_000)
+    comparator = NoiseModelComparator(model, 10_000)
     found = simulate_estimate(model, 10_000, 4)
-    before = in_force.compare_with_estimate(found).axes["gz"]
+    before = comparator.compare_with_estimate(found).axes["gz"]
     curve: AllanCurve = replace(found.curve, tau_s=found.curve.factors / 104.0)
-    after = in_force.compare_with_estimate(replace(found, rate_hz=104.0, curve=curve)).axes["gz"]
+    after = comparator.compare_with_estimate(replace(found, rate_hz=104.0, curve=curve)).axes["gz"]
     assert after.model == pytest.approx(before.model * np.sqrt(1.04))  # N divided by the root of a shorter τ
-    assert in_force.compare_with_estimate(found).axes["gz"].gap == before.gap
+    assert comparator.compare_with_estimate(found).axes["gz"].gap == before.gap
 
 
 def test_normal_score_agrees_with_the_chi_square_distribution() -> None:

@@ -35,7 +35,7 @@ def test_column_is_the_allan_variance_of_filtered_noise(order, cutoff_hz):
     factors = np.array([1, 2, 5, 16, 100, 1000])
     values = simulate_filtered_noise(order, cutoff_hz, 400_000)
     measured = overlapping_avar(values, factors)[0].mean(axis=1) / (ANGLE_RANDOM_WALK**2 * RATE_HZ)
-    stated = LowPass("digital", order, cutoff_hz / RATE_HZ).avar(factors)
+    stated = LowPass("digital", order, cutoff_hz / RATE_HZ).filtered_white_noise_avar(factors)
     assert measured[:4] == pytest.approx(stated[:4], rel=0.02)
     assert measured == pytest.approx(stated, rel=0.12)
 
@@ -47,7 +47,7 @@ def test_analogue_filter_equals_a_much_faster_digital_filter(cutoff_hz):
     fast = sosfilt(sections, np.random.default_rng(2).standard_normal((2_000_000, 6)), axis=0)[20_000:]
     factors = np.array([1, 2, 8, 64])
     measured = overlapping_avar(fast[::20], factors)[0].mean(axis=1)
-    stated = LowPass("sampled", 2, cutoff_hz / RATE_HZ).avar(factors)
+    stated = LowPass("sampled", 2, cutoff_hz / RATE_HZ).filtered_white_noise_avar(factors)
     assert measured / stated == pytest.approx(np.full(4, (measured / stated).mean()), rel=0.04)
 
 

@@ -8,14 +8,14 @@ import pytest
 
 from drivers.errors import ConfigError
 from monitor.publishing.reports.comparison_page import render_page
-from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
+from monitor.reconcile.several_recordings.comparison import RecordingsComparison, compare_results
 from tests.monitor.publishing.reports.test_reconcile_page import PageText
 from tests.monitor.reconcile.runs_made import DIAGNOSTIC, line, run, step, with_axes
 
 pytest.importorskip("jinja2")
 
 
-def make_comparison() -> Comparison:
+def make_comparison() -> RecordingsComparison:
     own = step("bias_step", time=350.0, height=1e-3)
     first = with_axes(run("cold <1>", line(1.5e-4)), run("cold <1>", axis="gx"))
     return compare_results(

@@ -18,7 +18,7 @@ from PIL import Image
 
 from monitor.publishing.rerun import blueprint, dynamic_heat_map
 from monitor.publishing.rerun.bounded_allan_history import COLUMNS
-from monitor.publishing.rerun.viewer_scene import Scene
+from monitor.publishing.rerun.viewer_scene import AllDevicesScene
 
 T0 = 1.76e9
 
@@ -58,7 +58,7 @@ def test_recording_has_surfaces_labels_and_marks(tmp_path: Path) -> None:
     path = tmp_path / "scene.rrd"
     stream = rr.RecordingStream("imu-monitor")
     stream.save(path)
-    scene = Scene(stream)
+    scene = AllDevicesScene(stream)
     scene.set_detailed_devices([ViewerDeviceDescription("bench-1")])
     for i in range(12):
         scene.draw("bench-1", "AllanAndCoefficientPanel", [(T0 + i, example_results.make_estimate(T0 + i, seed=i))])

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from monitor.publishing.terminal.reconcile_text import print_comparison, print_reconciliation
 from monitor.reconcile.result import Reconciliation
-from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
+from monitor.reconcile.several_recordings.comparison import RecordingsComparison, compare_results
 from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import line, run, step, with_axes
 
@@ -78,13 +78,13 @@ def test_long_lines_wrap_inside_their_column(width: int) -> None:
         assert word in words
 
 
-def render_comparison(c: Comparison, width: int = 140) -> list[str]:
+def render_comparison(c: RecordingsComparison, width: int = 140) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
     print_comparison(c, console)
     return console.export_text().splitlines()
 
 
-def make_comparison() -> Comparison:
+def make_comparison() -> RecordingsComparison:
     both = with_axes(run("warm", line(), step("bias_step", time=350.0, height=1e-3)), run("warm", axis="gx"))
     return compare_results([run("cold", line(3e-4)), both], None, {"short": "200 samples"})
 

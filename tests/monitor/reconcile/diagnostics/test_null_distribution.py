@@ -7,7 +7,7 @@ from scipy.stats import expon
 from monitor.noise.effects import AngleRandomWalk, PoissonSteps, RateRandomWalk, Resolution, Saturation
 from monitor.reconcile.diagnostics.null_distribution import (
     FALSE_ALARM_PROBABILITY,
-    NULL_GAINS,
+    NULL_GAIN_QUANTILE_PARAMETERS,
     SIMULATED_RECORDINGS,
     NullDistribution,
     all_simulations_have_improbable_gain,
@@ -24,7 +24,7 @@ PLACES = 500.0
 
 
 def quartile(diagnostic):
-    law = NULL_GAINS[diagnostic]
+    law = NULL_GAIN_QUANTILE_PARAMETERS[diagnostic]
     return law.offset + law.slope * np.log(PLACES)
 
 
@@ -34,7 +34,7 @@ def simulated(count, rng, shift=0.0):
     for _ in range(count):
         excess = rng.exponential(size=len(DIAGNOSTICS)) - np.log(4.0) + shift
         gains = {
-            diagnostic: quartile(diagnostic) + NULL_GAINS[diagnostic].scale * e
+            diagnostic: quartile(diagnostic) + NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale * e
             for diagnostic, e in zip(DIAGNOSTICS, excess, strict=True)
         }
         found.append({diagnostic: Finding(float(g), Location(), PLACES) for diagnostic, g in gains.items()})
@@ -44,7 +44,7 @@ def simulated(count, rng, shift=0.0):
 def test_levels_are_those_of_an_exponential():
     null = estimate_null_distributions({name: simulated(1, np.random.default_rng(0)) for name in ("gx", "gy", "gz")})
     for diagnostic in DIAGNOSTICS:
-        start, scale = quartile(diagnostic), NULL_GAINS[diagnostic].scale
+        start, scale = quartile(diagnostic), NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale
         assert null["gx"][diagnostic].null95 == pytest.approx(start + scale * (expon.isf(0.05) - np.log(4.0)))
         # once in 100 recordings, of all diagnostics and axes together
         chance = expon.isf(0.01 / (len(DIAGNOSTICS) * 3)) - np.log(4.0)
@@ -80,7 +80,7 @@ def test_more_axes_ask_for_more():
     for diagnostic in DIAGNOSTICS:
         assert six[diagnostic].null95 == one[diagnostic].null95
         assert six[diagnostic].threshold - one[diagnostic].threshold == pytest.approx(
-            NULL_GAINS[diagnostic].scale * np.log(6.0)
+            NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale * np.log(6.0)
         )
 
 
@@ -126,8 +126,10 @@ def test_gains_of_true_models_follow_the_expected_law(model, n):
         rng = np.random.default_rng([n, seed])
         y = white(n, rng) + sum(walk(n, rng, one.K) for one in model if isinstance(one, RateRandomWalk))
         for diagnostic, found in run_diagnostics(seen(axis(y, (), warmth(n)), model)).items():
-            above[diagnostic] += found.gain > NULL_GAINS[diagnostic].quantile(found.places, 0.25)
-            beyond += found.gain > NULL_GAINS[diagnostic].quantile(found.places, FALSE_ALARM_PROBABILITY / 60.0)
+            above[diagnostic] += found.gain > NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].quantile(found.places, 0.25)
+            beyond += found.gain > NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].quantile(
+                found.places, FALSE_ALARM_PROBABILITY / 60.0
+            )
     assert beyond <= 1
     for diagnostic, count in above.items():
         assert count <= 22, diagnostic

@@ -13,7 +13,7 @@ from monitor.reconcile.likelihood.effect_roles import (
     build_unit_regressors,
     effect_size,
     with_effect_size,
-    with_regressor_factors,
+    with_regression_coefficients,
 )
 from tests.contracts.effect_examples import make_effect
 from tests.monitor.reconcile.axes import RATE_HZ, warmth
@@ -63,7 +63,7 @@ def test_columns_times_factors_are_the_series(kind):
         one = replace(one, delay=0.03)
     made = build_unit_regressors(one, n, RATE_HZ, warmth(n))
     factors = np.array([0.8, -1.7, 0.6])[: len(made)]
-    fitted = with_regressor_factors(one, factors)
+    fitted = with_regression_coefficients(one, factors)
     want = drawn(fitted)
     summed = sum(factor * column for factor, column in zip(factors, made, strict=True))
     if kind.name == "rate_ramp":  # a ramp's R is a size without a sign
@@ -77,7 +77,7 @@ def test_phase_of_a_line_is_in_its_two_columns():
     line = Sinusoidal(amplitude=0.4, frequency=7.3, phase=2.2)
     made = np.stack(build_unit_regressors(line, n, RATE_HZ, None))
     factors, *_ = np.linalg.lstsq(made.T, drawn(line), rcond=None)
-    back = with_regressor_factors(line, factors)
+    back = with_regression_coefficients(line, factors)
     assert back.amplitude == pytest.approx(0.4)
     assert back.phase == pytest.approx(2.2)
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from monitor.reconcile.likelihood.whittle_fit import BinnedProductSums, maximise_whittle_likelihood
+from monitor.reconcile.likelihood.whittle_fit import BinnedRegressionSums, maximise_whittle_likelihood
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform
 
 n = 160
@@ -40,7 +40,7 @@ def dense(y, theta, beta=(0.0, 0.0, 0.0)):
 def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
     """Each coefficient in a bin of its own."""
     products = np.einsum("ik,jk->ijk", regressors, regressors)
-    found = BinnedProductSums(y**2, regressors * y, products)
+    found = BinnedRegressionSums(y**2, regressors * y, products)
     return maximise_whittle_likelihood(np.ones(n - 1), found, BASES, np.full(n - 1, constant), np.array(start))
 
 
@@ -124,7 +124,7 @@ def test_a_bin_of_many_is_the_sum_of_its_coefficients():
     regressors = rng.standard_normal((2, 2999))
     bases = np.array([np.ones(binned.count.size), 1.0 / binned.f_hz])
     products = np.array([[binned.sum_over_bins(a * b) for b in (y, *regressors)] for a in (y, *regressors)])
-    sums = BinnedProductSums(products[0, 0], products[1:, 0], products[1:, 1:])
+    sums = BinnedRegressionSums(products[0, 0], products[1:, 0], products[1:, 1:])
     found = maximise_whittle_likelihood(binned.count, sums, bases, np.zeros(binned.count.size), np.ones(2))
     each = binned.expand_to_coefficients(found.variance)
     left = y - found.beta @ regressors

@@ -22,8 +22,8 @@ from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.search.backward_elimination import (
     changed_sizes,
     eliminate_unneeded_effects,
+    revert_insignificant_size_changes,
     share_frequency_or_time,
-    with_significant_sizes,
 )
 from monitor.reconcile.search.cross_validation import accept_without_validation
 from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
@@ -89,13 +89,13 @@ def test_a_size_that_did_not_change_keeps_its_old_value():
     one = axis(noise(), MODEL)
     free = Hypothesis(MODEL, one.fit(MODEL))
     assert changed_sizes(free) == [0, 1]
-    assert with_significant_sizes(free).effects == MODEL
+    assert revert_insignificant_size_changes(free).effects == MODEL
 
 
 def test_of_two_sizes_the_one_that_changed_is_retuned():
     rng = np.random.default_rng(5)
     one = axis(1.1 * white(n, rng) + walk(n, rng), MODEL)
-    found = with_significant_sizes(Hypothesis(MODEL, one.fit(MODEL)))
+    found = revert_insignificant_size_changes(Hypothesis(MODEL, one.fit(MODEL)))
     assert changed_sizes(found) == [0]
     assert effect_size(found.effects[0]) == pytest.approx(1.1 * N, rel=0.02)
 
@@ -105,7 +105,7 @@ def test_a_term_that_is_compatible_with_zero_is_absent():
     rng = np.random.default_rng(6)
     one = axis(white(n, rng) + walk(n, rng), model)
     almost = (*MODEL, QuantizationNoise(Q=1e-8))
-    found = with_significant_sizes(Hypothesis(model, one.fit(almost, frozenset({0, 1, 2}))))
+    found = revert_insignificant_size_changes(Hypothesis(model, one.fit(almost, frozenset({0, 1, 2}))))
     assert changed_sizes(found) == [2]
     assert effect_size(found.effects[2]) == 0.0
 

@@ -223,7 +223,7 @@ def test_a_weak_ramp_is_named_although_every_diagnostic_is_below_its_threshold()
     found = looked(y + ramp * SIGMA * np.sqrt(2.0 * 12.5 / (ramp @ ramp)), (WHITE,))  # a gain of 12.5 nats
     assert names(found) == ["rate_ramp"]
     level = found.rounds[0].before.findings["level"].gain
-    assert STRICT["level"].search_threshold < level < STRICT["level"].threshold
+    assert STRICT["level"].min_gain_to_test_effects < level < STRICT["level"].threshold
 
 
 def test_poisson_steps_are_neither_correlated_noise_nor_another_bias_instability():

@@ -5,17 +5,17 @@ from dataclasses import replace
 from typing import Any
 
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
+from monitor.reconcile.several_recordings.comparison import RecordingsComparison, compare_results
 from monitor.reconcile.several_recordings.comparison_json import encode_comparison
 from tests.monitor.reconcile.runs_made import line, run, step
 
 
-def made() -> Comparison:
+def made() -> RecordingsComparison:
     leak = step("cross_axis", source=ParameterInterval("gx"), coefficient=ParameterInterval(0.1))
     return compare_results([run("a", line()), run("b", line(), leak)], None, {"c": "too short"})
 
 
-def written(c: Comparison) -> dict[str, Any]:
+def written(c: RecordingsComparison) -> dict[str, Any]:
     return dict(json.loads(encode_comparison(c)))
 
 

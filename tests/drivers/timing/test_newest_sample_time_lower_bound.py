@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.data_types import CounterTimedFormat, SampleBlock, make_block
+from drivers.timing.newest_sample_time_lower_bound import SETTLED_S, WINDOW_S, NewestSampleTimeLowerBound
 from drivers.timing.sample_clock import LastSample, SampleClock
-from drivers.timing.sample_time_lower_bound import SETTLED_S, WINDOW_S, NewestSampleTimeLowerBound
 
 NS_PER_S = 1e9
 START_S = 5_000.0

@@ -1,10 +1,10 @@
-"""Tests of the signal monitor, which turns motion and changes into events and restarts the estimate of an axis."""
+"""Tests of the monitor that turns motion and changes into events and restarts the estimate of an axis."""
 
 import numpy as np
 import pytest
 
 from drivers.data_types import make_block
-from monitor.estimation.detection.signal_monitor import SignalMonitor
+from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
 
 RATE_HZ = 100.0
 STEP_NS = 10_000_000
@@ -33,7 +33,7 @@ def convert_to_seconds(t_ns):
 def test_increased_noise_gives_an_event_and_a_restart_request(lost):
     values = simulate_noise(40_000)
     values[30_000:, 1] *= 2.0
-    monitor = SignalMonitor(RATE_HZ)
+    monitor = MotionAndChangeMonitor(RATE_HZ)
     process_in_blocks(monitor, values, lost=lost)
     (event,) = monitor.take_events()
     assert (event.kind, event.axis) == ("noise_changed", "gy")
@@ -51,7 +51,7 @@ def test_increased_noise_gives_an_event_and_a_restart_request(lost):
 def test_motion_is_reported_and_removed_only_on_request(remove_motion):
     values = simulate_noise(12_000)
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    monitor = SignalMonitor(RATE_HZ, remove_motion)
+    monitor = MotionAndChangeMonitor(RATE_HZ, remove_motion)
     passed = process_in_blocks(monitor, values)
     assert not monitor.is_moving
     passed += monitor.flush_delayed_samples()
@@ -72,7 +72,7 @@ def test_motion_is_reported_and_removed_only_on_request(remove_motion):
 def test_samples_at_rest_are_available_with_and_without_removal(remove_motion):
     values = simulate_noise(12_000)
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    monitor = SignalMonitor(RATE_HZ, remove_motion, keep_samples_at_rest=True)
+    monitor = MotionAndChangeMonitor(RATE_HZ, remove_motion, keep_samples_at_rest=True)
     process_in_blocks(monitor, values)
     at_rest = np.concatenate([block.values for block in monitor.take_samples_with_motion_masked()])
     assert len(at_rest) < len(values)  # the last samples are not classified yet
@@ -86,7 +86,7 @@ def test_samples_at_rest_are_available_with_and_without_removal(remove_motion):
 
 
 def test_samples_at_rest_are_kept_only_on_request():
-    monitor = SignalMonitor(RATE_HZ)
+    monitor = MotionAndChangeMonitor(RATE_HZ)
     process_in_blocks(monitor, simulate_noise(1000))
     assert monitor.take_samples_with_motion_masked() == []
 
@@ -96,7 +96,7 @@ def test_change_of_orientation_is_counted():
     values[:, 5] += 9.81
     values[6_000:6_200, 1] += 1.0
     values[6_100:, 3:6] = simulate_noise(12_000, 1)[6_100:, 3:6] + [9.81, 0.0, 0.0]
-    monitor = SignalMonitor(RATE_HZ)
+    monitor = MotionAndChangeMonitor(RATE_HZ)
     process_in_blocks(monitor, values)
     monitor.flush_delayed_samples()
     assert monitor.orientation_changes == 1
@@ -105,7 +105,7 @@ def test_change_of_orientation_is_counted():
 def test_motion_is_not_reported_as_changed_noise():
     values = simulate_noise(30_000)
     values[20_000:21_000, 3:] += 2.0 * np.random.default_rng(1).standard_normal((1000, 3))
-    monitor = SignalMonitor(RATE_HZ)
+    monitor = MotionAndChangeMonitor(RATE_HZ)
     process_in_blocks(monitor, values)
     assert {event.kind for event in monitor.take_events()} == {"moved"}
     assert not monitor.take_restart_requests()
@@ -114,7 +114,7 @@ def test_motion_is_not_reported_as_changed_noise():
 def test_zero_alarms_per_day_disables_change_detection():
     values = simulate_noise(20_000)
     values[10_000:] *= 3.0
-    monitor = SignalMonitor(RATE_HZ, alarms_per_day=0.0)
+    monitor = MotionAndChangeMonitor(RATE_HZ, alarms_per_day=0.0)
     process_in_blocks(monitor, values)
     assert "noise_changed" not in {event.kind for event in monitor.take_events()}
 
@@ -122,7 +122,7 @@ def test_zero_alarms_per_day_disables_change_detection():
 def test_different_rate_restarts_learning_and_keeps_the_counts():
     values = simulate_noise(12_000)
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    monitor = SignalMonitor(RATE_HZ)
+    monitor = MotionAndChangeMonitor(RATE_HZ)
     process_in_blocks(monitor, values)
     moved = monitor.samples_in_motion
     monitor.set_rate(RATE_HZ * 1.001)
@@ -138,7 +138,7 @@ def test_change_of_rate_loses_no_delayed_samples(at):
     """This also holds during a motion, which is still reported."""
     values = simulate_noise(12_000)
     values[7_700:8_000, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    monitor, passed = SignalMonitor(RATE_HZ, remove_motion=True), []
+    monitor, passed = MotionAndChangeMonitor(RATE_HZ, remove_motion=True), []
     for first in range(0, len(values), 130):
         part = values[first : first + 130]
         passed += monitor.process_samples(make_block(STEP_NS * np.arange(first, first + len(part)), part))
@@ -155,7 +155,7 @@ def test_changes_after_a_very_long_gap_have_correct_times(remove_motion):
     lost = 10**10
     values = simulate_noise(30_000)
     values[20_000:, 3] *= 2.0
-    monitor = SignalMonitor(RATE_HZ, remove_motion)
+    monitor = MotionAndChangeMonitor(RATE_HZ, remove_motion)
     process_in_blocks(monitor, simulate_noise(5_000, 9))
     t_ns = FIRST_NS + STEP_NS * (5_000 + lost + np.arange(len(values)))
     passed = monitor.process_samples(make_block(t_ns[:250], values[:250], lost=lost))

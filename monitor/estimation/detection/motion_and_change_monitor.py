@@ -28,7 +28,7 @@ class AxisRestartRequest:
     samples: int  # number of samples since the noise change, including missing samples
 
 
-class SignalMonitor:
+class MotionAndChangeMonitor:
     """Detector of motion and noise changes for one device.
 
     Parameters
