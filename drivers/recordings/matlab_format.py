@@ -87,7 +87,7 @@ def _load_columns(path: Path, notes: list[str]) -> tuple[dict[str, Floats], floa
                 table.check_column_count(path, len(columns))
         except EOFError:
             notes.append("The file is cut off; the variables after the cut are missing.")
-        except (ValueError, struct.error, zlib.error, UnicodeDecodeError) as error:
+        except (ValueError, OverflowError, struct.error, zlib.error) as error:
             raise RecordingError(f"{path}: is damaged: {error}") from error
     if not columns:
         why = f" ({notes[0].rstrip('.')})" if notes else ""
@@ -177,6 +177,13 @@ class _Content:
             raise ValueError(f"a data element has the type {kind}, expected numbers")
         return np.frombuffer(data, f"{self.order}{NUMBER_TYPES[kind]}")
 
+    def read_first_number(self) -> int:
+        """Return the first number of the next element."""
+        numbers = self.read_numbers()
+        if not numbers.size:
+            raise ValueError("a data element is empty, expected a number")
+        return int(numbers[0])
+
     def read_text(self) -> str:
         """Return the characters of the next element."""
         return bytes(self.read_element()[1]).decode("ascii")
@@ -186,7 +193,7 @@ def _iter_arrays(prefix: str, content: _Content, depth: int, field: str | None =
     """Yield the numeric arrays of a variable and of the fields of a structure, with their names."""
     if not len(content.data):
         return  # an empty field
-    flags = int(content.read_numbers()[0])
+    flags = content.read_first_number()
     shape = tuple(int(n) for n in content.read_numbers())
     stated_name = content.read_text()
     name = f"{prefix}{stated_name if field is None else field}"  # the array of a field has no name
@@ -197,7 +204,7 @@ def _iter_arrays(prefix: str, content: _Content, depth: int, field: str | None =
             raise ValueError(f"{name} has {numbers.size} numbers and the shape {shape}")
         yield name, numbers.reshape(shape, order="F")
     elif kind == STRUCTURE_CLASS and math.prod(shape) == 1 and depth < MAX_DEPTH:
-        length = int(content.read_numbers()[0])
+        length = content.read_first_number()
         text = content.read_text()
         if length < 1:
             raise ValueError(f"the field names of {name} have {length} characters")

@@ -127,5 +127,6 @@ def _open_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) 
     try:
         with archive.open(member) as file:
             yield file
-    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError) as error:  # RuntimeError: it is encrypted
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, UnicodeDecodeError) as error:
+        # RuntimeError means that the file is encrypted.
         raise RecordingError(f"{path}: {member.filename} cannot be read: {error}") from error

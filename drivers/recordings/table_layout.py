@@ -6,8 +6,8 @@ Parquet, Arrow and MATLAB files.
 A column name consists of a sensor, an axis and a unit, such as ``gyro_x [deg/s]``, ``wx (rad/s)`` or ``acc_x_g``. The
 names of these programs are among the recognized names:
 
-- EuRoC and TUM VI (ASL format): ``#timestamp [ns],w_RS_S_x [rad s^-1],a_RS_S_x [m s^-2]``
-  (ethz-asl/kalibr, ``aslam_offline_calibration/kalibr/python/kalibr_bagextractor``, and the files of the data sets)
+- EuRoC and TUM VI (ASL format): ``#timestamp [ns],w_RS_S_x [rad s^-1],a_RS_S_x [m s^-2]`` (the header that public
+  readers and writers of these data sets quote)
 - phyphox: ``"Time (s)","Gyroscope x (rad/s)"`` (phyphox/phyphox-android, ``DataExport.java``)
 - Sensor Logger: ``time,seconds_elapsed,z,y,x`` in ``Gyroscope.csv`` (tszheichoi/awesome-sensor-logger, ``UNITS.md``)
 - AndroSensor: ``ACCELEROMETER X (m/s²);…;TIME SINCE START (ms)``
@@ -219,7 +219,8 @@ def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
                 factor, offset = kind.convert(find_unit(table, options, quantity))
             except ConfigError as error:
                 raise ConfigError(f"{path}: column of {quantity}: {error}; state the unit with {kind.option}") from None
-            columns[quantity] = _convert(columns[quantity], factor, offset)
+            with np.errstate(invalid="ignore", over="ignore"):  # a huge number becomes infinite
+                columns[quantity] = _convert(columns[quantity], factor, offset)
         given = getattr(options, kind.key)
         contradicted = sorted({table.units[one] for one in quantities if one in table.units} - {given})
         if given is not None and contradicted:
@@ -255,7 +256,7 @@ def parse_column_name(name: str, sensor: str = "") -> ColumnName | None:
     if name in COLUMNS:
         return ColumnName(name, 0, None)
     stem, unit = _split_unit(name)
-    words = _split_words(stem)
+    words = [] if stem.strip() == "T" else _split_words(stem)  # T is a time or a temperature
     for at in range(len(words), 0, -1):
         found = _match_words(words[:at], sensor)
         if found is None:

@@ -55,7 +55,8 @@ def describe_likely_unit_errors(
         Unit from which the accelerations were converted.
     """
     some = values[:: max(len(values) // MAX_SAMPLES, 1)]
-    force = np.linalg.norm(some[:, 3:], axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged files contain signaling NaNs and huge numbers
+        force = np.linalg.norm(some[:, 3:], axis=1)
     force = force[np.isfinite(force)]
     notes: list[str] = []
     at_rest = False

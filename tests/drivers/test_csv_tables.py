@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import imu_monitor
 from drivers.data_types import AXES, Floats, concatenate_blocks
 from drivers.decoders import samples
 from drivers.errors import ConfigError, ImuError, LinkEnded
@@ -174,7 +175,9 @@ def test_column_names(name: str, quantity: str, unit: str | None) -> None:
     assert (found.quantity, found.unit) == (quantity, unit)
 
 
-@pytest.mark.parametrize("name", ["mx", "mag_x", "gx_raw", "x", "roll_deg", "q", "", "speed", "max", "gyro_x_furlong"])
+@pytest.mark.parametrize(
+    "name", ["mx", "T", "mag_x", "gx_raw", "x", "roll_deg", "q", "", "speed", "max", "gyro_x_furlong"]
+)
 def test_other_column_names(name: str) -> None:
     assert parse_column_name(name) is None
 
@@ -239,6 +242,20 @@ class TestOptions:
         assert found.values[:, 0].tolist() == [180 * DEGREE, 90 * DEGREE]
         assert found.t_s is not None
         assert found.t_s.tolist() == [0.0, 0.01]
+
+    def test_numbers_that_overflow_in_si_units_are_missing(self, tmp_path: Path) -> None:
+        found = read(tmp_path / "x.csv", "t,ax [g]\n0,1e308\n1,1\n")
+        assert np.array_equal(found.values[:, 3], [np.nan, G0], equal_nan=True)
+
+    def test_the_python_interface_has_the_same_arguments(self, tmp_path: Path) -> None:
+        path = tmp_path / "x.csv"
+        path.write_text(self.TEXT)
+        found = imu_monitor.read_recording(path, columns={"gx": 2}, gyro_unit="deg/s", time_unit="ms")
+        assert found["gx"].tolist() == [180 * DEGREE, 90 * DEGREE]
+        with pytest.raises(ConfigError, match='gyro_unit: "grad/s" is not a unit of angular rate'):
+            imu_monitor.read_recording(path, gyro_unit="grad/s")
+        with pytest.raises(ConfigError, match=r"columns gx=7: there is no column 7"):
+            imu_monitor.read_recording(path, columns={"gx": 7})
 
 
 class TestSeparators:
