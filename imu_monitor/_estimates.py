@@ -26,7 +26,7 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing.messages.analysis_json import AnalysisMessage, AxisAnalysis, AxisDeviations
 from monitor.publishing.messages.results import coefficient_values, deviations_with_interval_ends, measured_axes
 

@@ -1,4 +1,4 @@
-"""Reading of ArduPilot logs (DataFlash, ``.bin``), by the library pymavlink.
+"""Read ArduPilot logs (DataFlash, ``.bin``) with the library pymavlink.
 
 The layout of each message is part of the log (messages ``FMT``). These messages contain samples of an IMU, in rad/s,
 m/s² and °C (ArduPilot, page "Onboard Message Log Messages"):

@@ -1,4 +1,4 @@
-"""Reading of PX4 logs (ULog), by the library pyulog.
+"""Read PX4 logs (ULog) with the library pyulog.
 
 The layout of a message is part of the log. These topics contain samples of an IMU (PX4-Autopilot, folder ``msg``):
 

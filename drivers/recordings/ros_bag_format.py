@@ -1,4 +1,4 @@
-"""Reading of ROS 1 bags, ROS 2 bags (SQLite and MCAP) and MCAP files with ROS 2 messages, by the library rosbags.
+"""Read ROS 1 bags, ROS 2 bags (SQLite and MCAP) and MCAP files with ROS 2 messages with the library rosbags.
 
 Topics of type ``sensor_msgs/Imu`` contain rad/s and m/s². If the first covariance of a quantity is -1, the message does
 not provide the quantity (sensor_msgs/Imu.msg). Topics of type ``sensor_msgs/Temperature`` contain °C and can be joined

@@ -1,4 +1,4 @@
-"""Writing of recordings to files of any supported format.
+"""Write recordings to files of any supported format.
 
 Each recording is written to a temporary file, which is renamed on completion. If writing fails or is interrupted, an
 existing recording remains unchanged.

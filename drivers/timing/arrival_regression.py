@@ -1,4 +1,4 @@
-"""Estimation of the sample rate by a linear regression of arrival time on sample index."""
+"""Estimate the sample rate by a linear regression of arrival time on sample index."""
 
 from math import exp, inf, sqrt
 from typing import Final

@@ -1,4 +1,4 @@
-"""Estimation of sample times and missing samples from arrival times.
+"""Estimate sample times and missing samples from arrival times.
 
 Sample times lie on a line fitted to arrival time against sample index, so that transport jitter has little effect.
 

@@ -1,4 +1,4 @@
-"""Detection of missing samples from the values of a device counter.
+"""Detect missing samples from the values of a device counter.
 
 Counter values give the exact number of missing samples. If a counter may have wrapped several times, the number of
 wraps is estimated from arrival times (``drivers.timing.arrival_timeline``).

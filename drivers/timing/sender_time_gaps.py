@@ -1,4 +1,4 @@
-"""Detection of missing, late and reordered rows from sender times.
+"""Detect missing, late and reordered rows from sender times.
 
 If sender times are irregular, a long step does not necessarily mean that samples are missing. Samples therefore count
 as missing only if most of the time steps are regular.

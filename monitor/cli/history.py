@@ -54,7 +54,7 @@ def history(
 
     from drivers.data_types import AXES
     from drivers.recordings.formats import find_writer
-    from monitor.estimation.fit.coefficient_values import SYMBOLS
+    from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
     from monitor.history.history_table import choose_bucket_width_s as width_of
     from monitor.history.query_parameters import PARTS, HistoryQuery
     from monitor.history.time_ranges import parse_duration_s

@@ -20,7 +20,7 @@ from monitor.estimation.detection.line_and_outlier_detection import (
 )
 from monitor.estimation.detection.motion_detection import MotionEpisode
 from monitor.estimation.fit.coefficient_fit import Fit
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.estimation.fit.least_squares import K, Q
 from monitor.estimation.fit.low_pass_search import LowPass
 

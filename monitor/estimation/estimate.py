@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.fit.coefficient_values import Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import Coefficients, Status
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Conversion of estimates to the column values of a history row.
+"""Convert estimates to the column values of a history row.
 
 Each noise coefficient of a measured axis has four columns. For example, the column ``gz.N`` contains the estimated
 value of N on axis gz. The columns ``gz.N.lo`` and ``gz.N.hi`` contain the ends of the confidence interval. If only an
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 
 TAU_S: Final = tuple(float(f"{one}e{power}") for power in range(-4, 6) for one in (1, 3))
 """Averaging times at which Allan deviations are stored [s], from 0.1 ms to 300 000 s.

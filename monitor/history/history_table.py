@@ -1,4 +1,4 @@
-"""Reading of stored results as a table with a limited number of time buckets.
+"""Read stored results as a table with a limited number of time buckets.
 
 The function ``read_history`` merges the stored rows that fall into the same time bucket while it reads them. The
 required memory therefore depends on the number of requested points and not on the length of the time range. A time

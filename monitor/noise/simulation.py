@@ -1,4 +1,4 @@
-"""Simulation of samples according to a noise model.
+"""Simulate samples according to a noise model.
 
 Samples can be simulated in blocks of any size, and the block sizes do not affect the samples. For each axis, the
 sources are added first. The leaks from other axes are then added, and the transforms are applied to the sum. All
@@ -252,7 +252,7 @@ class ModelStream:
 
 
 class _AxisSimulator:
-    """Simulation of the effects on one axis."""
+    """Simulates the effects on one axis."""
 
     def __init__(self) -> None:
         self.white: list[NoiseSeries] = []

@@ -72,12 +72,12 @@ class Temperature(ParameterTable):
             wander = ExponentiallyCorrelated(sigma=self.wander, correlation_time=self.wander_time)
             parts.append(wander.start_series(rate_hz, rng))
 
-        def add_simulated_temperature(values: Floats, block: SampleBlockContext) -> None:
+        def add_temperature_samples(values: Floats, block: SampleBlockContext) -> None:
             values += self.mean
             for part in parts:
                 part.add_next_samples(values, block)
 
-        return StatelessSeries(add_simulated_temperature)
+        return StatelessSeries(add_temperature_samples)
 
 
 def recorded_temperature(temperature_c: Floats) -> NoiseSeries:

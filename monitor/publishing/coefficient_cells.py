@@ -6,7 +6,7 @@ from typing import Final
 
 from drivers.data_types import AXES
 from monitor.common.unit_formatting import NO_VALUE, Unit, coefficient_unit, format_number
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 
 TEMPERATURE_MARK: Final = "†"
 TEMPERATURE_MEANS: Final = "slow variance due to temperature"

@@ -16,7 +16,7 @@ from typing import Final
 from drivers.data_types import AXES
 from monitor.common import topics
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import Coefficients
+from monitor.estimation.fit.coefficients_with_intervals import Coefficients
 from monitor.publishing.messages.message import Message, decode_message
 from monitor.publishing.messages.results import (
     CoefficientsMessage,

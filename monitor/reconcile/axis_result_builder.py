@@ -1,4 +1,4 @@
-"""Conversion of the search on one axis into an ``AxisResult`` with parameters, confidence and justification."""
+"""Convert the search on one axis into an ``AxisResult`` with parameters, confidence and justification."""
 
 from dataclasses import replace
 from math import erf, exp, inf, log

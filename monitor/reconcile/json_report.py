@@ -28,7 +28,7 @@ from monitor.reconcile.result import (
     Reconciliation,
     RecordingFinding,
 )
-from monitor.reconcile.summary.ranked_findings import RankedGapCause, RankedRemainder, rank_findings
+from monitor.reconcile.summary.ranked_findings import RankedGapCause, RankedRemainingGap, rank_findings
 from monitor.reconcile.summary.summary_sentences import summarize
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
@@ -86,7 +86,7 @@ def _ranked_entry(finding: RankedGapCause) -> dict[str, Any]:
     }
 
 
-def _remainder_entry(one: RankedRemainder) -> dict[str, Any]:
+def _remainder_entry(one: RankedRemainingGap) -> dict[str, Any]:
     return {
         "axis": one.axis,
         "group": one.gap.group,

@@ -1,4 +1,4 @@
-"""Reading of configuration files, which reports all mistakes of a file together."""
+"""Read configuration files, and report all mistakes of a file together."""
 
 import dataclasses
 import os

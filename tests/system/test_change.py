@@ -14,7 +14,7 @@ import pytest
 
 from drivers.data_types import AXES
 from monitor.estimation.estimate import CoefficientsAfterEachSample, Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from tests.support.waiting import wait_for

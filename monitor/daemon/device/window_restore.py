@@ -1,4 +1,4 @@
-"""Restoration of the estimation window from the end of the recording after a restart of the program.
+"""Restore the estimation window from the end of the recording after the program restarts.
 
 The pipeline processes the recorded samples of the last window again, without reporting events. The start of each axis
 and the fitted values are read from the recorded state (``segment_file.DaemonState``).
@@ -24,7 +24,7 @@ MIN_REPLAY_S: Final = 600.0
 
 
 class WindowRestore:
-    """Restoration of the estimation window of one device after a restart of the program.
+    """Restores the estimation window of one device after the program restarts.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from drivers.errors import ConfigError
 from monitor.common.distributions import Z95
 from monitor.common.unit_formatting import COEFFICIENT_NAMES, coefficient_unit, sensor_kind
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
 from monitor.publishing.exporters.exported_coefficients import from_model

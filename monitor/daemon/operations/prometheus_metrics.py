@@ -21,7 +21,7 @@ from drivers.data_types import AXES, Event
 from monitor.common.device_health import Health
 from monitor.daemon.outputs.output import Output
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.standard_terms import STANDARD_TERMS
 from monitor.settings.loading import MetricsAddress

@@ -1,4 +1,4 @@
-"""Detection of drift models that no longer fit, based on the innovations.
+"""Detect drift models that no longer fit, based on the innovations.
 
 If the drift model fits, the mean of the squared normalised innovations ε²/S over n intervals has the distribution
 χ²_n/n. When the mean exceeds LIMIT, a misfit is reported. The next misfit is reported only after the mean has fallen

@@ -1,4 +1,4 @@
-"""Estimation of the angular rate of a moving vehicle with a bank of Kalman filters.
+"""Estimate the angular rate of a moving vehicle with a bank of Kalman filters.
 
 Each filter uses the "current" statistical model of Zhou & Kumar (1984) with the mean acceleration of Yuan et al.
 (2010). The filter state consists of the rate ω and its derivative, and the transition matrix is [[1, T], [0, 1]]. If

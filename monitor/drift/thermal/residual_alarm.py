@@ -1,4 +1,4 @@
-"""Detection of biases that lie outside the prediction interval of the thermal model too often.
+"""Detect biases that lie outside the prediction interval of the thermal model too often.
 
 If the model is correct, the bias lies above the 95 % prediction interval in 2.5 % of the intervals, and below it in
 another 2.5 %. A change is suspected if the bias lies outside the prediction interval, on the same side, in MIN_OUTSIDE

@@ -26,7 +26,7 @@ class IntervalMean:
 
 
 class RunningIntervalMeans:
-    """Computation of interval means from a stream of samples.
+    """Computes interval means from a stream of samples.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from monitor.drift.thermal.thermal_model import predict_interval_means
 from monitor.drift.thermal.thermal_results import choose_interval_s
 from monitor.estimation.allan.batch import EachAxis
 from monitor.estimation.analysis import RecordingAnalysis, fit_other_samples
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 
 SLOW_LETTERS: Final = ("K", "R")
 

@@ -54,7 +54,7 @@ class _Result:
 
 
 class LiveTotalAndHadamard:
-    """Computation of the total and Hadamard variance of a sliding window, one averaging time at a time.
+    """Computes the total and Hadamard variance of a sliding window, one averaging time at a time.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Detection of noise changes, bias steps and bursts of outliers at a specified rate of false alarms.
+"""Detect noise changes, bias steps and bursts of outliers at a specified rate of false alarms.
 
 The variance of each axis is monitored separately at averaging times of 1, 2, 4, … samples, which are called octaves.
 The reference variance of an octave is learned from the samples since the last change. A ``Change`` describes a noise

@@ -1,4 +1,4 @@
-"""Detection of quantization steps that are large enough to distort the measured noise.
+"""Detect quantization steps that are large enough to distort the measured noise.
 
 The quantization step is the smallest distance between two different values of an axis. The noise is estimated from the
 mean absolute difference of successive samples, because outliers and slow drift hardly affect it.

@@ -1,4 +1,4 @@
-"""Detection of spectral lines, resonances and outliers in a recording.
+"""Detect spectral lines, resonances and outliers in a recording.
 
 At most ``MAX_STRETCHES`` segments of ``ROWS`` samples are searched, so the search takes less than a second even for
 long recordings. Segments in which more than ``MAX_MISSING_SHARE`` of the samples are missing are skipped.

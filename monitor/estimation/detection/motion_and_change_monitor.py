@@ -1,4 +1,4 @@
-"""Detection of motion and noise changes in the samples of one device, before the samples reach the estimator.
+"""Detect motion and noise changes in the samples of one device, before the samples reach the estimator.
 
 Motion and noise changes are reported as events. After a noise change, the monitor requests that the estimator discards
 the old samples of the axis. The change detector ignores samples in motion.

@@ -1,4 +1,4 @@
-"""Detection of motion, knocks and handling of the sensor.
+"""Detect motion, knocks and handling of the sensor.
 
 The detector replaces samples in motion by NaN and reports each episode of motion. It continuously learns the noise at
 rest from the samples, see ``motion_kernel``. The samples are processed in blocks. One block before and two blocks after

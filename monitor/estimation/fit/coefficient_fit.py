@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.uncertainty import NOISES, CovarianceTable
-from monitor.estimation.fit.coefficient_values import Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import Coefficients, Status
 from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
 from monitor.estimation.fit.fit_kernel_types import (
     FitOptions,

@@ -29,7 +29,7 @@ from monitor.estimation.fit.coefficient_fit import (
     fit_coefficients,
     replace_axis_results,
 )
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, avar_upper_limit
 from monitor.estimation.fit.least_squares import N, Q
 

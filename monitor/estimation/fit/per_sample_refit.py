@@ -41,7 +41,7 @@ from monitor.estimation.allan.window_kernel import (
     mean_rate_slope,
 )
 from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, DesignMatrix, make_shared_inputs
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.estimation.fit.fit_kernel import fit_axes
 from monitor.estimation.fit.fit_kernel_types import (
     LIMIT_COUNT,

@@ -1,4 +1,4 @@
-"""Selection of the significant noise terms, computation of their confidence intervals, and storage of the linear maps.
+"""Select the significant noise terms, compute their confidence intervals, and store the linear maps.
 
 All decisions are based on the unconstrained solution û. If the true squared coefficient is t, the variance of û is v(t)
 = c0 + c1 t + c2 t². The method is described in ``coefficient_fit``.

@@ -15,7 +15,7 @@ from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing.messages.message import attributes_with_field_names, encode_json
 from monitor.publishing.messages.results import (
     CoefficientValue,

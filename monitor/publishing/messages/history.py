@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Ints
 from monitor.common import topics
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.history.estimate_to_columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
 from monitor.history.history_row import COUNTS, STATES
 from monitor.history.history_table import MAX_EVENTS, ColumnStatistics, HistoryTable

@@ -19,7 +19,7 @@ from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 from monitor.noise.standard_terms import unit_coefficient_allan_variances
 from monitor.publishing.messages.message import (
     Count,

@@ -17,7 +17,7 @@ from monitor.common.unit_formatting import DEFAULT_UNITS, KIND_NAMES, Kind, Unit
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.standard_terms import UNIT_SOURCES
 from monitor.publishing.plots.style import COLOURS, DARK, GREY, LABEL_BOX, draw_band, draw_legend_above, style_log_axis
 

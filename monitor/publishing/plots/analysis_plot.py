@@ -16,7 +16,7 @@ from monitor.common.unit_formatting import DEFAULT_UNITS, KINDS, Kind, UnitSyste
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
     TEMPERATURE_MARK,
     TEMPERATURE_MEANS,

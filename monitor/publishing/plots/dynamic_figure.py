@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats
 from monitor.common.unit_formatting import COEFFICIENT_NAMES, DEFAULT_UNITS, KIND_NAMES, Kind, Unit, UnitSystem, axes_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing.plots import style
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
 from drivers.number_ranges import DAY_S
 from monitor.common.unit_formatting import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
-from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.history.history_row import COUNTS, STATES
 from monitor.history.history_table import HistoryTable
 from monitor.history.stored_events import StoredEvent

@@ -18,7 +18,7 @@ from monitor.common.unit_formatting import (
 )
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
     TEMPERATURE_MARK,
     TEMPERATURE_MEANS,

@@ -28,7 +28,7 @@ from monitor.publishing.plots.reconcile_figures import (
     to_displayed_units,
 )
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.rerun.allan_chart import (
+from monitor.publishing.rerun.allan_chart_geometry import (
     HEIGHT,
     WIDTH,
     ChartDecadeRange,

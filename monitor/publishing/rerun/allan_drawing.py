@@ -17,7 +17,7 @@ from monitor.estimation.detection.comparison_with_noise_model import ModelCompar
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.axis_colours import Colour
-from monitor.publishing.rerun.allan_chart import (
+from monitor.publishing.rerun.allan_chart_geometry import (
     FILL_STEPS,
     HEIGHT,
     WIDTH,

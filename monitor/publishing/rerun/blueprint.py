@@ -21,7 +21,7 @@ from monitor.common.unit_formatting import (
     axes_of,
 )
 from monitor.publishing.rerun import dynamic_heat_map
-from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
+from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, WIDTH
 from monitor.publishing.rerun.shared_views import (
     RAW_SAMPLES_S,
     TIMELINE,

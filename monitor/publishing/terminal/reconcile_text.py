@@ -22,7 +22,7 @@ from monitor.reconcile.several_recordings.comparison import EffectInRecordings, 
 from monitor.reconcile.summary.ranked_findings import rank_findings
 from monitor.reconcile.summary.summary_sentences import (
     describe_finding,
-    describe_remainder,
+    describe_remaining_gap,
     format_share,
     summarize,
 )
@@ -71,7 +71,9 @@ def _findings_table(r: Reconciliation) -> RenderableType:
         sure = words.format_probability(one.confidence)
         rows.add_row(format_share(one.share), said, sure, words.describe_allan_influence(one))
     for left in ranking.remainders:
-        rows.add_row(format_share(left.share), Text(f"left over: {describe_remainder(left)}", style="yellow"), "", "")
+        rows.add_row(
+            format_share(left.share), Text(f"left over: {describe_remaining_gap(left)}", style="yellow"), "", ""
+        )
     return Padding(rows, (1, 0, 0, 0))
 
 

@@ -153,11 +153,11 @@ def gains_in_frequency_bands(residuals: Floats, variance: Floats, bands: int) ->
     edges = np.linspace(0, residuals.size, bands + 1).astype(np.int64)
     gains = np.empty(bands)
     for k, (first, last) in enumerate(pairwise(edges.tolist())):
-        band = np.zeros_like(coefficients)
-        band[first:last] = coefficients[first:last]
-        squares = idct(band, norm="ortho") ** 2
-        change = squares / squares.mean() * (1.0 - 1.0 / variance) - np.log(variance)
-        gains[k] = 0.5 * float(change.mean()) * (last - first)
+        # a transform of the band alone has the power of the band over time, at fewer times
+        squares = idct(coefficients[first:last], norm="ortho") ** 2
+        there = variance[((np.arange(squares.size) + 0.5) * variance.size / squares.size).astype(np.int64)]
+        change = squares / squares.mean() * (1.0 - 1.0 / there) - np.log(there)
+        gains[k] = 0.5 * float(change.sum())
     return gains
 
 
@@ -371,7 +371,7 @@ def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:
 
 @compiled
 def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]:
-    """Return the minimum and maximum of each column, the positions, and the sum of the logarithms.
+    """Return the minimum, the maximum, their rows, and the sum of the logarithms of each column.
 
     For speed, the logarithm is computed for products of eight values.
     """
@@ -434,6 +434,6 @@ def _bartlett_test(total: Floats, logs: Floats, count: int, squares: int) -> tup
 
 @lru_cache(maxsize=1024)
 def _bartlett_moments(count: int, half: float) -> tuple[float, float]:
-    """Return the mean and variance of Bartlett's statistic for ``count`` sums of 2·``half`` squares."""
+    """Return the mean and variance of Bartlett's statistic for ``count`` sums, each of ``2 * half`` squared values."""
     expected = half * count * (float(psi(count * half)) - float(np.log(count)) - float(psi(half)))
     return expected, half**2 * (count * float(polygamma(1, half)) - count**2 * float(polygamma(1, count * half)))

@@ -193,7 +193,7 @@ def _fit_line(
     fitted = _line_parameters(at, centre_hz)
     # the blocks do not resolve the deviation of a narrow line, so the phase is tracked with each start too
     block_phase = track_phase(z, rate_hz, length, fitted)
-    candidates = [fitted, *(one._replace(power=fitted.power) for _, one in starts)]
+    candidates = dict.fromkeys([fitted, *(one._replace(power=fitted.power) for _, one in starts)])
     tracked, phase, with_tracked = max(
         ((*phase_log_likelihood(z, rate_hz, block_phase, one), one) for one in candidates), key=lambda one: one[0]
     )

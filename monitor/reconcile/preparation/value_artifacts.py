@@ -1,4 +1,4 @@
-"""Detection of quantization, clipping and repeated samples in the values of one axis.
+"""Detect quantization, clipping and repeated samples in the values of one axis.
 
 Each function returns the detected artifact, or None. The evidence is the log-likelihood gain, in nats, over a series
 without the artifact.

@@ -1,4 +1,4 @@
-"""Detection of a wrong sample rate from the spectrum of a recording.
+"""Detect a wrong sample rate from the spectrum of a recording.
 
 A wrong sample rate multiplies all frequencies on all axes by the same ratio. The ratio can be estimated from the lines
 and resonances of the noise model (**features**). Without features, a wrong sample rate cannot be distinguished from a

@@ -63,7 +63,7 @@ class RankedGapCause:
 
 
 @dataclass(frozen=True, slots=True)
-class RankedRemainder:
+class RankedRemainingGap:
     """Remaining part of the gap on one axis."""
 
     axis: str
@@ -77,7 +77,7 @@ class GapRanking:
 
     whole_nats: float
     findings: tuple[RankedGapCause, ...]
-    remainders: tuple[RankedRemainder, ...]
+    remainders: tuple[RankedRemainingGap, ...]
 
     @property
     def explained_share(self) -> float:
@@ -108,7 +108,7 @@ def rank_findings(r: Reconciliation) -> GapRanking:
     left = _remaining_gaps(r)
     whole = sum(step.gain_nats for _, step in steps) + sum(gap.gain_nats for _, gap in left)
     findings = [_describe_group(group, whole, r) for group in groups]
-    remainders = [RankedRemainder(axis, gap, _share(gap.gain_nats, whole)) for axis, gap in left]
+    remainders = [RankedRemainingGap(axis, gap, _share(gap.gain_nats, whole)) for axis, gap in left]
     return GapRanking(
         whole,
         tuple(sorted(findings, key=lambda one: -one.gain_nats)),

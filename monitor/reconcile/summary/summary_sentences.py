@@ -10,7 +10,7 @@ from typing import Final
 
 from drivers.data_types import AXES
 from monitor.reconcile.result import Location, Reconciliation
-from monitor.reconcile.summary.ranked_findings import GapRanking, RankedGapCause, RankedRemainder, rank_findings
+from monitor.reconcile.summary.ranked_findings import GapRanking, RankedGapCause, RankedRemainingGap, rank_findings
 
 MAIN_SHARE: Final = 0.95
 """Share of the gap that the listed findings explain together."""
@@ -69,7 +69,7 @@ def summarize(r: Reconciliation) -> tuple[str, ...]:
         _describe_faults(r),
         _describe_result(r, ranking),
         _describe_findings(_main_findings(ranking), ranking),
-        _describe_remainders(ranking),
+        _describe_remaining_gaps(ranking),
         _recommend(r, ranking),
     )
     return tuple(sentence for sentence in sentences if sentence)
@@ -160,7 +160,7 @@ def _is_nearly_one(ratio: float | None) -> bool:
     return ratio is None or abs(ratio - 1.0) < UNMENTIONED_SIZE_CHANGE
 
 
-def _describe_remainders(ranking: GapRanking) -> str:
+def _describe_remaining_gaps(ranking: GapRanking) -> str:
     if not ranking.remainders:
         return ""
     left = 1.0 - ranking.explained_share
@@ -168,13 +168,13 @@ def _describe_remainders(ranking: GapRanking) -> str:
     if not large:
         axes = _on_axes({one.axis for one in ranking.remainders})
         return f"The remaining difference{axes} is significant, but only {format_share(left)} of the whole."
-    texts = [f"{describe_remainder(one)} ({format_share(one.share)})" for one in large]
+    texts = [f"{describe_remaining_gap(one)} ({format_share(one.share)})" for one in large]
     share = "" if not ranking.findings else f" ({format_share(left)} of the whole)"
     others = ", mainly" if len(ranking.remainders) > len(large) else ":"
     return f"No effect explains the rest{share}{others} {join_words(texts)}."
 
 
-def describe_remainder(one: RankedRemainder) -> str:
+def describe_remaining_gap(one: RankedRemainingGap) -> str:
     """Return a remaining difference as a phrase with its location and its axis."""
     return f"{GROUP_PHRASES[one.gap.group]}{_describe_location(one.gap.strongest.where)} on {one.axis}"
 
@@ -207,7 +207,7 @@ def _recommend(r: Reconciliation, ranking: GapRanking) -> str:
 
 
 def format_share(share: float) -> str:
-    """Format a share of the gap in percent.
+    """Format a share of the gap as a percentage.
 
     >>> format_share(0.5432), format_share(0.00321), format_share(0.00003), format_share(0.9996), format_share(1.0)
     ('54 %', '0.3 %', '< 0.1 %', '> 99.9 %', '100 %')

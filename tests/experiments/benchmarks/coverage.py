@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Ints, make_block
 from monitor.estimation.analysis import analyze
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 from tests.experiments.benchmarks.records import (
     HOURS_3,
     MIN_45,

@@ -38,7 +38,7 @@ from monitor.estimation.fit.coefficient_fit import (
     fit_coefficients,
     make_design_matrix,
 )
-from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from tests.experiments.benchmarks.records import (
     HOURS_3,
     MIN_45,

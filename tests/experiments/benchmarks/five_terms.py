@@ -21,7 +21,7 @@ from monitor.estimation.detection.line_and_outlier_detection import (
     outlier_share_of_axes,
 )
 from monitor.estimation.detection.motion_detection import detect_motion
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.noise.model import NoiseModel
 

@@ -29,7 +29,7 @@ from scipy.fft import dct, fft, next_fast_len
 from scipy.special import ndtri, sici
 
 from drivers.data_types import Floats, Ints
-from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 
 RATE_HZ: Final = 100.0
 AXES: Final = 6

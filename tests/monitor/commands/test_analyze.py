@@ -11,7 +11,7 @@ from drivers.recordings import save_samples
 from monitor.commands import analyze, thermal
 from monitor.commands.analyze import AnalysisRequest, TooFewSamples, run_analysis
 from monitor.common.unit_formatting import MILLI_G
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing import exporters
 from monitor.publishing.messages.analysis_json import AnalysisMessage
 from monitor.publishing.terminal.thermal_output import notes_on_hysteresis

@@ -13,7 +13,7 @@ from drivers.errors import ConfigError
 from drivers.recordings import WRITABLE, load_samples, save_samples
 from monitor.commands import analyze
 from monitor.commands.simulate import CHUNK_ROWS, SimulationRequest, run_simulation
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 
 COEFFICIENTS = {"Q": 2e-5, "N": 1.5e-4, "B": 3e-4, "K": 2e-4, "R": 3e-5}

@@ -18,7 +18,7 @@ from monitor.drift.compensation.live_compensation import MeasuredAndSubtractedDr
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings import loading as settings
 from monitor.settings.loading import BuiltLinkAndDecoder, Device

@@ -21,7 +21,7 @@ from monitor.daemon.outputs.table_output import TableOutput
 from monitor.daemon.service import Service
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.history import history_table as past
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.time_ranges import TimeRange

@@ -9,7 +9,7 @@ import pytest
 from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.analysis import MIN_SAMPLES, analyze, detect_disturbances
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.estimation.regular_grid import MAX_GAP_SAMPLES, place_samples_on_grid
 from tests.support.recordings import recorded_blocks, recordings, white
 

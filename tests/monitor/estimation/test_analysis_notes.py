@@ -12,7 +12,7 @@ from monitor.estimation.analysis import analyze
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.line_and_outlier_detection import SpectralLine, detect_spectral_lines_per_axis
 from monitor.estimation.detection.motion_detection import MotionEpisode
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.estimation.fit.low_pass_search import LowPass
 
 RATE_HZ = 100.0

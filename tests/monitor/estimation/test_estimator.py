@@ -7,7 +7,7 @@ from drivers.data_types import AXES, make_block
 from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.estimator import MAX_HISTORY_SAMPLES, MIN_SAMPLES, Estimator
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.history.estimate_to_columns import TAU_S, EstimateToColumnsConverter
 from tests.monitor.publishing.example_results import compute_design_matrix, make_estimate, make_true_coefficients
 

@@ -16,7 +16,7 @@ from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison, NoiseModelComparator
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
-from monitor.estimation.fit.coefficient_values import Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import Coefficients, Status
 from monitor.noise.model import NoiseModel
 
 GYRO = np.array([2.0e-6, 1.5e-4, 4.0e-5, 1.5e-6, 0.0])  # Q N B K R in SI

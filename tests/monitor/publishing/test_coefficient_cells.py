@@ -14,7 +14,7 @@ from monitor.common.unit_formatting import (
     coefficient_unit,
     format_number,
 )
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 from monitor.publishing.coefficient_cells import format_coefficient
 
 

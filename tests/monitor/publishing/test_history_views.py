@@ -12,7 +12,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings.formats import WRITABLE
 from monitor.common.unit_formatting import coefficient_unit
-from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.history.history_row import STATES, HistoryRow
 from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.stored_events import StoredEvent

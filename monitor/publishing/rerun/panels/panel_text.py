@@ -22,7 +22,7 @@ from monitor.common.unit_formatting import (
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.live_compensation import MeasuredAndSubtractedDrift
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import measured_axes

@@ -11,7 +11,7 @@ from drivers.data_types import AXES, Event
 from drivers.errors import ConfigError
 from monitor.daemon.operations.coefficient_limits import LimitMonitor, make_axis_limits
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 from monitor.noise.model import NoiseModel
 from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Limit

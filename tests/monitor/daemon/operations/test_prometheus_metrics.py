@@ -12,7 +12,7 @@ import pytest
 
 from drivers.data_types import AXES, Event
 from monitor.daemon.operations.prometheus_metrics import MAX_SCRAPES, MISSING_LIBRARY_TEXT, MetricsOutput
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.settings.loading import MetricsAddress
 from tests.monitor.publishing import example_results
 from tests.support.waiting import PATIENCE_S, wait_for

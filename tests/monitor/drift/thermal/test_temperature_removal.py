@@ -13,7 +13,7 @@ from monitor.drift.thermal.temperature_removal import (
     temperature_varied,
 )
 from monitor.estimation.analysis import analyze
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing.terminal.thermal_output import notes_on_temperature_dependence
 
 RATE_HZ = 2.0

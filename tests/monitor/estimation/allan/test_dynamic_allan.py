@@ -8,7 +8,7 @@ from monitor.estimation.allan import batch
 from monitor.estimation.allan.dynamic_allan import MAX_STEPS, compute_dynamic_allan
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.fit.coefficient_fit import MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.effects import (
     AngleRandomWalk,
     BiasInstability,

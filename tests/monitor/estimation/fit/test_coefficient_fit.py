@@ -12,7 +12,7 @@ from drivers.data_types import AXES
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.fit.coefficient_fit import Fit, MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
-from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk

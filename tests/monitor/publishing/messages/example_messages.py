@@ -21,7 +21,7 @@ from monitor.estimation.detection.comparison_with_noise_model import AxisModelCo
 from monitor.estimation.detection.motion_detection import MotionEpisode
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
-from monitor.estimation.fit.coefficient_values import Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import Coefficients, Status
 from monitor.history.history_table import HistoryTable
 from monitor.history.query_parameters import PARTS, HistoryQuery
 from monitor.history.stored_events import StoredEvent

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.data_types import AXES
-from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.history.history_row import STATES, HistoryRow, merge_rows
 from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.minute_aggregation import MinuteAggregator

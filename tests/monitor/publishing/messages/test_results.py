@@ -14,7 +14,7 @@ from monitor.estimation.allan.hadamard import compute_hadamard_curve
 from monitor.estimation.allan.total import compute_total_curve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.motion_detection import MotionEpisode
-from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.publishing.messages.analysis_json import AnalysisMessage
 from monitor.publishing.messages.results import (
     AllanMessage,

@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import ConfigError
 from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.publishing.plots import allan_figure, analysis_plot, dynamic_figure, style
 from monitor.publishing.plots.allan_figure import AdditionalDeviation
 from monitor.publishing.plots.analysis_plot import AnalysisPlotData

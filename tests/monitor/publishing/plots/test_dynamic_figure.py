@@ -7,7 +7,7 @@ import pytest
 
 from drivers.data_types import AXES
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
-from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.publishing.plots.dynamic_figure import (
     BAND_ENDS_INSIDE,
     MIN_LABEL_DISTANCE,

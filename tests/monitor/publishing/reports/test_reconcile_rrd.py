@@ -13,7 +13,7 @@ from tests.monitor.reconcile import samples
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
 from monitor.publishing.reports import reconcile_rrd
-from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
+from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, WIDTH
 
 
 def read_cells(path: Path) -> dict[str, list[object]]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.publishing.rerun.allan_chart import (
+from monitor.publishing.rerun.allan_chart_geometry import (
     FILL_STEPS,
     HEIGHT,
     WIDTH,
