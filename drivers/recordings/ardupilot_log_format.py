@@ -217,7 +217,7 @@ def _known_fields(messages: _Messages) -> dict[str, str]:
 
 
 def _list_imus(messages: Mapping[str, _Messages]) -> Sequence[Sequence[str]]:
-    """Return the IMUs of a log. A gyroscope and an accelerometer of the same number are an IMU."""
+    """Return the IMUs of a log. A gyroscope and an accelerometer with the same number form an IMU."""
     imus, gyros, accels = ([name for name in messages if name.startswith(kind)] for kind in ("IMU", "GYR", "ACC"))
     pairs = [f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if gyro[3:] == accel[3:]]
     return [group for group in (imus, *([pairs] if pairs else [gyros, accels])) if group]

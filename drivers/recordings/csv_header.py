@@ -25,7 +25,7 @@ BOM: Final = "\N{ZERO WIDTH NO-BREAK SPACE}"
 BLANKS: Final = ""
 """Separator of files whose fields are separated by any number of blanks."""
 SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas", BLANKS: "blanks"}
-"""Separators with their names. Commas are the third, because they may also be decimal commas."""
+"""Separators with their names. Commas follow semicolons and tabs, because they may also be decimal commas."""
 DECIMAL_COMMA_SEPARATORS: Final = (";", "\t")
 EXCEL_SEPARATOR: Final = re.compile("sep=.?", re.IGNORECASE)
 """First line that tells Excel the separator."""
@@ -61,7 +61,7 @@ def find_header(path: Path, label: Path, texts: Iterator[bytes], options: Readin
     label
         Name of the source in messages.
     texts
-        Pieces of text that end at line ends. The function takes the pieces up to the first line of samples.
+        Pieces of text that end at line ends. The function reads the pieces up to the first line of samples.
     options
         Columns that the user names.
 
@@ -79,7 +79,7 @@ def find_header(path: Path, label: Path, texts: Iterator[bytes], options: Readin
         for line in _iter_lines(text, number):
             number = line.number
             if header is not None and line.text and not line.text.startswith(COMMENT_MARKS):
-                # The header is the last line of its piece of text, so that the samples begin with this piece.
+                # The header is in an earlier piece of text without samples, so the samples begin in this piece.
                 return _build_header(path, label, header, line.text, text, first_number)
             if line.text.startswith(COMMENT_MARKS):
                 comment = line if header is None else comment

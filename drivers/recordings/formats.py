@@ -32,11 +32,11 @@ class Format:
     count_rows: Callable[[Path, ReadingOptions], int]
     """Function that returns the number of rows without keeping the samples."""
     open_writer: OpenWriter | None = None
-    """Function that writes a file; None if the program does not write the format."""
+    """Function that writes a file, or None if the program does not write the format."""
     any_columns: bool = False
     """True if the writer accepts columns of any names, and not only those of a recording."""
     extra: str = ""
-    """Extra whose packages read the format; "" if no extra is needed or if the functions check it."""
+    """Extra with the packages for the format, or "" if none is needed or if the functions check for it."""
 
 
 def _table_format(
@@ -64,7 +64,7 @@ def _table_format(
 def _log_format(
     read: Callable[[Path, str | None], Table], count_rows: Callable[[Path, str | None], int], extra: str
 ) -> Format:
-    """Return the format of a log, which has topics. The messages of the log determine the columns."""
+    """Return the format of a log that contains topics. The messages of the log determine the columns."""
 
     def check_topic(path: Path, options: ReadingOptions) -> str | None:
         if options.columns:
@@ -117,7 +117,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 WRITABLE: Final = tuple(suffix for suffix, one in FORMATS.items() if one.open_writer is not None)
 """Suffixes of the recordings that the program writes."""
 WRITABLE_TABLES: Final = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].any_columns)
-"""Suffixes of the tables with any columns that the program writes."""
+"""Suffixes of the formats in which the program writes tables with columns of any names."""
 
 
 def find_format(path: Path) -> Format:

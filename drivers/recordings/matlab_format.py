@@ -151,7 +151,7 @@ def _iter_unpacked(file: IO[bytes], size: int) -> Iterator[bytes]:
 
 @dataclass(slots=True)
 class _Content:
-    """Reader of the data elements in the content of an element."""
+    """Reader of the data elements inside another data element."""
 
     data: memoryview
     order: str

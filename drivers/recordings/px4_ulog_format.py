@@ -9,7 +9,7 @@ The layout of a message is part of the log. These topics contain samples of an I
 
 An autopilot with several IMUs has several instances of a topic, such as ``sensor_gyro:1``.
 
-pyulog reads only the messages of these topics. It needs at most the size of the file in memory.
+pyulog reads only the messages of these topics. It needs at most as much memory as the size of the file.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -110,7 +110,10 @@ def _discard(*_: object, **__: object) -> None:
 
 
 def _message_bytes(formats: Mapping[str, Any], name: str, sizes: dict[str, int]) -> int:
-    """Return the size of a message with its nested messages. A message that contains itself is too large."""
+    """Return the size of a message with its nested messages.
+
+    If a message contains itself, the returned size exceeds ``MAX_MESSAGE_BYTES``.
+    """
     from pyulog.core import ULog
 
     try:
@@ -163,7 +166,7 @@ def _known_columns(data: Any) -> tuple[str, ...]:
 
 
 def _list_imus(data: Mapping[str, Any]) -> Sequence[Sequence[str]]:
-    """Return the IMUs of a log, grouped by topic. A gyroscope and an accelerometer of the same number are an IMU."""
+    """Return the IMUs of a log, grouped by topic. A gyroscope and an accelerometer with the same number form an IMU."""
     groups = [[name for name, one in data.items() if one.name == kind] for kind in FIELDS]
     combined, integrated, gyros, accels, _ = groups
     pairs = [

@@ -24,7 +24,7 @@ from drivers.recordings import memory_check, table
 from drivers.recordings.topics import Topic, collect_columns, join_topics, select_topics
 
 METADATA: Final = "metadata.yaml"
-"""File that a folder with a ROS 2 bag contains."""
+"""File that identifies a folder as a ROS 2 bag."""
 STORAGE_SUFFIXES: Final = (".db3", ".mcap", ".zstd")
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
 TEMPERATURE_TYPE: Final = "sensor_msgs/msg/Temperature"

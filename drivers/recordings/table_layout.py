@@ -205,7 +205,7 @@ def find_layout(
 def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
     """Return a table with columns in SI units and °C.
 
-    A unit in the options precedes the unit that the file states.
+    A unit in the options takes precedence over the unit that the file states.
 
     Raises
     ------
@@ -230,7 +230,7 @@ def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
 
 
 def find_unit(table: Table, options: ReadingOptions, quantity: str) -> str:
-    """Return the unit of a quantity in a table: that of the options, that of the file, or the SI unit."""
+    """Return the unit of a quantity from the options, otherwise from the file, or the SI unit if neither states one."""
     kind = KIND_OF[quantity]
     unit: str = getattr(options, kind.key) or table.units.get(quantity) or kind.si_unit
     return unit

@@ -68,7 +68,7 @@ def select_topics(
     Raises
     ------
     ConfigError
-        If the topic does not exist, has other messages, or has to be chosen.
+        If the topic does not exist or contains other messages, or if the user must choose a topic.
     RecordingError
         If the file contains no samples of an IMU.
     """

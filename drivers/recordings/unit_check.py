@@ -31,7 +31,7 @@ MAX_SPREAD_AT_REST: Final = 0.03
 MAX_NOISE_AT_REST: Final = 0.4 * DEGREE
 """Largest noise density of a gyroscope at rest, rad/s/√Hz."""
 MAX_NOISE_ALONE: Final = 1.0 * DEGREE
-"""Largest noise density of gyroscopes without accelerometers that show whether the sensor is at rest, rad/s/√Hz."""
+"""Largest noise density of gyroscopes, rad/s/√Hz, if no accelerometer shows whether the sensor is at rest."""
 MAX_RATE_RAD_S: Final = 4000.0 * DEGREE
 """Median angular rate beyond the full scale of MEMS gyroscopes, rad/s."""
 MAD_TO_SIGMA: Final = 1.4826
@@ -75,7 +75,10 @@ def describe_likely_unit_errors(
 
 
 def _find_acceleration_unit(values: Floats, force_m_s2: float, unit: str) -> str | None:
-    """Return the unit in which the numbers of the file would be gravity, or None if the present unit fits best."""
+    """Return the unit in which the measured values would equal gravity.
+
+    The result is None if the present unit fits, or if no unit fits.
+    """
     number = force_m_s2 / acceleration_factor(unit)
     numbers = values[np.isfinite(values)] / acceleration_factor(unit)
     counts = tuple(f"g/{n}" for n in SENSITIVITIES) if _are_integers(numbers) else ()

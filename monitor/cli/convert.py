@@ -24,7 +24,7 @@ def convert(
     decoder: options.DecoderName = None,
     option: options.DecoderOptions = None,
 ) -> None:
-    """Write a recording in another format, without a change of times and values."""
+    """Write a recording in another format, without changing times or values."""
     from monitor.commands import convert as conversion
 
     last_s = options.parse_duration("--last", last)

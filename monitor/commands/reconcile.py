@@ -41,7 +41,7 @@ class ReconciliationRequest:
     """Recording, noise model and options of the command ``reconcile``."""
 
     recording: Path
-    model: NoiseModel | None  # None fits the five noise terms to the recording
+    model: NoiseModel | None  # with None, the five noise terms are fitted to the recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None

@@ -35,7 +35,7 @@ CONTENTS: Final = {"log": "CAN frames", "capture": "captured bytes", "raw": "raw
 BATCH_NS: Final = 100_000_000
 """Duration in ns of the samples that are passed to the sample clock at once. A live link returns similar batches."""
 SINGLE_NS: Final = 2_000_000_000
-"""Duration in ns at the start in which samples are passed one by one, because the clock does not know the rate yet."""
+"""Time in ns after the first sample during which samples are passed singly, because the rate is not known yet."""
 READ_TIMEOUT_S: Final = 1.0
 MIN_STEP_BACK_S: Final = 60.0
 """Minimum duration in s of half the range of a counter for the detection of steps back.
@@ -228,7 +228,7 @@ class _CaptureTimes:
         self._started = False  # True after the first sample
 
     def assign_device_times(self, samples: SampleBlock) -> SampleBlock:
-        """Return the samples with times of the device counter, or with even spacing.
+        """Return the samples with times from the device counter, or with evenly spaced times.
 
         Raises
         ------

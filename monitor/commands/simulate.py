@@ -132,7 +132,7 @@ def choose_sample_grid(
 def start_stream(
     model: NoiseModel, rate_hz: float, seed: int, temperature_c: Floats | None = None, name: str = "the model"
 ) -> ModelStream:
-    """Start a simulation, and name the model in the text of an error.
+    """Start a simulation. Error messages contain the name of the model.
 
     Parameters
     ----------

@@ -106,7 +106,7 @@ def build_axis_result(
 
 
 def _with_outlier_misfit(search: AxisSearchResult) -> HypothesisDiagnostics:
-    """Return the final diagnostics with the misfit that the replacement of outliers hides."""
+    """Return the final diagnostics, including the misfit that the replacement of outliers removes."""
     if not any(isinstance(effect, Outliers) for effect in search.hypothesis.added):
         return search.final
     misfit = max((one.trials[0].misfit_nats for one in search.rounds), default=0.0)
@@ -215,7 +215,7 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics
 def _trials_not_added_too(hypothesis: Hypothesis, index: int, trials: tuple[Trial, ...]) -> tuple[Trial, ...]:
     """Return the selected trial and its alternatives, without effects that were added in other rounds.
 
-    An effect that was added in another round is no alternative, because it explains another difference.
+    An effect that was added in another round is not an alternative, because it explains another difference.
     """
     added = [effect for at, effect in enumerate(hypothesis.effects) if at >= hypothesis.given_count and at != index]
     alternatives = [one for one in trials[1:] if not any(_is_same_effect(one.effect, effect) for effect in added)]

@@ -1,6 +1,7 @@
 """Groups and parts of the numerical kernels. Each part has a function that calls all its kernels.
 
-The functions import the modules of the kernels, so that a command does not import them if its kernels are compiled.
+The functions import the modules of the kernels when they are called. A command whose kernels are compiled does not call
+the functions and therefore does not import these modules.
 """
 
 from collections.abc import Callable
@@ -117,9 +118,9 @@ def _call_reconciliation() -> None:
 
 
 WINDOW: Final = "Allan deviation"
-"""Name of the part that contains the kernels of the sliding window."""
+"""Name of the kernel part for the sliding window."""
 FIT: Final = "noise coefficients"
-"""Name of the part that contains the kernels of the fit."""
+"""Name of the kernel part for the fit."""
 SERVICE: Final = KernelGroup(
     "service",
     (

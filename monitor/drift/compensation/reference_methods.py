@@ -155,7 +155,7 @@ def _run_filter(x: Floats, phi: Floats, gain: Floats) -> Floats:
 
 
 def _filter_noise_modes(x: Floats) -> Floats:
-    """Filter the noise modes among the empirical modes of x [n], and return the sum of all modes."""
+    """Decompose x [n] into empirical modes, filter the modes that are noise, and return the sum of all modes."""
     try:
         from PyEMD import EMD
     except ImportError as error:

@@ -16,7 +16,7 @@ from monitor.common.distributions import Z95
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 
 MIN_OUTSIDE: Final = 4
-"""Number of intervals with a bias outside the prediction interval, on the same side, at which a change is suspected."""
+"""A change is suspected if at least this many recent biases are outside the prediction interval on the same side."""
 WINDOW_INTERVALS: Final = 6
 """Number of recent intervals with a known bias that are considered."""
 FAR_HALF_WIDTHS: Final = 2.0

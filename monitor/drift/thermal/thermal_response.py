@@ -114,7 +114,10 @@ def temperature_beyond_range(excess_c: Floats, range_c: tuple[float, float]) -> 
 
 
 def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
-    """Return a power of x, extrapolated linearly outside the range ``ends`` with the mean slope over the range."""
+    """Return a power of x.
+
+    Outside the range ``ends``, the power is extrapolated linearly with its mean slope over the range.
+    """
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])

@@ -73,7 +73,7 @@ REMOVED_AFTER: Final = 2
 EPISODE_GAP_BLOCKS: Final = 4
 """Number of blocks at rest that end an episode of motion."""
 LOOK_EVERY: Final = 20
-"""Number of blocks between two tests of whether a disturbance is constant."""
+"""Number of blocks after which the detector tests again whether a disturbance is constant."""
 WANDER: Final = 4.0
 """Maximum scatter of the block means, relative to the scatter expected from the noise within blocks."""
 MIN_VARIANCE: Final = 1e-30

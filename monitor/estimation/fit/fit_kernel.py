@@ -54,7 +54,7 @@ This limit is lower than ``MISFIT_SIGMA`` to prevent a bias in N.
 TOTAL_MISFIT_SIGMA: Final = 6.0
 """Deviation of χ² in σ above which the five noise terms do not explain the Allan variances."""
 SHORT_ROWS: Final = 4
-"""Number of shortest averaging times at which the residuals are tested."""
+"""Number of averaging times, beginning with the shortest, at which the residuals are tested."""
 FILTER_MEMORY: Final = 16
 """Largest cluster size in samples that can be left out of a fit."""
 WHITE: Final = PAIRS.index((N, N))

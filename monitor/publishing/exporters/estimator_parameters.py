@@ -368,4 +368,4 @@ PARAMETER_FILES: Final = (
         is_fragment=True,
     ),
 )
-"""Parameter files of one value per kind of sensor. Kalibr is the first entry, because other programs use its names."""
+"""Parameter files with one value for each kind of sensor. Kalibr is first, because other programs use its names."""

@@ -1,8 +1,8 @@
 """Export of noise coefficients as the result file of imu_utils.
 
-The file contains what the program itself writes (class FitAllanGyr, which differs from its README). ``gyr_n`` and
-``acc_n`` are standard deviations of a sample, N/√dt. ``gyr_w`` and ``acc_w`` are the minimum of the fitted Allan
-deviation, which the program calls bias instability. The Allan variance of N, B and K is
+The file has the format that imu_utils itself writes (class FitAllanGyr). The README of imu_utils differs from it.
+``gyr_n`` and ``acc_n`` are standard deviations of a sample, N/√dt. ``gyr_w`` and ``acc_w`` are the minimum of the
+fitted Allan deviation, which the program calls bias instability. The Allan variance of N, B and K is
 
     σ²(τ) = N²/τ + (2 ln 2/π) B² + K² τ/3  (IEEE Std 952)
 

@@ -6,8 +6,8 @@ depends only on the effective number of independent places (``NULL_GAIN_QUANTILE
 quartile of the gain. Above q, the density of a gain g is modelled as exp(−(g − q)/s).
 
 One simulated recording is used to check that the noise model is Gaussian enough. If a gain is improbably large, more
-recordings are simulated. If a gain is improbably large in all ``SIMULATED_RECORDINGS`` recordings, the simulated gains
-can increase the thresholds. A model that is not Gaussian is always simulated this number of times.
+recordings are simulated. If a gain is improbably large in all ``SIMULATED_RECORDINGS`` recordings, the thresholds are
+raised above the simulated gains if necessary. A model that is not Gaussian is always simulated this number of times.
 
 If the noise model is true, 1 % of all recordings exceed a threshold in any diagnostic on any axis.
 """
@@ -32,7 +32,7 @@ UPPER_QUANTILE: Final = 0.25
 EXCESS_RANGE_NATS: Final = (1.0, 1.3)
 """Range of the mean excess of simulated gains over the upper quartile."""
 IMPROBABLE: Final = 0.002
-"""Probability below which a gain is improbably large, so that another recording is simulated."""
+"""A gain is improbably large if its probability is below this value. Another recording is then simulated."""
 AXIS_MARGIN_NATS: Final = 3.0
 """Margin between the largest simulated gain of an axis and the threshold, in nats."""
 
@@ -113,8 +113,8 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
     Parameters
     ----------
     simulated : mapping of str to sequence of Findings
-        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. The gains can increase the
-        thresholds of an axis only if all its recordings have been simulated.
+        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. If an axis has all recordings, its
+        thresholds are raised above the gains if necessary.
     """
     chance = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * max(len(simulated), 1))
     complete = [axis for axis, of in simulated.items() if len(of) >= SIMULATED_RECORDINGS]

@@ -64,9 +64,9 @@ class FrequencyBand:
 
 
 def extract_band(series: Floats, rate_hz: float, centre_hz: float, half_width_hz: float) -> FrequencyBand | None:
-    """Extract a frequency band of a real series, or return None if the series has no noise beside the band.
+    """Extract a frequency band of a real series, or return None if there is no noise next to the band.
 
-    The density of the background noise is the median of the periodogram beside the band, divided by ln 2.
+    The density of the background noise is the median of the periodogram next to the band, divided by ln 2.
 
     Parameters
     ----------

@@ -53,8 +53,8 @@ MIN_MODULATION_GAIN_NATS: Final = 3.0
 """Log-likelihood in nats by which a modulated line must exceed both other processes, so that neither of them is
 named."""
 MAX_SWEEP_RESIDUAL: Final = 1e-3
-"""Variance of the phase around a parabola, relative to the variance around a straight line, below which the line is a
-sweep. For a random frequency, the ratio is near 1."""
+"""Largest variance of the phase around a parabola, relative to the variance around a straight line, at which the line
+is a sweep. For a random frequency, the ratio is near 1."""
 CARRIER_PADDING: Final = 4
 """Zero padding of the periodogram that determines the frequency of a modulated line."""
 

@@ -93,7 +93,7 @@ def _copy_samples(new: Floats, known_at: Ints, first: int, last: int, width: int
     """Fill a long run of missing samples with successive samples from the side of the run with more samples.
 
     A linear trend is added to the copied samples, so that the mean levels beside their original place match those
-    beside the run. If there are too few samples, their mirror image continues them.
+    beside the run. If there are too few samples, they are extended with their mirror image.
 
     Parameters
     ----------

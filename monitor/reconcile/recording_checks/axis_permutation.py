@@ -4,8 +4,8 @@ The spectrum of each recorded axis is compared with the spectrum of each axis of
 three axes is fitted, because the unit may also be wrong. The noise of a real sensor varies from run to run, so the
 noise level of each axis and the power in each band may differ from the model. A permutation is reported if the
 permuted axes fit clearly better than the axes in the order of the file, and if the permutation explains most of their
-differences. An axis with an additional noise may fit another axis slightly better, but not well. Two axes with the same
-spectrum cannot be distinguished and keep their order. Noise spectra do not show the sign of an axis.
+differences. With additional noise, a recorded axis may fit another axis of the model slightly better, but not well. Two
+axes with the same spectrum cannot be distinguished and keep their order. Noise spectra do not show the sign of an axis.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,9 +26,9 @@ LEVEL_LOG_SIGMA: Final = 0.12
 BAND_LOG_SIGMA: Final = 0.2
 """Standard deviation of the logarithm of the power in one band, relative to the axis, between runs (empirical)."""
 MAX_BAND_COST_NATS: Final = 10.0
-"""Upper limit in nats of the cost of a power difference in one band. The limit keeps the cost of a moved line small."""
+"""Upper limit of the cost of a power difference in one band, in nats. It keeps the cost of a moved line small."""
 MAX_AXIS_COST_NATS: Final = 32.0
-"""Upper limit in nats of the cost of a different noise level on one axis."""
+"""Upper limit of the cost of a different noise level on one axis, in nats."""
 CORRELATED_BANDS: Final = 3.0
 """Number of neighbouring bands with correlated deviations (empirical)."""
 PENALTIES_NATS: Final = {

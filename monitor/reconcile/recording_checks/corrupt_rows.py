@@ -36,7 +36,7 @@ SIMULATED_HEAD_SAMPLES: Final = 256
 """Number of samples in a simulation of the first rows."""
 HEAD_SIMULATIONS: Final = 8
 MAX_HEAD_RATIO: Final = 3.0
-"""Largest distance of a first row, relative to the largest simulated distance, that the model can explain."""
+"""Largest distance of a first row that the model can explain, relative to the largest simulated distance."""
 NEIGHBOURS: Final = 5
 """Number of samples on each side that contribute to the median."""
 PREFILTER_DISTANCE: Final = 4.0

@@ -1,4 +1,4 @@
-"""Check a recording for motion, knocks and handling, and remove the samples in motion.
+"""Check a recording for motion, knocks and handling, and remove the samples recorded during motion.
 
 ``analyze --rest`` uses the same motion detector. Motion of a sensor affects several axes at the same time. A
 disturbance of a single axis may be a noise effect and is therefore not removed. Axes with steps or changes of the noise

@@ -13,8 +13,8 @@ therefore tests each feature separately, relative to the surrounding spectrum.
   group remains at the stated frequency.
 
 The noise level is no evidence for a wrong sample rate. An error of 20 % changes the level by 10 %, and the noise of
-many sensors varies as much from run to run. The cutoff of a low-pass filter is too weak to count as evidence. For a
-sample rate that is wrong by 5 %, the gain of the cutoff is at most 7 nats in 60 000 samples of a real sensor.
+many sensors varies as much from run to run. The cutoff of a low-pass filter is not sharp enough to count as evidence.
+For a sample rate that is wrong by 5 %, the gain of the cutoff is at most 7 nats in 60 000 samples of a real sensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -288,7 +288,11 @@ def _estimate_stated_ratio(groups: Sequence[FeatureGroup], x: float) -> SampleRa
 
 
 def _estimate_common_ratio(groups: Sequence[FeatureGroup]) -> SampleRateErrorEstimate | None:
-    """Estimate the ratio by which at least two groups move, if no group remains at the stated frequency."""
+    """Estimate the common ratio by which the frequencies of the groups have moved.
+
+    The result is None if fewer than two groups have moved, if their ratios differ, or if a group remains at the stated
+    frequency.
+    """
     wide = [maximum_filter1d(one.gains, 2 * round(MAX_FREQUENCY_DRIFT / LOG_RATIO_STEP) + 1) for one in groups]
     total = np.where(np.abs(LOG_RATIOS) > MAX_FREQUENCY_DRIFT, np.sum(wide, axis=0), 0.0)
     best = int(total.argmax())

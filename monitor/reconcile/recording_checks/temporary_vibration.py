@@ -2,8 +2,9 @@
 
 The spectrum of short blocks is compared with the median spectrum of all blocks. A temporary vibration increases the
 power in a narrow frequency band during a few blocks in succession, and the band is quiet at all other times. Changes of
-the power at all frequencies are motion or a step of the noise, which other checks and the search for noise effects
-handle. If the same change occurs in a simulation of the model, the vibration cannot be distinguished from noise.
+the power at all frequencies indicate motion or a step of the noise. They are handled by other checks and by the search
+for noise effects. If the same change occurs in a simulation of the model, the vibration cannot be distinguished from
+noise.
 
 The band is replaced with random noise during the vibration. The noise has the power of the neighbouring frequencies.
 """
@@ -53,8 +54,9 @@ A moving resonance is not quiet in this region.
 """
 MIN_NEIGHBOUR_BINS: Final = 12
 MAX_QUIET_RATIO: Final = 1.5
-"""Largest mean power of a quiet bin, relative to the background, for many blocks. During the vibration, this limit
-applies to all other frequencies. At other times, it applies to the neighbouring frequencies."""
+"""Largest mean power of a quiet bin, relative to the background, if it is averaged over many blocks. During the
+vibration, this limit applies to the median of all other frequencies. At other times, it applies to the neighbouring
+frequencies."""
 MIN_CONTRAST: Final = 4.0
 """Smallest ratio of the mean power in the band during and outside the vibration."""
 MIN_Z: Final = 5.0
@@ -225,7 +227,7 @@ def _close_gaps(active: Mask) -> Mask:
 
 
 def _widen(active: Mask) -> Mask:
-    """Return the blocks with one block more at both ends of each episode."""
+    """Return the active blocks, with each episode extended by one block at both ends."""
     wide = active.copy()
     wide[1:] |= active[:-1]
     wide[:-1] |= active[1:]

@@ -82,8 +82,8 @@ PENALTY_NATS: Final[dict[str, float]] = {
 """Penalty of each effect in nats.
 
 On an axis without the effect, the gain exceeds the penalty with a probability of about 4e-5. With six axes and twenty
-effects, a wrong effect is then found in about one of 200 recordings of a true model. The values come from simulated
-recordings of a true model. For one fitted size without a location, the value is close to the quantile of χ²₁/2.
+effects, a wrong effect is then found in about one of 200 recordings for which the model is true. The values come from
+simulations with a true model. For one fitted size without a location, the value is close to the quantile of χ²₁/2.
 """
 SHAPES_PER_DECADE: Final = 4
 """Number of shape values per decade in the first search."""
@@ -340,8 +340,8 @@ def _best_time_constant(
     """Return the most likely effect, or an empty list if the fitted time constant is out of range.
 
     If the first search finds only a small gain, the function returns an empty list and does not refine the time
-    constant. With adjacent time constants T and 1.84 T, the correlation of an exponential with the nearer one is at
-    least 2 √1.36/(1 + 1.36) = 0.988. The first search therefore finds nearly the largest gain.
+    constant. Between adjacent time constants T and 1.84 T, the correlation of an exponential with the nearer exponential
+    is at least 2 √1.36/(1 + 1.36) = 0.988. The first search therefore finds nearly the largest gain.
     """
     best = _most_likely(whitened.axis, whitened.effects, trials)
     gain = whitened.axis.fit((*whitened.effects, best)).log_likelihood

@@ -54,7 +54,7 @@ GAIN_SWEEPS: Final = 2
 MAX_LOG_GAIN_CHANGE: Final = 1.5
 """Largest change of the logarithm of a gain in one sweep of the fit."""
 MAX_LOG_BANDWIDTH_CHANGE: Final = 1.0
-"""Largest change of the logarithm of a bandwidth from the first search."""
+"""Largest change of the logarithm of a bandwidth relative to the first search."""
 MIN_HALF_SHARE: Final = 0.2
 """Smallest share of the gain that each half of the recording must contribute, for all axes together and for each
 axis."""
@@ -197,7 +197,7 @@ def _cross_spectra_of_halves(
 def _without_weak_axes(joint: "_JointFit", spectra: CrossSpectra, halves: Sequence[CrossSpectra]) -> "_JointFit":
     """Leave out the axes on which the vibration explains too little, as long as more than two axes remain.
 
-    The gain of an axis comes from the correlations with the other axes and from the spectrum. The gain must exceed
+    The gain of an axis comes from its correlations with the other axes and from its spectrum. The gain must exceed
     ``RESIZE_PENALTY_NATS``, and each half of the recording must contribute to the part from the correlations.
 
     Parameters

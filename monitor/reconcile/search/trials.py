@@ -86,7 +86,7 @@ MAX_OUTLIER_Z: Final = 4.0
 MIN_DISTANT_SCALE: Final = 3.5
 """Smallest standard deviation of distant outliers, relative to the noise. Other heavy tails have a smaller ratio."""
 MAX_MISFIT_SHARE: Final = 0.2
-"""Largest accepted misfit of distant outliers, relative to the gain."""
+"""Largest accepted misfit of distant outliers, as a fraction of the gain from fitting the outliers."""
 MAX_BAND_SHARE: Final = 0.5
 """Largest share of one frequency band in the gain of a variance change of white noise."""
 BAND_MARGIN_NATS: Final = 3.0
@@ -98,7 +98,7 @@ ALTERNATIVE_MARGIN_NATS: Final = 1.0
 MAX_BAND_FRACTION: Final = 0.25
 """Largest width of a narrow frequency band, as a fraction of the sample rate."""
 MOVE_ADVANTAGE_NATS: Final = 4.0
-"""Score advantage, in nats, of a moved line. An additional line would have two more fitted sizes."""
+"""Score advantage, in nats, of a moved line over an additional line, which would need two more fitted sizes."""
 MAX_MOVED_SIZE_RATIO: Final = 3.0
 """Largest ratio of the sizes of a line before and after a change of the frequency."""
 NOISE_PRIORITY_NATS: Final = 5.0
@@ -222,7 +222,7 @@ def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
 def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Try outliers, unless another cause of heavy tails is as likely.
 
-    Samples that are marked as outliers are replaced, so that the diagnostics no longer see a misfit of distant
+    Samples that are marked as outliers are replaced, so that the diagnostics no longer show the misfit of distant
     outliers. The trial keeps this misfit.
     """
     far = whitened.outlier_fit

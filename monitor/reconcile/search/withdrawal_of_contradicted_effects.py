@@ -37,7 +37,7 @@ from monitor.reconcile.likelihood.axis_fit import Effects
 MIN_COMB_LINES: Final = 4
 MAX_HARMONIC: Final = 60
 MIN_PULSE_LINES: Final = 2
-"""Smallest number of additional harmonic lines that contradict rectangular pulses."""
+"""Smallest number of additional harmonic lines that rules out rectangular pulses."""
 MAX_PULSE_DIVISOR: Final = 4
 """Largest divisor of the pulse frequency. The lines may be harmonics of the divided frequency."""
 PULSE_ORDER_TOLERANCE: Final = 0.005

@@ -84,7 +84,7 @@ def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[M
 
 
 def _compare_expected_gap(expected: float, growth: float, gap: DiagnosticGap, seconds: float) -> tuple[Meaning, str]:
-    """Compare the expected difference with the threshold, and return the meaning of the absence with an explanation."""
+    """Compare the expected difference with the threshold, and return a conclusion about the absence with a reason."""
     said = (
         f"with the size in the other recording, {seconds:.6g} s of data would show a gap of about {expected:.1f} "
         f"({gap.diagnostic}), and the threshold of {gap.threshold:.1f} is not passed"

@@ -18,7 +18,7 @@ MAX_LISTED: Final = 5
 """Largest number of listed findings."""
 MAX_LISTED_REMAINDERS: Final = 2
 UNMENTIONED_SIZE_CHANGE: Final = 0.05
-"""Largest relative change of the size of a moved line that is not described."""
+"""Largest relative change of the size of a moved line that the summary does not mention."""
 MIN_REMAINDER_SHARE: Final = 0.01
 """Smallest share of the gap that a remaining difference needs to be described."""
 EFFECT_PHRASES: Final = {

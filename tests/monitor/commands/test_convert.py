@@ -1,4 +1,4 @@
-"""Tests of ``convert``: every readable format to every written format, without a change of times and values."""
+"""Tests of ``convert``: every readable format to every written format, without changing times or values."""
 
 import os
 from collections.abc import Callable

@@ -33,7 +33,7 @@ MIN_TANH_ARGUMENT: Final = 0.01
 class WanderingLine(Source):
     """Oscillation A sin φ(t), where the frequency dφ/dt/2π = f0 + δ(t) wanders with the standard deviation s of δ.
 
-    Unlike ``Narrowband``, which can have the same spectrum, the amplitude is constant. The Allan variance is an
+    The amplitude is constant, unlike that of ``Narrowband``, which can have the same spectrum. The Allan variance is an
     integral over the spectrum. If no phase is given, the phase is random.
 
     >>> line = WanderingLine(amplitude=1.0, frequency=20.0, frequency_deviation=0.2, correlation_time=20.0)
