@@ -58,6 +58,8 @@ MAX_LOG_BANDWIDTH_CHANGE: Final = 1.0
 MIN_HALF_SHARE: Final = 0.2
 """Smallest share of the gain that each half of the recording must contribute, for all axes together and for each
 axis."""
+MAX_LOSS_SHARE: Final = 0.2
+"""Largest increase of the significant gains of all diagnostics, relative to the gain of the correlations."""
 MAX_SAME_BANDWIDTH_RATIO: Final = 4.0
 """Largest ratio of the bandwidths of a vibration and a noise effect that the vibration replaces."""
 VALIDATION_REASON: Final = "both halves of the recording contain the correlation of the axes"
@@ -174,7 +176,7 @@ def _with_strongest_vibration(
         changed[names[at]] = _with_vibration(searches[names[at]], joint.kept[at], _build_trial(joint, number, at))
     before = sum(_significant_gain(searches[name], null[name]) for name in changed)
     after = sum(_significant_gain(one, null[name]) for name, one in changed.items())
-    return changed if after <= before else {}
+    return changed if after - before < MAX_LOSS_SHARE * best.gain_nats else {}
 
 
 def _significant_gain(search: AxisSearchResult, null: AxisNull) -> float:
@@ -197,8 +199,9 @@ def _cross_spectra_of_halves(
 def _without_weak_axes(joint: "_JointFit", spectra: CrossSpectra, halves: Sequence[CrossSpectra]) -> "_JointFit":
     """Leave out the axes on which the vibration explains too little, as long as more than two axes remain.
 
-    The gain of an axis comes from its correlations with the other axes and from its spectrum. The gain must exceed
-    ``RESIZE_PENALTY_NATS``, and each half of the recording must contribute to the part from the correlations.
+    The gain of an axis comes from its correlations with the other axes and from its spectrum. This gain and the gain
+    of the correlations alone must exceed ``RESIZE_PENALTY_NATS``, and each half of the recording must contribute to the
+    gain from the correlations.
 
     Parameters
     ----------
@@ -220,9 +223,10 @@ def _without_weak_axes(joint: "_JointFit", spectra: CrossSpectra, halves: Sequen
 
 
 def _gain_of_axis(joint: "_JointFit", spectra: CrossSpectra, halves: Sequence[CrossSpectra], at: int) -> float:
-    """Return the log-likelihood gain of the vibration on one axis.
+    """Return the log-likelihood gain of the vibration on one axis, but at most the gain of the correlations.
 
-    If a half of the recording contributes too little, the value is negative.
+    A peak in the spectrum of an axis is no evidence that the axis shares the vibration. If a half of the recording
+    contributes too little, the value is negative.
     """
     vibration, hypothesis = joint.vibration, joint.hypotheses[at]
     rest = np.where(np.arange(vibration.gains.size) == at, 0.0, vibration.gains)
@@ -237,7 +241,7 @@ def _gain_of_axis(joint: "_JointFit", spectra: CrossSpectra, halves: Sequence[Cr
     without = hypothesis.axis.fit(hypothesis.effects, common).log_likelihood
     without += _without_axis(joint, spectra, at).vibration.gain_nats
     saved = sum(PENALTY_NATS[effect.name] for effect in hypothesis.added if effect not in joint.kept[at])
-    return _joint_log_likelihood(joint, at, float(vibration.gains[at])) - without + saved
+    return min(whole, _joint_log_likelihood(joint, at, float(vibration.gains[at])) - without + saved)
 
 
 def _without_axis(joint: "_JointFit", spectra: CrossSpectra, at: int) -> "_JointFit":
