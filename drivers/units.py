@@ -2,15 +2,19 @@
 
 Each table maps a unit name to the factor that converts a number to rad/s, m/s² or s. A temperature unit also has an
 offset. Unit names are case-sensitive. An unknown unit raises ``ConfigError``.
+
+A unit of angular rate or acceleration may be divided by a number, as in ``deg/s/131`` or ``g/16384``. Data sheets state
+this number as the sensitivity in LSB/(°/s) or LSB/g. ``rad s^-1`` is another spelling of ``rad/s``.
 """
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Final, TypeVar
 
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_choices_by_similarity
-from drivers.number_ranges import HOUR_S
+from drivers.number_ranges import HOUR_S, SCALE
 
 G0: Final = 9.80665
 """Standard acceleration of free fall in m/s², exact by definition (CGPM 1901)."""
@@ -76,6 +80,7 @@ TIME: Final[Mapping[str, float]] = {
 }
 """Factor that converts each unit of time to s."""
 
+_SENSITIVITY: Final = re.compile(r"(.*\S)\s*/\s*(\d+(?:\.\d*)?(?:e\d+)?)")
 T = TypeVar("T")
 
 
@@ -85,16 +90,16 @@ def angular_rate_factor(unit: str) -> float:
     >>> round(angular_rate_factor("deg/s"), 6)
     0.017453
     """
-    return _look_up(RATE, unit, "angular rate")
+    return _look_up_scaled(RATE, unit, "angular rate")
 
 
 def acceleration_factor(unit: str) -> float:
     """Return the factor that converts a unit of acceleration to m/s². Raise ConfigError if the unit is unknown.
 
-    >>> acceleration_factor("g")
-    9.80665
+    >>> acceleration_factor("g"), acceleration_factor("g/2")
+    (9.80665, 4.903325)
     """
-    return _look_up(ACCELERATION, unit, "acceleration")
+    return _look_up_scaled(ACCELERATION, unit, "acceleration")
 
 
 def temperature_factor_and_offset(unit: str) -> tuple[float, float]:
@@ -113,9 +118,18 @@ def time_factor(unit: str) -> float:
     return _look_up(TIME, unit, "time")
 
 
+def _look_up_scaled(table: Mapping[str, float], unit: str, quantity: str) -> float:
+    """Return the factor of a unit that may be divided by a sensitivity, as in ``g/16384``."""
+    divided = _SENSITIVITY.fullmatch(unit.strip())
+    if divided is None or unit.strip() in table or not SCALE.supports(sensitivity := float(divided[2])):
+        return _look_up(table, unit, quantity)
+    return _look_up(table, divided[1], quantity) / sensitivity
+
+
 def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
     # Unicode has two characters for the prefix micro.
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
+    name = name.replace(" s^-1", "/s").replace(" s^-2", "/s^2")
     if name not in table:
         raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices_by_similarity(name, tuple(table))}')
     return table[name]

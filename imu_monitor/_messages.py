@@ -12,12 +12,17 @@ from typing import Final
 from drivers.errors import ConfigError, ImuError, NotReady
 
 ARGUMENTS: Final = {
+    "--accel-unit": "accel_unit",
+    "--columns": "columns",
     "--correlation-time S": "correlation_time_s",
+    "--gyro-unit": "gyro_unit",
     "--last 1d": "last_s=86400",
     "--last": "last_s",
     "--out": "folder",
     "--rate HZ": "rate_hz",
     "--rate": "rate_hz",
+    "--temperature-unit": "temperature_unit",
+    "--time-unit": "time_unit",
     "--topic (in a configuration file: topic)": "topic",
     "--topic": "topic",
     "--window S": "window_s",

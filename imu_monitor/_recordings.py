@@ -14,6 +14,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
 from drivers.number_ranges import RATE_HZ, NumberRange
+from drivers.recordings.reading_options import create_reading_options
 from drivers.recordings.table import ALIASES, COLUMNS
 from imu_monitor._display import build_dataframe, render_html
 from imu_monitor._messages import errors_name_arguments, name_arguments
@@ -145,6 +146,11 @@ def read_recording(
     *,
     last_s: float | None = None,
     topic: str | None = None,
+    columns: Mapping[str, str | int] | None = None,
+    gyro_unit: str | None = None,
+    accel_unit: str | None = None,
+    temperature_unit: str | None = None,
+    time_unit: str | None = None,
 ) -> Recording:
     """Read a recording from a file, or from all segments in a folder.
 
@@ -159,6 +165,17 @@ def read_recording(
         Duration in s of the part to read at the end of the recording. By default, the whole recording is read.
     topic : str, optional
         Topic to read from a ROS bag or a log of PX4. By default, its only IMU is read.
+    columns : mapping of str to str or int, optional
+        Column of a table for each quantity (``t``, ``gx``, …, ``temperature``): a name, a number from 1, or ``"-"`` to
+        leave the quantity out. By default, the columns are recognized by their names.
+    gyro_unit : str, optional
+        Unit of the angular rates in the file, such as ``"deg/s"``. By default, the unit that the file states, or rad/s.
+    accel_unit : str, optional
+        Unit of the accelerations in the file, such as ``"g"``. By default, the unit that the file states, or m/s².
+    temperature_unit : str, optional
+        Unit of the temperatures in the file, such as ``"K"``. By default, the unit that the file states, or °C.
+    time_unit : str, optional
+        Unit of the times in the file, such as ``"ns"``. By default, the unit that the file states, or s.
 
     Returns
     -------
@@ -170,7 +187,8 @@ def read_recording(
     RecordingError
         If the file or folder contains no recording.
     ConfigError
-        If the sample rate or a library is missing, the suffix is unknown, or the samples do not fit into memory.
+        If the sample rate or a library is missing, the suffix, a column or a unit is unknown, or the samples do not fit
+        into memory.
 
     Examples
     --------
@@ -182,7 +200,17 @@ def read_recording(
     >>> imu_monitor.read_recording(path, last_s=30.0)
     <Recording of gx gy gz ax ay az: 3000 samples, 30 s>
     """
-    return to_public(recordings.load_samples(Path(path), rate_hz, last_s, topic))
+    options = create_reading_options(
+        {
+            "topic": topic,
+            "columns": None if columns is None else dict(columns),
+            "gyro_unit": gyro_unit,
+            "accel_unit": accel_unit,
+            "temperature_unit": temperature_unit,
+            "time_unit": time_unit,
+        }
+    )
+    return to_public(recordings.load_samples(Path(path), rate_hz, last_s, options))
 
 
 def to_public(recording: recordings.Recording) -> Recording:

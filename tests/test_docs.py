@@ -18,8 +18,10 @@ import drivers.decoders
 from drivers import module_lookup
 from drivers.data_types import EVENT_KINDS, make_block
 from drivers.recordings import FORMATS
+from drivers.recordings.reading_options import OPTION_NAMES
 from drivers.zenoh.sample_message import encode_samples
 from monitor.cli import app
+from monitor.cli.shared.options import READING_OPTIONS
 from monitor.common import topics
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
@@ -144,7 +146,9 @@ def test_command_tables_are_complete() -> None:
     rows = re.findall(row, COMMANDS_PAGE.read_text("utf-8"), re.M)
     assert [name for name, _ in rows] == list(COMMANDS)
     assert [name for name, _ in re.findall(row, get_section(README, "Commands"), re.M)] == list(COMMANDS)
-    everywhere = {"--help", "--seconds", "--viewer"}
+    of_tables = {OPTION_NAMES[name] for name in READING_OPTIONS} - {"--topic"}
+    everywhere = {"--help", "--seconds", "--viewer", *of_tables}
+    assert of_tables <= set(re.findall(r"--[a-z-]+", COMMANDS_PAGE.read_text("utf-8")))
     for name, row in rows:
         assert list_options(name) - everywhere == set(re.findall(r"--[a-z-]+", row)), name
 

@@ -41,6 +41,7 @@ from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, require_packages_of_format, segment_file
 from drivers.recordings.ardupilot_log_format import is_ardupilot_log
+from drivers.recordings.reading_options import ReadingOptions
 from drivers.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
@@ -76,7 +77,7 @@ DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log":
 """Default decoder of each kind of file; "" if the settings must name the decoder."""
 
 
-class Settings(LinkSettings):
+class Settings(LinkSettings, ReadingOptions):
     """Configuration keys of a replay."""
 
     path: FilePath = Field(
@@ -95,9 +96,6 @@ class Settings(LinkSettings):
     )
     channel: str | None = Field(
         None, examples=["1"], description="channel of a CAN log that is replayed; absent: all channels"
-    )
-    topic: str | None = Field(
-        None, examples=["/imu/data"], description="topic of a ROS bag or of a log of an autopilot; absent: the only IMU"
     )
 
 
@@ -168,7 +166,7 @@ class ReplayLink(PolledLink):
 
     def _read_items(self) -> Generator[TimedChunk]:
         if self._kind == "recording":
-            recording = load_samples(self._path, self._settings.rate, topic=self._settings.topic)
+            recording = load_samples(self._path, self._settings.rate, options=self._settings)
             self.notes = recording.notes
             return _read_messages(recording, self._message_rows(recording))
         if self._kind == "raw":

@@ -1,6 +1,7 @@
 """Reading and writing of recordings in CSV, .npz, Parquet and Arrow files, or in a folder of segments.
 
-Logs of robots and of autopilots (ROS bags, MCAP, logs of PX4 and ArduPilot) are only read.
+Logs of robots and of autopilots (ROS bags, MCAP, logs of PX4 and ArduPilot), MATLAB files, and folders and zip archives
+of phone apps are only read.
 
 ``load_samples`` reads a file or a folder and returns a ``Recording``, which includes notes about irregularities of the
 file, such as missing values.
@@ -28,14 +29,18 @@ from drivers.extras import require_extra
 from drivers.file_access import check_regular_file
 from drivers.number_ranges import DURATION_S, RATE_HZ
 from drivers.recordings import memory_check
-from drivers.recordings.formats import FORMATS, WRITABLE, Format, find_format, is_recording
-from drivers.recordings.ros_bag_format import is_bag_folder
+from drivers.recordings.formats import FORMATS, WRITABLE, Format, find_format, is_recording, is_recording_folder
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.table import EXAMPLE_HEADER, T_LIMIT_S, Table
+from drivers.recordings.table_layout import find_unit
+from drivers.recordings.unit_check import describe_likely_unit_errors
 from drivers.recordings.writing import open_recording_writer, save_samples
+from drivers.units import time_factor
 
 __all__ = [
     "FORMATS",
     "WRITABLE",
+    "ReadingOptions",
     "Recording",
     "create_recording",
     "is_recording",
@@ -49,6 +54,8 @@ __all__ = [
 
 MAX_VALUE: Final = 1e100
 """Largest absolute value. The sum of the squares of larger values could overflow float64."""
+MIN_UNIX_S: Final = 6e8
+"""Unix time in s before which no recording of a MEMS sensor was made (1989)."""
 TIME_RESOLUTION_S: Final = 1e-6
 """Time difference in s that is slightly larger than the resolution of Unix times in float64."""
 
@@ -69,7 +76,10 @@ class Recording:
 
 
 def load_samples(
-    path: Path, rate_hz: float | None = None, last_s: float | None = None, topic: str | None = None
+    path: Path,
+    rate_hz: float | None = None,
+    last_s: float | None = None,
+    options: ReadingOptions = DEFAULT_OPTIONS,
 ) -> Recording:
     """Read a recording from a file, or from all segments in a folder.
 
@@ -82,8 +92,8 @@ def load_samples(
         file.
     last_s
         Duration in s of the part to read at the end of the recording. None reads the whole recording.
-    topic
-        Topic to read from a log that contains several. None selects the only IMU of the log.
+    options
+        Topic to read from a log that contains several, and columns and units of a table.
 
     Raises
     ------
@@ -99,10 +109,10 @@ def load_samples(
         except ConfigError as error:
             raise ConfigError(f"{option}: {error}") from None
     try:
-        if path.is_dir() and not is_bag_folder(path):
-            found = _load_folder(path, rate_hz, last_s, topic)
+        if path.is_dir() and not is_recording_folder(path):
+            found = _load_folder(path, rate_hz, last_s, options)
         else:
-            found = _load_file(path, rate_hz, topic)
+            found = _load_file(path, rate_hz, options)
     except OSError as error:
         raise RecordingError(_error_text(path, error)) from error
     except MemoryError as error:
@@ -133,7 +143,7 @@ def create_recording(columns: Mapping[str, Floats], rate_hz: float | None = None
         If there are neither times nor a sample rate.
     """
     copies = {name: np.array(column, np.float64) for name, column in columns.items()}
-    return _assemble(Path(source), Table(copies, None, []), rate_hz)
+    return _assemble(Path(source), Table(copies, None, []), rate_hz, DEFAULT_OPTIONS)
 
 
 def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]:
@@ -173,9 +183,9 @@ def _error_text(path: Path, error: RecordingError | OSError) -> str:
 # --- from columns to a recording -----------------------------------------------------------------
 
 
-def _load_file(path: Path, rate_hz: float | None, topic: str | None) -> Recording:
+def _load_file(path: Path, rate_hz: float | None, options: ReadingOptions) -> Recording:
     if not _is_empty(path):
-        return _assemble(path, _format_with_packages(path).read(path, topic), rate_hz)
+        return _assemble(path, _format_with_packages(path).read(path, options), rate_hz, options)
     if not is_recording(path):
         raise ConfigError(
             f"{path}: the file is empty, and its name does not end like that of a recording; known are "
@@ -187,8 +197,8 @@ def _load_file(path: Path, rate_hz: float | None, topic: str | None) -> Recordin
 
 
 def _is_empty(path: Path) -> bool:
-    """Return True if a file is empty. Raise OSError if the path is neither a regular file nor the folder of a bag."""
-    if is_bag_folder(path):
+    """Return True if a file is empty. Raise OSError if the path is neither a file nor the folder of one recording."""
+    if is_recording_folder(path):
         return False
     check_regular_file(path)
     return path.stat().st_size == 0
@@ -199,7 +209,7 @@ def _format_with_packages(path: Path) -> Format:
     return find_format(path)
 
 
-def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
+def _assemble(path: Path, table: Table, rate_hz: float | None, options: ReadingOptions) -> Recording:
     n = _common_length(path, table.columns)
     notes = list(table.notes)
     rate = _choose_rate(_supported_fs(table.fs, notes), rate_hz, notes)
@@ -215,7 +225,19 @@ def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
     temperature_c = table.columns.get("temperature", np.full(n, np.nan))
     values, temperature_c = values[rows], temperature_c[rows].copy()
     _drop_large(values, temperature_c, notes)
+    notes += describe_likely_unit_errors(
+        values, _mean_rate(t_s, rate), *(find_unit(table, options, axis) for axis in (AXES[0], AXES[3]))
+    )
     return _read_only_recording(t_s, values, temperature_c, rate, axes, notes)
+
+
+def _mean_rate(t_s: Floats | None, rate_hz: float | None) -> float | None:
+    """Return the stated sample rate in Hz, or the rate that follows from the times. None if neither is known."""
+    if rate_hz is not None or t_s is None or t_s.size < 2:
+        return rate_hz
+    steps = np.diff(t_s[: 1 << 16])
+    step_s = float(np.mean(steps[steps > 0.0])) if np.any(steps > 0.0) else 0.0
+    return 1.0 / step_s if step_s else None
 
 
 def _read_only_recording(
@@ -275,12 +297,19 @@ def _usable_times(
     if 2 * lost > t.size:
         what = f"{lost} of {t.size} values of t are not times in seconds (first: {t[~usable][0]:g})"
         if rate_hz is None:
-            raise RecordingError(f"{path}: {what}; give t in seconds, or leave t out and give --rate HZ")
+            raise RecordingError(f"{path}: {what}; {_suggest_time_unit(t)}or leave t out and give --rate HZ")
         notes.append(f"{what}; the stated rate of {rate_hz:g} Hz is used instead of t.")
         return None, slice(None)
     if lost:
         notes.append(f"{lost} of {t.size} rows have no usable time and were left out.")
     return t[usable], usable
+
+
+def _suggest_time_unit(t: Floats) -> str:
+    """Return the advice to state the unit of times that fit Unix times in another unit than s."""
+    median = float(np.median(np.abs(t[np.isfinite(t)]))) if np.isfinite(t).any() else 0.0
+    unit = next((unit for unit in ("ms", "us", "ns") if MIN_UNIX_S < median * time_factor(unit) < T_LIMIT_S), None)
+    return "give t in seconds, " if unit is None else f"they fit Unix times in {unit}: give --time-unit {unit}, "
 
 
 def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
@@ -307,7 +336,7 @@ def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
 # --- folders -------------------------------------------------------------------------------------
 
 
-def _load_folder(path: Path, rate_hz: float | None, last_s: float | None, topic: str | None) -> Recording:
+def _load_folder(path: Path, rate_hz: float | None, last_s: float | None, options: ReadingOptions) -> Recording:
     """Read all segments in a folder. Skip unreadable segments, and append a note for each skipped segment."""
     segments = sorted((p for p in path.iterdir() if is_recording(p) and p.name[0] != "."), key=_number_order)
     if not segments:
@@ -317,10 +346,10 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None, topic:
     free = memory_check.available_bytes()
     rows = size_bytes = 0
     if last_s is None:
-        _check_folder(path, segments, free, topic)
+        _check_folder(path, segments, free, options)
     for segment in reversed(segments):
         try:
-            part = _load_file(segment, rate_hz, topic)
+            part = _load_file(segment, rate_hz, options)
         except (RecordingError, OSError) as error:
             notes.append(f"A segment was left out: {_error_text(segment, error)}.")
             continue
@@ -340,12 +369,12 @@ def _number_order(path: Path) -> list[str | int]:
     return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", path.name))]
 
 
-def _check_folder(path: Path, segments: Sequence[Path], free: int | None, topic: str | None) -> None:
+def _check_folder(path: Path, segments: Sequence[Path], free: int | None, options: ReadingOptions) -> None:
     """Raise an error if the readable segments together contain too many rows."""
     rows = size_bytes = 0
     for segment in segments:
         try:
-            rows += 0 if _is_empty(segment) else _format_with_packages(segment).count_rows(segment, topic)
+            rows += 0 if _is_empty(segment) else _format_with_packages(segment).count_rows(segment, options)
         except (RecordingError, OSError):
             continue  # the note about the segment is added when the segment is read
         size_bytes += segment.stat().st_size

@@ -1,6 +1,7 @@
 """Reading and writing of plain and gzip-compressed CSV recordings.
 
-An empty field or ``nan`` is a missing value. Blank lines and comment lines before the header line are skipped.
+An empty field or ``nan`` is a missing value. Blank lines and comment lines are skipped. ``csv_header`` finds the header
+line and the separator, and ``table_layout`` the columns that are read.
 
 NumPy parses text in large pieces. A piece with a damaged line is parsed line by line, so that only the damaged line is
 lost. If the last line has no line ending, it is skipped, because its last number may be incomplete.
@@ -8,12 +9,12 @@ lost. If the last line has no line ending, it is skipped, because its last numbe
 Lines are counted before parsing, so that ``drivers.recordings.memory_check`` can reject a file that is too large.
 """
 
-import csv
 import gzip
 import io
+import re
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -21,21 +22,29 @@ from typing import IO, Final, cast
 
 import numpy as np
 
-from drivers.data_types import AXES, Floats
+from drivers.data_types import Floats
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular_file
-from drivers.recordings import memory_check, table
+from drivers.recordings import csv_header, memory_check, table
+from drivers.recordings.csv_header import (
+    BLANKS,
+    COMMENT_MARKS,
+    DECIMAL_COMMA_SEPARATORS,
+    CsvHeader,
+    parse_number,
+    split_fields,
+)
+from drivers.recordings.reading_options import ReadingOptions
+from drivers.recordings.table_layout import find_layout
 
 READ_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 1 << 20
-MAX_PREAMBLE_BYTES: Final = 1 << 20
-"""Maximum total size of the blank lines and comments before the header."""
 MAX_EMPTY_MEMBERS: Final = 1000
 """Maximum number of consecutive gzip members without content."""
 MAX_BAD_LINES: Final = 100_000
 """Number of invalid lines after which reading stops if most lines are invalid."""
-COMMENT_MARKS: Final = (b"#", b"%")
-BOM: Final = b"\xef\xbb\xbf"
+NOT_SAMPLES: Final = re.compile(rb"^[ \t]*(?:[#%].*)?\n", re.MULTILINE)
+"""Pattern of blank lines and comment lines."""
 GZIP_BYTES: Final = 1 << 16
 """Number of compressed bytes that are decompressed at once.
 
@@ -58,45 +67,71 @@ class _BadLines:
         self.count += 1
 
 
-def read_csv(path: Path) -> table.Table:
-    """Read the known columns of a plain or gzip-compressed CSV file. A truncated last line is skipped.
+@dataclass(frozen=True, slots=True)
+class CsvSource:
+    """A CSV file, or a CSV file in an archive."""
+
+    path: Path  # file on disk, whose size determines the limits
+    label: str  # name of the source in messages
+    sensor: str  # name of the sensor for columns that are only named x, y and z
+    open_stream: Callable[[], AbstractContextManager[IO[bytes]]]
+
+
+def read_csv(path: Path, options: ReadingOptions) -> table.Table:
+    """Read the columns of a plain or gzip-compressed CSV file. A truncated last line is skipped.
 
     Raises
     ------
     RecordingError
         If the file has no header or no samples, or if most lines are invalid.
     ConfigError
-        If the samples do not fit into memory.
+        If the samples do not fit into memory, or if a column in the options does not exist.
     """
-    notes: list[str] = []
-    bad = _BadLines()
-    count_csv_rows(path)
-    with open_regular_file(path) as file:
-        texts = _whole_lines(_decompressed(file, notes), notes)
-        head = _find_header(path, texts)
-        if head is None:
-            what = notes[-1] if notes else "It has no line at all."
-            raise RecordingError(f"{path}: has not one complete line, expected {table.EXAMPLE_HEADER}. {what}")
-        names = _column_names(path, head)
-        chosen = table.select_known_columns(path, names, notes, f" in line {head.number}")
-        use = [names.index(name) for name in chosen.values()]
-        parts = list(_parse_pieces(path, head, texts, names, use, bad))
-    rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
-    if 2 * bad.count > len(rows):
-        raise _too_many_bad_lines(path, bad, len(rows))
-    if bad.count:
-        notes.append(f"{bad.count} of {len(rows)} lines are not samples and are read as missing ({bad.first}).")
-    if not len(rows):
-        what = f". {notes[-1]}" if notes else ""
-        raise RecordingError(f"{path}: has a header line but no complete line of samples after it{what}")
-    return table.Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
+    return read_csv_source(_file_source(path), options)
 
 
 def count_csv_rows(path: Path) -> int:
     """Return the number of complete lines in a CSV file. Raise an error if the file exceeds a size limit."""
-    limit = memory_check.measure_read_limit(path)
+    return count_csv_source_rows(_file_source(path))
+
+
+def _file_source(path: Path) -> CsvSource:
+    return CsvSource(path, str(path), path.name.partition(".")[0], lambda: open_regular_file(path))
+
+
+def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
+    """Read the columns of a CSV file on disk or in an archive. See ``read_csv``."""
+    notes: list[str] = []
+    bad = _BadLines()
+    label = Path(source.label)
+    count_csv_source_rows(source)
+    with source.open_stream() as file:
+        texts = _whole_lines(_decompressed(file, notes), notes)
+        header = csv_header.find_header(source.path, label, texts, options)
+        if header is None:
+            what = notes[-1] if notes else "It has no line at all."
+            raise RecordingError(f"{label}: has not one complete line, expected {table.EXAMPLE_HEADER}. {what}")
+        layout = find_layout(
+            label, header.names, options, notes, f" in line {header.number}" if header.number else "", source.sensor
+        )
+        use = list(layout.columns.values())
+        parts = list(_parse_pieces(label, header, texts, use, bad))
+    rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
+    if 2 * bad.count > len(rows):
+        raise _too_many_bad_lines(label, bad, len(rows))
+    if bad.count:
+        notes.append(f"{bad.count} of {len(rows)} lines are not samples and are read as missing ({bad.first}).")
+    if not len(rows):
+        what = f". {notes[-1]}" if notes else ""
+        raise RecordingError(f"{label}: has a header line but no complete line of samples after it{what}")
+    return table.Table({name: rows[:, i] for i, name in enumerate(layout.columns)}, None, notes, layout.units)
+
+
+def count_csv_source_rows(source: CsvSource) -> int:
+    """Return the number of complete lines in a CSV file on disk or in an archive. See ``count_csv_rows``."""
+    limit = memory_check.measure_read_limit(source.path)
     lines = unpacked = 0
-    with open_regular_file(path) as file:
+    with source.open_stream() as file:
         for text in _whole_lines(_decompressed(file, []), []):
             lines += text.count(b"\n")
             unpacked += len(text)
@@ -104,6 +139,14 @@ def count_csv_rows(path: Path) -> int:
             if unpacked > limit.size_bytes:
                 limit.check_unpacked_size(unpacked)
     return lines
+
+
+def read_csv_column_names(source: CsvSource, options: ReadingOptions) -> list[str]:
+    """Return the column names of a CSV file, without reading the samples. Return no names if there is no header."""
+    with source.open_stream() as file:
+        texts = _whole_lines(_decompressed(file, []), [])
+        header = csv_header.find_header(source.path, Path(source.label), texts, options)
+        return header.names if header is not None else []
 
 
 def _too_many_bad_lines(path: Path, bad: _BadLines, rows: int) -> RecordingError:
@@ -165,155 +208,74 @@ def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
         notes.append("The last line has no end and was left out; the file may be cut off.")
 
 
-@dataclass(frozen=True, slots=True)
-class _Header:
-    """Header line of a CSV file, and the text that was read together with the header line."""
-
-    line: bytes
-    number: int  # line number of the header
-    rest: bytes
-    rest_number: int  # line number of the first line of ``rest``
-
-
-def _find_header(path: Path, texts: Iterator[bytes]) -> _Header | None:
-    """Find the header line of a CSV file. Return None if the text contains no complete line.
-
-    The header is the first line that is not a comment. ``numpy.savetxt``, however, writes the header as a comment. If
-    the last comment names an axis and the next line does not, the comment is the header.
-    """
-    number = size = 0
-    comment: _Header | None = None
-    for text in texts:
-        start = 0
-        while (end := text.find(b"\n", start)) >= 0:
-            line = text[start:end].removeprefix(BOM if number == 0 else b"").strip()
-            number, begin, start = number + 1, start, end + 1
-            if line.startswith(COMMENT_MARKS):
-                comment = _Header(line.lstrip(b"#% "), number, text[start:], number + 1) if _has_axis(line) else None
-            elif line:
-                if comment is not None and not _has_axis(line):
-                    return _Header(comment.line, comment.number, text[begin:], number)
-                return _Header(line, number, text[start:], number + 1)
-            size += end + 1 - begin
-            if size > MAX_PREAMBLE_BYTES:
-                raise RecordingError(
-                    f"{path}: has no header line within its first {number} lines, only comments and blank lines; "
-                    f"expected {table.EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
-                )
-    if comment is None and number:
-        return _Header(b"", number, b"", number + 1)
-    return comment
-
-
-def _has_axis(line: bytes) -> bool:
-    """Return True if a CSV line contains the name of an axis, with or without a comment mark before the first field."""
-    fields = line.lstrip(b"#% ").decode("utf-8", errors="replace").split(",")
-    return any(field.strip(' \t"') in AXES for field in fields)
-
-
-def _column_names(path: Path, head: _Header) -> list[str]:
-    """Return the column names in a header line. Raise RecordingError if the line is not a header line."""
-    if b"\0" in head.line or not head.line:
-        raise RecordingError(
-            f"{path}: is no CSV text, expected a first line such as {table.EXAMPLE_HEADER}"
-            f"{table.describe_suffix_mismatch(path)}"
-        )
-    text = head.line.decode("utf-8", errors="replace")
-    for separator, word in ((";", "semicolons"), ("\t", "tabs")):
-        if separator in text and "," not in text:
-            raise RecordingError(
-                f"{path}: the columns of line {head.number} are separated by {word}; separate them by commas"
-            )
-    table.check_column_count(path, text.count(",") + 1)
-    names = [name.strip(' \t"') for name in _split_fields(text)]
-    if all(_parse_number(name) is not None for name in names):
-        raise RecordingError(
-            f"{path}: the header line is missing: line {head.number} consists of numbers; "
-            f"expected a header line such as {table.EXAMPLE_HEADER}"
-        )
-    return names
-
-
 def _parse_pieces(
-    path: Path, head: _Header, texts: Iterable[bytes], names: Sequence[str], use: Sequence[int], bad: _BadLines
+    path: Path, header: CsvHeader, texts: Iterable[bytes], use: Sequence[int], bad: _BadLines
 ) -> Iterator[Floats]:
     """Yield a float array [lines, used columns] for each piece of CSV text."""
-    number, rows = head.rest_number, 0
-    for text in chain((head.rest,), texts):
+    number, rows = header.rest_number, 0
+    for text in chain((header.rest,), texts):
         text = text.replace(b"\r\n", b"\n")
-        lines = text.decode("utf-8", errors="replace").split("\n")[:-1]
         if text.strip():
-            part = _parse_regular_lines(text, lines, len(names), use)
-            part = _parse_line_by_line(lines, number, names, use, bad) if part is None else part
+            part = _parse_regular_lines(text, header, use)
+            if part is None and (samples := NOT_SAMPLES.sub(b"", text)) != text and samples:
+                part = _parse_regular_lines(samples, header, use)
+            part = _parse_line_by_line(text, number, header, use, bad) if part is None else part
             rows += len(part)
             if bad.count > MAX_BAD_LINES and 2 * bad.count > rows:
                 raise _too_many_bad_lines(path, bad, rows)
             yield part
-        number += len(lines)
+        number += text.count(b"\n")
 
 
-def _parse_regular_lines(text: bytes, lines: list[str], width: int, use: Sequence[int]) -> Floats | None:
+def _parse_regular_lines(text: bytes, header: CsvHeader, use: Sequence[int]) -> Floats | None:
     """Return a float array [lines, used columns], or None if any line is irregular."""
+    if header.separator in DECIMAL_COMMA_SEPARATORS and b"," in text:
+        text = text.replace(b",", b".")
     codes = np.frombuffer(text, np.uint8)
-    commas_before = np.searchsorted(np.flatnonzero(codes == ord(",")), np.flatnonzero(codes == ord("\n")))
-    if np.any(np.diff(commas_before, prepend=0) != width - 1):
+    line_ends = np.flatnonzero(codes == ord("\n"))
+    if header.separator == BLANKS:
+        solid = codes > ord(" ")  # a field begins at each change from white space to text
+        separators = np.flatnonzero(solid[1:] & ~solid[:-1]) + 1
+        fields_before = np.searchsorted(separators, line_ends) + bool(solid[0])
+        width = len(header.names)
+    else:
+        fields_before = np.searchsorted(np.flatnonzero(codes == ord(header.separator)), line_ends)
+        width = len(header.names) - 1
+    if np.any(np.diff(fields_before, prepend=0) != width):
         return None
+    lines = text.decode("utf-8", errors="replace").split("\n")[:-1]
     try:
-        return np.loadtxt(lines, delimiter=",", comments=None, usecols=use, ndmin=2)
+        return np.loadtxt(lines, delimiter=header.separator or None, comments=None, usecols=use, ndmin=2)
     except ValueError:
         return None
 
 
-def _parse_line_by_line(
-    lines: Sequence[str], number: int, names: Sequence[str], use: Sequence[int], bad: _BadLines
-) -> Floats:
-    """Return a float array [lines, used columns]. Invalid lines become rows of NaN."""
+def _parse_line_by_line(text: bytes, number: int, header: CsvHeader, use: Sequence[int], bad: _BadLines) -> Floats:
+    """Return a float array [lines, used columns]. Invalid lines become rows of NaN. Comment lines are skipped."""
     missing = [np.nan] * len(use)
     rows: list[list[float]] = []
-    for offset, line in enumerate(lines):
-        if not line.strip():
+    for offset, line in enumerate(text.decode("utf-8", errors="replace").split("\n")[:-1]):
+        if not line.strip() or line.lstrip().startswith(COMMENT_MARKS):
             continue
         try:
-            rows.append(_parse_sample(line, names, use))
+            rows.append(_parse_sample(line, header, use))
         except ValueError as error:
             bad.record_bad_line(number + offset, str(error))
             rows.append(missing)
     return np.array(rows).reshape(len(rows), len(use))
 
 
-def _parse_sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[float]:
-    fields = _split_fields(line)
-    if len(fields) != len(names):
-        raise ValueError(f"{len(fields)} fields where the header has {len(names)}")
+def _parse_sample(line: str, header: CsvHeader, use: Sequence[int]) -> list[float]:
+    fields = split_fields(line, header.separator)
+    if len(fields) != len(header.names):
+        raise ValueError(f"{len(fields)} fields where the header has {len(header.names)}")
     row = []
     for i in use:
-        number = _parse_number(fields[i])
+        number = parse_number(fields[i], header.separator)
         if number is None:
-            raise ValueError(f"{names[i]} is {fields[i].strip()[:20]!a}")
+            raise ValueError(f"{header.names[i]} is {fields[i].strip()[:20]!a}")
         row.append(number)
     return row
-
-
-def _split_fields(line: str) -> list[str]:
-    if '"' not in line:
-        return line.split(",")
-    try:
-        return next(csv.reader([line]))
-    except csv.Error:
-        return []
-
-
-def _parse_number(field: str) -> float | None:
-    """Return the number in a CSV field, NaN for an empty field, or None for text.
-
-    Unlike ``float``, 1_000 is rejected.
-    """
-    if not field or field.isspace():
-        return float("nan")
-    try:
-        return None if "_" in field else float(field)
-    except ValueError:
-        return None
 
 
 @contextmanager

@@ -10,22 +10,26 @@ from drivers.errors import ConfigError
 from drivers.recordings import (
     ardupilot_log_format,
     csv_format,
+    matlab_format,
     mcap_writer,
     npz_format,
     px4_ulog_format,
     ros_bag_format,
+    sensor_csv_format,
 )
 from drivers.recordings import parquet_and_arrow_format as arrow_format
+from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
+from drivers.recordings.table_layout import convert_to_si
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
     """Functions that read and write one recording format."""
 
-    read: Callable[[Path, str | None], Table]
-    """Function that reads a file. The second argument is the topic to read, or None."""
-    count_rows: Callable[[Path, str | None], int]
+    read: Callable[[Path, ReadingOptions], Table]
+    """Function that reads a file."""
+    count_rows: Callable[[Path, ReadingOptions], int]
     """Function that returns the number of rows without keeping the samples."""
     open_writer: OpenWriter | None = None
     """Function that writes a file; None if the program does not write the format."""
@@ -35,46 +39,77 @@ class Format:
     """Extra whose packages read the format; "" if no extra is needed or if the functions check it."""
 
 
-def _table_format(read: Callable[[Path], Table], open_writer: OpenWriter, count_rows: Callable[[Path], int]) -> Format:
+def _table_format(
+    read: Callable[[Path, ReadingOptions], Table],
+    open_writer: OpenWriter | None,
+    count_rows: Callable[[Path, ReadingOptions], int],
+) -> Format:
     """Return the format of a table, which has no topics."""
 
-    def refuse_topic(path: Path, topic: str | None) -> None:
-        if topic is not None:
-            raise ConfigError(f"{path}: contains a single table and no topics; leave out the topic {topic}")
+    def refuse_topic(path: Path, options: ReadingOptions) -> None:
+        if options.topic is not None:
+            raise ConfigError(f"{path}: contains a single table and no topics; leave out the topic {options.topic}")
 
-    def read_table(path: Path, topic: str | None) -> Table:
-        refuse_topic(path, topic)
-        return read(path)
+    def read_table(path: Path, options: ReadingOptions) -> Table:
+        refuse_topic(path, options)
+        return convert_to_si(path, read(path, options), options)
 
-    def count_table_rows(path: Path, topic: str | None) -> int:
-        refuse_topic(path, topic)
-        return count_rows(path)
+    def count_table_rows(path: Path, options: ReadingOptions) -> int:
+        refuse_topic(path, options)
+        return count_rows(path, options)
 
     return Format(read_table, count_table_rows, open_writer, any_columns=True)
 
 
-_ROS_BAG: Final = Format(ros_bag_format.read_ros_bag, ros_bag_format.count_ros_bag_rows, extra="ros")
+def _log_format(
+    read: Callable[[Path, str | None], Table], count_rows: Callable[[Path, str | None], int], extra: str
+) -> Format:
+    """Return the format of a log, which has topics. The messages of the log determine the columns."""
+
+    def check_topic(path: Path, options: ReadingOptions) -> str | None:
+        if options.columns:
+            raise ConfigError(f"{path}: the messages of this log determine the columns; leave out --columns")
+        return options.topic
+
+    return Format(
+        lambda path, options: convert_to_si(path, read(path, check_topic(path, options)), options),
+        lambda path, options: count_rows(path, check_topic(path, options)),
+        extra=extra,
+    )
+
+
+_SENSOR_FILES: Final = Format(sensor_csv_format.read_sensor_files, sensor_csv_format.count_sensor_rows)
+_ROS_BAG: Final = _log_format(ros_bag_format.read_ros_bag, ros_bag_format.count_ros_bag_rows, "ros")
+
+
+def _count_csv_rows(path: Path, _: ReadingOptions) -> int:
+    return csv_format.count_csv_rows(path)
+
+
+def _count_ipc_rows(path: Path, _: ReadingOptions) -> int:
+    return arrow_format.count_ipc_rows(path)
+
 
 FORMATS: Final[Mapping[str, Format]] = {
-    ".csv": _table_format(csv_format.read_csv, csv_format.open_csv_writer, csv_format.count_csv_rows),
-    ".csv.gz": _table_format(
-        csv_format.read_csv, partial(csv_format.open_csv_writer, use_gzip=True), csv_format.count_csv_rows
-    ),
+    ".csv": _table_format(csv_format.read_csv, csv_format.open_csv_writer, _count_csv_rows),
+    ".csv.gz": _table_format(csv_format.read_csv, partial(csv_format.open_csv_writer, use_gzip=True), _count_csv_rows),
     ".npz": _table_format(npz_format.read_npz, npz_format.open_npz_writer, npz_format.count_npz_rows),
     ".parquet": _table_format(
         arrow_format.read_parquet, arrow_format.open_parquet_writer, arrow_format.count_parquet_rows
     ),
-    ".arrow": _table_format(arrow_format.read_ipc, arrow_format.open_ipc_writer, arrow_format.count_ipc_rows),
-    ".feather": _table_format(arrow_format.read_ipc, arrow_format.open_ipc_writer, arrow_format.count_ipc_rows),
+    ".arrow": _table_format(arrow_format.read_ipc, arrow_format.open_ipc_writer, _count_ipc_rows),
+    ".feather": _table_format(arrow_format.read_ipc, arrow_format.open_ipc_writer, _count_ipc_rows),
     ".arrows": _table_format(
-        arrow_format.read_ipc, partial(arrow_format.open_ipc_writer, stream=True), arrow_format.count_ipc_rows
+        arrow_format.read_ipc, partial(arrow_format.open_ipc_writer, stream=True), _count_ipc_rows
     ),
+    ".mat": _table_format(matlab_format.read_matlab, None, matlab_format.count_matlab_rows),
+    ".zip": _SENSOR_FILES,
     ".bag": _ROS_BAG,
     ".db3": _ROS_BAG,
     ".mcap": replace(_ROS_BAG, open_writer=mcap_writer.open_mcap_writer),
-    ".ulg": Format(px4_ulog_format.read_ulog, px4_ulog_format.count_ulog_rows, extra="px4"),
-    ".bin": Format(
-        ardupilot_log_format.read_ardupilot_log, ardupilot_log_format.count_ardupilot_rows, extra="ardupilot"
+    ".ulg": _log_format(px4_ulog_format.read_ulog, px4_ulog_format.count_ulog_rows, "px4"),
+    ".bin": _log_format(
+        ardupilot_log_format.read_ardupilot_log, ardupilot_log_format.count_ardupilot_rows, "ardupilot"
     ),
 }
 """Recording format for each file suffix."""
@@ -86,7 +121,7 @@ WRITABLE_TABLES: Final = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].
 
 
 def find_format(path: Path) -> Format:
-    """Return the recording format of a file, or of the folder of a ROS 2 bag.
+    """Return the recording format of a file, or of a folder that contains a single recording.
 
     Raises
     ------
@@ -95,6 +130,8 @@ def find_format(path: Path) -> Format:
     """
     if ros_bag_format.is_bag_folder(path):
         return _ROS_BAG
+    if sensor_csv_format.is_sensor_folder(path):
+        return _SENSOR_FILES
     suffix = _suffix(path)
     if not suffix:
         raise ConfigError(
@@ -128,8 +165,13 @@ def find_writer(path: Path, any_columns: bool = False) -> OpenWriter:
 
 
 def is_recording(path: Path) -> bool:
-    """Return True if the name has the suffix of a recording format, or if the path is the folder of a ROS 2 bag."""
-    return _suffix(path) in FORMATS or ros_bag_format.is_bag_folder(path)
+    """Return True if the name has the suffix of a recording format, or if the folder contains a single recording."""
+    return _suffix(path) in FORMATS or is_recording_folder(path)
+
+
+def is_recording_folder(path: Path) -> bool:
+    """Return True if a folder contains a single recording: a ROS 2 bag, or one CSV file per sensor."""
+    return ros_bag_format.is_bag_folder(path) or sensor_csv_format.is_sensor_folder(path)
 
 
 def _suffix(path: Path) -> str:

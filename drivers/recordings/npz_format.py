@@ -17,7 +17,6 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from io import FileIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -30,6 +29,9 @@ from numpy.typing import NDArray
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
+from drivers.recordings.reading_options import ReadingOptions
+from drivers.recordings.table_layout import TableLayout, find_layout, is_known_column
+from drivers.recordings.zip_index import IndexSizeLimitedFile
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # local file header, PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
@@ -39,15 +41,12 @@ NPY_ERRORS: Final = (
 )  # fmt: skip
 """Exceptions that NumPy and zlib raise when an array is damaged."""
 COPY_BYTES: Final = 1 << 18
-MAX_INDEX_BYTES: Final = 4_000_000
-"""Maximum size in bytes of the index of an archive, enough for about 50 000 arrays."""
 MAX_HEADER_BYTES: Final = 1 << 16
 MAX_DEFLATE_RATIO: Final = 1032
 """Highest compression ratio of deflate, https://zlib.net/zlib_tech.html."""
 NUMERIC_KINDS: Final = "fiu"
 """Values of ``numpy.dtype.kind`` that a column may have: float, signed integer and unsigned integer."""
 NPY_MAGIC: Final = b"\x93NUMPY"
-KNOWN_KEYS: Final = frozenset((*table.COLUMNS, *table.ALIASES, "fs"))
 NPY_HEADER: Final = re.compile(
     rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?:False|True), "
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
@@ -57,19 +56,6 @@ NPY_HEADER: Final = re.compile(
 
 The header is matched by a regular expression and never evaluated as Python code.
 """
-
-
-class _IndexSizeLimitedFile(FileIO):
-    """File that raises an error if more than MAX_INDEX_BYTES are read at once.
-
-    ``zipfile`` reads the whole index at once and uses about ten times as much memory as the size of the index.
-    """
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Read up to ``size`` bytes from the file."""
-        if size is not None and size > MAX_INDEX_BYTES:
-            raise zipfile.BadZipFile(f"the index has {size} bytes, expected at most {MAX_INDEX_BYTES}")
-        return super().read(size) or b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,16 +72,17 @@ class _Header:
         return math.prod(self.shape)
 
 
-def count_npz_rows(path: Path) -> int:
+def count_npz_rows(path: Path, options: ReadingOptions) -> int:
     """Return the number of rows of a .npz file according to the array headers, or 0 if the file is truncated."""
-    with _IndexSizeLimitedFile(path) as file:
+    with IndexSizeLimitedFile(path) as file:
         if not _has_index(path, file):
             return 0  # the reader checks the number of rows of a truncated archive
         with _open_archive(path, file) as archive:
-            return _check_columns(path, archive, table.select_known_columns(path, _array_names(archive), []))
+            names = _array_names(archive)
+            return _check_columns(path, archive, names, find_layout(path, names, options, []))
 
 
-def read_npz(path: Path) -> table.Table:
+def read_npz(path: Path, options: ReadingOptions) -> table.Table:
     """Read the known arrays of a .npz file. If the file is truncated, only the complete values are read.
 
     Raises
@@ -106,20 +93,24 @@ def read_npz(path: Path) -> table.Table:
         If the samples do not fit into memory.
     """
     notes: list[str] = []
-    with _IndexSizeLimitedFile(path) as file:
+    with IndexSizeLimitedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
-                chosen = table.select_known_columns(path, _array_names(archive), notes)
-                _check_columns(path, archive, chosen)
+                names = _array_names(archive)
+                layout = find_layout(path, names, options, notes)
+                _check_columns(path, archive, names, layout)
                 with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
-                    columns = {n: _read_array(path, archive, key).astype(np.float64) for n, key in chosen.items()}
-                return table.Table(columns, _read_fs(path, archive, notes), notes)
-    arrays, cut = _recover_arrays(path)
+                    columns = {
+                        quantity: _read_array(path, archive, names[i]).astype(np.float64)
+                        for quantity, i in layout.columns.items()
+                    }
+                return table.Table(columns, _read_fs(path, archive, notes), notes, layout.units)
+    arrays, cut = _recover_arrays(path, options)
     if not arrays:
         raise RecordingError(f"{path}: is damaged or cut off before its first number")
     where = f" inside {cut}" if cut else ""
     notes.append(f"The file is cut off{where} and was read up to the cut; later columns are missing.")
-    return _table_of_recovered(path, arrays, cut, notes)
+    return _table_of_recovered(path, arrays, cut, options, notes)
 
 
 def _has_index(path: Path, file: IO[bytes]) -> bool:
@@ -152,11 +143,11 @@ def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
     return names[key] if key in names else names[f"{key}.npy"]
 
 
-def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> int:
+def _check_columns(path: Path, archive: zipfile.ZipFile, names: Sequence[str], layout: TableLayout) -> int:
     """Check the array headers of all columns, and return the length of the longest column."""
     rows = 0
     limit = memory_check.measure_read_limit(path)
-    for key in chosen.values():
+    for key in (names[i] for i in layout.columns.values()):
         header = _read_header(path, archive, key)
         if header.dtype.kind not in NUMERIC_KINDS:
             raise RecordingError(f"{path}: {key} contains {_describe_dtype(header.dtype)}, expected numbers")
@@ -256,24 +247,26 @@ def _single_number(fs: NDArray[Any], notes: list[str]) -> float | None:
 
 
 def _table_of_recovered(
-    path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]
+    path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, options: ReadingOptions, notes: list[str]
 ) -> table.Table:
     """Return the arrays of a truncated archive as a ``Table``. Pad the truncated column with NaN."""
-    chosen = table.select_known_columns(path, list(arrays), notes)
+    names = list(arrays)
+    layout = find_layout(path, names, options, notes)
     columns = {}
-    for name, key in chosen.items():
+    for name, key in ((quantity, names[i]) for quantity, i in layout.columns.items()):
         if arrays[key].ndim != 1:
             raise RecordingError(f"{path}: {key} has shape {arrays[key].shape}, expected one dimension")
         columns[name] = arrays[key].astype(np.float64)
-    short = next((name for name, key in chosen.items() if key == cut), None)
+    short = next((quantity for quantity, i in layout.columns.items() if names[i] == cut), None)
     if short is not None:
         column = columns[short]
         n = max(other.size for other in columns.values())
         columns[short] = np.concatenate([column, np.full(n - column.size, np.nan)])
-    return table.Table(columns, _single_number(arrays["fs"], notes) if "fs" in arrays else None, notes)
+    fs = _single_number(arrays["fs"], notes) if "fs" in arrays else None
+    return table.Table(columns, fs, notes, layout.units)
 
 
-def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
+def _recover_arrays(path: Path, options: ReadingOptions) -> tuple[dict[str, NDArray[Any]], str | None]:
     """Recover the arrays of a truncated .npz file by searching for local file headers.
 
     The result is a dictionary of arrays by name, and the name of the truncated array or None. Arrays with unknown names
@@ -295,7 +288,7 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
                 packed = int.from_bytes(extra[12:20], "little")
             start += extra_size
             pieces = _MemberReader(data, start, method, None if flags & 8 else packed)
-            array = _read_up_to_cut(pieces, limit, unpacked, wanted=key in KNOWN_KEYS)
+            array = _read_up_to_cut(pieces, limit, unpacked, wanted=key == "fs" or is_known_column(key, options))
             unpacked += pieces.unpacked
             if array is not None:
                 arrays[key] = array

@@ -16,6 +16,8 @@ from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
+from drivers.recordings.reading_options import ReadingOptions
+from drivers.recordings.table_layout import find_layout
 
 METADATA_KEY: Final = b"imu-monitor"
 """Key of the metadata that the daemon writes to the schema of a segment."""
@@ -50,7 +52,7 @@ def import_pyarrow(path: Path) -> Any:
     return pa
 
 
-def read_parquet(path: Path) -> table.Table:
+def read_parquet(path: Path, options: ReadingOptions) -> table.Table:
     """Read the known columns of a Parquet file.
 
     Raises
@@ -62,25 +64,36 @@ def read_parquet(path: Path) -> table.Table:
     """
     notes: list[str] = []
     with _open_parquet(path) as file:
-        chosen, _ = _check_parquet(path, file, notes)
-        return _float_table(path, file.read(columns=list(chosen.values())), chosen, notes)
+        chosen, units, _ = _check_parquet(path, file, options, notes)
+        return _float_table(path, file.read(columns=list(chosen.values())), chosen, units, notes)
 
 
-def count_parquet_rows(path: Path) -> int:
+def count_parquet_rows(path: Path, options: ReadingOptions) -> int:
     """Return the number of rows according to the index of a Parquet file."""
     with _open_parquet(path) as file:
-        return _check_parquet(path, file, [])[1]
+        return _check_parquet(path, file, options, [])[2]
 
 
-def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
+def _check_parquet(
+    path: Path, file: Any, options: ReadingOptions, notes: list[str]
+) -> tuple[dict[str, str], dict[str, str], int]:
+    """Return the column name and the unit of each quantity, and the number of rows."""
     metadata = file.metadata
     table.check_column_count(path, metadata.num_columns)
-    chosen = table.select_known_columns(path, file.schema_arrow.names, notes)
+    chosen, units = _select_columns(path, file.schema_arrow.names, options, notes)
     _check_types(path, file.schema_arrow, chosen)
     rows = int(metadata.num_rows)
     stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
     memory_check.measure_read_limit(path).check_row_count(max(rows, stated))
-    return chosen, rows
+    return chosen, units, rows
+
+
+def _select_columns(
+    path: Path, names: Sequence[str], options: ReadingOptions, notes: list[str]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the column name and the unit of each quantity."""
+    layout = find_layout(path, names, options, notes)
+    return {quantity: names[i] for quantity, i in layout.columns.items()}, layout.units
 
 
 @contextmanager
@@ -109,7 +122,7 @@ def _open_parquet(path: Path) -> Iterator[Any]:
             ) from error
 
 
-def read_ipc(path: Path) -> table.Table:
+def read_ipc(path: Path, options: ReadingOptions) -> table.Table:
     """Read the known columns of an Arrow file or stream. If the file is truncated, only the complete batches are read.
 
     An Arrow file is read as a stream, because it consists of an Arrow stream between two magic strings.
@@ -127,9 +140,8 @@ def read_ipc(path: Path) -> table.Table:
     with open_regular_file(path) as file:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
-        chosen = table.select_known_columns(
-            path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes
-        )
+        names = [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)]
+        chosen, units = _select_columns(path, names, options, notes)
         count, _ = _check_ipc(path, start, schema, chosen)
         if not _has_end_mark(path, start > 0):
             notes.append("The file has no end mark; it is cut off and was read up to the cut.")
@@ -147,7 +159,7 @@ def read_ipc(path: Path) -> table.Table:
         except (pa.ArrowException, OSError) as error:
             notes.append(f"Only {len(batches)} complete batches could be read: {first_message_line(error)}.")
     schema = batches[0].schema if batches else schema
-    return _float_table(path, pa.Table.from_batches(batches, schema), chosen, notes)
+    return _float_table(path, pa.Table.from_batches(batches, schema), chosen, units, notes)
 
 
 def count_ipc_rows(path: Path) -> int:
@@ -223,11 +235,13 @@ def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
             raise RecordingError(f"{path}: {key} contains {type_}, expected numbers{unit}")
 
 
-def _float_table(path: Path, data: Any, chosen: Mapping[str, str], notes: list[str]) -> table.Table:
+def _float_table(
+    path: Path, data: Any, chosen: Mapping[str, str], units: Mapping[str, str], notes: list[str]
+) -> table.Table:
     """Return the chosen columns of a pyarrow table as float64 arrays. Null values become NaN."""
     float64 = import_pyarrow(path).float64()
     columns = {name: data.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
-    return table.Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
+    return table.Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes, units)
 
 
 def first_message_line(error: Exception) -> str:

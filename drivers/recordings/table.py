@@ -1,9 +1,8 @@
 """Types and functions that all recording formats share."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -47,6 +46,7 @@ class Table:
     columns: dict[str, Floats]  # float64 arrays [n]; the keys are names in COLUMNS; NaN = missing
     fs: float | None  # sample rate in Hz; None if the file states no rate
     notes: list[str]
+    units: Mapping[str, str] = field(default_factory=dict)  # units that the file states
 
 
 def check_column_count(path: Path, columns: int) -> None:
@@ -57,54 +57,9 @@ def check_column_count(path: Path, columns: int) -> None:
         )
 
 
-def select_known_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
-    """Select the known columns of a recording file.
-
-    Parameters
-    ----------
-    path
-        Path of the file, used in error messages.
-    names
-        Names of all columns in the file.
-    notes
-        List to which a note about unused columns is appended.
-    where
-        Position of the column names in the file, used in error messages, such as " in line 3".
-
-    Returns
-    -------
-    dict
-        Mapping from each known column name to the column name in the file.
-
-    Raises
-    ------
-    RecordingError
-        If the file contains no axis, a known column occurs twice, or the file has too many columns.
-    """
-    check_column_count(path, len(names))
-    known = {*COLUMNS, *ALIASES}
-    repeated = sorted(name for name, count in Counter(names).items() if count > 1 and name in known)
-    if repeated:
-        raise RecordingError(f"{path}: column {repeated[0]} occurs twice; each may occur once")
-    chosen = {name: name for name in COLUMNS if name in names}
-    for alias, name in ALIASES.items():
-        if alias in names:
-            chosen.setdefault(name, alias)
-    if not any(axis in chosen for axis in AXES):
-        raise RecordingError(
-            f"{path}: no axis among its columns ({format_name_list(names)}){where}; "
-            f"a recording has some of {' '.join(AXES)}, in rad/s and m/s²{describe_suffix_mismatch(path)}"
-        )
-    used = {*chosen.values(), "fs"}
-    others = [name for name in names if name not in used]
-    if others:
-        notes.append(f"Other columns are not used: {format_name_list(others)}.")
-    return chosen
-
-
 CONTENTS: Final = (
-    (b"PK\3\4", "a zip archive", (".npz",)),
-    (b"PK\5\6", "an empty zip archive", (".npz",)),
+    (b"PK\3\4", "a zip archive", (".npz", ".zip")),
+    (b"PK\5\6", "an empty zip archive", (".npz", ".zip")),
     (b"PAR1", "Parquet", (".parquet",)),
     (b"ARROW1\0\0", "an Arrow file", (".arrow", ".feather")),
     (b"\xff\xff\xff\xff", "an Arrow stream", (".arrows",)),
@@ -116,7 +71,7 @@ CONTENTS: Final = (
     (b"ULog\x01\x12\x35", "a PX4 log", (".ulg",)),
     (b"\xa3\x95\x80", "an ArduPilot log", (".bin",)),
     (b"\x89HDF", "HDF5", ()),
-    (b"MATLAB", "a MATLAB file", ()),
+    (b"MATLAB", "a MATLAB file", (".mat",)),
     (b"\x89PNG", "a picture", ()),
     (b"%PDF", "a PDF document", ()),
 )

@@ -9,11 +9,12 @@ from drivers.errors import ConfigError, NotReady, make_printable_and_shorten
 from monitor.cli.shared import options, output
 
 
+@options.with_reading_options
 def analyze(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
     rate: options.Rate = None,
     last: options.Last = None,
-    topic: options.Topic = None,
+    reading: options.Reading = None,
     decoder: options.DecoderName = None,
     option: options.DecoderOptions = None,
     tau: Annotated[
@@ -57,7 +58,7 @@ def analyze(
         rest,
         bool(json or plot),
         last_s,
-        topic,
+        reading,
         options.parse_decoder(decoder, option),
     )
     try:

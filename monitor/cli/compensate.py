@@ -10,6 +10,7 @@ from drivers.file_access import real_path
 from monitor.cli.shared import options, output, service_in_terminal
 
 
+@options.with_reading_options
 def compensate(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Recording without drift: .npz, .csv, .parquet, ….")],
@@ -25,7 +26,7 @@ def compensate(
     ] = None,
     rate: options.Rate = None,
     last: options.Last = None,
-    topic: options.Topic = None,
+    reading: options.Reading = None,
     decoder: options.DecoderName = None,
     option: options.DecoderOptions = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
@@ -49,7 +50,7 @@ def compensate(
     last_s = options.parse_duration("--last", last)
     arma_order = options.parse_arma_order(order)
     wanted = compensating.CompensationRequest(
-        recording, out, method, rate, arma_order, last_s, topic, options.parse_decoder(decoder, option)
+        recording, out, method, rate, arma_order, last_s, reading, options.parse_decoder(decoder, option)
     )
     with output.show_progress_bar() as tell:
         output.compile_analysis_kernels(tell)

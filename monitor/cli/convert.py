@@ -8,6 +8,7 @@ import typer
 from monitor.cli.shared import options, output, service_in_terminal
 
 
+@options.with_reading_options
 def convert(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
     out: Annotated[
@@ -19,7 +20,7 @@ def convert(
     ],
     rate: options.Rate = None,
     last: options.Last = None,
-    topic: options.Topic = None,
+    reading: options.Reading = None,
     decoder: options.DecoderName = None,
     option: options.DecoderOptions = None,
 ) -> None:
@@ -29,7 +30,7 @@ def convert(
     last_s = options.parse_duration("--last", last)
     service_in_terminal.exit_on_sigterm()
     choice = options.parse_decoder(decoder, option)
-    request = conversion.ConversionRequest(recording, out, rate, last_s, topic, choice)
+    request = conversion.ConversionRequest(recording, out, rate, last_s, reading, choice)
     with output.show_progress_bar() as tell:
         result = conversion.run_conversion(request, tell)
     temperature = ", temperature" if conversion.has_temperature(result) else ""

@@ -11,6 +11,7 @@ from drivers.extras import require_extra
 from monitor.cli.shared import options, output, service_in_terminal
 
 
+@options.with_reading_options
 def reconcile(
     recordings: Annotated[
         list[Path],
@@ -29,7 +30,7 @@ def reconcile(
     seed: options.ReportSeed = 1,
     rate: options.Rate = None,
     last: options.Last = None,
-    topic: options.Topic = None,
+    reading: options.Reading = None,
     decoder: options.DecoderName = None,
     option: options.DecoderOptions = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
@@ -56,14 +57,14 @@ def reconcile(
             output.compile_analysis_kernels(tell)
             if several:
                 every = reconciling.RecordingsComparisonRequest(
-                    tuple(recordings), tested, out, seed, rate, last_s, topic, choice
+                    tuple(recordings), tested, out, seed, rate, last_s, reading, choice
                 )
                 runs = reconciling.compare_recordings(every, tell)
                 data, show = comparison_json.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
                 one = reconciling.reconcile_and_write_report(
                     reconciling.ReconciliationRequest(
-                        recordings[0], tested, out, seed, rate, last_s=last_s, topic=topic, decoder=choice
+                        recordings[0], tested, out, seed, rate, last_s=last_s, reading=reading, decoder=choice
                     ),
                     tell,
                 )

@@ -10,6 +10,7 @@ from drivers.file_access import real_path
 from monitor.cli.shared import options, output, service_in_terminal
 
 
+@options.with_reading_options
 def simulate(
     model: Annotated[str, typer.Argument(metavar="MODEL.toml|NAME", help="Model file, or name of a shipped model.")],
     seconds: Annotated[str, typer.Option(metavar="S", help="Length in seconds; also 30min, 1h, 2d.")],
@@ -21,7 +22,7 @@ def simulate(
     temperature_from: Annotated[
         Path | None, typer.Option(metavar="RECORDING", help="Use the temperature of this recording.")
     ] = None,
-    topic: options.Topic = None,
+    reading: options.Reading = None,
     truth: Annotated[
         bool,
         typer.Option(
@@ -40,7 +41,7 @@ def simulate(
         if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{option}: {path} is also the output file of --out; choose another name")
     noise = load_model(model, Path.cwd())
-    request = simulation.SimulationRequest(noise, out, length_s, seed, rate, temperature_from, truth, model, topic)
+    request = simulation.SimulationRequest(noise, out, length_s, seed, rate, temperature_from, truth, model, reading)
     service_in_terminal.exit_on_sigterm()
     with output.show_progress_bar() as tell:
         result = simulation.run_simulation(request, tell)

@@ -13,6 +13,7 @@ JsonPath = Annotated[Path | None, typer.Option(metavar="FILE", help="Result as J
 PlotPath = Annotated[Path | None, typer.Option(metavar="FILE.png", help="Means and model as a picture.")]
 
 
+@options.with_reading_options
 def thermal_fit(
     recording: RecordingPath,
     out: Annotated[Path | None, typer.Option(metavar="MODEL.json", help="Where to write the model.")] = None,
@@ -24,7 +25,7 @@ def thermal_fit(
     ] = None,
     rate: options.Rate = None,
     last: options.Last = None,
-    topic: options.Topic = None,
+    reading: options.Reading = None,
     decoder: options.DecoderName = None,
     option: options.DecoderOptions = None,
     json: JsonPath = None,
@@ -41,7 +42,7 @@ def thermal_fit(
     output.check_output_file("--out", out)
     interval_s, last_s = options.parse_duration("--interval", interval), options.parse_duration("--last", last)
     study = thermal.fit_thermal_models(
-        recording, interval_s, rate, last_s, topic, options.parse_decoder(decoder, option)
+        recording, interval_s, rate, last_s, reading, options.parse_decoder(decoder, option)
     )
     if json is not None:
         output.write_file_or_stdout("--json", json, text.encode_thermal_fit(study) + b"\n")
@@ -57,12 +58,13 @@ def thermal_fit(
         text.print_thermal_fit(study, Console())
 
 
+@options.with_reading_options
 def thermal_predict(
     recording: RecordingPath,
     model: Annotated[Path, typer.Option(metavar="MODEL.json", help="Model file that thermal fit has written.")],
     rate: options.Rate = None,
     last: options.Last = None,
-    topic: options.Topic = None,
+    reading: options.Reading = None,
     decoder: options.DecoderName = None,
     option: options.DecoderOptions = None,
     json: JsonPath = None,
@@ -81,7 +83,7 @@ def thermal_predict(
         thermal.read_model_file(model),
         rate,
         options.parse_duration("--last", last),
-        topic,
+        reading,
         options.parse_decoder(decoder, option),
     )
     if json is not None:

@@ -18,6 +18,7 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import AVERAGING_TIME_S
 from drivers.recordings import Recording, iter_blocks
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_decoding import DecoderChoice, load_recording
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
@@ -67,7 +68,7 @@ class AnalysisRequest:
     exclude_motion: bool = False  # True to exclude samples during motion
     total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
     last_s: float | None = None  # duration at the end of the recording to use; None = all
-    topic: str | None = None  # topic to read; None = the only IMU of the recording
+    reading: ReadingOptions = DEFAULT_OPTIONS  # reading, columns and units to read
     decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
 
 
@@ -105,7 +106,7 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
     """
     try:
         recording = load_recording(
-            request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+            request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
         )
         return analyze_recording(
             recording,

@@ -16,6 +16,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, NotReady
 from drivers.module_lookup import format_suggestion
 from drivers.recordings import iter_blocks
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import open_recording_writer
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_decoding import DecoderChoice, load_recording
@@ -44,7 +45,7 @@ class CompensationRequest:
     rate_hz: float | None = None
     order: Order | None = None  # order of the ARMA drift model; None = selected by a criterion
     last_s: float | None = None  # duration at the end of the recording to use; None = all
-    topic: str | None = None  # topic to read; None = the only IMU of the recording
+    reading: ReadingOptions = DEFAULT_OPTIONS  # reading, columns and units to read
     decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
 
 
@@ -75,7 +76,7 @@ def run_compensation(
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
     found = load_recording(
-        request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+        request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
     )
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:

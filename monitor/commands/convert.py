@@ -12,6 +12,7 @@ from drivers.file_access import real_path
 from drivers.recordings import Recording, open_recording_writer
 from drivers.recordings.formats import find_writer
 from drivers.recordings.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.topics import JOIN
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_decoding import DecoderChoice, load_recording
@@ -27,7 +28,7 @@ class ConversionRequest:
     out: Path
     rate_hz: float | None = None
     last_s: float | None = None  # duration at the end of the recording to use; None = all
-    topic: str | None = None  # topic to read; None = the only IMU of the recording
+    reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
     decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
 
 
@@ -53,7 +54,7 @@ def run_conversion(request: ConversionRequest, report_progress: ProgressCallback
     if real_path(request.recording) == real_path(request.out):
         raise ConfigError(f"{request.out}: is the recording itself; choose another name")
     found = load_recording(
-        request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+        request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
     )
     axes = [axis for axis in found.axes if not np.isnan(found.values[:, AXES.index(axis)]).all()] or found.axes
     with open_recording_writer(request.out, axes, has_temperature(found)) as append_samples:

@@ -20,6 +20,7 @@ from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.file_access import real_path
 from drivers.recordings import FORMATS, iter_blocks
 from drivers.recordings import Recording as Samples
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_decoding import DecoderChoice, load_recording
@@ -46,7 +47,7 @@ class ReconciliationRequest:
     rate_hz: float | None = None
     notes: tuple[str, ...] = ()  # additional notes for the report
     last_s: float | None = None  # length of the end of the recording that is used; None for all
-    topic: str | None = None  # topic to read; None for the only IMU of the recording
+    reading: ReadingOptions = DEFAULT_OPTIONS  # reading, columns and units to read
     decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
 
 
@@ -60,7 +61,7 @@ class RecordingsComparisonRequest:
     seed: int = 1
     rate_hz: float | None = None
     last_s: float | None = None  # length of the end of each recording that is used; None for all
-    topic: str | None = None  # topic to read from each recording; None for the only IMU
+    reading: ReadingOptions = DEFAULT_OPTIONS  # reading, columns and units to read
     decoder: DecoderChoice | None = None  # decoder of CAN logs or of captured bytes
 
 
@@ -84,7 +85,7 @@ def reconcile_and_write_report(
         If the data do not support an answer.
     """
     found = load_recording(
-        request.recording, request.rate_hz, request.last_s, request.topic, request.decoder, report_progress
+        request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
     )
     create_report_folder(request.out)
     try:
@@ -166,7 +167,7 @@ def compare_recordings(
             request.rate_hz,
             notes,
             request.last_s,
-            request.topic,
+            request.reading,
             request.decoder,
         )
         try:

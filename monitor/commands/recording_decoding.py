@@ -21,6 +21,7 @@ from drivers.decoders.base import Decoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.settings_model import TableError
 from drivers.timing.sample_clock import SampleClock
 from monitor.commands.progress import ProgressCallback, ignore_progress
@@ -55,7 +56,7 @@ def load_recording(
     path: Path,
     rate_hz: float | None = None,
     last_s: float | None = None,
-    topic: str | None = None,
+    reading: ReadingOptions = DEFAULT_OPTIONS,
     decoder: DecoderChoice | None = None,
     report_progress: ProgressCallback = ignore_progress,
 ) -> Recording:
@@ -63,7 +64,7 @@ def load_recording(
 
     Parameters
     ----------
-    path, rate_hz, last_s, topic
+    path, rate_hz, last_s, reading
         See ``drivers.recordings.load_samples``.
     decoder : DecoderChoice, optional
         Decoder of a CAN log, of captured bytes, or of raw data of the daemon.
@@ -85,10 +86,10 @@ def load_recording(
         if kind in CONTENTS:
             names = list_decoders(CARRIERS[kind]) if kind in CARRIERS else module_lookup.list_modules(drivers.decoders)
             raise ConfigError(f"{path}: contains {CONTENTS[kind]}; name the decoder with --decoder: {', '.join(names)}")
-        return load_samples(path, rate_hz, last_s, topic)
+        return load_samples(path, rate_hz, last_s, reading)
     if kind == "recording":
         raise ConfigError(f"{path}: contains samples, which need no decoder; leave out --decoder")
-    if topic is not None:
+    if reading.topic is not None:
         raise ConfigError(f"{path}: contains no topics; leave out --topic")
     found = _decode_file(path, decoder, rate_hz, report_progress)
     return found if last_s is None else take_last(found, last_s)

@@ -17,6 +17,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import SAMPLE_COUNT
 from drivers.recordings import Recording, load_samples, open_recording_writer
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.noise.model import NoiseModel
@@ -39,7 +40,7 @@ class SimulationRequest:
     temperature_from: Path | None = None  # recording from which the temperature is taken
     truth: bool = False  # True to write a file with the drawn random values
     name: str = "the model"  # name of the model in messages
-    topic: str | None = None  # topic to read from the recording of the temperature; None for its only IMU
+    reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +211,7 @@ def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats |
     """
     if request.temperature_from is None:
         return None
-    found = _load_recording(request.temperature_from, request.rate_hz, request.topic)
+    found = _load_recording(request.temperature_from, request.rate_hz, request.reading)
     known = np.isfinite(found.temperature_c)
     if not known.any():
         raise ConfigError(f"{request.temperature_from}: has no temperature; a column temperature in °C is needed")
@@ -221,14 +222,14 @@ def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats |
     return np.interp(np.arange(length) / rate_hz, t_s[order], temperature_c[order])
 
 
-def _load_recording(path: Path, rate_hz: float | None, topic: str | None) -> Recording:
+def _load_recording(path: Path, rate_hz: float | None, reading: ReadingOptions) -> Recording:
     """Load the recording of the temperature. The requested sample rate is used if the recording has none."""
     try:
-        return load_samples(path, topic=topic)
+        return load_samples(path, options=reading)
     except ConfigError:
         if rate_hz is None:
             raise
-        return load_samples(path, rate_hz, topic=topic)
+        return load_samples(path, rate_hz, options=reading)
 
 
 def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> bytes:

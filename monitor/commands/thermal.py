@@ -16,6 +16,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from monitor.commands.recording_decoding import DecoderChoice, load_recording
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
@@ -61,7 +62,7 @@ def fit_thermal_models(
     interval_s: float | None = None,
     rate_hz: float | None = None,
     last_s: float | None = None,
-    topic: str | None = None,
+    reading: ReadingOptions = DEFAULT_OPTIONS,
     decoder: DecoderChoice | None = None,
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
@@ -76,8 +77,8 @@ def fit_thermal_models(
         Sample rate, if the recording has none.
     last_s : float, optional
         Length in seconds of the end of the recording that is used. By default the whole recording is used.
-    topic : str, optional
-        Topic to read. By default the only IMU of the recording is read.
+    reading : ReadingOptions, optional
+        Topic, columns and units to read.
     decoder : DecoderChoice, optional
         Decoder of a CAN log or of captured bytes.
 
@@ -86,7 +87,7 @@ def fit_thermal_models(
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, topic, decoder)
+    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, reading, decoder)
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -102,7 +103,7 @@ def predict_bias_of_recording(
     models: Mapping[str, ThermalModel],
     rate_hz: float | None = None,
     last_s: float | None = None,
-    topic: str | None = None,
+    reading: ReadingOptions = DEFAULT_OPTIONS,
     decoder: DecoderChoice | None = None,
 ) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models that were fitted to an earlier recording.
@@ -117,8 +118,8 @@ def predict_bias_of_recording(
         Sample rate, if the recording has none.
     last_s : float, optional
         Length in seconds of the end of the recording that is used. By default the whole recording is used.
-    topic : str, optional
-        Topic to read. By default the only IMU of the recording is read.
+    reading : ReadingOptions, optional
+        Topic, columns and units to read.
     decoder : DecoderChoice, optional
         Decoder of a CAN log or of captured bytes.
 
@@ -128,7 +129,7 @@ def predict_bias_of_recording(
         If the recording cannot be read, or if it has no temperature.
     """
     interval = next(iter(models.values())).interval_s
-    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, topic, decoder)
+    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, reading, decoder)
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
@@ -234,11 +235,11 @@ def _read_interval_means(
     interval_s: float | None,
     rate_hz: float | None,
     last_s: float | None,
-    topic: str | None,
+    reading: ReadingOptions,
     decoder: DecoderChoice | None,
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
     """Return the interval means of each recorded axis, and notes about the recording."""
-    found = load_recording(recording, rate_hz, last_s, topic, decoder)
+    found = load_recording(recording, rate_hz, last_s, reading, decoder)
     values, temperature_c, rate, notes = place_samples_and_temperature_on_grid(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")

@@ -10,7 +10,7 @@ from pymavlink import DFReader
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError
 from drivers.links import replay_link
-from drivers.recordings import ardupilot_log_format, load_samples, memory_check, save_samples
+from drivers.recordings import ReadingOptions, ardupilot_log_format, load_samples, memory_check, save_samples
 from monitor.commands.analyze import AnalysisRequest, run_analysis
 from tests.support.dataflash import Messages, dataflash_bytes, imu, raw_sensor, table_of, write_dataflash
 from tests.support.recordings import recordings
@@ -30,7 +30,7 @@ def noise(n: int, seed: int = 1) -> np.ndarray[Any, Any]:
 
 def refusal(path: Path, topic: str | None = None) -> str:
     with pytest.raises(ImuError) as error:
-        load_samples(path, topic=topic)
+        load_samples(path, options=ReadingOptions(topic=topic))
     line = str(error.value)
     assert "\n" not in line
     assert line.startswith(f"{path}: ")
@@ -86,7 +86,7 @@ class TestSamples:
         assert found.values.tobytes() == values.tobytes()
         assert found.t_s is not None
         assert found.t_s.tolist() == (t_us * 1e-6).tolist()
-        assert load_samples(path, topic="ACC").axes == ACCELS
+        assert load_samples(path, options=ReadingOptions(topic="ACC")).axes == ACCELS
 
     def test_fixed_point_numbers_are_scaled(self, tmp_path: Path) -> None:
         rows = table_of(TimeUS=times_us(3).astype("<u8"), GyrX=np.array([150, -25, 0], "<i2"))
@@ -110,7 +110,7 @@ class TestSamples:
             ),
         )
         assert "contains 3 IMU topics: IMU, IMU2, IMU3" in refusal(path)
-        found = load_samples(path, topic=f"IMU{number if number > 1 else ''}")
+        found = load_samples(path, options=ReadingOptions(topic=f"IMU{number if number > 1 else ''}"))
         assert found.values.tobytes() == flights[number - 1][1].astype(np.float64).tobytes()
         assert found.t_s is not None
         np.testing.assert_allclose(found.t_s, flights[number - 1][0], rtol=0.0, atol=1e-6)
@@ -121,14 +121,14 @@ class TestTopics:
         path = write_dataflash(tmp_path / "x.bin", *(imu(times_us(30), noise(30, i), i) for i in range(2)))
         assert "contains 2 IMU topics: IMU, IMU:1; choose with --topic" in refusal(path)
         for topic, seed in (("IMU", 0), ("IMU:0", 0), ("IMU:1", 1)):
-            assert load_samples(path, topic=topic).values.tobytes() == noise(30, seed).tobytes()
+            assert load_samples(path, options=ReadingOptions(topic=topic)).values.tobytes() == noise(30, seed).tobytes()
         assert refusal(path, "IMU:2").endswith('contains no topic "IMU:2"; possible are IMU:1, IMU')
 
     def test_mixed_rates(self, tmp_path: Path) -> None:
         gyro = raw_sensor("GYR", times_us(1000, 1000.0), noise(1000)[:, :3])
         path = write_dataflash(tmp_path / "x.bin", gyro, raw_sensor("ACC", times_us(800, 800.0), noise(800)[:, 3:]))
         assert "mixed rates: GYR 1000 Hz and ACC 800 Hz" in refusal(path)
-        assert load_samples(path, topic="GYR").axes == GYROS
+        assert load_samples(path, options=ReadingOptions(topic="GYR")).axes == GYROS
 
     def test_the_message_imu_is_preferred(self, tmp_path: Path) -> None:
         values = noise(30)

@@ -11,7 +11,7 @@ import pyulog
 
 from drivers.data_types import AXES
 from drivers.errors import ImuError
-from drivers.recordings import load_samples, memory_check, save_samples
+from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
 from monitor.commands.analyze import AnalysisRequest, run_analysis
 from tests.support.recordings import recordings
 from tests.support.ulog import (
@@ -40,7 +40,7 @@ def noise(n: int, seed: int = 1) -> np.ndarray[Any, Any]:
 
 def refusal(path: Path, topic: str | None = None) -> str:
     with pytest.raises(ImuError) as error:
-        load_samples(path, topic=topic)
+        load_samples(path, options=ReadingOptions(topic=topic))
     line = str(error.value)
     assert "\n" not in line
     assert line.startswith(f"{path}: ")
@@ -112,7 +112,7 @@ class TestSamples:
         found = load_samples(path)
         assert found.values.tobytes() == values.tobytes()
         assert set(found.temperature_c) == {41.0}
-        alone = load_samples(path, topic="sensor_gyro")
+        alone = load_samples(path, options=ReadingOptions(topic="sensor_gyro"))
         assert alone.axes == GYROS
         assert set(alone.temperature_c) == {40.0}
 
@@ -152,9 +152,13 @@ class TestTopics:
         assert "contains 3 IMU topics: sensor_combined, vehicle_imu, vehicle_imu:1; choose with --topic" in refusal(
             path
         )
-        np.testing.assert_allclose(load_samples(path, topic="vehicle_imu:1").values, noise(50, 1), rtol=2e-7)
+        np.testing.assert_allclose(
+            load_samples(path, options=ReadingOptions(topic="vehicle_imu:1")).values, noise(50, 1), rtol=2e-7
+        )
         for name in ("vehicle_imu", "vehicle_imu:0"):
-            np.testing.assert_allclose(load_samples(path, topic=name).values, noise(50, 0), rtol=2e-7)
+            np.testing.assert_allclose(
+                load_samples(path, options=ReadingOptions(topic=name)).values, noise(50, 0), rtol=2e-7
+            )
         assert 'contains no topic "vehicle_imu:2"; possible are vehicle_imu:1' in refusal(path, "vehicle_imu:2")
 
     def test_mixed_rates(self, tmp_path: Path) -> None:
@@ -162,7 +166,7 @@ class TestTopics:
         accel = one_sensor("sensor_accel", times_us(800, 800.0), noise(800)[:, 3:], 40.0)
         path = write_ulog(tmp_path / "x.ulg", gyro, accel)
         assert "mixed rates: sensor_gyro 1000 Hz and sensor_accel 800 Hz" in refusal(path)
-        assert load_samples(path, topic="sensor_accel").axes == ACCELS
+        assert load_samples(path, options=ReadingOptions(topic="sensor_accel")).axes == ACCELS
 
     def test_no_imu_at_all(self, tmp_path: Path) -> None:
         path = write_ulog(tmp_path / "x.ulg", UlogTopic("cpuload", rows_of(times_us(3), load=np.ones(3, "<f4"))))

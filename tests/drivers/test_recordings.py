@@ -202,8 +202,8 @@ class TestPieceByPiece:
 
 class TestSaveRefuses:
     def test_unknown_suffix(self, tmp_path):
-        with pytest.raises(ConfigError, match=r"x\.mat: the suffix is not that of a recording; known are \.csv"):
-            save_samples(tmp_path / "x.mat", *samples())
+        with pytest.raises(ConfigError, match=r"x\.xls: the suffix is not that of a recording; known are \.csv"):
+            save_samples(tmp_path / "x.xls", *samples())
 
     def test_missing_folder(self, path):
         with pytest.raises(ConfigError, match="there is no folder"):
@@ -466,11 +466,8 @@ class TestText:
             ("# t,gx,az\n", "no complete line of samples"),
             ("# a log\n% of nothing\n1,2\n", "header line is missing: line 3 consists of numbers"),
             ("# a log\nstart of the log\nt,gx\n0,1\n", r"no axis among its columns \(start of the log\) in line 2"),
-            ("# a log\n\nt;gx\n0;1\n", "line 3 are separated by semicolons"),
             ("# a\n" * 300_000, "no header line within its first 262145 lines"),
             ("0.1,2,3\n0.2,3,4\n", "header line is missing.*t,gx,gy"),
-            ("t;gx\n0;1\n", "separated by semicolons; separate them by commas"),
-            ("t\tgx\n0\t1\n", "separated by tabs"),
             ("a,b\n1,2\n", r"no axis among its columns \(a, b\) in line 1"),
             (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + b"\0" * 99, "no CSV text|no axis"),
             ("t,gx\n".encode("utf-16"), "no CSV text"),

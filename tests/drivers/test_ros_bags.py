@@ -15,7 +15,7 @@ from drivers.data_types import AXES, concatenate_blocks
 from drivers.decoders import samples
 from drivers.errors import ConfigError, ImuError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links import replay_link
-from drivers.recordings import load_samples, memory_check, ros_bag_format, ros_bag_readers, save_samples
+from drivers.recordings import ReadingOptions, load_samples, memory_check, ros_bag_format, ros_bag_readers, save_samples
 from drivers.recordings.topics import iter_row_blocks
 from monitor.commands.analyze import AnalysisRequest, run_analysis
 from tests.support.ros_bags import KINDS, imu_topic, storage_file, temperature_topic, text_topic, write_bag
@@ -40,7 +40,7 @@ def noise(n: int, seed: int = 1) -> np.ndarray:
 def refusal(path: Path, topic: str | None = None) -> str:
     """The one line that refuses a bag."""
     with pytest.raises(ImuError) as error:
-        load_samples(path, topic=topic)
+        load_samples(path, options=ReadingOptions(topic=topic))
     line = str(error.value)
     assert "\n" not in line
     assert line.startswith(f"{path}")
@@ -139,7 +139,7 @@ class TestTopics:
             f"{bag}: contains 2 IMU topics: /left/imu, /right/imu; "
             "choose with --topic (in a configuration file: topic), such as /left/imu"
         )
-        assert load_samples(bag, topic="/right/imu").values.tobytes() == noise(20, 1).tobytes()
+        assert load_samples(bag, options=ReadingOptions(topic="/right/imu")).values.tobytes() == noise(20, 1).tobytes()
 
     def test_an_absent_topic_names_the_nearest_first(self, tmp_path: Path) -> None:
         topics = {"/a": imu_topic(times_ns(5), noise(5)), "/imu/data": imu_topic(times_ns(5), noise(5))}
@@ -174,7 +174,7 @@ class TestJoin:
         t_ns, gyro, accel = times_ns(50), noise(50, 1), noise(50, 2)
         topics = {"/gyro": imu_topic(t_ns, gyro), "/accel": imu_topic(t_ns + 2_000_000, accel)}
         bag = write_bag(tmp_path, "mcap", topics)
-        found = load_samples(bag, topic="/gyro+/accel")
+        found = load_samples(bag, options=ReadingOptions(topic="/gyro+/accel"))
         assert found.values.tobytes() == np.hstack([gyro[:, :3], accel[:, 3:]]).tobytes()
         assert found.t_s is not None
         assert found.t_s.tolist() == seconds(t_ns).tolist()
@@ -183,7 +183,7 @@ class TestJoin:
         t_ns, values = times_ns(50), noise(50)
         kept = np.arange(50) != 20
         topics = {"/gyro": imu_topic(t_ns, values), "/accel": imu_topic(t_ns[kept] + 1_000_000, values[kept])}
-        found = load_samples(write_bag(tmp_path, "mcap", topics), topic="/gyro+/accel")
+        found = load_samples(write_bag(tmp_path, "mcap", topics), options=ReadingOptions(topic="/gyro+/accel"))
         values[20, 3:] = np.nan
         np.testing.assert_array_equal(found.values, values)
 
@@ -200,7 +200,7 @@ class TestJoin:
         warm = temperature_topic(t_ns[5::20], np.array([20.0, 21.0, 22.0]))
         bag = write_bag(tmp_path, "ros1", {"/imu": imu_topic(t_ns, noise(50)), "/imu/temperature": warm})
         assert np.isnan(load_samples(bag).temperature_c).all()
-        found = load_samples(bag, topic="/imu+/imu/temperature")
+        found = load_samples(bag, options=ReadingOptions(topic="/imu+/imu/temperature"))
         assert found.values.tobytes() == noise(50).tobytes()
         expected = np.repeat([np.nan, 20.0, 21.0, 22.0], [5, 20, 20, 5])
         np.testing.assert_array_equal(found.temperature_c, expected)

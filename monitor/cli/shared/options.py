@@ -1,10 +1,12 @@
 """Command-line options that several commands share, and functions that parse option values."""
 
+import functools
+import inspect
 import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, overload
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, overload
 
 import typer
 
@@ -110,14 +112,56 @@ Last = Annotated[
     str | None, typer.Option(metavar="S", help="Use only the last S seconds of the recording; also 1h, 1d.")
 ]
 
-Topic = Annotated[
-    str | None,
-    typer.Option(
+READING_OPTIONS = {
+    "topic": typer.Option(
         metavar="NAME",
         help="Topic of a ROS bag or of an autopilot's log; by default its only IMU. A+B joins gyroscope and "
         "accelerometer.",
     ),
-]
+    "columns": typer.Option(
+        metavar="Q=COLUMN,…",
+        help="Columns of a table by name or number, e.g. gx=omega_x,t=1; by default recognized by name.",
+    ),
+    "gyro_unit": typer.Option(metavar="UNIT", help="Unit of gx, gy, gz in the file: deg/s, deg/s/131, mrad/s, …"),
+    "accel_unit": typer.Option(metavar="UNIT", help="Unit of ax, ay, az in the file: g, mg, g/16384, …"),
+    "temperature_unit": typer.Option(metavar="UNIT", help="Unit of the temperature in the file: °C, K or °F."),
+    "time_unit": typer.Option(metavar="UNIT", help="Unit of the times in the file: s, ms, us or ns."),
+}
+"""Options that determine how a recording is read, by the field of ``ReadingOptions``."""
+Reading = Any
+"""Annotation of the argument that ``with_reading_options`` replaces by READING_OPTIONS."""
+Command = TypeVar("Command", bound=Callable[..., None])
+
+
+def with_reading_options(command: Command) -> Command:
+    """Replace the argument ``reading`` of a command by the options READING_OPTIONS.
+
+    The command receives ``ReadingOptions`` as its argument ``reading``.
+    """
+
+    @functools.wraps(command)
+    def parse_options_and_run(**arguments: Any) -> None:
+        from drivers.recordings.reading_options import create_reading_options, parse_column_mapping
+
+        given = {name: arguments.pop(name) for name in READING_OPTIONS}
+        if given["columns"] is not None:
+            with name_option_in_config_errors("--columns"):
+                given["columns"] = parse_column_mapping(given["columns"])
+        command(**arguments, reading=create_reading_options(given))
+
+    parameters: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command).parameters.values():
+        if parameter.name == "reading":
+            parameters += (
+                inspect.Parameter(name, parameter.kind, default=None, annotation=Annotated[str | None, option])
+                for name, option in READING_OPTIONS.items()
+            )
+        else:
+            parameters.append(parameter)
+    parse_options_and_run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    parse_options_and_run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return cast("Command", parse_options_and_run)
+
 
 DecoderName = Annotated[
     str | None,

@@ -447,8 +447,8 @@ WRONG_ARGUMENTS = {
     ),
     "nothing to write": (("simulate", "consumer-mems", "--seconds", "1"), "Missing option '--out'"),
     "unknown suffix": (
-        build_simulate_arguments("consumer-mems", "--out", "x.mat"),
-        "x.mat: the suffix is not that of a recording",
+        build_simulate_arguments("consumer-mems", "--out", "x.xlsx"),
+        "x.xlsx: the suffix is not that of a recording",
     ),
     "recording in a missing folder": (
         build_simulate_arguments("consumer-mems", "--out", "nowhere/x.csv"),
@@ -928,6 +928,27 @@ def test_present_result_of_a_daemon_is_exported(run_program: RunProgram, monkeyp
 
 
 @pytest.mark.long
+def test_commands_read_a_table_with_other_columns_and_units(run_program: RunProgram, recording: Path) -> None:
+    header, *rows = recording.read_text().splitlines()
+    names = dict(zip(("t", "gx", "gy", "gz", "ax", "ay", "az"), "abcdefg", strict=True))
+    Path("other.csv").write_text(";".join(names[name] for name in header.split(",")) + "\n" + "".join(
+        f"{1e3 * float(t)!r};{';'.join(others)}\n".replace(".", ",") for t, *others in (row.split(",") for row in rows)
+    ))  # fmt: skip
+    mapping = ("--columns", ",".join(f"{quantity}={name}" for quantity, name in names.items()), "--time-unit", "ms")
+    first = run_program("analyze", str(recording), "--json", "-")
+    second = run_program("analyze", "other.csv", *mapping, "--json", "-")
+    assert first.status == second.status == 0
+    assert json.loads(first.out)["axes"] == json.loads(second.out)["axes"]
+    assert run_program("compensate", "other.csv", *mapping, "--out", "x.npz").status in (0, 3)
+    wrong = run_program("analyze", "other.csv", "--gyro-unit", "grad/s")
+    assert wrong.require_one_error_line().startswith(
+        'imu-monitor: --gyro-unit: "grad/s" is not a unit of angular rate;'
+    )
+    for command in (("thermal", "fit"), ("thermal", "predict", "--model", "x"), ("reconcile", "--out", "x")):
+        line = run_program(*command, "other.csv", "--columns", "gq=a").require_one_error_line()
+        assert line.startswith('imu-monitor: --columns: "gq"; possible are g')
+
+
 def test_result_of_analyze_is_exported(
     run_program: RunProgram, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1580,7 +1601,7 @@ def test_failed_thread_is_reported_in_one_line(
         (("analyze", "a.csv", "--rte", "1"), "No such option: --rte of imu-monitor analyze; did you mean --rate?"),
         (
             ("analyze", "a.csv", "--xyz"),
-            "No such option: --xyz of imu-monitor analyze; known are --rate, --last, --topic, --decoder, --option,",
+            "No such option: --xyz of imu-monitor analyze; known are --rate, --last, --topic, --columns, --gyro-unit,",
         ),
         (("thermal", "fitt", "a.csv"), "Did you mean 'fit'?"),
         (("quux",), "known are demo, run, check, "),

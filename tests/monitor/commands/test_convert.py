@@ -14,6 +14,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import WRITABLE, load_samples, save_samples
 from drivers.recordings.mcap_writer import split_times
+from drivers.recordings.reading_options import ReadingOptions
 from monitor.commands.convert import BLOCK_ROWS, ConversionRequest, run_conversion
 from tests.support import dataflash, ros_bags, ulog
 from tests.support.program import exit_status
@@ -124,9 +125,8 @@ def test_another_program_reads_stamps_to_the_nanosecond(tmp_path: Path) -> None:
 def test_temperature_of_mcap_is_joined_by_topic(tmp_path: Path) -> None:
     save_samples(tmp_path / "in.npz", *make_samples())
     expected = run_conversion(ConversionRequest(tmp_path / "in.npz", tmp_path / "a.mcap"))
-    found = run_conversion(
-        ConversionRequest(tmp_path / "a.mcap", tmp_path / "b.csv", topic="/imu/data+/imu/temperature")
-    )
+    both = ReadingOptions(topic="/imu/data+/imu/temperature")
+    found = run_conversion(ConversionRequest(tmp_path / "a.mcap", tmp_path / "b.csv", reading=both))
     np.testing.assert_array_equal(found.temperature_c, expected.temperature_c)
     assert_equal_recordings(load_samples(tmp_path / "b.csv"), expected, mcap=False)
 

@@ -85,6 +85,9 @@ def make_recording_check(suffix: str) -> Check:
 def recording_seeds(suffix: str) -> Iterator[bytes]:
     """Return recordings that the project writes, and truncated ones."""
     rng = np.random.default_rng(7)
+    if suffix in (".mat", ".zip"):
+        yield from _matlab_seeds() if suffix == ".mat" else _sensor_archive_seeds()
+        return
     if suffix not in WRITABLE:
         yield from robot_log_seeds(suffix)
         return
@@ -97,12 +100,40 @@ def recording_seeds(suffix: str) -> Iterator[bytes]:
         yield data[: len(data) * 2 // 3]
     if suffix == ".csv":
         yield b't,gx,"az",temp\r\n0,1,,nan\r\n0.01,inf,"2",\r\n\r\n0.02,1e999,x,3\r\n0.03,1,2,3\r\n'
+        yield b"#timestamp [ns],w_RS_S_x [rad s^-1]\n# remark\n1403636579758555392,0.1\n1403636579763555584,0.2\n"
+        yield b'sep=;\n"Time (ms)";"Gyro x (deg/s)";\n"0,5";1,5;\n1;2e1;\n'
+        yield b"time_us\tax_g\ttemp_k\n1\t2,5\t300\n2\t2,5\t300\n"
+        yield b"loopIteration, time (us), gyroADC[0], accSmooth[2]\n1, 500, -4, 2048\n2, 1000, -4, 2048\n"
+        yield b"stamp wx wy\n 0.1  1 2\n0.2 1 2\n"
     if suffix == ".npz":
         packed = io.BytesIO()
         np.savez(packed, fs=np.array(100), gz=np.arange(4.0), ax=np.arange(4, dtype=np.int16))
         yield packed.getvalue()
     if suffix in (".arrow", ".parquet", ".arrows"):
         yield from _arrow_seeds(suffix)
+
+
+def _matlab_seeds() -> Iterator[bytes]:
+    """Return MATLAB files with vectors, matrices and structures, as SciPy writes them."""
+    from scipy.io import savemat
+
+    t, values = np.arange(6) * 0.01, np.ones((6, 3))
+    for compress in (False, True):
+        file = io.BytesIO()
+        savemat(file, {"t": t, "gyro": values, "imu": {"acc": values.T}, "fs": 100.0}, do_compression=compress)
+        yield file.getvalue()
+
+
+def _sensor_archive_seeds() -> Iterator[bytes]:
+    """Return zip archives with one CSV file per sensor."""
+    for method in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w", method) as archive:
+            for name in ("Gyroscope", "Accelerometer"):
+                archive.writestr(
+                    f"{name}.csv", "time,seconds_elapsed,z,y,x\n1,0.00,1,2,3\n2,0.01,1,2,3\n3,0.02,1,2,3\n"
+                )
+        yield file.getvalue()
 
 
 def robot_log_seeds(suffix: str) -> Iterator[bytes]:
@@ -151,7 +182,12 @@ def _arrow_seeds(suffix: str) -> Iterator[bytes]:
 
 SIZES: Final = {".csv": 2000, ".csv.gz": 2000}
 WORDS: Final = {
-    ".csv": ("t,gx,gy,gz\n", "temp", "nan", "inf", "1e999", "\r\n", '"', ",", "\0", "-9.3e9", "#", "1_0"),
+    ".csv": (
+        "t,gx,gy,gz\n", "temp", "nan", "inf", "1e999", "\r\n", '"', ",", "\0", "-9.3e9", "#", "1_0", ";", "\t", " ",
+        "sep=;", "[deg/s]", "time,",
+    ),
+    ".mat": (b"\x0e\0\0\0", b"\x0f\0\0\0", b"\x06\0\0\0", b"\x09\0\0\0", b"\xff\xff\xff\x7f", "gyro"),
+    ".zip": ("PK\3\4", "PK\1\2", "PK\5\6", "Gyroscope.csv", "seconds_elapsed,"),
     ".npz": ("PK\3\4", "PK\1\2", "PK\5\6", "gz.npy", "t.npy", "fs.npy", "\x93NUMPY", "'<f8'", "(99999999999,)"),
     ".parquet": ("PAR1", "gz", "t"),
     ".arrow": ("ARROW1\0\0", b"\xff\xff\xff\xff"),
