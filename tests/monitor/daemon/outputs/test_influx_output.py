@@ -12,7 +12,6 @@ import pytest
 import trustme
 from hypothesis import given
 from hypothesis import strategies as st
-from line_protocol_parser import parse_line
 from structlog.testing import capture_logs
 
 from drivers.data_types import Event
@@ -27,6 +26,8 @@ from monitor.settings.loading import MetricsAddress, load_config
 from tests.monitor.publishing import example_results
 from tests.support.ports import free_port
 from tests.support.waiting import FOREVER_S, stays_true, wait_for
+
+parse_line = pytest.importorskip("line_protocol_parser", reason="line-protocol-parser is not installed").parse_line
 
 PATH = "/api/v2/write?org=lab&bucket=imu"
 STATUS_S, ESTIMATE_S = 1.76e9 + 0.5, 1.76e9 + 0.25
