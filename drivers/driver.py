@@ -32,7 +32,7 @@ MAX_UNDECODED_BYTES: Final = 2000
 MIN_UNDECODED_S: Final = 3.0
 """Minimum time in s without a decoded sample after which a running device counts as lost.
 
-If ten sample periods are longer than this time, ten sample periods apply instead.
+If ten sample periods are longer, they apply instead.
 """
 MAX_QUEUED_EVENTS: Final = 1000
 """Maximum number of events in the queue. If the queue is full, the oldest event is dropped."""

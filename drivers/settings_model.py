@@ -1,8 +1,8 @@
 """Base class of the settings in a configuration file, and validation of one table of a configuration file.
 
-Each field of a settings model describes one key with its type, supported range, default and description. A field also
-has an example if it has no default, or if its default disables a feature. ``check_table`` finds all mistakes in a
-table.
+Each field of a settings model describes one key with its type, supported range, default and description. A field
+without a default, or with a default that disables a feature, also has an example. ``check_table`` finds all mistakes in
+a table.
 """
 
 import contextlib

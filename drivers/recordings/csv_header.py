@@ -236,7 +236,7 @@ def _find_separator(label: Path, header: _Line, sample: str) -> str:
 
 
 def _build_numbered(label: Path, line: _Line, options: ReadingOptions, rest: bytes) -> CsvHeader:
-    """Return the header of a file without header line, whose columns the user gives by their numbers."""
+    """Return the header of a file without a header line, whose columns the user selects by number."""
     given = [column for column in options.columns.values() if column != NOT_READ]
     if not given or not all(column.isdecimal() for column in given):
         raise RecordingError(

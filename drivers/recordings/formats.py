@@ -44,7 +44,7 @@ def _table_format(
     open_writer: OpenWriter | None,
     count_rows: Callable[[Path, ReadingOptions], int],
 ) -> Format:
-    """Return the format of a table, which has no topics."""
+    """Return the format of a file that contains a single table and no topics."""
 
     def refuse_topic(path: Path, options: ReadingOptions) -> None:
         if options.topic is not None:
@@ -154,7 +154,7 @@ def find_writer(path: Path, any_columns: bool = False) -> OpenWriter:
     Raises
     ------
     ConfigError
-        If such files are not written.
+        If the program does not write this format.
     """
     found = find_format(path)
     if any_columns and not found.any_columns:

@@ -1,8 +1,8 @@
 """Read ROS 1 bags, ROS 2 bags (SQLite and MCAP) and MCAP files with ROS 2 messages with the library rosbags.
 
-Topics of type ``sensor_msgs/Imu`` contain rad/s and m/s². If the first covariance of a quantity is -1, the message does
-not provide the quantity (sensor_msgs/Imu.msg). Topics of type ``sensor_msgs/Temperature`` contain °C and can be joined
-to an IMU.
+Topics of type ``sensor_msgs/Imu`` contain values in rad/s and m/s². If the first covariance of a quantity is -1, the
+message does not provide the quantity (sensor_msgs/Imu.msg). Topics of type ``sensor_msgs/Temperature`` contain values
+in °C and can be joined to an IMU.
 
 Messages are decoded block by block. The times are the header stamps. If most messages have no header stamp, the times
 of the log are used instead.
@@ -34,7 +34,7 @@ COLUMNS_OF_TYPES: Final[Mapping[str, tuple[str, ...]]] = {
 }
 NOT_PROVIDED: Final = -1.0
 MIN_LOG_S: Final = 1.0
-"""Time of the log in s from which on a stamp of 0 is missing. The times of a simulation begin at 0."""
+"""Log time in s from which a stamp of 0 counts as missing. The times of a simulation begin at 0."""
 MISSING: Final = (float("nan"),) * 3
 MAX_METADATA_BYTES: Final = 4_000_000
 EXPECTED: Final = "messages of type sensor_msgs/Imu"

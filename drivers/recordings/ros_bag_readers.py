@@ -42,7 +42,7 @@ Message = tuple[Connection, int, bytes]
 """Connection, time of the log in ns, and bytes of a message."""
 
 MAX_CHUNK_BYTES: Final = 256_000_000
-"""Maximum unpacked size of the chunks that are in memory at the same time. By default, a chunk of ROS has 1 to 4 MB."""
+"""Maximum unpacked size of the chunks that are in memory at the same time. The default in ROS is 1 to 4 MB."""
 MAX_MESSAGE_BYTES: Final = 64_000_000
 MAX_INDEX_BYTES: Final = 64_000_000
 """Maximum size of the index of a chunk in a ROS 1 bag, and of the summary section of an MCAP file."""

@@ -1,7 +1,8 @@
 """Reading of recordings that consist of one CSV file per sensor, in a folder or in a zip archive.
 
 phyphox and Sensor Logger write one file per sensor, such as ``Gyroscope.csv`` and ``Accelerometer.csv``. Each file has
-times of its own. A file is a topic, and the topics are joined as those of a log (``drivers.recordings.topics``).
+times of its own. Each file is treated as a topic, and the topics are joined like those of a log
+(``drivers.recordings.topics``).
 
 The layouts are those of phyphox/phyphox-android (``DataExport.java``) and tszheichoi/awesome-sensor-logger
 (``UNITS.md``). ``Accelerometer.csv`` of Sensor Logger contains no gravity, so ``TotalAcceleration.csv`` is preferred.

@@ -1,7 +1,7 @@
 """Layout of a table: the column that contains each quantity, and the unit of the column.
 
-The options of the user and the column names of the file determine the layout. All tables use the same rules: CSV, .npz,
-Parquet, Arrow and MATLAB files.
+The options of the user and the column names of the file determine the layout. The same rules apply to all tables: CSV,
+.npz, Parquet, Arrow and MATLAB files.
 
 A column name consists of a sensor, an axis and a unit, such as ``gyro_x [deg/s]``, ``wx (rad/s)`` or ``acc_x_g``. The
 names of these programs are among the recognized names:
@@ -98,7 +98,8 @@ SENSOR_NAMES: Final[Mapping[str, tuple[str, int]]] = {
     # On phones, these names mean the acceleration without gravity.
     **dict.fromkeys(("linear acceleration", "linear accelerometer", "lin acc", "user acceleration"), ("a", 2)),
 }  # fmt: skip
-"""Letter and rank of each sensor, by the words before the axis in a column name. A lower rank is preferred."""
+"""Letter and rank of each sensor. The keys are the words before the axis in a column name. A lower rank is
+preferred."""
 TIME_NAMES: Final[Mapping[str, tuple[int, str | None]]] = {
     "seconds elapsed": (1, "s"), "time since start": (1, None), "time since start in": (1, None),
     "elapsed time": (1, None), "header stamp": (1, None), "timestamp": (2, None), "time stamp": (2, None),
@@ -135,7 +136,7 @@ class ColumnName:
 
 @dataclass(frozen=True, slots=True)
 class TableLayout:
-    """Columns of a table that a recording consists of."""
+    """Columns of a table that contain the quantities of a recording."""
 
     columns: dict[str, int]  # index of the column of each quantity, in the order of COLUMNS
     units: dict[str, str]  # unit of each quantity that the file states or implies
@@ -379,7 +380,7 @@ def _stated_units(
 
 
 def _unit_of_other_name(name: str, kind: QuantityKind) -> str | None:
-    """Return the unit in a column name whose other words are unknown."""
+    """Return the unit in a column name whose other words are not recognized."""
     stem, unit = _split_unit(name)
     words = _split_words(stem)
     endings = ("".join(words[at:]) for at in range(1, len(words)))

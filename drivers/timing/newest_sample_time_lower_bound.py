@@ -15,7 +15,7 @@ from typing import Final
 WINDOW_S: Final = 60.0
 """Length in s of each of the two windows over which the minimum delay is computed."""
 MAX_STEP_S: Final = 1.0
-"""Maximum time in s by which one arrival extends a window.
+"""Maximum time in s that one arrival adds to the duration of a window.
 
 Without this limit, a single long pause between arrivals could fill a window.
 """

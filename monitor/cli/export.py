@@ -64,7 +64,7 @@ def export(
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> "NoiseCoefficients":
-    """Return the coefficients that a running daemon publishes at present."""
+    """Return the coefficients that a running daemon currently publishes."""
     from monitor.publishing import exporters
     from monitor.publishing.zenoh.coefficients_client import receive_coefficients
 

@@ -38,9 +38,10 @@ SINGLE_NS: Final = 2_000_000_000
 """Duration in ns at the start in which samples are passed one by one, because the clock does not know the rate yet."""
 READ_TIMEOUT_S: Final = 1.0
 MIN_STEP_BACK_S: Final = 60.0
-"""Time in s of half the range of a counter above which a step of more than half the range is a step back.
+"""Minimum duration in s of half the range of a counter for the detection of steps back.
 
-In a shorter range, such a step is a gap.
+If half the range lasts at least this long, a step of more than half the range is a step back. Otherwise, the step is a
+gap.
 """
 
 
@@ -254,7 +255,7 @@ class _CaptureTimes:
         return make_block(t_ns, samples.values, samples.temperature_c, samples.ticks, samples.lost)
 
     def _counter_steps(self, ticks: Ints, modulus: int, period_s: float) -> Ints:
-        """Return the step of the counter before each sample [n]. A step back counts as a typical step."""
+        """Return the step of the counter before each sample [n]. A step back is replaced with the typical step."""
         before = self._tick
         steps: Ints = np.diff(ticks, prepend=ticks[0] if before is None else before) % modulus
         self._tick = int(ticks[-1])

@@ -250,8 +250,8 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
     """Return the range of averaging times at which the Allan variance and the fit differ by the largest factor.
 
     Only residuals above ``DEPARTURE_SIGMA`` standard deviations are considered. The largest residual in standard
-    deviations would often be misleading. If noise that the five terms do not describe raises the fit, the Allan
-    variance is below the fit at other averaging times.
+    deviations would often be misleading. If noise outside the five terms raises the fitted curve, the Allan variance
+    lies below this curve at other averaging times.
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):

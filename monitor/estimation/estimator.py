@@ -95,7 +95,7 @@ class Estimator:
         self._history_samples = 0  # total number of samples in ``_history``
         self._total_hadamard = LiveTotalAndHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
-        # Fit inputs of each axis whose Allan variance the five noise terms do not explain, and None for other axes.
+        # For each axis: the fit inputs if the five noise terms do not explain the Allan variance, or None otherwise.
         self._contradicting: list[tuple[CovarianceTable, MeasuredVariancesAndSlopes] | None] = [None] * 6
         self._low_passes: list[LowPass | None] = [None] * 6
         self._search_axis = 0  # axis that is searched for a low-pass filter

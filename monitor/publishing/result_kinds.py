@@ -83,8 +83,9 @@ def keep_newest(waiting: list[TimedResult], new: TimedResult) -> None:
 def keep_newest_and_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
     """Append the new result, and drop the previous result if the remaining results are closely spaced.
 
-    The previous result is dropped if the result before it is less than POINT_INTERVAL_S older than the new result. The
-    new estimate takes over the coefficient history of a dropped estimate. The parameters are those of ``keep_all``.
+    The previous result is dropped if the new result is less than POINT_INTERVAL_S newer than the result before the
+    previous one. The new estimate takes over the coefficient history of a dropped estimate. The parameters are those of
+    ``keep_all``.
     """
     if len(waiting) > 1 and new[0] - waiting[-2][0] < POINT_INTERVAL_S:
         _, previous = waiting.pop()

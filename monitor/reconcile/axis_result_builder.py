@@ -213,9 +213,9 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics
 
 
 def _trials_not_added_too(hypothesis: Hypothesis, index: int, trials: tuple[Trial, ...]) -> tuple[Trial, ...]:
-    """Return the selected trial and the trials of effects that were not added in other rounds.
+    """Return the selected trial and its alternatives, without effects that were added in other rounds.
 
-    An effect that was added too is no alternative, because it explains another difference.
+    An effect that was added in another round is no alternative, because it explains another difference.
     """
     added = [effect for at, effect in enumerate(hypothesis.effects) if at >= hypothesis.given_count and at != index]
     alternatives = [one for one in trials[1:] if not any(_is_same_effect(one.effect, effect) for effect in added)]

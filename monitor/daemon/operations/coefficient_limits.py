@@ -27,7 +27,7 @@ from monitor.settings.loading import Device, Limit
 LIMIT_CROSSED: Final = "limit_crossed"
 """Kind of event that is raised when a limit is crossed."""
 LIMIT_BACK: Final = "limit_back"
-"""Kind of event that is raised when a coefficient returns within a crossed limit."""
+"""Kind of event that is raised when a coefficient that had crossed a limit is within the limit again."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Detect biases that lie outside the prediction interval of the thermal model too often.
 
 If the model is correct, the bias lies above the 95 % prediction interval in 2.5 % of the intervals, and below it in
-another 2.5 %. A change is suspected if the bias lies outside the prediction interval, on the same side, in MIN_OUTSIDE
-of the last WINDOW_INTERVALS intervals. The measured false alarm rate is given in docs/thermal-measurements.md.
+another 2.5 %. A change is suspected if, in MIN_OUTSIDE of the last WINDOW_INTERVALS intervals, the bias lies outside
+the prediction interval on the same side. The measured false alarm rate is given in docs/thermal-measurements.md.
 """
 
 from collections import deque
@@ -53,7 +53,8 @@ class UnexplainedBiasChangeDetector:
 
     @property
     def recent_intervals_fit_prediction(self) -> bool:
-        """Return True if the last bias agrees with its prediction and at most one recent bias per side lies outside."""
+        """Return True if the last bias agrees with its prediction, with at most one recent bias outside on each
+        side."""
         return not (self._recent and self._recent[-1].side) and all(self._count_outside(side) < 2 for side in (-1, 1))
 
     @property

@@ -319,8 +319,7 @@ def keep_newest(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: in
     """
     w = compiled_view_window_arrays(ints, floats, missing, taus)
     state, places = w.state, w.phase.size // LANES
-    # The counts of missing samples at older phase points are made to differ, so older second differences count as
-    # incomplete.
+    # Give older phase points different counts of missing samples, so that older second differences count as incomplete.
     oldest = ring_row(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
         missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back

@@ -1,7 +1,7 @@
 """Export of N and K as parameter files of state estimators and calibration programs.
 
 Each program reads one value of N and one value of K for each kind of sensor, so the value of the worst axis is
-exported. The programs differ in file syntax, parameter names, and in the form in which they state the noise:
+exported. The programs differ in file syntax and parameter names. They state the noise in one of these forms:
 
 - a continuous-time density, which the program converts to its own time step,
 - the square of the density, as a covariance in continuous time,
@@ -138,7 +138,7 @@ class ParameterFile:
         inflation
             Factor that multiplies N and K.
         dt_s
-            Time step of the target program [s]. By default, the default of the program or the sample period.
+            Time step of the target program [s]. If None, the default of the program or the sample period is used.
         rostopic
             ROS topic on which the IMU publishes.
 
@@ -181,7 +181,7 @@ class ParameterFile:
         return [*lines, self.line.format(name=one.name, value=format_float(value))]
 
     def _time_step_s(self, rate_hz: float | None, dt_s: float | None) -> float:
-        """Return the time step of the target program. A file of continuous-time values does not depend on it."""
+        """Return the time step of the target program. Continuous-time values do not depend on the time step."""
         if rate_hz is None and any("{rate}" in text for text in self.before):
             raise ConfigError(f"{self.name} needs an update_rate, and the model has no sample_rate")
         sample_period_s = None if rate_hz is None else 1.0 / rate_hz

@@ -31,7 +31,7 @@ KINDS_IN_DICTIONARY: Final[tuple[tuple[Kind, str, float, str, float, str], ...]]
     ("gyro", "arw", DEGREE * ROOT_HOUR, "deg/sqrt(hr)", DEGREE * HOUR_S, "deg/hr"),
     ("accel", "vrw", ROOT_HOUR, "m/s/sqrt(hr)", 1.0, "m/s^2"),
 )
-"""Kind of sensor, key of the random walk with its factor and unit, and factor and unit of the bias."""
+"""Kind of sensor, then key, factor and unit of the random walk, and factor and unit of the bias."""
 
 
 def export_gnss_ins_sim(

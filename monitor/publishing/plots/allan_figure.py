@@ -165,7 +165,7 @@ def _draw_other(
     longest_allan_tau_s: float, line_style: str,
 ) -> Floats:  # fmt: skip
     """Draw the total or Hadamard deviation of one axis, and return the drawn values."""
-    # The line begins at the last point of the Allan deviation, because the total deviation continues the curve.
+    # Start the line at the last point of the Allan deviation, because the total deviation continues from this point.
     line = points | (other.tau_s == longest_allan_tau_s) if other.only_beyond else points
     y, colour = other.deviation[:, i] * factor, COLOURS[number]
     panel.plot(other.tau_s[line], y[line], line_style, color=colour, linewidth=0.9, alpha=0.8, zorder=2)

@@ -30,7 +30,7 @@ from monitor.publishing.zenoh.subscriber import (
 
 RESULT_TOPICS: Final = tuple(one for one in topics.TOPICS if one.encoding == topics.JSON and one.when != "query")
 SAMPLE_TOPICS: Final = tuple(one for one in topics.TOPICS if one.encoding == topics.MSGPACK)
-"""Topics that are printed only if the key expression names the topic, because they contain most of the data."""
+"""Topics that contain most of the data. They are printed only if the key expression names them."""
 WAIT_S: Final = 0.25
 """Longest time [s] until the function notices that it must stop, or that nobody reads its output."""
 

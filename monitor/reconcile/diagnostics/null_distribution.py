@@ -51,8 +51,8 @@ class NullDistribution:
     def min_gain_to_test_effects(self) -> float:
         """Gain above which the search tests the effects one by one, in nats.
 
-        With a true model, a gain exceeds the mean of both quantiles in about one of six recordings. The penalties of
-        the effects then prevent wrong effects.
+        With a true model, a gain exceeds the mean of both quantiles in about one of six recordings. The penalties then
+        prevent the search from adding wrong effects.
         """
         return 0.5 * (self.null95 + self.threshold)
 
@@ -113,8 +113,8 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
     Parameters
     ----------
     simulated : mapping of str to sequence of Findings
-        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. If an axis has all recordings, the
-        gains can increase the thresholds of this axis.
+        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. The gains can increase the
+        thresholds of an axis only if all its recordings have been simulated.
     """
     chance = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * max(len(simulated), 1))
     complete = [axis for axis, of in simulated.items() if len(of) >= SIMULATED_RECORDINGS]

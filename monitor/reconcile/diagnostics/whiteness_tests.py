@@ -181,8 +181,9 @@ def compute_level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats, fl
     A unit step at sample s has the cosine transform X_k = −√(2/n) sin(πks/n)/(2 sin(πk/2n)). A Fourier transform
     computes the weighted sums Σ W_k X_k² = Σ W_k (1 − cos(2πks/n))/(4n sin²(πk/2n)) for all s.
 
-    Between successive samples, the product of data and step changes by a random amount. If the times are independent,
-    this change and the product have the same variance. The sum of the ratios is the number of independent times.
+    Between successive samples, the product of data and step changes by a random amount. If the gains at both times are
+    independent, this change has the same variance as the product. The ratio of the two variances, summed over all
+    times, is the effective number of independent times.
 
     Returns
     -------

@@ -58,7 +58,7 @@ MIN_CACHED_SERIES: Final = 8
 """Smallest number of cached series that are not smooth."""
 MAX_CACHED_SMOOTH_SERIES: Final = 128
 SMOOTH_EFFECTS: Final = (RateRamp, BiasCurve, TemperatureBias, TemperatureLag, TurnOnTransient)
-"""Deterministic effects that change slowly if the time constant is not short."""
+"""Deterministic effects that change slowly unless they have a short time constant."""
 MIN_BLOCKS_PER_TIME_CONSTANT: Final = 16
 """Smallest time constant of a smooth effect, in blocks of the smooth transform."""
 WHOLE_RECORDING: Final = slice(None)
@@ -474,6 +474,6 @@ def _with_unit_noise_size(effect: Effect) -> Effect:
 
 @lru_cache(MAX_CACHED_UNIT_EFFECTS)
 def _with_unit_size(regressor: Regressor) -> Regressor:
-    """Return the regressor with an effect of size one, for use as a cache key."""
+    """Return the regressor of the effect with size one, which serves as a cache key."""
     effect, at = regressor
     return with_regression_coefficients(effect, np.ones(MAX_REGRESSORS)), at

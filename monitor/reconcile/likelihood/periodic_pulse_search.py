@@ -184,9 +184,9 @@ def _largest_harmonic_sums(power: Floats, lowest: int, highest: int, last: int) 
     """Return the largest sum for each number of harmonics in ``HARMONICS``, and the index of the highest harmonic.
 
     The fundamental frequencies have indices from ``lowest`` to ``highest``, and the highest harmonic has an index below
-    ``last``. Let j be the index of the highest of n harmonics. Harmonic k has the index kj/n, rounded. The even
-    harmonics of 2n harmonics are thus the harmonics of n harmonics with the same j, and only the odd ones are added.
-    The harmonics are added in blocks of indices j.
+    ``last``. Let j be the index of the highest of n harmonics. Harmonic k has the index kj/n, rounded. With 2n
+    harmonics and the same j, the even harmonics therefore have the indices of the n harmonics, and only the odd
+    harmonics are added. The harmonics are added in blocks of indices j.
     """
     best, places = np.full(len(HARMONICS), -1.0), np.zeros(len(HARMONICS), np.int64)
     sums = np.empty(HARMONIC_SUM_BLOCK)

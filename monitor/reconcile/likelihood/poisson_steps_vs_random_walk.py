@@ -152,7 +152,7 @@ class _JumpFilterState(NamedTuple):
 
 
 class _JumpFilterUpdate(NamedTuple):
-    """Update of each hypothesis with one block mean, for no jump (0) and for a jump (1) in the block."""
+    """Update of each hypothesis with one block mean, without (0) and with (1) a jump in the block."""
 
     weight: Floats  # [2, JUMP_AGES] probability
     inverse_variance: Floats  # [2, JUMP_AGES] inverse of the variance of the innovation

@@ -396,7 +396,7 @@ def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]
 
 @compiled
 def _best_contrast(x: Floats, total: Floats, inside: int, whole: int) -> tuple[float, int]:
-    """Return the largest gain from fitting a separate power to one tile of each row, and the index of the row.
+    """Fit a separate power to one tile of each row, and return the largest gain and the index of its row.
 
     Let x be the sum of c squares in the tile, and R the sum of the other d squares of the row. The gain is (c+d)/2
     ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d). A low power is ignored if the tile has fewer than

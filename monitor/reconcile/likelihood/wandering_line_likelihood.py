@@ -26,7 +26,7 @@ from monitor.common.compiled import compiled
 Complexes = NDArray[np.complex128]
 
 BLOCK_LENGTHS: Final = (4, 8, 16, 32, 64, 128)
-"""Numbers of samples of z in a block."""
+"""Possible lengths of a block, in samples of z."""
 MIN_BLOCKS: Final = 16
 PHASE_ITERATIONS: Final = 6
 INITIAL_PHASE_VARIANCE: Final = 100.0
@@ -239,7 +239,7 @@ def _forward(emission: Floats, transition: Floats, first: Floats) -> tuple[float
 
 @compiled
 def _smoothed_states(forward: Floats, transition: Floats, emission: Floats) -> Ints:
-    """Return the most likely frequency of each block, given all blocks."""
+    """Return the most likely frequency of each block, given the data of all blocks."""
     states = np.empty(forward.shape[0], np.int64)
     backward = np.ones(forward.shape[1])
     for b in range(forward.shape[0] - 1, -1, -1):
@@ -251,7 +251,7 @@ def _smoothed_states(forward: Floats, transition: Floats, emission: Floats) -> I
 
 @compiled
 def _draw_states(forward: Floats, transition: Floats, chances: Floats) -> Ints:
-    """Draw the frequency of each block, given all blocks."""
+    """Draw the frequencies of all blocks from their joint distribution given the data."""
     states = np.empty(forward.shape[0], np.int64)
     for b in range(forward.shape[0] - 1, -1, -1):
         weight = forward[b].copy()

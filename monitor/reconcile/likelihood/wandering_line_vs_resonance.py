@@ -50,10 +50,11 @@ HALF_POWER_DEVIATIONS: Final = sqrt(8.0 * log(2.0))
 """Full width of a Gaussian line at half power, in standard deviations."""
 MIN_POWER: Final = 1e-3
 MIN_MODULATION_GAIN_NATS: Final = 3.0
-"""Log-likelihood gain of a modulated line over both other processes, in nats, above which neither is named."""
+"""Log-likelihood in nats by which a modulated line must exceed both other processes, so that neither of them is
+named."""
 MAX_SWEEP_RESIDUAL: Final = 1e-3
-"""Variance of the phase that a linear change of the frequency leaves, below which the line is a sweep. The variance is
-relative to the variance that a constant frequency leaves. For a random frequency, it is near 1."""
+"""Variance of the phase around a parabola, relative to the variance around a straight line, below which the line is a
+sweep. For a random frequency, the ratio is near 1."""
 CARRIER_PADDING: Final = 4
 """Zero padding of the periodogram that determines the frequency of a modulated line."""
 

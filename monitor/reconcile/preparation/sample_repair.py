@@ -92,8 +92,8 @@ def fill_missing_samples(y: Floats, replace_mask: Mask, rng: np.random.Generator
 def _copy_samples(new: Floats, known_at: Ints, first: int, last: int, width: int, rng: np.random.Generator) -> None:
     """Fill a long run of missing samples with successive samples from the side of the run with more samples.
 
-    A line is added to the copied samples, so that the changes of the mean level at both ends of the run equal those at
-    the ends of the copied samples. If there are too few samples, their mirror image continues them.
+    A linear trend is added to the copied samples, so that the mean levels beside their original place match those
+    beside the run. If there are too few samples, their mirror image continues them.
 
     Parameters
     ----------

@@ -26,9 +26,9 @@ LEVEL_LOG_SIGMA: Final = 0.12
 BAND_LOG_SIGMA: Final = 0.2
 """Standard deviation of the logarithm of the power in one band, relative to the axis, between runs (empirical)."""
 MAX_BAND_COST_NATS: Final = 10.0
-"""Largest cost in nats of a different power in one band. The limit keeps the cost of a moved line small."""
+"""Upper limit in nats of the cost of a power difference in one band. The limit keeps the cost of a moved line small."""
 MAX_AXIS_COST_NATS: Final = 32.0
-"""Largest cost in nats of a different noise level on one axis."""
+"""Upper limit in nats of the cost of a different noise level on one axis."""
 CORRELATED_BANDS: Final = 3.0
 """Number of neighbouring bands with correlated deviations (empirical)."""
 PENALTIES_NATS: Final = {

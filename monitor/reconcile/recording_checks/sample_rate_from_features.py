@@ -56,7 +56,7 @@ MIN_STATED_GAIN_NATS: Final = 12.0
 MAX_SPREAD: Final = 0.25
 """Largest deviation of a group from the common log ratio, as a fraction of the common log ratio."""
 MAX_PEAK_LOG_DISTANCE: Final = 0.02
-"""Largest distance of the peak of a group from the log ratio that was estimated from the likelihood."""
+"""Largest difference between the log ratio from the likelihood and the log ratio at the peak of a group."""
 SAME_GROUP_RATIO: Final = 1.01
 """Largest frequency ratio of the same feature on different axes."""
 HARMONIC_TOLERANCE: Final = 0.003
@@ -274,7 +274,7 @@ def _max_gain_near(gains: Floats, x: float, reach: float) -> float:
 
 
 def _estimate_stated_ratio(groups: Sequence[FeatureGroup], x: float) -> SampleRateErrorEstimate | None:
-    """Return the ratio that the model states, or None if the features do not move by this ratio."""
+    """Estimate the ratio near the stated log ratio ``x``, or return None if the features do not move by this ratio."""
     if not 10.0 * LOG_RATIO_STEP < abs(x) <= MAX_LOG_RATIO:
         return None
     reach = min(MAX_STATED_FREQUENCY_DRIFT, 0.5 * abs(x))

@@ -43,13 +43,13 @@ MIN_LENGTH_BLOCKS: Final = 3
 MAX_SHARE: Final = 0.5
 """Largest share of the recording."""
 MAX_EPISODES: Final = 3
-"""Largest number of episodes of one band. A line with a varying amplitude has more."""
+"""Largest number of episodes of one band. A line with a varying amplitude has more episodes."""
 MAX_WIDTH: Final = 0.15
 """Largest width of the band, relative to half the sample rate."""
 NEIGHBOUR_WIDTHS: Final = 3
-"""Number of widths on each side of the band that must be quiet at other times.
+"""Width of the region on each side of the band that must be quiet at other times, in widths of the band.
 
-A moving resonance is not quiet there.
+A moving resonance is not quiet in this region.
 """
 MIN_NEIGHBOUR_BINS: Final = 12
 MAX_QUIET_RATIO: Final = 1.5
@@ -185,7 +185,7 @@ def _examine_band(axis: str, spectra: _BlockSpectra, first: int, last: int) -> T
 
 
 def _find_active_blocks(ratio: Floats, first: int, last: int) -> Mask | None:
-    """Return the blocks with large power in a band, or None if the blocks are not a few episodes."""
+    """Return the blocks with large power in a band, or None if they do not form a few episodes."""
     # successive bins of a Hann window are correlated, with two thirds of the degrees of freedom
     width = last - first
     freedom = 2.0 / 3.0 * width

@@ -210,7 +210,8 @@ def _gravity_ratio(values: Mapping[str, Floats], triad: Sequence[str], model: No
 def _step_ratio(y: Floats, axis: str, model: NoiseModel) -> float | None:
     """Return the ratio of the quantization step in the recording to the step in the model, or None.
 
-    The largest known ratio that fits is returned, because the values are also multiples of fractions of the true step.
+    The largest known ratio that fits is returned, because multiples of the true step are also multiples of its
+    fractions.
     """
     step = next((effect.step for effect in model.effects.get(axis, ()) if isinstance(effect, Resolution)), None)
     values = y[np.isfinite(y)]

@@ -107,7 +107,8 @@ def _accept_if_diagnostics_agree(
 ) -> AxisSearchResult:
     """Return the result with a simpler hypothesis, unless a diagnostic becomes significant.
 
-    If ``replacement_reason`` is given, the last added effect is new and is recorded as a round of the search.
+    If ``replacement_reason`` is given, the last added effect replaces other effects and is recorded as a round of the
+    search.
     """
     if simpler is search.hypothesis:
         return search

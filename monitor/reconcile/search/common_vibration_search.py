@@ -56,7 +56,8 @@ MAX_LOG_GAIN_CHANGE: Final = 1.5
 MAX_LOG_BANDWIDTH_CHANGE: Final = 1.0
 """Largest change of the logarithm of a bandwidth from the first search."""
 MIN_HALF_SHARE: Final = 0.2
-"""Smallest share of the gain that each half of the recording must contribute, for all axes and for each axis."""
+"""Smallest share of the gain that each half of the recording must contribute, for all axes together and for each
+axis."""
 MAX_SAME_BANDWIDTH_RATIO: Final = 4.0
 """Largest ratio of the bandwidths of a vibration and a noise effect that the vibration replaces."""
 VALIDATION_REASON: Final = "both halves of the recording contain the correlation of the axes"
@@ -196,8 +197,8 @@ def _cross_spectra_of_halves(
 def _without_weak_axes(joint: "_JointFit", spectra: CrossSpectra, halves: Sequence[CrossSpectra]) -> "_JointFit":
     """Leave out the axes on which the vibration explains too little, as long as more than two axes remain.
 
-    The gain of an axis is the gain of the correlations with the other axes and of the spectrum. The gain must exceed
-    ``RESIZE_PENALTY_NATS``, and each half of the recording must contribute to the gain of the correlations.
+    The gain of an axis comes from the correlations with the other axes and from the spectrum. The gain must exceed
+    ``RESIZE_PENALTY_NATS``, and each half of the recording must contribute to the part from the correlations.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Cross-validation of a new effect on the two halves of a recording.
 
 The hypotheses with and without the effect are fitted to one half and tested on the other half. The effect is kept if
-the likelihood of the other half increases and the gap of the diagnostic decreases. It is enough if both hold after the
-sizes of all other noise have been fitted to the other half. One-time effects, and effects with too little evidence in
-one half, are kept without cross-validation.
+the likelihood of the other half increases and the gap of the diagnostic decreases. If one of these conditions is not
+met, the test is repeated after the sizes of all other noise have been fitted to the other half. One-time effects, and
+effects with too little evidence in one half, are kept without cross-validation.
 """
 
 from collections.abc import Collection

@@ -193,7 +193,7 @@ def _as_rivals(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def _as_rivals_of_noise(deterministic: Sequence[Trial]) -> list[Trial]:
-    """Convert deterministic trials to rivals of the noise effects, with the scores without additional slow noise."""
+    """Convert deterministic trials to rivals of the noise effects, using their scores without additional slow noise."""
     return [
         replace(one, score=one.score_without_slow_noise, slow_noise_score=0.0, is_rival_only=True)
         for one in deterministic
@@ -377,7 +377,7 @@ def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> li
 
 
 def _prefer_single_size(trials: list[Trial]) -> list[Trial]:
-    """Move the trial of one new size to the start if a common factor is hardly better."""
+    """Move the trial of a single new size to the start if a common factor is only slightly better."""
     size = next(one for one in trials if one.name == RETUNE)
     if trials[0].name != "scale_factor" or trials[0].score >= size.score + SINGLE_SIZE_MARGIN_NATS:
         return trials
@@ -445,8 +445,7 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     """Try a common factor for all noise effects of the model.
 
-    If several sizes changed and the factor fits nearly as well, the factor gets at least the score of the separate
-    sizes.
+    If the factor fits nearly as well as several changed sizes, it gets at least the score of these sizes.
     """
     effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_effect_indices(hypothesis.model)
 

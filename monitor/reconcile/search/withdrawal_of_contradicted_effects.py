@@ -6,7 +6,7 @@ resonances, low-pass filters and power laws are withdrawn in these cases:
 - Several lines or resonances overlap.
 - ``MIN_COMB_LINES`` or more lines are harmonics of one frequency.
 - A significant difference remains at the frequency of the effect. If a line or resonance at this frequency is kept, the
-  difference comes from the line or resonance and does not contradict a filter or a power law.
+  difference is attributed to it and does not contradict a filter or a power law.
 
 A leak is withdrawn if more than half of the dependence on other axes remains. Pulses are withdrawn if more than a tenth
 of the harmonics remains, or if several lines are harmonics of the pulses. A step or a curve is withdrawn if the mean
@@ -47,9 +47,9 @@ DIFFERENCE_DIVISORS: Final = (1, 2, 3)
 HARMONIC_TOLERANCE: Final = 2e-4
 """Largest distance of a line from a harmonic, relative to the highest line frequency."""
 RESONANCE_REACH_HALF_WIDTHS: Final = 2.0
-"""Distance from a resonance, in half widths, within which other lines and resonances overlap."""
+"""Largest distance of an overlapping line or resonance from a resonance, in half widths."""
 WANDERING_REACH_DEVIATIONS: Final = 3.0
-"""Distance from the mean frequency of a wandering line, in standard deviations, within which other effects overlap."""
+"""Largest distance of an overlapping effect from the mean frequency of a wandering line, in standard deviations."""
 LINE_REACH_HZ: Final = 0.1
 MAX_REMAINING_SHARE: Final = 0.1
 """Largest remaining gain, relative to the gain that an effect should explain."""

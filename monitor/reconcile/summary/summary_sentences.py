@@ -20,7 +20,7 @@ MAX_LISTED_REMAINDERS: Final = 2
 UNMENTIONED_SIZE_CHANGE: Final = 0.05
 """Largest relative change of the size of a moved line that is not described."""
 MIN_REMAINDER_SHARE: Final = 0.01
-"""Smallest share of the gap at which a remaining difference is described."""
+"""Smallest share of the gap that a remaining difference needs to be described."""
 EFFECT_PHRASES: Final = {
     "angle_random_walk": "white noise N",
     "bias_instability": "bias instability B",
