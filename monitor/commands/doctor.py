@@ -23,6 +23,7 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Literal
+from urllib.parse import urlsplit
 
 from drivers import file_access
 from drivers.extras import find_missing_packages
@@ -104,6 +105,7 @@ def _check_configured(config: Config) -> Iterator[Finding]:
     yield from _check_viewer(config)
     yield from _check_storage(config)
     yield from _check_metrics(config)
+    yield from _check_influx(config)
     yield from _check_reconcile(config)
     for hook in config.hooks:
         if hook.command:
@@ -111,8 +113,11 @@ def _check_configured(config: Config) -> Iterator[Finding]:
             yield _check_permissions(command, f"hook {command.name}", secret=False)
 
 
-def _check_permissions(path: Path, about: str = "permissions", secret: bool = True) -> Finding:
-    """Check which users may write a file. If the file contains a password, also check which users may read it."""
+def _check_permissions(path: Path, about: str = "permissions", secret: bool | None = None) -> Finding:
+    """Check which users may write a file, and which users may read it if it is secret.
+
+    By default, a file is secret if it contains a password.
+    """
     try:
         seen = path.stat()
     except OSError as error:
@@ -126,7 +131,7 @@ def _check_permissions(path: Path, about: str = "permissions", secret: bool = Tr
         return _doubt(about, text, f"chown root {path}")
     if mode & stat.S_IWGRP:
         return _doubt(about, f"{path}: the group {_group(seen.st_gid)} can write it", f"chmod g-w {path}")
-    if secret and mode & stat.S_IROTH and contains_secret(path):
+    if mode & stat.S_IROTH and (contains_secret(path) if secret is None else secret):
         return _wrong(about, f"{path}: everyone can read the password in it", f"chmod o-r {path}")
     return _well(about, f"{path}: {mode:04o}, owner {_user(seen.st_uid)}")
 
@@ -307,6 +312,21 @@ def _check_metrics(config: Config) -> Iterator[Finding]:
     if not own.host.startswith(LOOPBACK):
         text = f"{own.host}: everyone who reaches this machine can read the metrics"
         yield _doubt("metrics", text, "listen on 127.0.0.1, and let a local collector forward them")
+
+
+def _check_influx(config: Config) -> Iterator[Finding]:
+    own = config.influx
+    if own is None or own.url is None:
+        return
+    parts = urlsplit(own.url)
+    host = str(parts.hostname)
+    port = parts.port or (443 if parts.scheme == "https" else 80)
+    yield _check_reachable("influx", f"tcp/[{host}]:{port}" if ":" in host else f"tcp/{host}:{port}")
+    if own.token_file is not None:
+        yield _check_permissions(own.token_file, "influx token", secret=True)
+    if parts.scheme == "http" and not host.startswith(LOOPBACK):
+        text = f"{host}: everyone on the network between can read the results and the token"
+        yield _doubt("influx", text, "use https")
 
 
 def _check_reconcile(config: Config) -> Iterator[Finding]:

@@ -43,6 +43,7 @@ from monitor.settings.loading import Config, Device, Storage, VirtualTable
 
 if TYPE_CHECKING:
     from monitor.daemon.operations.prometheus_metrics import MetricsOutput
+    from monitor.daemon.outputs.influx_output import InfluxOutput
     from monitor.publishing.rerun.queued_view import RerunView
 
 MAX_IDLE_S: Final = 0.05
@@ -111,9 +112,12 @@ class Service:
         self._viewer_url = ""  # last announced URL of the web viewer
         self.hooks = Hooks(config.hooks, self.zenoh.publish_json_return_error)
         self.metrics = _build_metrics_output(config)
+        self.influx = _build_influx_output(config)
         self.outputs += [ZenohOutput(self.zenoh), self.hooks, *more]
         if self.metrics is not None:
             self.outputs.append(self.metrics)
+        if self.influx is not None:
+            self.outputs.append(self.influx)
         if self.viewer is not None:
             self.outputs.append(ViewerOutput(self.viewer))
         if self.history is not None:
@@ -139,7 +143,7 @@ class Service:
             self._close()
 
     def _start(self) -> None:
-        for output in (self.history, self.zenoh, self.metrics, self.viewer):
+        for output in (self.history, self.zenoh, self.metrics, self.influx, self.viewer):
             if output is not None:
                 output.start()
         for worker in self.workers:
@@ -188,6 +192,7 @@ class Service:
             "recording": self.recorder,
             "history": self.history,
             "metrics": self.metrics,
+            "influx": self.influx,
             "hook": self.hooks if self.hooks.hooks else None,
             **self._writers,
         }
@@ -332,7 +337,7 @@ class Service:
         finally:
             self._commands.abort_reconciliations()
             self._commands.publish_reconciled({worker.name: worker for worker in self.workers})
-            for output in (self.recorder, self.hooks, self.metrics, self.viewer, self.zenoh, self.history):
+            for output in (self.recorder, self.hooks, self.metrics, self.influx, self.viewer, self.zenoh, self.history):
                 if output is not None:
                     output.close()
 
@@ -386,6 +391,15 @@ def _build_metrics_output(config: Config) -> "MetricsOutput | None":
     )
 
     return MetricsOutput(config.metrics)
+
+
+def _build_influx_output(config: Config) -> "InfluxOutput | None":
+    settings = config.influx
+    if settings is None or settings.url is None:
+        return None
+    from monitor.daemon.outputs.influx_output import InfluxOutput  # imports http.client, so only if it is needed
+
+    return InfluxOutput(settings.url, settings.token_file, settings.interval_s)
 
 
 def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) -> "RerunView | None":

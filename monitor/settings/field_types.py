@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
+from urllib.parse import parse_qs, urlsplit
 
 from pydantic import BeforeValidator
 
@@ -20,6 +21,10 @@ RATE_TEXT: Final = re.compile(r"\s*([0-9.]+)\s*Hz\s*")
 ENDPOINT_TEXT: Final = re.compile(r"[a-z]+/.+")
 ZENOH_KEY: Final = re.compile(r"[^/*$?#]+(/[^/*$?#]+)*")
 ADDRESS_TEXT: Final = re.compile(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):([0-9]{1,5})", re.ASCII)
+INFLUX_URL: Final = "http://127.0.0.1:8086/api/v2/write?org=lab&bucket=imu"
+"""Example of a write endpoint of InfluxDB."""
+INFLUX_PRECISIONS: Final = ("ns", "n", "nanosecond", "auto")
+"""Values of the parameter ``precision`` that mean nanoseconds in the different versions of InfluxDB."""
 VIEWER_MODES: Final = ("auto", "native", "web", "none")
 SIZE_TEXT: Final = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,20})?)\s*(?:([kMGT]?)(i?)B|%)")
 
@@ -131,6 +136,22 @@ def _address(text: str, _: Path | None) -> MetricsAddress:
     return MetricsAddress(match[1].strip("[]"), int(match[2]))
 
 
+def _check_influx_url(url: str) -> None:
+    try:
+        parts = urlsplit(url)
+        has_host = bool(parts.hostname) and parts.port != 0
+    except ValueError:  # the port or the IPv6 address is invalid
+        has_host = False
+    printable = url.isascii() and url.isprintable() and " " not in url
+    if not (printable and has_host and parts.scheme in ("http", "https") and parts.path.strip("/")) or parts.fragment:
+        raise ConfigError(f'{format_value(url)} is not the address of a write endpoint; write "{INFLUX_URL}"')
+    parameters = parse_qs(parts.query)
+    if parts.username is not None or "p" in parameters:
+        raise ConfigError("the address contains a password; write user:password into token_file instead")
+    if not set(parameters.get("precision", [])) <= set(INFLUX_PRECISIONS):
+        raise ConfigError("remove precision from the address, because the times are sent in nanoseconds")
+
+
 DURATION_FROM_TEXT: Final = BeforeValidator(_parse_duration_text)
 """Annotation of a duration in seconds that a configuration may state as a text such as "1h"."""
 Duration = Annotated[float, DURATION_S, DURATION_FROM_TEXT]
@@ -139,3 +160,4 @@ RelativePath = Annotated[Path, ConvertedFrom(str, _path)]
 Endpoint = Annotated[str, checked_by(_check_endpoint)]
 ZenohKey = Annotated[str, checked_by(_check_zenoh_key)]
 Address = Annotated[MetricsAddress, ConvertedFrom(str, _address)]
+InfluxUrl = Annotated[str, checked_by(_check_influx_url)]

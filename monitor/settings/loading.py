@@ -21,12 +21,14 @@ from monitor.settings.schema import (
     ConfigFile,
     Device,
     Hook,
+    InfluxTable,
     Limit,
     LogTable,
     Storage,
     ViewerTable,
     ZenohTable,
 )
+from monitor.settings.token_file import read_token
 
 __all__ = [
     "DEVICE_NAME",
@@ -36,6 +38,7 @@ __all__ = [
     "Device",
     "FaultsTable",
     "Hook",
+    "InfluxTable",
     "Limit",
     "LogTable",
     "MetricsAddress",
@@ -64,6 +67,7 @@ class Config:
     storage: Storage | None = None  # None if nothing is kept
     hooks: tuple[Hook, ...] = ()
     metrics: MetricsAddress | None = None
+    influx: InfluxTable | None = None  # None if nothing is sent
     path: Path | None = None  # of the file
     table: Mapping[str, Any] = dataclasses.field(
         default_factory=dict
@@ -133,7 +137,7 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
     except ConfigError as error:
         return ConfigReading(None, [f"{path}: {error}"])
     checked = check_table(ConfigFile, table, path.resolve().parent)
-    warnings = _check_zenoh_file(checked)
+    warnings = [*_check_zenoh_file(checked), *_check_token_file(checked)]
     wrong = [_format_problem(problem, table) for problem in checked.problems]
     if line := file_permissions.explain_untrusted_file(path):
         wrong.append(line)
@@ -149,7 +153,8 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
 
 def _configuration(file: ConfigFile) -> Config:
     storage = None if file.storage.folder == Path() else file.storage
-    return Config(file.devices, file.zenoh, file.viewer, file.log, storage, file.hooks, file.metrics.listen)
+    influx = None if file.influx.url is None else file.influx
+    return Config(file.devices, file.zenoh, file.viewer, file.log, storage, file.hooks, file.metrics.listen, influx)
 
 
 def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
@@ -171,6 +176,20 @@ def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
     files = ((path, None), *((one, True) for one in secrets))
     exposed = ((file, file_permissions.describe_exposed_secret(file, secret)) for file, secret in files)
     return [f"zenoh.config: {file.name}: {line}" for file, line in exposed if line]
+
+
+def _check_token_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
+    """Check the token file of InfluxDB, and return a warning if all users can read the token."""
+    path = checked.value.influx.token_file if checked.value else None
+    if path is None:
+        return []
+    try:
+        read_token(path)
+    except ConfigError as error:
+        checked.add_problem("influx.token_file", str(error))
+        return []
+    line = file_permissions.describe_exposed_secret(path, is_secret=True)
+    return [f"influx.token_file: {path.name}: {line}"] if line else []
 
 
 def _zenoh_file_secrets(path: Path) -> tuple[Path, ...]:

@@ -25,9 +25,11 @@ from monitor.common.topics import ENDPOINT
 from monitor.settings.driver_settings import BuiltLinkAndDecoder, VirtualTable, build_link_and_decoder
 from monitor.settings.field_types import (
     DURATION_FROM_TEXT,
+    INFLUX_URL,
     Address,
     Duration,
     Endpoint,
+    InfluxUrl,
     RelativePath,
     ZenohKey,
     check_memory_limit,
@@ -43,6 +45,7 @@ THERMAL_INTERVAL_SAMPLES: Final = 8
 """Minimum number of samples in a thermal interval, for an estimate of the uncertainty of the mean."""
 THERMAL_INTERVAL_S: Final = NumberRange("s", 1e-6, DAY_S)
 SEGMENT_LENGTH_S: Final = NumberRange("s", 10.0, DAY_S)
+INFLUX_INTERVAL_S: Final = NumberRange("s", 1.0, DAY_S)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 AXIS_PATTERNS: Final = (*AXES, "g*", "a*", "*")
 
@@ -361,6 +364,25 @@ class MetricsTable(SettingsModel):
     )
 
 
+class InfluxTable(SettingsModel):
+    """Table ``[influx]``: settings of the output to InfluxDB."""
+
+    url: InfluxUrl | None = Field(
+        None, examples=[INFLUX_URL], description="write endpoint, http or https; absent: nothing is sent"
+    )
+    token_file: RelativePath | None = Field(
+        None, examples=["influx-token"], description="file with the token; absent: requests contain no token"
+    )
+    interval_s: Annotated[float, INFLUX_INTERVAL_S, DURATION_FROM_TEXT] = Field(
+        10.0, alias="interval", examples=["10s"], description="interval between two requests"
+    )
+
+    def find_conflicting_settings(self) -> Iterator[Conflict]:
+        """Yield a conflict if there is a token and no server."""
+        if self.token_file is not None and self.url is None:
+            yield Conflict("token_file", "there is no server to send the token to; add url", ("url",))
+
+
 class LogTable(SettingsModel):
     """Table ``[log]``: settings of the log messages."""
 
@@ -377,6 +399,7 @@ class ConfigFile(SettingsModel):
     storage: Storage = Field(Storage(), description="samples and results that are kept on disk")
     hooks: ListOf[Hook] = Field((), alias="hook", description="actions for events")
     metrics: MetricsTable = Field(MetricsTable(), description="numbers for Prometheus")
+    influx: InfluxTable = Field(InfluxTable(), description="numbers for InfluxDB")
     log: LogTable = Field(LogTable(), description="messages of the service")
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:

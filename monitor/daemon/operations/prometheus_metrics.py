@@ -2,28 +2,16 @@
 
 The main loop stores the newest status and estimate of each device. A server thread answers each scrape with the stored
 values, so a scrape does not delay the main loop. If the port is in use, the server tries again.
-
-All values are in SI units. A coefficient with only an upper bound has ``hi`` and no value. A coefficient that is not
-estimated has no entry.
 """
 
 import socket
 import socketserver
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
-from drivers.data_types import AXES, Event
-from monitor.common.device_health import Health
-from monitor.daemon.outputs.output import Output
-from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
-from monitor.noise.effect import gyro_and_accel_units
-from monitor.noise.standard_terms import STANDARD_TERMS
+from monitor.daemon.outputs.newest_metrics import NewestMetrics
 from monitor.settings.loading import MetricsAddress
 
 if TYPE_CHECKING:
@@ -42,38 +30,9 @@ PATH: Final = "/metrics"
 """Path of the metrics in the URL."""
 MISSING_LIBRARY_TEXT: Final = 'prometheus-client is not installed: pip install "imu-monitor[metrics]"'
 """Status message if the library is not installed."""
-STATES: Final = ("running", "waiting", "lost", "ended")
-"""Possible states of a device."""
-_GYRO_UNITS: Final = ", ".join(
-    f"{symbol} {gyro_and_accel_units(term)[symbol][0]}" for symbol, term in STANDARD_TERMS.items()
-)
-UNITS: Final = f"gyroscopes {_GYRO_UNITS}; accelerometers with m/s for rad"
-"""Units of the coefficients in the descriptions."""
-
-Rows = Mapping[tuple[str, ...], float | None]
-"""Values of one metric by label values, or None if unknown."""
-Numbers = Callable[[Health], float | None]
-"""Function that reads one value from the health of a device."""
-
-COUNTERS: Final[dict[str, tuple[str, Numbers]]] = {
-    "received": ("Samples received", lambda one: one.received),
-    "lost": ("Samples missing on the wire", lambda one: one.lost),
-    "bad": ("Samples rejected because of a failed check or an impossible value", lambda one: one.bad),
-    "overflowed": ("Samples overwritten before they were used", lambda one: one.overflowed),
-    "repeated": ("Repeated samples, which were discarded", lambda one: one.repeated),
-    "late": ("Samples that arrived too late and were discarded", lambda one: one.late),
-}
-"""Descriptions and values of the counters ``imu_monitor_samples_<name>_total``."""
-GAUGES: Final[dict[str, tuple[str, Numbers]]] = {
-    "sample_rate_hertz": ("Measured sample rate", lambda one: one.rate_hz),
-    "uptime_seconds": ("Time since the device was started", lambda one: one.uptime_s),
-    "moving": ("1 while the device is moved", lambda one: float(one.moving)),
-    "limits_crossed": ("Number of crossed user limits", lambda one: float(len(one.crossed))),
-}
-"""Descriptions and values of the gauges ``imu_monitor_<name>``."""
 
 
-class MetricsOutput(Output):
+class MetricsOutput(NewestMetrics):
     """Output that serves the newest values of each device to Prometheus.
 
     Parameters
@@ -83,38 +42,14 @@ class MetricsOutput(Output):
     """
 
     def __init__(self, settings: MetricsAddress) -> None:
+        super().__init__()
         self._settings = settings
         self.state = "starting"
         self.port = 0
         """Port of the server, or 0 while the server does not listen."""
-        self._healths: dict[str, Health] = {}
-        self._estimates: dict[str, Estimate] = {}
-        self._events: Counter[tuple[str, str]] = Counter()
         self._server: _Server | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="metrics", daemon=True)
-
-    # --- called by the main loop
-
-    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Store the newest estimate of a device."""
-        if isinstance(result, Estimate):
-            self._estimates[device] = result
-
-    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Count an event of a device."""
-        self._events[device, event.kind] += 1
-
-    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Store the newest status of a device."""
-        self._healths[device] = health
-
-    def remove_device(self, device: str) -> None:
-        """Remove the stored values of a device."""
-        self._healths.pop(device, None)
-        self._estimates.pop(device, None)
-        for key in [key for key in self._events if key[0] == device]:
-            del self._events[key]
 
     def start(self) -> None:
         """Start the server in a thread."""
@@ -133,12 +68,14 @@ class MetricsOutput(Output):
 
     def collect(self) -> "Iterator[Metric]":
         """Yield all current metrics."""
-        healths, estimates = dict(self._healths), dict(self._estimates)
-        yield from _device_metrics(healths)
-        yield from _process_metrics(healths)
-        yield from _coefficient_metrics(estimates)
-        counts: Rows = {key: float(count) for key, count in dict(self._events).items()}
-        yield _metric("events", "Number of events", ("device", "kind"), counts, counter=True)
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        for metric in self.read_metrics():
+            kind = CounterMetricFamily if metric.is_counter else GaugeMetricFamily
+            family = kind(metric.name, metric.description, labels=metric.labels)
+            for one in metric.values:
+                family.add_metric(one.label_values, one.value)
+            yield family
 
     # --- server thread
 
@@ -226,66 +163,3 @@ def _make_handler(registry: "CollectorRegistry") -> "type[MetricsHandler]":
 
     Handler.registry = registry
     return Handler
-
-
-def _device_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
-    for name, (words, number) in COUNTERS.items():
-        rows: Rows = {(device,): number(one) for device, one in healths.items()}
-        yield _metric(f"samples_{name}", words, ("device",), rows, counter=True)
-    for name, (words, number) in GAUGES.items():
-        yield _metric(name, words, ("device",), {(device,): number(one) for device, one in healths.items()})
-    states: Rows = {(device, state): float(one.state == state) for device, one in healths.items() for state in STATES}
-    yield _metric("state", "1 for the present state of the device", ("device", "state"), states)
-    latencies: dict[tuple[str, ...], float | None] = {}
-    for device, one in healths.items():
-        latencies |= {(device, "0.5"): one.latency_p50_s, (device, "0.99"): one.latency_p99_s}
-    words = "Latency from reception to publication, over the last second"
-    yield _metric("latency_seconds", words, ("device", "quantile"), latencies)
-
-
-def _process_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
-    if not healths:
-        return
-    newest = list(healths.values())[-1]
-    yield _metric("memory_bytes", "Resident memory of the service", (), {(): newest.memory_bytes})
-    well: Rows = {
-        (output,): float(state == "ok" or state.startswith("ok,"))
-        for output, state in newest.outputs.items()
-        if state != "off"
-    }
-    yield _metric("output_up", "1 while the output works", ("output",), well)
-
-
-def _coefficient_metrics(estimates: Mapping[str, Estimate]) -> "Iterator[Metric]":
-    for name, words in (
-        ("value", "of the window"),
-        ("lo", "lower end of the 95 % interval"),
-        ("hi", "upper end of the 95 % interval, or the one-sided 95 % bound if there is no value"),
-    ):
-        rows: Rows = {
-            (device, axis, letter): float(getattr(one.coefficients, name)[row, column])
-            for device, one in estimates.items()
-            for column, axis in enumerate(AXES)
-            for row, letter in enumerate(SYMBOLS)
-        }
-        words = f"Coefficient of IEEE Std 952, {words}; SI: {UNITS}"
-        yield _metric(
-            "coefficient" if name == "value" else f"coefficient_{name}", words, ("device", "axis", "letter"), rows
-        )
-
-
-def _metric(
-    name: str,
-    words: str,
-    labels: tuple[str, ...],
-    rows: Rows,
-    counter: bool = False,
-) -> "Metric":
-    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
-
-    kind = CounterMetricFamily if counter else GaugeMetricFamily
-    family = kind(f"imu_monitor_{name}", words, labels=labels)
-    for key, value in rows.items():
-        if value is not None and np.isfinite(value):
-            family.add_metric(key, value)
-    return family

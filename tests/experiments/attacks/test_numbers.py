@@ -206,7 +206,10 @@ def iter_config_tables() -> Iterator[tuple[str, type[SettingsModel], str]]:
     yield virtual + limit, schema.Limit, "limit"
     yield virtual + "[device.driver.faults]\n{}\n", driver_settings.FaultsTable, "faults"
     yield DEVICE.format(keys="", driver=VIRTUAL + "\n{}"), driver_settings.VirtualTable, "virtual"
-    for name, kind in (("viewer", schema.ViewerTable), ("metrics", schema.MetricsTable), ("log", schema.LogTable)):
+    for name, kind in (
+        ("viewer", schema.ViewerTable), ("metrics", schema.MetricsTable), ("influx", schema.InfluxTable),
+        ("log", schema.LogTable),
+    ):  # fmt: skip
         yield virtual + f"[{name}]\n{{}}\n", kind, name
     yield virtual + '[storage]\nfolder = "kept"\n{}\n', schema.Storage, "storage"
     yield virtual + '[[hook]]\non = ["*"]\nkey = "a/b"\n{}\n', schema.Hook, "hook"
@@ -255,7 +258,8 @@ def test_every_kind_of_numeric_key_is_found() -> None:
     for expected in (
         ("device", "rate"), ("device", "tau"), ("device", "refit"), ("device", "alarms_per_day"), ("limit", "hold"),
         ("faults", "jitter"), ("virtual", "seed"), ("virtual", "silence"), ("viewer", "memory"), ("viewer", "port"),
-        ("storage", "keep"), ("hook", "timeout"), ("metrics", "listen"), ("link serial", "baudrate"),
+        ("storage", "keep"), ("hook", "timeout"), ("metrics", "listen"), ("influx", "interval"),
+        ("link serial", "baudrate"),
         ("link can", "bitrate"), ("link replay", "bytes_per_second"), ("decoder text", "scale"),
         ("decoder dbc", "tick"),
         ("decoder stim300", "rate"), ("decoder witmotion", "gyro_range"),

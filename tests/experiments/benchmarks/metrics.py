@@ -1,6 +1,7 @@
-"""Processor time and size of a scrape of ``[metrics]``: ``python -m tests.experiments.benchmarks.metrics``.
+"""Processor time and size of a scrape of ``[metrics]`` and of a batch of ``[influx]``.
 
-The processor time includes the client and does not depend on the load of the machine.
+``python -m tests.experiments.benchmarks.metrics`` prints both. The processor time of a scrape includes the client. The
+processor time of a batch is the time that the main loop spends on formatting.
 """
 
 import statistics
@@ -8,6 +9,7 @@ import time
 import urllib.request
 
 from monitor.daemon.operations.prometheus_metrics import MetricsOutput
+from monitor.daemon.outputs.influx_output import format_lines
 from monitor.settings.loading import MetricsAddress
 from tests.monitor.publishing import example_results
 
@@ -31,7 +33,13 @@ def main() -> None:
                 size = len(response.read())
             took_s.append(time.process_time() - begun_s)
         output.close()
-        print(f"{devices:4d} devices: {1e3 * statistics.median(took_s):6.1f} ms, {size / 1e3:7.1f} kB")
+        print(f"{devices:4d} devices, scrape: {1e3 * statistics.median(took_s):6.1f} ms, {size / 1e3:7.1f} kB")
+        took_s = []
+        for _ in range(SCRAPES):
+            begun_s = time.process_time()
+            size = len("\n".join(format_lines(output.read_metrics())).encode())
+            took_s.append(time.process_time() - begun_s)
+        print(f"{devices:4d} devices, batch:  {1e3 * statistics.median(took_s):6.1f} ms, {size / 1e3:7.1f} kB")
 
 
 if __name__ == "__main__":

@@ -237,6 +237,37 @@ def test_unprotected_listening_beyond_this_machine_is_found(tmp_path: Path) -> N
     assert "everyone who reaches this machine can read the metrics" in str(select_findings(found, "metrics"))
 
 
+def test_influx_server_and_token_are_checked(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("s3cret")
+    token.chmod(0o644)
+
+    def check(url: str) -> list[Finding]:
+        text = VIRTUAL + QUIET + f'[influx]\nurl = "{url}"\ntoken_file = "token"\n'
+        return select_findings(examine_config(tmp_path, text), "influx")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        (answer,) = check(f"http://127.0.0.1:{port}/write")
+    assert (answer.mark, answer.text) == ("well", f"tcp/127.0.0.1:{port}: answers")
+    (silence,) = check(f"http://127.0.0.1:{port}/write")
+    assert silence.mark == "doubt"
+    assert f"tcp/127.0.0.1:{port}: no answer" in silence.text
+    unencrypted = check("http://influx.invalid/write")
+    assert [one.do for one in unencrypted if "everyone on the network" in one.text] == ["use https"]
+    assert not any("everyone on the network" in one.text for one in check("https://influx.invalid/write"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are not POSIX's here")
+def test_exposed_token_is_wrong(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("s3cret")
+    text = VIRTUAL + QUIET + '[influx]\nurl = "http://127.0.0.1:1/write"\ntoken_file = "token"\n'
+    for mode, mark in ((0o644, "wrong"), (0o640, "well")):
+        token.chmod(mode)
+        assert require_one_finding(examine_config(tmp_path, text), "influx token").mark == mark
+
+
 def test_storage_folder_is_tested_and_left_unchanged(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     found = require_one_finding(

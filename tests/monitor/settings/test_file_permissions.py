@@ -89,6 +89,31 @@ def test_private_key_of_a_zenoh_file_is_checked(public_folder: Path) -> None:
     assert f"nose.key: holds a secret that anyone on this machine may read: chmod o-r {key}" in warning
 
 
+def test_token_that_anyone_may_read_gives_a_warning(public_folder: Path) -> None:
+    token = write_file(public_folder / "token", "s3cret", 0o644)
+    influx = '[influx]\nurl = "http://127.0.0.1:8086/write"\ntoken_file = "token"\n'
+    path = write_file(public_folder / "a.toml", VIRTUAL + influx, 0o644)
+    (warning,) = loading.load_config(path).warnings
+    assert warning == (
+        f"{path}: influx.token_file: token: holds a secret that anyone on this machine may read: chmod o-r {token}"
+    )
+    token.chmod(0o640)
+    assert loading.load_config(path).warnings == ()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"two words", b"two\nlines", "ü".encode()])
+def test_missing_or_malformed_token_is_refused_without_showing_it(tmp_path: Path, content: bytes | None) -> None:
+    influx = '[influx]\nurl = "http://127.0.0.1:8086/write"\ntoken_file = "token"\n'
+    path = write_file(tmp_path / "a.toml", VIRTUAL + influx, 0o644)
+    if content is not None:
+        (tmp_path / "token").write_bytes(content)
+    (line,) = loading.examine_config_file(path).wrong
+    problem = (
+        "No such file or directory" if content is None else "must contain the token, as one word of ASCII characters"
+    )
+    assert line == f"{path}: influx.token_file: {tmp_path / 'token'}: {problem}"
+
+
 def test_untrusted_or_invalid_zenoh_file_is_refused(public_folder: Path) -> None:
     zenoh = write_file(public_folder / "z.json5", SECRET, 0o602)
     path = write_file(public_folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)

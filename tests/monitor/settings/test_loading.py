@@ -119,6 +119,40 @@ INVALID_CONFIGS = {
         format_device() + '[metrics]\nlisten = "9464"',
         ['metrics.listen: "9464" is not a host and port; write "127.0.0.1:9464"'],
     ),
+    "influx without a path": (
+        format_device() + '[influx]\nurl = "http://127.0.0.1:8086"',
+        [
+            'influx.url: "http://127.0.0.1:8086" is not the address of a write endpoint; write "http://127.0.0.1:8086/api'
+        ],
+    ),
+    "influx of another scheme": (
+        format_device() + '[influx]\nurl = "udp://127.0.0.1:8089/x"',
+        ["is not the address of a write endpoint"],
+    ),
+    "influx with an impossible port": (
+        format_device() + '[influx]\nurl = "http://127.0.0.1:99999/write"',
+        ["is not the address of a write endpoint"],
+    ),
+    "influx with a password": (
+        format_device() + '[influx]\nurl = "http://me:hunter2@127.0.0.1:8086/write?db=x"',
+        ["influx.url: the address contains a password; write user:password into token_file instead"],
+    ),
+    "influx with a password as parameter": (
+        format_device() + '[influx]\nurl = "http://127.0.0.1:8086/write?db=x&u=me&p=hunter2"',
+        ["influx.url: the address contains a password; write user:password into token_file instead"],
+    ),
+    "influx with another precision": (
+        format_device() + '[influx]\nurl = "http://127.0.0.1:8086/write?db=x&precision=s"',
+        ["influx.url: remove precision from the address, because the times are sent in nanoseconds"],
+    ),
+    "influx with a token but no server": (
+        format_device() + '[influx]\ntoken_file = "/dev/null"',
+        ["influx.token_file: there is no server to send the token to; add url"],
+    ),
+    "influx with an interval below that of the status": (
+        format_device() + '[influx]\ninterval = "100ms"',
+        ["influx.interval: "],
+    ),
     "unknown key": (format_device("windw = 60.0"), ['device a: windw: unknown key; did you mean "window"?']),
     "unknown table": ("[zenho]\n" + format_device(), ['zenho: unknown key; did you mean "zenoh"?']),
     "unknown key of zenoh": (
@@ -374,6 +408,7 @@ VALID_CONFIG = {
     "storage": {},
     "hook": [{"on": ["*"], "key": "x"}],
     "metrics": {},
+    "influx": {},
     "log": {},
 }
 MISTAKES = [
@@ -447,6 +482,8 @@ MISTAKES = [
     (("hook", 0, "command"), ["mail"]),
     (("hook", 0, "timeout"), "never"),
     (("metrics", "listen"), "9464"),
+    (("influx", "url"), "127.0.0.1:8086"),
+    (("influx", "interval"), "often"),
     (("log", "level"), "loud"),
     (("log", "format"), 3),
 ]

@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import pytest
-from monitor.estimation.fit.coefficient_values import SYMBOLS
 from msgspec import Meta
 
 from drivers.data_types import Event
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.operations.prometheus_metrics import MetricsOutput
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.settings.loading import MetricsAddress
 from tests.monitor.publishing import example_results
 
