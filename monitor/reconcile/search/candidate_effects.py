@@ -340,8 +340,8 @@ def _best_time_constant(
     """Return the most likely effect, or an empty list if the fitted time constant is out of range.
 
     If the first search finds only a small gain, the function returns an empty list and does not refine the time
-    constant. Between adjacent time constants T and 1.84 T, the correlation of an exponential with the nearer exponential
-    is at least 2 √1.36/(1 + 1.36) = 0.988. The first search therefore finds nearly the largest gain.
+    constant. Between adjacent time constants T and 1.84 T, the correlation of an exponential with the nearer
+    exponential is at least 2 √1.36/(1 + 1.36) = 0.988. The first search therefore finds nearly the largest gain.
     """
     best = _most_likely(whitened.axis, whitened.effects, trials)
     gain = whitened.axis.fit((*whitened.effects, best)).log_likelihood
