@@ -40,7 +40,7 @@ from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, require_packages_of_format, segment_file
-from drivers.recordings.ardupilot_log_format import is_ardupilot_log
+from drivers.recordings.file_formats.ardupilot_log_format import is_ardupilot_log
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.recordings import (
+from drivers.recordings.file_formats import (
     ardupilot_log_format,
     csv_format,
     matlab_format,
@@ -17,7 +17,7 @@ from drivers.recordings import (
     ros_bag_format,
     sensor_csv_format,
 )
-from drivers.recordings import parquet_and_arrow_format as arrow_format
+from drivers.recordings.file_formats import parquet_and_arrow_format as arrow_format
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 from drivers.recordings.table_layout import convert_to_si

@@ -28,14 +28,14 @@ from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, mak
 from drivers.errors import ImuError, RecordingError
 from drivers.file_access import open_regular_file
 from drivers.number_ranges import COUNTER_STEP, RATE_HZ
-from drivers.recordings.arrow_message_sizes import iter_batch_sizes
-from drivers.recordings.memory_check import ROW_BYTES
-from drivers.recordings.parquet_and_arrow_format import (
+from drivers.recordings.file_formats.arrow_message_sizes import iter_batch_sizes
+from drivers.recordings.file_formats.parquet_and_arrow_format import (
     METADATA_KEY,
     SEGMENT_COLUMNS,
     first_message_line,
     import_pyarrow,
 )
+from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
 
 SUFFIX: Final = ".arrows"

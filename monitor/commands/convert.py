@@ -10,8 +10,8 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.file_access import real_path
 from drivers.recordings import Recording, open_recording_writer
+from drivers.recordings.file_formats.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
 from drivers.recordings.formats import find_writer
-from drivers.recordings.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.topics import JOIN
 from monitor.commands.progress import ProgressCallback, ignore_progress

@@ -10,7 +10,8 @@ from pymavlink import DFReader
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError
 from drivers.links import replay_link
-from drivers.recordings import ReadingOptions, ardupilot_log_format, load_samples, memory_check, save_samples
+from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
+from drivers.recordings.file_formats import ardupilot_log_format
 from monitor.commands.analyze import AnalysisRequest, run_analysis
 from tests.support.dataflash import Messages, dataflash_bytes, imu, raw_sensor, table_of, write_dataflash
 from tests.support.recordings import recordings

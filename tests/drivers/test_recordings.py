@@ -30,9 +30,13 @@ from drivers.recordings import (
     open_recording_writer,
     save_samples,
 )
-from drivers.recordings import parquet_and_arrow_format as arrow_format
-from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
-from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
+from drivers.recordings.file_formats import parquet_and_arrow_format as arrow_format
+from drivers.recordings.file_formats.arrow_message_sizes import (
+    check_batch_buffer_sizes,
+    count_column_buffers,
+    iter_batch_sizes,
+)
+from drivers.recordings.file_formats.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recordings.formats import WRITABLE_TABLES
 from drivers.recordings.writing import atomic_write_path
 from tests.support.recordings import recordings
@@ -873,7 +877,7 @@ class TestRoom:
             raise MemoryError
 
         path = written(tmp_path / "x.csv", ROWS)
-        monkeypatch.setattr("drivers.recordings.csv_format.np.concatenate", fail)
+        monkeypatch.setattr("drivers.recordings.file_formats.csv_format.np.concatenate", fail)
         with pytest.raises(ConfigError, match=r"x\.csv: does not fit into the memory that is free"):
             load_samples(path)
 

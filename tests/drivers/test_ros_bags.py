@@ -15,7 +15,8 @@ from drivers.data_types import AXES, concatenate_blocks
 from drivers.decoders import samples
 from drivers.errors import ConfigError, ImuError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links import replay_link
-from drivers.recordings import ReadingOptions, load_samples, memory_check, ros_bag_format, ros_bag_readers, save_samples
+from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
+from drivers.recordings.file_formats import ros_bag_format, ros_bag_readers
 from drivers.recordings.topics import iter_row_blocks
 from monitor.commands.analyze import AnalysisRequest, run_analysis
 from tests.support.ros_bags import KINDS, imu_topic, storage_file, temperature_topic, text_topic, write_bag

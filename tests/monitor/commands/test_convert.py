@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import WRITABLE, load_samples, save_samples
-from drivers.recordings.mcap_writer import split_times
+from drivers.recordings.file_formats.mcap_writer import split_times
 from drivers.recordings.reading_options import ReadingOptions
 from monitor.commands.convert import BLOCK_ROWS, ConversionRequest, run_conversion
 from tests.support import dataflash, ros_bags, ulog

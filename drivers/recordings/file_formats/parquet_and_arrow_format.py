@@ -15,7 +15,11 @@ import numpy as np
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
-from drivers.recordings.arrow_message_sizes import check_batch_buffer_sizes, count_column_buffers, iter_batch_sizes
+from drivers.recordings.file_formats.arrow_message_sizes import (
+    check_batch_buffer_sizes,
+    count_column_buffers,
+    iter_batch_sizes,
+)
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import find_layout
 

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
+from drivers.recordings.file_formats.zip_index import IndexSizeLimitedFile
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import TableLayout, find_layout, is_known_column
-from drivers.recordings.zip_index import IndexSizeLimitedFile
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # local file header, PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"

@@ -17,7 +17,7 @@ from drivers.data_types import AXES, Floats, Ints
 from drivers.errors import RecordingError
 from drivers.extras import require_extra
 from drivers.recordings import table
-from drivers.recordings.ros_bag_format import IMU_TYPE, NOT_PROVIDED, TEMPERATURE_TYPE
+from drivers.recordings.file_formats.ros_bag_format import IMU_TYPE, NOT_PROVIDED, TEMPERATURE_TYPE
 
 IMU_TOPIC: Final = "/imu/data"
 TEMPERATURE_TOPIC: Final = "/imu/temperature"

@@ -20,11 +20,16 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import table
-from drivers.recordings.csv_format import CsvSource, count_csv_source_rows, read_csv_column_names, read_csv_source
+from drivers.recordings.file_formats.csv_format import (
+    CsvSource,
+    count_csv_source_rows,
+    read_csv_column_names,
+    read_csv_source,
+)
+from drivers.recordings.file_formats.zip_index import IndexSizeLimitedFile
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import convert_to_si, find_layout
 from drivers.recordings.topics import GYROS, JOIN, Topic, join_topics, select_topics
-from drivers.recordings.zip_index import IndexSizeLimitedFile
 
 GYROSCOPES: Final = ("Gyroscope", "GyroscopeUncalibrated")
 ACCELEROMETERS: Final = ("TotalAcceleration", "Accelerometer", "AccelerometerUncalibrated", "Linear Acceleration")

@@ -25,8 +25,9 @@ import numpy as np
 from drivers.data_types import Floats
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular_file
-from drivers.recordings import csv_header, memory_check, table
-from drivers.recordings.csv_header import (
+from drivers.recordings import memory_check, table
+from drivers.recordings.file_formats import csv_header
+from drivers.recordings.file_formats.csv_header import (
     BLANKS,
     COMMENT_MARKS,
     DECIMAL_COMMA_SEPARATORS,

@@ -102,7 +102,7 @@ def _open_bag(path: Path) -> Iterator[tuple[_Bag, memory_check.RecordingSizeLimi
     """Check the files of a bag and open the bag."""
     from rosbags.typesys import Stores, get_typestore
 
-    from drivers.recordings import ros_bag_readers as readers
+    from drivers.recordings.file_formats import ros_bag_readers as readers
 
     limit = _check_files(path)
     # The definitions in the bag are not used, since both types are the same in all versions of ROS 1 and of ROS 2.
@@ -147,7 +147,7 @@ def _list_topics(connections: Iterable[Any], counts: Mapping[int, int]) -> list[
 
 def _check_files(path: Path) -> memory_check.RecordingSizeLimits:
     """Return the size limits of a bag. Raise an error if a file is not a regular file or too large."""
-    from drivers.recordings.ros_bag_readers import iter_unpacked
+    from drivers.recordings.file_formats.ros_bag_readers import iter_unpacked
 
     files = [path]
     if path.is_dir():
