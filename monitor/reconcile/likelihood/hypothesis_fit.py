@@ -6,7 +6,7 @@ added effects and of deterministic effects are always fitted.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from math import exp, log
+from math import exp, log, sqrt
 from typing import Final
 
 import numpy as np
@@ -28,6 +28,8 @@ recording with six axes has about 24 sizes, so this occurs in about one of 200 r
 """
 GOLDEN: Final = 0.6180339887498949
 SHAPE_ITERATIONS: Final = 12
+MAX_LOG_HALF_WIDTH: Final = 3.0
+"""Largest half width of an interval that is symmetric on a logarithmic scale."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +247,8 @@ def find_maximum_by_golden_section(function: Callable[[float], float], lo: float
 def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
     """Compute the 95 % interval of the size of an effect.
 
-    The interval is symmetric for a deterministic effect, and symmetric on a logarithmic scale for a noise effect.
+    The interval is symmetric for a deterministic effect, and symmetric on a logarithmic scale for a noise effect. If a
+    noise effect is hardly significant, the interval of its variance is symmetric and may include zero.
 
     Parameters
     ----------
@@ -259,7 +262,11 @@ def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
         return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
         return ParameterInterval(value)
-    ends = value * exp(-Z95 * error / value), value * exp(Z95 * error / value)
+    half = Z95 * error / value  # of the logarithm; twice as large relative to the variance
+    if half < MAX_LOG_HALF_WIDTH:
+        ends = value * exp(-half), value * exp(half)
+    else:
+        ends = 0.0, value * sqrt(1.0 + 2.0 * half)
     effect = fit.effects[effect_index]
     if isinstance(effect, CommonVibration) and effect.gain < 0.0:
         return ParameterInterval(-value, -ends[1], -ends[0])

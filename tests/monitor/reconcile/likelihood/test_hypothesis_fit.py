@@ -1,5 +1,7 @@
 """A model is believed until the data object; shapes and intervals beside SciPy's."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -129,6 +131,18 @@ def test_intervals_of_sizes():
         inside += [white_noise.lo < N < white_noise.hi, step.lo < -3e-4 < step.hi]
         assert white_noise.lo * white_noise.hi == pytest.approx(white_noise.value**2)
     assert np.mean(inside) > 0.87  # of 80, less than 0.88 once in 150
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-9])
+def test_interval_of_an_insignificant_size_begins_at_zero(size):
+    fit = fit_with_fewest_changes(axis(white(n, np.random.default_rng(1))), (WHITE, RateRandomWalk(K=K)), ()).fit
+    tiny = replace(fit, effects=(WHITE, RateRandomWalk(K=size * K)))
+    whittle = replace(fit.whittle, theta=np.array([fit.whittle.theta[0], (size * K) ** 2]))
+    tiny = replace(tiny, whittle=whittle, fitted_noise=(0, 1))
+    found = compute_size_interval(tiny, 1)
+    assert (found.value, found.lo) == (pytest.approx(size * K), 0.0)
+    deviation = np.sqrt(np.linalg.pinv(whittle.theta_information)[1, 1])  # of K²
+    assert found.hi == pytest.approx(np.sqrt((size * K) ** 2 + 1.96 * deviation), rel=1e-3)
 
 
 def test_a_size_that_is_held_or_zero_has_no_interval():
