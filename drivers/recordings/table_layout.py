@@ -361,7 +361,7 @@ def _stated_units(
     options: ReadingOptions,
     notes: list[str],
 ) -> dict[str, str]:
-    """Return the unit of each quantity that the column names state or imply."""
+    """Return the unit of each quantity, as stated or implied by the column names."""
     found = {}
     assumes = False
     for quantity, i in chosen.items():

@@ -259,7 +259,7 @@ def _simulate_axes(
 def _search_all_axes(
     run: RecordingContext, model: NoiseModel, null: Mapping[str, AxisNull], fitted_first: bool
 ) -> _AxesSearchResult:
-    """Search every axis for missing effects, after a test of the sample rate.
+    """Test the sample rate, then search every axis for missing effects.
 
     If two axes appear to leak into each other, the search on one axis is repeated without this leak.
     """

@@ -90,7 +90,7 @@ class AlternativeEffect:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticPlotData:
-    """Data of one plot that compares a recorded axis with the expectation of a noise model."""
+    """Data for one plot that compares a recorded axis with the prediction of a noise model."""
 
     diagnostic: str  # name of the diagnostic
     x_name: str  # quantity on the x axis: "frequency", "averaging time", "time", …

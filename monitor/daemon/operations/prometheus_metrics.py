@@ -145,7 +145,7 @@ class _Server(socketserver.ThreadingTCPServer):
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore errors of connections that the client has closed."""
+        """Ignore errors from connections that the client has closed."""
 
 
 def _make_handler(registry: "CollectorRegistry") -> "type[MetricsHandler]":

@@ -244,7 +244,7 @@ def _merge_into_level(
     moved: Floats,
     merged: Floats,
 ) -> None:
-    """Merge all cases with the final level ``level`` into one Gaussian, and write the mean and covariance in place."""
+    """Merge all cases that end at ``level`` into one Gaussian, and write its mean and covariance in place."""
     d, other = table.shape[0], 1 - level
     state_covariance, pull, known, at, covariance = (
         update.state_covariance,

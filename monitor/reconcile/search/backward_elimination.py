@@ -5,7 +5,7 @@ accepted if the penalised likelihood does not decrease.
 
 1. An added effect is left out, and the remaining sizes are fitted again.
 2. Two neighbouring lines or resonances are replaced by one resonance.
-3. A changed size of the noise model is replaced by the old size, or by zero.
+3. The old size, or zero, is tried in place of each changed size of the noise model.
 4. Changed sizes are replaced by one common factor, for one axis or for the three axes of a triad.
 
 If an effect also occurs on another axis, its location is known, and a smaller gain is sufficient. A simplification is

@@ -172,7 +172,7 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
 def _expected_gain(fit: AxisFit, effect: Effect) -> float:
     """Return the expected log-likelihood gain, in nats, of a deterministic effect.
 
-    The gain is ½ Σ s²/v with the transform s of the effect and the variance v of the noise.
+    The gain is ½ Σ s²/v, where s is the transform of the effect and v is the variance of the noise.
     """
     half = fit.axis
     columns = half.regressor_cosine_transforms(effect)
