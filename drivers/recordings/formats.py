@@ -10,12 +10,12 @@ from drivers.errors import ConfigError
 from drivers.recordings.file_formats import (
     ardupilot_log_format,
     csv_format,
+    csv_per_sensor_format,
     matlab_format,
     mcap_writer,
     npz_format,
     px4_ulog_format,
     ros_bag_format,
-    sensor_csv_format,
 )
 from drivers.recordings.file_formats import parquet_and_arrow_format as arrow_format
 from drivers.recordings.reading_options import ReadingOptions
@@ -78,7 +78,7 @@ def _log_format(
     )
 
 
-_SENSOR_FILES: Final = Format(sensor_csv_format.read_sensor_files, sensor_csv_format.count_sensor_rows)
+_SENSOR_FILES: Final = Format(csv_per_sensor_format.read_sensor_files, csv_per_sensor_format.count_sensor_rows)
 _ROS_BAG: Final = _log_format(ros_bag_format.read_ros_bag, ros_bag_format.count_ros_bag_rows, "ros")
 
 
@@ -130,7 +130,7 @@ def find_format(path: Path) -> Format:
     """
     if ros_bag_format.is_bag_folder(path):
         return _ROS_BAG
-    if sensor_csv_format.is_sensor_folder(path):
+    if csv_per_sensor_format.is_sensor_folder(path):
         return _SENSOR_FILES
     suffix = _suffix(path)
     if not suffix:
@@ -171,7 +171,7 @@ def is_recording(path: Path) -> bool:
 
 def is_recording_folder(path: Path) -> bool:
     """Return True if a folder contains a single recording: a ROS 2 bag, or one CSV file per sensor."""
-    return ros_bag_format.is_bag_folder(path) or sensor_csv_format.is_sensor_folder(path)
+    return ros_bag_format.is_bag_folder(path) or csv_per_sensor_format.is_sensor_folder(path)
 
 
 def _suffix(path: Path) -> str:

@@ -13,7 +13,7 @@ from monitor.cli.shared import options, output
 from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
-    from monitor.history.history_table import HistoryTable
+    from monitor.history.bucketed_history import HistoryTable
     from monitor.history.query_parameters import HistoryQuery
     from monitor.history.time_ranges import TimeRange
 
@@ -55,7 +55,7 @@ def history(
     from drivers.data_types import AXES
     from drivers.recordings.formats import find_writer
     from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
-    from monitor.history.history_table import choose_bucket_width_s as width_of
+    from monitor.history.bucketed_history import choose_bucket_width_s as width_of
     from monitor.history.query_parameters import PARTS, HistoryQuery
     from monitor.history.time_ranges import parse_duration_s
     from monitor.publishing.terminal import history_text
@@ -105,7 +105,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
 
 def _from_file(source: Path | None, name: str | None) -> Get:
     """Return a function that queries the history file, even while a daemon writes to the file."""
-    from monitor.history import history_table as past
+    from monitor.history import bucketed_history as past
     from monitor.history.sqlite_store import open_history
 
     if source is None:

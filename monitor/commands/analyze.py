@@ -20,7 +20,7 @@ from drivers.number_ranges import AVERAGING_TIME_S
 from drivers.recordings import Recording, iter_blocks
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.recording_decoding import DecoderChoice, load_recording
+from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
     TemperatureRemovalComparison,

@@ -19,7 +19,7 @@ from drivers.recordings import iter_blocks
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import open_recording_writer
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.recording_decoding import DecoderChoice, load_recording
+from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
 from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.compensation_score import score_at_rest

@@ -15,7 +15,7 @@ from drivers.recordings.formats import find_writer
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.topics import JOIN
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.recording_decoding import DecoderChoice, load_recording
+from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 
 BLOCK_ROWS: Final = 1 << 16
 

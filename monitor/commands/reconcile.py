@@ -23,7 +23,7 @@ from drivers.recordings import Recording as Samples
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.recording_decoding import DecoderChoice, load_recording
+from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.json_report import SCHEMA, encode_report

@@ -17,7 +17,7 @@ from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
-from monitor.commands.recording_decoding import DecoderChoice, load_recording
+from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel

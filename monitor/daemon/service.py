@@ -35,7 +35,7 @@ from monitor.daemon.outputs.table_output import TableOutput
 from monitor.daemon.outputs.viewer_output import ViewerOutput
 from monitor.daemon.outputs.zenoh_output import ZenohOutput
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
-from monitor.history.history_table import HistoryTable
+from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.publisher import ZenohPublisher

@@ -17,8 +17,8 @@ from monitor.common.unit_formatting import format_utc
 from monitor.daemon.outputs.output import Output
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
-from monitor.history import history_table as past
-from monitor.history.history_table import HistoryTable
+from monitor.history import bucketed_history as past
+from monitor.history.bucketed_history import HistoryTable
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange

@@ -23,7 +23,7 @@ from drivers.number_ranges import (
 from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
-    from monitor.commands.recording_decoding import DecoderChoice
+    from monitor.commands.wire_format_decoding import DecoderChoice
     from monitor.drift.compensation.arma import Order
     from monitor.estimation.allan.batch import TauGrid
     from monitor.publishing.exporters import NoiseCoefficients
@@ -197,7 +197,7 @@ def parse_decoder(name: str | None, options: list[str] | None) -> "DecoderChoice
     ConfigError
         If there are options without a decoder, or if an option is not a key with a value.
     """
-    from monitor.commands.recording_decoding import DecoderChoice
+    from monitor.commands.wire_format_decoding import DecoderChoice
 
     if name is None:
         if options:

@@ -21,7 +21,7 @@ from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
-from monitor.publishing.exporters.exported_coefficients import from_model
+from monitor.publishing.exporters.export_input import from_model
 from monitor.settings.loading import Device, Limit
 
 LIMIT_CROSSED: Final = "limit_crossed"

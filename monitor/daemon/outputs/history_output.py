@@ -10,7 +10,7 @@ from drivers.errors import NotReady, RecordingError
 from monitor.common.device_health import Health
 from monitor.daemon.outputs.output import Output
 from monitor.estimation.estimate import Estimate
-from monitor.history.history_table import HistoryTable, read_history
+from monitor.history.bucketed_history import HistoryTable, read_history
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.query_parameters import parse_query
 from monitor.history.sqlite_store import FILE_NAME, open_history

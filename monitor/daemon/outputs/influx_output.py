@@ -199,7 +199,7 @@ class InfluxOutput(NewestMetrics):
         if error and not before:
             _log.warning("influx", text=error)
         elif before and not error:
-            _log.info("influx", text="writing continues")
+            _log.info("influx", text=f"{self._host}: writing continues")
 
 
 class _RedirectRefusal(urllib.request.HTTPRedirectHandler):

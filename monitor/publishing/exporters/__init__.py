@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 from drivers.errors import ConfigError
 from drivers.number_ranges import COEFFICIENT, INFLATION
 from monitor.publishing.exporters.estimator_parameters import PARAMETER_FILES
-from monitor.publishing.exporters.exported_coefficients import (
+from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
     NoiseCoefficients,
     from_analysis_json,

@@ -16,7 +16,7 @@ from typing import Final
 from drivers.errors import ConfigError
 from drivers.number_ranges import DURATION_S, HOUR_S
 from monitor.common.unit_formatting import DEGREE, ROOT_HOUR, Kind, axes_of
-from monitor.publishing.exporters.exported_coefficients import (
+from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
     NoiseCoefficients,
     comment_on_omitted_terms,

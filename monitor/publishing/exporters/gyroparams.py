@@ -13,7 +13,7 @@ simulation.
 from typing import Final
 
 from monitor.common.unit_formatting import Kind, axes_of
-from monitor.publishing.exporters.exported_coefficients import (
+from monitor.publishing.exporters.export_input import (
     NoiseCoefficients,
     ascii_unit,
     comment_on_omitted_terms,

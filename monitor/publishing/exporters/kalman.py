@@ -29,7 +29,7 @@ from drivers.errors import ConfigError
 from drivers.number_ranges import DURATION_S
 from monitor.common.unit_formatting import sensor_kind
 from monitor.noise.effects import BiasInstability
-from monitor.publishing.exporters.exported_coefficients import (
+from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
     NoiseCoefficients,
     ascii_unit,

@@ -16,8 +16,8 @@ from drivers.errors import NotReady
 from drivers.number_ranges import DAY_S
 from monitor.common.unit_formatting import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
+from monitor.history.bucketed_history import HistoryTable
 from monitor.history.history_row import COUNTS, STATES
-from monitor.history.history_table import HistoryTable
 from monitor.history.stored_events import StoredEvent
 from monitor.publishing.plots import style
 from monitor.publishing.terminal.history_text import summary_line

@@ -14,9 +14,9 @@ from drivers.data_types import Floats
 from drivers.recordings.formats import find_writer
 from drivers.recordings.writing import atomic_write_path
 from monitor.common.unit_formatting import sensor_kind
+from monitor.history.bucketed_history import HistoryTable
 from monitor.history.history_row import COUNTS, STATES
-from monitor.history.history_table import HistoryTable
-from monitor.publishing.exporters.exported_coefficients import ascii_unit
+from monitor.publishing.exporters.export_input import ascii_unit
 
 STATUS_UNITS: Final = {"rate": "Hz", "latency": "s", "memory": "B", "temperature": "degC"}
 STATE_COLUMN_NAME: Final = "state (" + "; ".join(f"{i} {name}" for i, name in enumerate(STATES)) + ")"

@@ -25,7 +25,7 @@ from monitor.common.unit_formatting import (
 from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
-from monitor.publishing.exporters.exported_coefficients import COEFFICIENT_EFFECTS
+from monitor.publishing.exporters.export_input import COEFFICIENT_EFFECTS
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AxisResult,

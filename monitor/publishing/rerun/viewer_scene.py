@@ -12,7 +12,7 @@ import rerun as rr
 
 from drivers.data_types import Floats
 from monitor.common.device_health import Health
-from monitor.history.history_table import HistoryTable
+from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.rerun import panels
 from monitor.publishing.rerun.panels import Panel
 from monitor.publishing.rerun.shared_views import TIMELINE

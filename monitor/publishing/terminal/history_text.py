@@ -25,8 +25,8 @@ from monitor.common.unit_formatting import (
     format_number,
     format_utc,
 )
+from monitor.history.bucketed_history import ColumnStatistics, HistoryTable
 from monitor.history.history_row import COUNTS, STATES
-from monitor.history.history_table import ColumnStatistics, HistoryTable
 from monitor.publishing.terminal.tables import plain_table
 
 LETTERS: Final = ("N", "B", "K")

@@ -13,7 +13,7 @@ from drivers.errors import ConfigError, LinkUnavailable, NotReady
 from drivers.zenoh.connection_diagnosis import explain_refusals
 from drivers.zenoh.session_config import format_zenoh_error
 from monitor.common import topics
-from monitor.history.history_table import HistoryTable
+from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.messages.history import decode_history
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.zenoh.subscriber import client_configurations

@@ -22,7 +22,7 @@ from monitor.daemon.service import Service
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import Status
-from monitor.history import history_table as past
+from monitor.history import bucketed_history as past
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.remote_device_states import RemoteDeviceRegistry

@@ -13,8 +13,8 @@ from drivers.errors import ConfigError, NotReady
 from drivers.recordings.formats import WRITABLE_TABLES
 from monitor.common.unit_formatting import coefficient_unit
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
+from monitor.history.bucketed_history import HistoryTable, build_table
 from monitor.history.history_row import STATES, HistoryRow
-from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.plots.history_plot import save_history_plot

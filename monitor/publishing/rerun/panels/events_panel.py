@@ -12,7 +12,7 @@ import rerun as rr
 from drivers.data_types import Event, Floats
 from monitor.common.unit_formatting import format_utc
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
-from monitor.history.history_table import HistoryTable
+from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.rerun.panels.noise_panels import CoefficientsPanel
 from monitor.publishing.rerun.panels.panel import Panel
 

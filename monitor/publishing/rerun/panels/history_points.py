@@ -8,7 +8,7 @@ point is drawn.
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.history.history_table import ColumnStatistics, HistoryTable
+from monitor.history.bucketed_history import ColumnStatistics, HistoryTable
 from monitor.publishing.plots.style import omit_wide_intervals
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from monitor.common.unit_formatting import axes_of
-from monitor.history.history_table import HistoryTable
+from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.rerun.panels import history_points
 from monitor.publishing.rerun.panels.decimation import average_buckets

@@ -17,7 +17,7 @@ from monitor.common.unit_formatting import (
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
-from monitor.history.history_table import HistoryTable
+from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.style import omit_wide_intervals
 from monitor.publishing.rerun import allan_drawing, dynamic_heat_map

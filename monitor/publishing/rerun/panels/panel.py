@@ -15,7 +15,7 @@ from monitor.common.unit_formatting import (
     SAMPLE_UNITS,
     sensor_kind,
 )
-from monitor.history.history_table import HistoryTable
+from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.rerun.panels.decimation import decimate_extremes

@@ -22,7 +22,7 @@ from monitor.estimation.detection.motion_detection import MotionEpisode
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
 from monitor.estimation.fit.coefficients_with_intervals import Coefficients, Status
-from monitor.history.history_table import HistoryTable
+from monitor.history.bucketed_history import HistoryTable
 from monitor.history.query_parameters import PARTS, HistoryQuery
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from drivers.data_types import AXES
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
+from monitor.history.bucketed_history import HistoryTable, build_table
 from monitor.history.history_row import STATES, HistoryRow, merge_rows
-from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.query_parameters import PARTS, HistoryQuery
 from monitor.history.stored_events import StoredEvent

@@ -7,8 +7,8 @@ import pytest
 
 from drivers.data_types import AXES
 from monitor.common.unit_formatting import COEFFICIENT_UNITS, sensor_kind
+from monitor.history.bucketed_history import HistoryTable, build_table
 from monitor.history.history_row import HistoryRow
-from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 

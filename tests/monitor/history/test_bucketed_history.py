@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import NotReady
-from monitor.history import history_table as past
+from monitor.history import bucketed_history as past
+from monitor.history.bucketed_history import HistoryTable
 from monitor.history.history_row import HistoryRow
-from monitor.history.history_table import HistoryTable
 from monitor.history.sqlite_store import HistoryFileWriter, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange

@@ -13,7 +13,7 @@ from drivers.data_types import AXES, EXTENDED_ID, Chunk, Floats, SampleBlock, ma
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recordings import load_samples, save_samples
 from drivers.recordings.reading_options import ReadingOptions
-from monitor.commands.recording_decoding import DecoderChoice, load_recording
+from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from tests.contracts.decoder_examples import CAN_SIGNALS, DEGREE, STIM300, VECTORNAV, Example
 from tests.support.program import exit_status
 from tests.support.recordings import recordings
