@@ -81,7 +81,7 @@ def check_recording(recording: Recording, model: NoiseModel | None, seed: int) -
     if found:  # large distances during the motion hid corrupt rows
         values, found = check_corrupt_rows(values, rate_hz, simulated, model)
         findings += found
-    values, found = check_temporary_vibration(values, rate_hz, simulated)
+    values, found = check_temporary_vibration(values, rate_hz, simulated, seed)
     findings += found
     findings += check_repeated_rows(values, rate_hz, model)
     if model is not None:

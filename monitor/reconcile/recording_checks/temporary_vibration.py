@@ -38,8 +38,6 @@ FALSE_ALARM_PROBABILITY: Final = 1e-5
 """Probability of a false alarm of one axis."""
 GAP_BINS: Final = 2
 """Largest number of bins between two cells of one vibration."""
-GAP_BLOCKS: Final = 1
-"""Largest number of quiet blocks within one vibration."""
 MIN_LENGTH_BLOCKS: Final = 3
 MAX_SHARE: Final = 0.5
 """Largest share of the recording."""
@@ -94,6 +92,7 @@ def check_temporary_vibration(
     values: Mapping[str, Floats],
     rate_hz: float,
     simulated: Mapping[str, Floats] | None,
+    seed: int,
 ) -> tuple[dict[str, Floats], list[RecordingFinding]]:
     """Remove vibrations that last for a part of the recording, and return the values with the findings.
 
@@ -105,6 +104,8 @@ def check_temporary_vibration(
         Sample rate in Hz.
     simulated : mapping of str to ndarray or None
         Simulation of the model under test.
+    seed : int
+        Seed of the noise that replaces the vibration. The noise of each axis is independent.
     """
     spectra = {axis: found for axis, y in values.items() if (found := _block_spectra(y, rate_hz)) is not None}
     vibrations = [one for axis, spectrum in spectra.items() for one in _find_vibrations(axis, spectrum)]
@@ -113,14 +114,15 @@ def check_temporary_vibration(
         false = [one for axis, spectrum in drawn.items() if spectrum for one in _find_vibrations(axis, spectrum)]
         vibrations = [one for one in vibrations if not any(_have_common_band(one, other) for other in false)]
     corrected = dict(values)
-    findings = []
+    findings: list[RecordingFinding] = []
     while vibrations:
         largest = max(vibrations, key=lambda one: one.contrast)
         vibrations = [one for one in vibrations if not _is_same_vibration(one, largest)]
         axes = tuple(axis for axis in AXES if axis in spectra and _is_affected(spectra[axis], largest))
         amplitude = 0.0
         for axis in axes:
-            corrected[axis], size = _remove_vibration(corrected[axis], rate_hz, spectra[axis], largest)
+            rng = np.random.default_rng([seed, len(findings), AXES.index(axis)])
+            corrected[axis], size = _remove_vibration(corrected[axis], rate_hz, spectra[axis], largest, rng)
             amplitude = size if axis == largest.axis else amplitude
         findings.append(_describe(largest, axes, amplitude, spectra[largest.axis].block_samples / rate_hz))
     return corrected, findings
@@ -129,11 +131,9 @@ def check_temporary_vibration(
 def _block_spectra(y: Floats, rate_hz: float) -> _BlockSpectra | None:
     """Return the spectra of the blocks, or None if the recording is too short or contains no noise."""
     size = int(np.clip(2 ** int(np.log2(max(y.size / BLOCKS, 1.0))), *BLOCK_SAMPLES))
-    blocks = y[: y.size // size * size].reshape(-1, size)
-    if len(blocks) < MIN_BLOCKS or not np.isfinite(blocks).any():
+    if y.size // size < MIN_BLOCKS or not np.isfinite(y).any():
         return None
-    mean = np.nanmean(np.where(np.isfinite(blocks), blocks, np.nan)) if not np.isfinite(blocks).all() else 0.0
-    blocks = np.where(np.isfinite(blocks), blocks, mean)
+    blocks = _interpolate_missing(y)[: y.size // size * size].reshape(-1, size)
     t = np.linspace(-1.0, 1.0, size)
     blocks = blocks - blocks.mean(axis=1, keepdims=True)
     blocks = blocks - np.outer(blocks @ t / (t @ t), t)
@@ -144,6 +144,12 @@ def _block_spectra(y: Floats, rate_hz: float) -> _BlockSpectra | None:
     ratio = power / background
     ratio[:, :FIRST_USED_BIN] = ratio[:, -LAST_BINS:] = 1.0
     return _BlockSpectra(ratio, size, rate_hz / size)
+
+
+def _interpolate_missing(y: Floats) -> Floats:
+    known = np.isfinite(y)
+    at = np.arange(y.size)
+    return y if known.all() else np.interp(at, at[known], y[known])
 
 
 def _find_vibrations(axis: str, spectra: _BlockSpectra) -> list[TemporaryVibration]:
@@ -219,10 +225,9 @@ def _describe_band(axis: str, spectra: _BlockSpectra, first: int, last: int, act
 
 
 def _close_gaps(active: Mask) -> Mask:
-    """Return the blocks with short quiet gaps filled."""
+    """Return the active blocks, and single quiet blocks between two active blocks."""
     closed = active.copy()
-    for gap in range(1, GAP_BLOCKS + 1):
-        closed[gap:-1] |= active[: -gap - 1] & active[gap + 1 :]
+    closed[1:-1] |= active[:-2] & active[2:]
     return closed
 
 
@@ -253,19 +258,16 @@ def _is_affected(spectra: _BlockSpectra, found: TemporaryVibration) -> bool:
 
 
 def _remove_vibration(
-    y: Floats, rate_hz: float, spectra: _BlockSpectra, found: TemporaryVibration
+    y: Floats, rate_hz: float, spectra: _BlockSpectra, found: TemporaryVibration, rng: np.random.Generator
 ) -> tuple[Floats, float]:
     """Return the axis without the vibration, and the amplitude of the vibration."""
-    missing = ~np.isfinite(y)
-    at = np.arange(y.size)
-    whole = np.interp(at, at[~missing], y[~missing]) if missing.any() else y
+    missing, whole = ~np.isfinite(y), _interpolate_missing(y)
     half_hz = 0.5 * (found.last_hz - found.first_hz) + 2.0 * spectra.bin_hz
     band = extract_band(whole, rate_hz, 0.5 * (found.first_hz + found.last_hz), half_hz)
     if band is None:
         return y, 0.0
     blocks = np.minimum(np.arange(band.z.size) * (y.size / band.z.size) // spectra.block_samples, found.active.size - 1)
     during = _widen(found.active)[blocks.astype(np.int64)]
-    rng = np.random.default_rng(0)
     noise = (rng.standard_normal(band.z.size) + 1j * rng.standard_normal(band.z.size)) * np.sqrt(0.5)
     vibration = np.where(during, band.z - noise, 0.0)
     power = float(np.mean(np.abs(band.z[found.active[blocks.astype(np.int64)]]) ** 2)) - 1.0
