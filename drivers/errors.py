@@ -14,6 +14,8 @@ Links convert the exceptions of vendor libraries to these classes and keep the o
 other exception in a module without I/O is a bug.
 """
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final
 
 MAX_TEXT_CHARACTERS: Final = 2000
@@ -89,3 +91,27 @@ class RecordingError(ImuError, ValueError):
 
 class NotReady(ImuError):
     """There are too few samples for a result."""
+
+
+@contextmanager
+def convert_library_errors(format_message: Callable[[str], str]) -> Iterator[None]:
+    """Convert the exceptions that a library raises for a damaged file to RecordingError.
+
+    Errors of this project, of the operating system and of the memory are not changed.
+
+    Parameters
+    ----------
+    format_message
+        Function that returns the message for a cause.
+
+    >>> with convert_library_errors(lambda cause: f"run.bag: is no complete bag ({cause})"):
+    ...     {}["index"]
+    Traceback (most recent call last):
+    drivers.errors.RecordingError: run.bag: is no complete bag ('index')
+    """
+    try:
+        yield
+    except (ImuError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        raise RecordingError(format_message((describe_error(error) or type(error).__name__).rstrip("."))) from error

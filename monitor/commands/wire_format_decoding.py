@@ -121,7 +121,7 @@ def _decode_file(
             limit.check_row_count(rows)
             report_progress(f"decoding, {rows} samples", None)
     except LinkEnded:
-        pass
+        pass  # the whole file has been decoded
     except LinkUnavailable as error:
         raise RecordingError(str(error)) from error
     finally:

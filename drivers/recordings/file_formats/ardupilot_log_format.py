@@ -14,7 +14,7 @@ pymavlink finds the messages, and this module decodes them block by block.
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats, Ints
-from drivers.errors import ImuError, RecordingError, describe_error
+from drivers.errors import RecordingError, convert_library_errors
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.topics import BLOCK_ROWS, JOIN, Topic, join_topics, select_topics
@@ -139,16 +139,10 @@ def _discard(*_: object, **__: object) -> None:
     """Ignore text that a library prints."""
 
 
-@contextmanager
-def _pymavlink_errors(path: Path) -> Iterator[None]:
-    """Convert the exceptions of pymavlink to RecordingError."""
-    try:
-        yield
-    except (ImuError, OSError, MemoryError):
-        raise
-    except Exception as error:
-        what = (describe_error(error) or type(error).__name__).rstrip(".")
-        raise RecordingError(f"{path}: the log is damaged ({what}); copy it from the autopilot again") from error
+def _pymavlink_errors(path: Path) -> AbstractContextManager[None]:
+    return convert_library_errors(
+        lambda cause: f"{path}: the log is damaged ({cause}); copy it from the autopilot again"
+    )
 
 
 # --- topics --------------------------------------------------------------------------------------

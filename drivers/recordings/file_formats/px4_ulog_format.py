@@ -12,15 +12,15 @@ An autopilot with several IMUs has several instances of a topic, such as ``senso
 pyulog reads only the messages of these topics. It needs at most as much memory as the size of the file.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from drivers.errors import ImuError, RecordingError, describe_error
+from drivers.errors import RecordingError, convert_library_errors
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.topics import JOIN, Topic, join_topics, select_topics
@@ -116,10 +116,8 @@ def _message_bytes(formats: Mapping[str, Any], name: str, sizes: dict[str, int])
     """
     from pyulog.core import ULog
 
-    try:
+    with suppress(KeyError):  # not a basic type, but a nested message
         return int(ULog.get_field_size(name))
-    except KeyError:
-        pass
     if name not in sizes:
         sizes[name] = MAX_MESSAGE_BYTES + 1
         fields = formats[name].fields if name in formats else []
@@ -127,16 +125,10 @@ def _message_bytes(formats: Mapping[str, Any], name: str, sizes: dict[str, int])
     return sizes[name]
 
 
-@contextmanager
-def _pyulog_errors(path: Path) -> Iterator[None]:
-    """Convert the exceptions of pyulog to RecordingError."""
-    try:
-        yield
-    except (ImuError, OSError, MemoryError):
-        raise
-    except Exception as error:
-        what = (describe_error(error) or type(error).__name__).rstrip(".")
-        raise RecordingError(f"{path}: is no PX4 log ({what}){table.describe_suffix_mismatch(path)}") from error
+def _pyulog_errors(path: Path) -> AbstractContextManager[None]:
+    return convert_library_errors(
+        lambda cause: f"{path}: is no PX4 log ({cause}){table.describe_suffix_mismatch(path)}"
+    )
 
 
 # --- topics --------------------------------------------------------------------------------------

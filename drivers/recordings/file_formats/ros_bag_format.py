@@ -10,7 +10,7 @@ of the log are used instead.
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from drivers.errors import ImuError, RecordingError, describe_error
+from drivers.errors import RecordingError, convert_library_errors
 from drivers.file_access import check_regular_file, open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.topics import Topic, collect_columns, join_topics, select_topics
@@ -118,16 +118,8 @@ def _open_bag(path: Path) -> Iterator[tuple[_Bag, memory_check.RecordingSizeLimi
             yield _Bag(bag2.connections, topics, bag2.messages, store.deserialize_cdr), limit
 
 
-@contextmanager
-def _bag_errors(path: Path) -> Iterator[None]:
-    """Convert the exceptions of rosbags, and of the libraries that it uses, to RecordingError."""
-    try:
-        yield
-    except (ImuError, OSError, MemoryError):
-        raise
-    except Exception as error:
-        what = (describe_error(error) or type(error).__name__).rstrip(".")
-        raise RecordingError(f"{path}: is no complete bag ({what}){_describe_remedy(path)}") from error
+def _bag_errors(path: Path) -> AbstractContextManager[None]:
+    return convert_library_errors(lambda cause: f"{path}: is no complete bag ({cause}){_describe_remedy(path)}")
 
 
 def _describe_remedy(path: Path) -> str:

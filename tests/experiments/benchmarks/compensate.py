@@ -238,7 +238,7 @@ def _score_motion(sensor: str, seed: int, truth: Floats, method: str) -> tuple[M
 
 def slow(seeds: int) -> None:
     """Print how much of a constant slow rotation remains, after half an hour at rest."""
-    table = create_table("Constant rotation for ten minutes: what is left of it", "°/s", *SENSORS)
+    table = create_table("Constant rotation for ten minutes: remaining error", "°/s", *SENSORS)
     for rate in (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 5.0):
         cells = []
         for sensor in SENSORS:

@@ -159,7 +159,7 @@ class Observer:
         return gain + float(np.sum(prior))
 
     def _wandering(self) -> float:
-        """Of the line with its true phase, less what it takes to learn the phase: see the module."""
+        """Return the gain of the line with its true phase, less the cost of learning the phase (see the module)."""
         parameters = self.effect.parameters
         walk = parameters["frequency_deviation"] * np.sqrt(2.0 / parameters["correlation_time"])
         stretches = self.world.seconds * walk ** (2.0 / 3.0)

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[3]
 
 @dataclass(frozen=True)
 class KillResult:
-    """What the history file contained after a kill."""
+    """Content of the history file after a kill."""
 
     acknowledged: int  # rows that the writer reported as written
     found: int  # minutes found in the file

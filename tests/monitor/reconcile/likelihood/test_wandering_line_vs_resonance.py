@@ -1,4 +1,4 @@
-"""A wandering line, a resonance and a line of varying amplitude are told apart, and the line can be subtracted."""
+"""Tests of the comparison of a wandering line with a resonance and a modulated line, and of the subtraction of the line."""
 
 import numpy as np
 import pytest
