@@ -1,4 +1,4 @@
-"""Tests of the comparison of a wandering line with a resonance and a modulated line, and of the subtraction of the line."""
+"""Tests of the comparison of a wandering line with a resonance and a modulated line, and of its subtraction."""
 
 import numpy as np
 import pytest
