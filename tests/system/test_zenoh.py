@@ -170,7 +170,8 @@ mode = "none"
         wait_for(lambda: listener.poll_and_check(lambda: keys <= set(listener.messages)), "every key")
     listener.poll()
     listener.close()
-    assert set(listener.messages) == keys
+    # only on a slow machine does the test last until the first total deviations
+    assert keys <= set(listener.messages) <= keys | {topics.TOTAL.key("imu", "bench-1")}
     for topic in wanted:
         for encoding, payload in listener.messages[topic.key("imu", "bench-1")]:
             assert encoding == topic.encoding
