@@ -448,7 +448,7 @@ WRONG_ARGUMENTS = {
     "nothing to write": (("simulate", "consumer-mems", "--seconds", "1"), "Missing option '--out'"),
     "unknown suffix": (
         build_simulate_arguments("consumer-mems", "--out", "x.xlsx"),
-        "x.xlsx: the suffix is not that of a recording",
+        "x.xlsx: the suffix is unknown; recordings are written as .csv",
     ),
     "recording in a missing folder": (
         build_simulate_arguments("consumer-mems", "--out", "nowhere/x.csv"),
@@ -1464,7 +1464,7 @@ def test_history_accepts_a_time_range_and_a_step(run_program: RunProgram, histor
         (("{kept}", "--from", "2025-11-22", "--to", "2025-11-21"), 2, "is not after --from"),
         (("{kept}", "--axis", "g"), 2, "possible are gx, gy"),
         (("{kept}", "--plot", "h.pdf"), 2, "ending in .png"),
-        (("{kept}", "--out", "h.xls"), 2, "known are .csv"),
+        (("{kept}", "--out", "h.xls"), 2, "tables are written as .csv"),
         (("{kept}", "--connect", "tcp/127.0.0.1:1"), 2, "not both"),
         ((".",), 2, "history.sqlite: no such file"),
         (("absent.toml",), 2, "no such file"),
