@@ -16,7 +16,7 @@ from typing import Final, Literal
 import numpy as np
 
 from drivers.data_types import AXES, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
-from drivers.decoders.base import Decoder, LateFrameCountingDecoder
+from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import Link
 from drivers.timing.sample_clock import SampleClock
@@ -139,6 +139,11 @@ class Driver:
     def late_frames_hint(self) -> str:
         """Message that states the delay of late frames and suggests a remedy; "" if no frame was late recently."""
         return self._counts_late.late_frames_hint if self._counts_late else ""
+
+    @property
+    def on_board_filter_note(self) -> str:
+        """Note that the samples are corrected by a filter of the sensor; "" if they are not corrected."""
+        return self.decoder.on_board_filter_note if isinstance(self.decoder, FilterReportingDecoder) else ""
 
     def take_events(self) -> list[Event]:
         """Remove and return all queued events, oldest first."""
