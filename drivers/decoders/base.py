@@ -1,9 +1,9 @@
 """Interface of a decoder, and functions shared by the decoders. Decoders convert bytes to samples and do no I/O.
 
-A decoder module ``drivers/decoders/<protocol>.py`` defines ``Settings`` and ``build(settings) -> Decoder``.
-``Settings`` is a pydantic model with the keys of ``[device.driver.decoder_options]``. If the model accepts settings
-that are invalid for the decoder, ``build`` raises one ``ConfigError`` with a line for each mistake. Each line of the
-``ConfigError`` begins with the configuration key, for example "signals.gx: ...".
+A decoder module, such as ``drivers/decoders/binary_frames/stim300.py``, defines ``Settings`` and
+``build(settings) -> Decoder``. ``Settings`` is a pydantic model with the keys of ``[device.driver.decoder_options]``.
+If the model accepts settings that are invalid for the decoder, ``build`` raises one ``ConfigError`` with a line for
+each mistake. Each line of the ``ConfigError`` begins with the configuration key, for example "signals.gx: ...".
 
 ``feed`` never raises an exception because of invalid bytes. A frame with a wrong checksum or format is dropped and
 counted in ``Decoder.bad``. The field ``lost`` of the next sample block includes the number of dropped frames.

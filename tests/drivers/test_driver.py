@@ -15,8 +15,10 @@ import pytest
 
 from drivers import driver as driver_module
 from drivers.data_types import NO_TICK, Chunk, make_block
-from drivers.decoders import dbc, stim300, text, vectornav_binary
-from drivers.decoders import samples as samples_decoder
+from drivers.decoders import dbc
+from drivers.decoders.binary_frames import stim300, vectornav_binary
+from drivers.decoders.messages import samples as samples_decoder
+from drivers.decoders.text_lines import text
 from drivers.driver import MAX_UNDECODED_BYTES, AxisMap, Driver, parse_axis_map
 from drivers.errors import ConfigError
 from drivers.timing.sample_clock import SampleClock

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import Chunk, SampleBlock, concatenate_blocks
-from drivers.decoders.vectornav_ascii import Settings, build
+from drivers.decoders.text_lines.vectornav_ascii import Settings, build
 from tests.support.nmea_sentences import make_sentence
 from tests.support.recordings import recordings
 

@@ -15,7 +15,7 @@ from drivers.data_types import (
     concatenate_blocks,
     make_block,
 )
-from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, build_message_dtype
+from drivers.decoders.binary_frames.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, build_message_dtype
 
 EXAMPLE_1 = bytes.fromhex("FA 01 08 00 93 50 2E 42 83 3E F1 3F 48 B5 04 BB 92 88")
 EXAMPLE_2_WRONG = bytes.fromhex("FA 05 08 00 01 00" + "00" * 20 + "A8 3A")
