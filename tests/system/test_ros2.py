@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 from drivers.data_types import SampleBlock, concatenate_blocks
-from drivers.decoders import ros2_imu
+from drivers.decoders.messages import ros2_imu
 from drivers.links import zenoh_link
 from tests.support.ports import free_endpoint
 from tests.support.ros2_messages import DIAGNOSTIC_ARRAY, decode

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from drivers.zenoh.rmw_attachment import encode_attachment
 from drivers.zenoh.ros2_imu_message import encode_imu_messages
-from tests.drivers.decoders.test_ros2_imu import ACCEL, CAPTURED_ATTACHMENT, GOLDEN, GYRO
+from tests.drivers.decoders.messages.test_ros2_imu import ACCEL, CAPTURED_ATTACHMENT, GOLDEN, GYRO
 from tests.support.ros2_messages import IMU, decode, stamp_ns
 
 STAMP_NS = 1_700_000_000_123_456_789
