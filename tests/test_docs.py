@@ -45,6 +45,7 @@ SIMULATOR = ROOT / "docs" / "simulator.md"
 EXPORT = ROOT / "docs" / "export.md"
 COMMANDS_PAGE = ROOT / "docs" / "commands.md"
 MESSAGES = ROOT / "docs" / "messages.md"
+RECORDING_FORMATS = ROOT / "docs" / "recording-formats.md"
 DECODERS = ROOT / "docs" / "decoders.md"
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 PAGES = sorted([README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
@@ -189,8 +190,8 @@ def test_protocol_table_lists_every_decoder() -> None:
 
 
 def test_every_recording_format_is_named() -> None:
-    named = re.findall(r"\.[a-z0-9.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
-    assert set(FORMATS) <= set(named)
+    rows = re.findall(r"^\| ([^|]*\.[^|]*) \|", RECORDING_FORMATS.read_text("utf-8"), re.M)
+    assert set(FORMATS) <= set(re.findall(r"`(\.[a-z0-9.]+)`", " ".join(rows)))
 
 
 # --- links, pictures, files, names
