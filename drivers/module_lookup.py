@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 from collections.abc import Sequence
 from difflib import SequenceMatcher, get_close_matches
+from pathlib import Path
 from types import ModuleType
 
 from drivers.errors import ConfigError
@@ -15,7 +16,7 @@ def list_modules(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
     Parameters
     ----------
     package
-        Package that contains the modules.
+        Package that contains the modules. If it has the attribute ``SUBPACKAGES``, the modules of these are included.
     suffix
         End of the module names, such as "_link". The suffix is removed from the returned names.
 
@@ -24,8 +25,7 @@ def list_modules(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
     tuple of str
         Sorted names. A module named ``base`` is omitted.
     """
-    found = (module.name for module in pkgutil.iter_modules(package.__path__))
-    return tuple(sorted(n.removesuffix(suffix) for n in found if n != "base" and n.endswith(suffix)))
+    return tuple(sorted(_find_modules(package, suffix)))
 
 
 def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleType:
@@ -34,7 +34,7 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
     Parameters
     ----------
     package
-        Package that contains the module.
+        Package that contains the module, as for ``list_modules``.
     name
         Name of the module without its suffix.
     suffix
@@ -45,10 +45,23 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
     ConfigError
         If the module does not exist. The error text lists all names, beginning with the most similar name.
     """
-    known = list_modules(package, suffix)
-    if name not in known:
-        raise ConfigError(f'unknown name "{name}"{format_choices_by_similarity(name, known)}')
-    return importlib.import_module(f"{package.__name__}.{name}{suffix}")
+    paths = _find_modules(package, suffix)
+    if name not in paths:
+        raise ConfigError(f'unknown name "{name}"{format_choices_by_similarity(name, tuple(sorted(paths)))}')
+    return importlib.import_module(paths[name])
+
+
+def _find_modules(package: ModuleType, suffix: str) -> dict[str, str]:
+    """Return the name without suffix and the import path of each module of a package and of its ``SUBPACKAGES``."""
+    subpackages: tuple[str, ...] = getattr(package, "SUBPACKAGES", ())
+    paths = {}
+    for subpackage in ("", *subpackages):
+        folders = [str(Path(folder, subpackage)) for folder in package.__path__]
+        for module in pkgutil.iter_modules(folders):
+            if module.name not in ("base", *subpackages) and module.name.endswith(suffix):
+                path = ".".join(filter(None, (package.__name__, subpackage, module.name)))
+                paths[module.name.removesuffix(suffix)] = path
+    return paths
 
 
 def format_suggestion(word: str, known: Sequence[str]) -> str:

@@ -1,9 +1,9 @@
 """Interface of a decoder, and functions shared by the decoders. Decoders convert bytes to samples and do no I/O.
 
-A decoder module ``drivers/decoders/<protocol>.py`` defines ``Settings`` and ``build(settings) -> Decoder``.
-``Settings`` is a pydantic model with the keys of ``[device.driver.decoder_options]``. If the model accepts settings
-that are invalid for the decoder, ``build`` raises one ``ConfigError`` with a line for each mistake. Each line of the
-``ConfigError`` begins with the configuration key, for example "signals.gx: ...".
+A decoder module, such as ``drivers/decoders/binary_frames/stim300.py``, defines ``Settings`` and
+``build(settings) -> Decoder``. ``Settings`` is a pydantic model with the keys of ``[device.driver.decoder_options]``.
+If the model accepts settings that are invalid for the decoder, ``build`` raises one ``ConfigError`` with a line for
+each mistake. Each line of the ``ConfigError`` begins with the configuration key, for example "signals.gx: ...".
 
 ``feed`` never raises an exception because of invalid bytes. A frame with a wrong checksum or format is dropped and
 counted in ``Decoder.bad``. The field ``lost`` of the next sample block includes the number of dropped frames.
@@ -83,6 +83,19 @@ class LateFrameCountingDecoder(Protocol):
     def late_frames_hint(self) -> str:
         """Message that states the delay of late frames and suggests a remedy; "" if no frame was late recently."""
 
+
+@runtime_checkable
+class FilterReportingDecoder(Protocol):
+    """Interface of a decoder for sensors that can send values which their own filter has corrected."""
+
+    @property
+    def on_board_filter_note(self) -> str:
+        """Note that the samples are corrected by a filter of the sensor; "" if they are not corrected."""
+
+
+ON_BOARD_FILTER_NOTE: Final = (
+    "the filter of the sensor has corrected these angular rates, which hides bias instability B and random walk K"
+)
 
 HINT_FRAMES: Final = 1000
 """Number of valid frames after which an earlier rejected frame is no longer reported."""

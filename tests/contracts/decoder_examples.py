@@ -3,7 +3,6 @@
 A decoder that is not listed is tested with its default settings and a coarse resolution.
 """
 
-import importlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -57,7 +56,7 @@ class Example:
     @property
     def carrier(self) -> str:
         """Kind of the decoder's input: bytes, frames or messages."""
-        module = importlib.import_module(f"{decoders.__name__}.{self.name}")
+        module = module_lookup.import_module(decoders, self.name)
         carriers = [getattr(attribute, "carrier", None) for attribute in vars(module).values()]
         return str(next(carrier for carrier in carriers if isinstance(carrier, str)))
 
@@ -67,7 +66,7 @@ class Example:
         if self.name == "dbc":
             (folder / "imu.dbc").write_text(CAN_DATABASE)
             settings["file"] = str(folder / "imu.dbc")
-        module = importlib.import_module(f"{decoders.__name__}.{self.name}")
+        module = module_lookup.import_module(decoders, self.name)
         decoder: Decoder = module.build(read_settings(module.Settings, settings))
         return decoder
 

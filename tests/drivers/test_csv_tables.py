@@ -10,7 +10,7 @@ import pytest
 
 import imu_monitor
 from drivers.data_types import AXES, Floats, concatenate_blocks
-from drivers.decoders import samples
+from drivers.decoders.messages import samples
 from drivers.errors import ConfigError, ImuError, LinkEnded
 from drivers.links import replay_link
 from drivers.recordings import Recording, load_samples, save_samples

@@ -15,8 +15,10 @@ import pytest
 
 from drivers import driver as driver_module
 from drivers.data_types import NO_TICK, Chunk, make_block
-from drivers.decoders import dbc, stim300, text, vectornav_binary
-from drivers.decoders import samples as samples_decoder
+from drivers.decoders import dbc
+from drivers.decoders.binary_frames import stim300, vectornav_binary
+from drivers.decoders.messages import samples as samples_decoder
+from drivers.decoders.text_lines import text
 from drivers.driver import MAX_UNDECODED_BYTES, AxisMap, Driver, parse_axis_map
 from drivers.errors import ConfigError
 from drivers.timing.sample_clock import SampleClock
@@ -345,6 +347,16 @@ def test_status_text_names_the_window_if_all_can_frames_are_late():
     assert rig.driver.state == "waiting"
     assert rig.driver.text.startswith("loopback: ")
     assert rig.driver.text.endswith(f" bytes without a sample; {LATE_FRAME_HINT}")
+
+
+def test_status_names_the_decoder_that_fits_undecoded_bytes():
+    encoder = stim300.build(stim300.Settings())
+    with run_driver() as rig:
+        for chunk in encoder.encode(make_samples(0, 200, tick_s=1.0, modulus=256)):
+            rig.link.write(chunk.data)
+        rig.wait_until(lambda: 'the bytes fit decoder = "stim300"' in rig.driver.text)
+        rig.send(50)
+        rig.wait_until(lambda: rig.driver.state == "running" and not rig.driver.text)
 
 
 def test_times_are_unix_if_the_link_has_unix_times():

@@ -44,6 +44,15 @@ def test_only_the_requested_module_is_imported(package):
     assert "some_package.can_link" not in sys.modules
 
 
+def test_modules_of_subpackages_are_found_by_their_names(package, tmp_path):
+    (tmp_path / "some_package" / "inner").mkdir()
+    (tmp_path / "some_package" / "inner" / "__init__.py").write_text("")
+    (tmp_path / "some_package" / "inner" / "udp_link.py").write_text("NAME = 'udp_link'\n")
+    package.SUBPACKAGES = ("inner",)
+    assert list_modules(package, "_link") == ("broken", "can", "serial", "udp")
+    assert import_module(package, "udp", "_link").__name__ == "some_package.inner.udp_link"
+
+
 def test_error_inside_a_module_is_not_hidden(package):
     with pytest.raises(RuntimeError, match="imported"):
         import_module(package, "broken", "_link")
@@ -70,4 +79,6 @@ def test_all_links_and_decoders_can_be_imported():
         members = list_modules(package, suffix)
         assert members
         for member in members:
-            assert import_module(package, member, suffix).__name__ == f"{package.__name__}.{member}{suffix}"
+            name = import_module(package, member, suffix).__name__
+            assert name.startswith(f"{package.__name__}.")
+            assert name.endswith(f".{member}{suffix}")

@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag2.reader import zstd
 
 from drivers.data_types import AXES, concatenate_blocks
-from drivers.decoders import samples
+from drivers.decoders.messages import samples
 from drivers.errors import ConfigError, ImuError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links import replay_link
 from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples

@@ -6,7 +6,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from drivers.data_types import Event
-from drivers.decoders import samples
+from drivers.decoders.messages import samples
 from monitor.daemon.service import Service
 from monitor.settings.loading import VirtualTable
 from monitor.simulator.demo_config import build_demo_config

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import EXTENDED_ID, Chunk, concatenate_blocks
-from drivers.decoders import samples
+from drivers.decoders.messages import samples
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
 from drivers.links import base, replay_link
 from drivers.links.base import Link

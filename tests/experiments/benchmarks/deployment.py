@@ -22,7 +22,7 @@ import numpy as np
 import psutil
 
 from drivers.data_types import make_block
-from drivers.decoders import vectornav_binary
+from drivers.decoders.binary_frames import vectornav_binary
 from monitor.common import shipped_config_paths
 from monitor.noise.model_loading import read_model
 

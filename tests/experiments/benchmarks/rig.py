@@ -24,7 +24,7 @@ import psutil
 import zenoh
 
 from drivers.data_types import Ints, make_block
-from drivers.decoders import vectornav_binary
+from drivers.decoders.binary_frames import vectornav_binary
 from tests.support.ports import free_port
 from tests.support.waiting import wait_for
 

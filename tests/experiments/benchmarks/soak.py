@@ -21,7 +21,7 @@ import numpy as np
 import psutil
 
 from drivers.data_types import Chunk, make_block
-from drivers.decoders import vectornav_binary
+from drivers.decoders.binary_frames import vectornav_binary
 from drivers.driver import SampleCounts
 from drivers.errors import LinkEnded, LinkLost
 from drivers.links.base import Carrier

@@ -14,8 +14,8 @@ from functools import cache, reduce
 from operator import xor
 from typing import Any, Final
 
-from drivers.decoders.stim300 import IDENTIFIERS
-from drivers.decoders.vectornav_binary import FIELD_SIZES
+from drivers.decoders.binary_frames.stim300 import IDENTIFIERS
+from drivers.decoders.binary_frames.vectornav_binary import FIELD_SIZES
 
 DEGREE: Final = math.pi / 180.0
 G: Final = 9.80665

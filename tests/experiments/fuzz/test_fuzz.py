@@ -103,7 +103,7 @@ def test_large_allocation_and_large_growth_are_findings() -> None:
 
 
 def test_sample_of_a_frame_with_wrong_checksum_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
-    from drivers.decoders import stim300, xsens_mtdata2
+    from drivers.decoders.binary_frames import stim300, xsens_mtdata2
 
     monkeypatch.setattr(stim300, "has_valid_crc", lambda frame: True)
     monkeypatch.setattr(xsens_mtdata2, "sum", lambda data: 0, raising=False)

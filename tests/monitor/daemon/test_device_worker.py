@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from drivers.data_types import concatenate_blocks, make_block
-from drivers.decoders import dbc, samples, text, vectornav_binary
+from drivers.decoders import dbc
+from drivers.decoders.binary_frames import vectornav_binary
+from drivers.decoders.messages import samples
+from drivers.decoders.text_lines import text
 from drivers.errors import ConfigError
 from drivers.links import replay_link
 from monitor.daemon.device import device_worker

@@ -8,7 +8,7 @@ import pytest
 import drivers.decoders
 import drivers.links
 from drivers import module_lookup
-from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
+from drivers.decoders.text_lines.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from monitor.common.shipped_config_paths import CONFIG_FOLDER, resolve_model_path

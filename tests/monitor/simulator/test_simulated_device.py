@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from drivers.decoders import stim300, vectornav_binary, xsens_mtdata2
+from drivers.decoders.binary_frames import stim300, vectornav_binary, xsens_mtdata2
 from drivers.driver import Driver
 from drivers.errors import ConfigError
 from drivers.timing.sample_clock import SampleClock

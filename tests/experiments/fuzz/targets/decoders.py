@@ -6,7 +6,6 @@ truncated frames and repetitions. The samples must not depend on how the stream 
 the decoder receives them one by one or all at once.
 """
 
-import importlib
 import struct
 import tempfile
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
+from drivers import decoders, module_lookup
 from drivers.data_types import AXES, EXTENDED_ID, NO_TICK, Chunk, CounterTimedFormat, SampleBlock, make_block
 from drivers.decoders.base import Decoder
 from drivers.decoders.dbc import DbcDecoder
@@ -63,7 +63,7 @@ def build_samples(data: bytes, decoder: Decoder) -> SampleBlock:
 @cache
 def _settings(name: str, i: int) -> Any:
     example = _examples(name)[i]
-    module = importlib.import_module(f"drivers.decoders.{name}")
+    module = module_lookup.import_module(decoders, name)
     return module.build, read_settings(module.Settings, dict(example.settings))
 
 
@@ -295,7 +295,7 @@ def check_dbc(data: bytes) -> None:
 
 
 def _build_decoder(name: str) -> Decoder:
-    module = importlib.import_module(f"drivers.decoders.{name}")
+    module = module_lookup.import_module(decoders, name)
     decoder: Decoder = module.build(module.Settings())
     return decoder
 

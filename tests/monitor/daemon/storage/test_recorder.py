@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import Chunk, SampleBlock, concatenate_blocks, make_block
-from drivers.decoders import text
+from drivers.decoders.text_lines import text
 from drivers.driver import AxisMap
 from drivers.recordings import load_samples, segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata

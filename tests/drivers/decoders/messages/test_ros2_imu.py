@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.data_types import NO_TICK, Chunk, SenderTimedFormat, concatenate_blocks, make_block
-from drivers.decoders import ros2_imu
 from drivers.decoders.base import HINT_FRAMES, Decoder
+from drivers.decoders.messages import ros2_imu
 
 GOLDEN_HEAD = bytes.fromhex("0001000000F1536515CD5B0709000000696D755F6C696E6B00000000")
 GYRO, ACCEL = (0.01, -0.02, 0.03), (0.1, 0.2, 9.81)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, SampleBlock, concatenate_blocks, make_block
-from drivers.decoders.witmotion import Settings, build, encode_packet
+from drivers.decoders.binary_frames.witmotion import Settings, build, encode_packet
 from drivers.errors import ConfigError
 from drivers.units import DEGREE, G0
 from tests.support.settings import read_settings

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
-from drivers.decoders.xsens_mtdata2 import MAX_PAYLOAD, Settings, _match_message, build, encode_message
+from drivers.decoders.binary_frames.xsens_mtdata2 import MAX_PAYLOAD, Settings, _match_message, build, encode_message
 
 DOCUMENTED_FRAME = bytes.fromhex(
     "FA FF 36 31 10 20 02 DF C5 10 60 04 00 45 9D A0 40 20 0C BE DC 9A FA 3F 54 9F 37 41 1C BB 70"

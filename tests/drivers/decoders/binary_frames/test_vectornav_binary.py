@@ -15,7 +15,7 @@ from drivers.data_types import (
     concatenate_blocks,
     make_block,
 )
-from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, build_message_dtype
+from drivers.decoders.binary_frames.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, build_message_dtype
 
 EXAMPLE_1 = bytes.fromhex("FA 01 08 00 93 50 2E 42 83 3E F1 3F 48 B5 04 BB 92 88")
 EXAMPLE_2_WRONG = bytes.fromhex("FA 05 08 00 01 00" + "00" * 20 + "A8 3A")
@@ -109,6 +109,25 @@ def test_setting_selects_compensated_or_uncompensated_values() -> None:
     assert corrected is not None
     assert raw.values.tolist() == [[4, 4, 4, 3, 3, 3]]
     assert corrected.values.tolist() == [[1, 1, 1, 2, 2, 2]]
+
+
+@pytest.mark.parametrize(
+    ("fields", "compensated", "noted"),
+    [
+        (1 << 5 | 1 << 8, False, True),
+        (1 << 5 | 1 << 9, False, False),
+        (1 << 5 | 1 << 9, True, True),
+        (1 << 9, True, False),
+    ],
+    ids=["only compensated", "raw of both", "compensated of both", "only raw"],
+)
+def test_note_says_that_the_filter_has_corrected_the_rates(fields: int, compensated: bool, noted: bool) -> None:
+    decoder = build(Settings(compensated=compensated))
+    assert decoder.on_board_filter_note == ""
+    decoder.feed(
+        [Chunk(make_message({1: fields}, pack_floats(*range(9 if fields & 1 << 5 and fields & 1 << 9 else 6))), 0)]
+    )
+    assert ("hides bias instability" in decoder.on_board_filter_note) == noted
 
 
 @pytest.mark.parametrize("masks", [{4: 1}, {6: 3}, {1: 0x8001}, {1: 0}, {3: 0x0800}])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
-from drivers.decoders.text import MAX_LINE_BYTES, Settings, build
+from drivers.decoders.text_lines.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
 from tests.support.nmea_sentences import make_sentence
 from tests.support.settings import read_settings

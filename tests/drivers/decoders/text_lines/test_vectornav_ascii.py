@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import Chunk, SampleBlock, concatenate_blocks
-from drivers.decoders.vectornav_ascii import Settings, build
+from drivers.decoders.text_lines.vectornav_ascii import Settings, build
 from tests.support.nmea_sentences import make_sentence
 from tests.support.recordings import recordings
 
@@ -49,6 +49,13 @@ def test_ymr_sentence_is_decoded(line: bytes, row: list[float]) -> None:
     assert got is not None
     assert got.values.tolist() == [row]
     assert np.isnan(got.temperature_c).all()
+
+
+@pytest.mark.parametrize(("line", "noted"), [(YMR_SENTENCE, True), (IMU_SENTENCE, False)], ids=["VNYMR", "VNIMU"])
+def test_note_says_that_the_filter_has_corrected_the_rates(line: bytes, noted: bool) -> None:
+    decoder = build(Settings())
+    decoder.feed([Chunk(line, 77)])
+    assert ("select $VNIMU" in decoder.on_board_filter_note) == noted
 
 
 def test_auto_uses_only_the_first_kind_of_sentence() -> None:

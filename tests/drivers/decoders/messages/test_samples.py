@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.data_types import Chunk, SenderTimedFormat, concatenate_blocks, make_block
-from drivers.decoders import samples
 from drivers.decoders.base import HINT_FRAMES
+from drivers.decoders.messages import samples
 from drivers.zenoh.sample_message import encode_samples
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from drivers.data_types import Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks, make_block
 from drivers.decoders.base import MAX_BYTES_WITHOUT_FRAME
-from drivers.decoders.stim300 import IDENTIFIERS, SIZES, Settings, build, datagram_crc, has_valid_crc
+from drivers.decoders.binary_frames.stim300 import IDENTIFIERS, SIZES, Settings, build, datagram_crc, has_valid_crc
 from drivers.errors import ConfigError
 from drivers.units import DEGREE, G0
 from tests.support.settings import read_settings

@@ -1,0 +1,1 @@
+"""Decoders of serial streams that consist of binary frames. Each module is one decoder."""

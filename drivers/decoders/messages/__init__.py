@@ -1,0 +1,1 @@
+"""Decoders of messages that a transport delivers whole, such as zenoh messages."""

@@ -1,0 +1,1 @@
+"""Decoders of serial streams that consist of text lines. Each module is one decoder."""
