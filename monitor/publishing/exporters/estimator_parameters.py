@@ -213,7 +213,7 @@ KALIBR_PARAMETERS: Final = _noise_and_bias(
     "accelerometer_random_walk",
 )
 KALIBR_LINES: Final = (
-    "rostopic: {rostopic}  # topic of the IMU in the bag for Kalibr (--rostopic)",
+    "rostopic: {rostopic}  # topic of the IMU in the bag for Kalibr",
     "update_rate: {rate}  # Hz",
 )
 OPENCV_FIRST_LINES: Final = ("%YAML:1.0",)
