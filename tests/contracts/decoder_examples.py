@@ -75,6 +75,7 @@ FLOAT32_STEP = 2.0**-22  # step of a float32 for numbers from 2 to 4
 COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az", "temperature")
 TEXT = Example("text", {"columns": COLUMNS}, 1e-14, 1e-13, 1e-13)
 OTHER_UNITS = {"gyro_unit": "deg/s", "accel_unit": "mg", "temperature_unit": "K", "delimiter": ";"}
+EPSON = Example("epson_uart", {"model": "g366pdg0"}, DEGREE / 66, 0.25e-3 * G, 2.0**-8, checksum=True)
 STIM300 = Example("stim300", {}, DEGREE / 2**14, G / 2**19, 2.0**-8, checksum=True)
 VECTORNAV = Example("vectornav_binary", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
 XSENS = Example("xsens_mtdata2", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
@@ -108,7 +109,7 @@ LISTED_EXAMPLES = (
     ),
     WITMOTION,
     Example("witmotion", {"temperature": "jy61"}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 1 / 340, True),
-    Example("epson_uart", {"model": "g366pdg0"}, DEGREE / 66, 0.25e-3 * G, 2.0**-8, checksum=True),
+    EPSON,
     Example(
         "epson_uart", {"model": "g364pdca", "bits": 32}, DEGREE * 0.00375 / 2**16, 0.125e-3 * G / 2**16, 1e-7, True
     ),

@@ -31,7 +31,7 @@ from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedF
 from drivers.decoders import base
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_choices_by_similarity
-from drivers.settings_model import Conflict, ListOf, SettingsModel, checked_by, one_of
+from drivers.settings_model import Conflict, ListOf, SettingsModel, checked_by
 from drivers.units import DEGREE, G0
 
 HEADER: Final = b"\x80"
@@ -63,7 +63,23 @@ class Model(NamedTuple):
     accel_16g_mg: float | None = None  # accelerometer LSB in the range of 16 g; None if there is only one range
 
 
-MODELS: Final = {
+ModelName = Literal[
+    "g320",
+    "g330pdg0",
+    "g354",
+    "g355qdg0",
+    "g364pdc0",
+    "g364pdca",
+    "g365pdc1",
+    "g365pdf1",
+    "g366pdg0",
+    "g370pdf1",
+    "g370pdg0",
+    "g370pds0",
+    "g370pdt0",
+    "g570pr20",
+]
+MODELS: Final[dict[ModelName, Model]] = {
     "g320": Model(0.008, 0.2, -0.0037918, 2634),
     "g330pdg0": Model(1 / 66, 0.25, 2.0**-8, 0, 0.5),
     "g354": Model(0.016, 0.2, -0.0037918, 2634),
@@ -95,9 +111,7 @@ def _check_fields(fields: tuple[str, ...]) -> None:
 class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
-    model: Annotated[str, one_of(tuple(MODELS))] = Field(
-        examples=["g366pdg0"], description=f"sensor model, which determines the scales: {' '.join(MODELS)}"
-    )
+    model: ModelName = Field(examples=["g366pdg0"], description="sensor model, which determines the scales")
     fields: Annotated[ListOf[str], checked_by(_check_fields)] = Field(
         ("flags", "temperature", "gyro", "accel", "gpio", "count"),
         description=f"fields that the sensor sends before the checksum: {' '.join(FIELDS)}",
