@@ -75,6 +75,7 @@ FLOAT32_STEP = 2.0**-22  # step of a float32 for numbers from 2 to 4
 COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az", "temperature")
 TEXT = Example("text", {"columns": COLUMNS}, 1e-14, 1e-13, 1e-13)
 OTHER_UNITS = {"gyro_unit": "deg/s", "accel_unit": "mg", "temperature_unit": "K", "delimiter": ";"}
+EPSON = Example("epson_uart", {"model": "g366pdg0"}, DEGREE / 66, 0.25e-3 * G, 2.0**-8, checksum=True)
 STIM300 = Example("stim300", {}, DEGREE / 2**14, G / 2**19, 2.0**-8, checksum=True)
 VECTORNAV = Example("vectornav_binary", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
 XSENS = Example("xsens_mtdata2", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
@@ -108,6 +109,16 @@ LISTED_EXAMPLES = (
     ),
     WITMOTION,
     Example("witmotion", {"temperature": "jy61"}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 1 / 340, True),
+    EPSON,
+    Example(
+        "epson_uart", {"model": "g364pdca", "bits": 32}, DEGREE * 0.00375 / 2**16, 0.125e-3 * G / 2**16, 1e-7, True
+    ),
+    Example("microstrain_mip", {}, FLOAT32_STEP, G * FLOAT32_STEP, None, checksum=True),
+    Example("microstrain_mip", {"increments": True}, 2 * FLOAT32_STEP, G * FLOAT32_STEP, None, checksum=True),
+    Example("sbg_ecom", {}, 2.0**-26, 2.0**-20, 2.0**-8, checksum=True),
+    Example("sbg_ecom", {"message": "imu_data"}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
+    Example("silicon_sensing_dmu", {}, FLOAT32_STEP, G * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
+    Example("silicon_sensing_dmu", {"length": 40}, FLOAT32_STEP, G * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
     Example("dbc", {"signals": CAN_SIGNALS}, 2.0**-9, 2.0**-8, 2.0**-8),
     Example("ros2_imu", {}, 1e-15, 1e-14, None),
     Example("samples", {}, 1e-15, 1e-14, 1e-14),

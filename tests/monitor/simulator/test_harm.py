@@ -126,8 +126,14 @@ def count_needed_samples(kinds: np.ndarray, samples: int, fault: FaultKind) -> i
     return samples + int(np.flatnonzero((enough_faults & intact)[samples - 1 :])[0])
 
 
-WITH_COUNTER = ("vectornav_binary", "stim300", "xsens_mtdata2", "ros2_imu", "samples")
-WITH_CHECKSUM = ("vectornav_binary", "stim300", "xsens_mtdata2", "vectornav_ascii", "witmotion")
+WITH_COUNTER = (
+    *("vectornav_binary", "stim300", "xsens_mtdata2", "ros2_imu", "samples"),
+    *("epson_uart-g366pdg0", "microstrain_mip", "sbg_ecom", "silicon_sensing_dmu"),
+)
+WITH_CHECKSUM = (
+    *("vectornav_binary", "stim300", "xsens_mtdata2", "vectornav_ascii", "witmotion"),
+    *("epson_uart-g366pdg0", "microstrain_mip", "sbg_ecom", "silicon_sensing_dmu"),
+)
 
 
 @pytest.fixture(params=("vectornav_binary", "dbc", "ros2_imu", "samples", "text"))

@@ -25,6 +25,7 @@ from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
+from tests.experiments.fuzz.binary_formats import BINARY_FORMATS
 from tests.experiments.fuzz.checked_clock import CheckedClock
 from tests.experiments.fuzz.checks import feed_and_check, summarize_blocks
 from tests.experiments.fuzz.formats import FORMATS, is_subsequence
@@ -38,6 +39,7 @@ MAX_CALLS: Final = 4
 MAX_TIMED_BLOCKS: Final = 6
 """Limit of the blocks that are passed to the clock, which has a separate target."""
 START_NS: Final = 1_000_000_000
+STREAM_FORMATS: Final = {**FORMATS, **BINARY_FORMATS}
 RATES_HZ: Final = (None, 100.0, 1000.0, 12.5)
 EXTRA_EXAMPLES: Final = (
     Example("vectornav_binary", {"compensated": True}),
@@ -101,7 +103,7 @@ def make_stream_check(name: str) -> Check:
         reader = InputReader(data)
         i = reader.read_byte() % len(_examples(name))
         settings = _examples(name)[i].settings
-        form = FORMATS["text-nmea" if settings.get("nmea") else name]
+        form = STREAM_FORMATS["text-nmea" if settings.get("nmea") else name]
         step, rate, pace = 1 + reader.read_byte(), reader.choose(RATES_HZ), reader.read_byte()
         build, keys = _settings(name, i)
         wire = _build_stream(reader, lambda part: form.wrap(part, settings), build(keys))
@@ -133,7 +135,7 @@ def make_wire_check(name: str) -> Check:
     def check(data: bytes) -> None:
         i = data[0] % len(_examples(name)) if data else 0
         settings = _examples(name)[i].settings
-        form = FORMATS["text-nmea" if settings.get("nmea") else name]
+        form = STREAM_FORMATS["text-nmea" if settings.get("nmea") else name]
         build, keys = _settings(name, i)
         one, wire = build(keys), data[1:]
         whole = feed_and_check(one, [[Chunk(wire, START_NS)]])
@@ -171,15 +173,28 @@ def stream_seeds(name: str) -> Iterator[bytes]:
         yield head + encode_pieces(encoded, b"\0")
         yield head + b"\5\x18" + rng.bytes(24) + b"\0\x09rubbish\r\n" + b"\5\x18" + rng.bytes(24)
         yield head + b"\1\x20" + rng.bytes(32) + b"\4\1\7" + b"\2\x20" + rng.bytes(32) + b"\3\x20" + rng.bytes(32)
-        inner = {"vectornav_binary": encoded[1:-2], "xsens_mtdata2": encoded[4:-1], "stim300": encoded[:-4]}.get(
-            name, encoded
-        )
+        inner = encoded[CONTENT.get(name, slice(None))]
         if example.name in ("text", "vectornav_ascii"):
             inner = inner.strip().strip(b"$").partition(b"\r")[0].rpartition(b"*")[0] or inner
         yield head + b"".join(b"\1" + bytes([len(part)]) + part for part in [inner[:190]] * 4)
 
 
+CONTENT: Final = {
+    "epson_uart": slice(1, -3),
+    "microstrain_mip": slice(4, -2),
+    "sbg_ecom": slice(6, -3),
+    "silicon_sensing_dmu": slice(2, -2),
+    "stim300": slice(0, -4),
+    "vectornav_binary": slice(1, -2),
+    "xsens_mtdata2": slice(4, -1),
+}
+"""Part of an encoded frame that ``Format.wrap`` takes."""
+
 WORDS: Final = {
+    "epson_uart": (b"\x80", b"\x0d", b"\xfe\0", b"\xfe\1"),
+    "microstrain_mip": (b"\x75\x65\x80", b"\x0e\4", b"\x0e\5", b"\x0e\7", b"\x0e\x08", b"\x0a\xd6", b"\4\x18"),
+    "sbg_ecom": (b"\xff\x5a\x2c\0\x20\0", b"\xff\x5a\3\0\x3a\0", b"\xff\5", b"\xff\3", b"\x33", b"\0\0\xc0\x7f"),
+    "silicon_sensing_dmu": (b"\x55\xaa", b"\x7f\xc0\0\0", b"\xff\x80\0\0"),
     "text": ("nan", "inf", "-inf", "1e308", "1e-320", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
     "vectornav_ascii": ("$VNIMU,", "$VNYMR,", "nan", "inf", "*XX", "\r\n", "1e999"),
     "xsens_mtdata2": (b"\xfa\xff\x36", b"\x40\x20\x0c", b"\x80\x20\x0c", b"\x10\x60\x04", b"\x08\x10\x04", b"\x7f\xc0"),
