@@ -81,6 +81,10 @@ XSENS = Example("xsens_mtdata2", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT3
 WITMOTION = Example("witmotion", {}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 0.01, checksum=True)
 
 LISTED_EXAMPLES = (
+    Example("aceinna_dmu", {}, 1260 * DEGREE / 2**16, 20 * G / 2**16, 200 / 2**16, checksum=True),
+    Example("aceinna_dmu", {"packet": "S0"}, 1260 * DEGREE / 2**16, 20 * G / 2**16, 200 / 2**16, checksum=True),
+    Example("aceinna_dmu", {"packet": "z1"}, DEGREE * 2.0**-17, 8 * FLOAT32_STEP, None, checksum=True),
+    Example("aceinna_dmu", {"packet": "s1", "accel_unit": "g"}, DEGREE * 2.0**-17, G * FLOAT32_STEP, 1e-5, True),
     TEXT,
     Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),
     Example("text", {"columns": ("t", "-", *COLUMNS), "time_unit": "ms"}, 1e-14, 1e-13, 1e-13),

@@ -27,11 +27,14 @@ from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
 from tests.experiments.fuzz.checked_clock import CheckedClock
 from tests.experiments.fuzz.checks import feed_and_check, summarize_blocks
-from tests.experiments.fuzz.formats import FORMATS, is_subsequence
+from tests.experiments.fuzz.formats import FORMATS as BASIC_FORMATS
+from tests.experiments.fuzz.formats import is_subsequence
+from tests.experiments.fuzz.framed_formats import FRAMED_FORMATS
 from tests.experiments.fuzz.input_reader import InputReader, encode_pieces
 from tests.experiments.fuzz.target import Check, target
 from tests.support.settings import read_settings
 
+FORMATS: Final = BASIC_FORMATS | FRAMED_FORMATS
 MAX_STREAM_BYTES: Final = 3000
 """Limit of the length of a stream in bytes, including repetitions."""
 MAX_CALLS: Final = 4
@@ -180,6 +183,7 @@ def stream_seeds(name: str) -> Iterator[bytes]:
 
 
 WORDS: Final = {
+    "aceinna_dmu": (b"UUS0\x1e", b"UUS1\x18", b"UUz1\x28", b"UUs1\x34", b"\0\0\xc0\x7f"),
     "text": ("nan", "inf", "-inf", "1e308", "1e-320", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
     "vectornav_ascii": ("$VNIMU,", "$VNYMR,", "nan", "inf", "*XX", "\r\n", "1e999"),
     "xsens_mtdata2": (b"\xfa\xff\x36", b"\x40\x20\x0c", b"\x80\x20\x0c", b"\x10\x60\x04", b"\x08\x10\x04", b"\x7f\xc0"),
