@@ -43,7 +43,7 @@ class Example:
 
     name: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    gyro_step: float = 1e-3  # rad/s; value of the last bit or digit
+    gyro_step: float | None = 1e-3  # rad/s; value of the last bit or digit; None if the format has no angular rates
     accel_step: float = 1e-2  # m/s²
     temperature_step: float | None = 0.5  # °C; None if the format has no temperature
     checksum: bool = False  # True if every damaged byte is detected
@@ -85,6 +85,7 @@ LISTED_EXAMPLES = (
     Example("aceinna_dmu", {"packet": "S0"}, 1260 * DEGREE / 2**16, 20 * G / 2**16, 200 / 2**16, checksum=True),
     Example("aceinna_dmu", {"packet": "z1"}, DEGREE * 2.0**-17, 8 * FLOAT32_STEP, None, checksum=True),
     Example("aceinna_dmu", {"packet": "s1", "accel_unit": "g"}, DEGREE * 2.0**-17, G * FLOAT32_STEP, 1e-5, True),
+    Example("bno08x_rvc", {}, None, 1e-3 * G, None, checksum=True),
     TEXT,
     Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),
     Example("text", {"columns": ("t", "-", *COLUMNS), "time_unit": "ms"}, 1e-14, 1e-13, 1e-13),

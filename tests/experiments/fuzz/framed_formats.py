@@ -51,6 +51,22 @@ def _aceinna_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
             yield (*(DEGREE * x for x in floats[3:]), *(unit * x for x in floats[:3]))
 
 
+# --- BNO08x RVC
+
+
+def _rvc_wrap(data: bytes, settings: Settings) -> bytes:
+    body = data[:16].ljust(16, b"\0")
+    return b"\xaa\xaa" + body + bytes([sum(body) % 256])
+
+
+def _rvc_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
+    for at in find_offsets(stream, b"\xaa\xaa"):
+        frame = stream[at : at + 19]
+        if len(frame) == 19 and sum(frame[2:18]) % 256 == frame[18]:
+            yield (None, None, None, *(G * x / 1000 for x in struct.unpack_from("<3h", frame, 9)))
+
+
 FRAMED_FORMATS: Final = {
     "aceinna_dmu": Format(_aceinna_wrap, _aceinna_readings),
+    "bno08x_rvc": Format(_rvc_wrap, _rvc_readings),
 }
