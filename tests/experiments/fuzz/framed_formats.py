@@ -7,6 +7,7 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
+from drivers.decoders.binary_frames.ublox_esf import CLASSES
 from tests.experiments.fuzz.formats import (
     DEGREE,
     Format,
@@ -14,6 +15,7 @@ from tests.experiments.fuzz.formats import (
     Reading,
     Settings,
     compute_crc,
+    compute_xor,
     find_offsets,
     has_finite_values,
 )
@@ -66,7 +68,82 @@ def _rvc_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
             yield (None, None, None, *(G * x / 1000 for x in struct.unpack_from("<3h", frame, 9)))
 
 
+# --- u-blox
+
+UBLOX_AXES: Final = {14: 0, 13: 1, 5: 2, 16: 3, 17: 4, 18: 5}
+
+
+def _ublox_check(body: bytes) -> bytes:
+    a = b = 0
+    for byte in body:
+        a = (a + byte) % 256
+        b = (b + a) % 256
+    return bytes([a, b])
+
+
+def _ublox_wrap(data: bytes, settings: Settings) -> bytes:
+    """Build a message with any measurements, an NMEA sentence or another message."""
+    is_meas = settings.get("message") == "esf-meas"
+    head, data = data[:1], data[1:]
+    if head > b"\xf0":
+        return b"$%b*%02X\r\n" % (b"GNGGA,1,2", compute_xor(b"GNGGA,1,2"))
+    if head > b"\xe0":
+        code, payload = b"\x01\x07", data
+    elif is_meas:
+        code, payload = b"\x10\x02", data[: len(data) // 4 * 4].ljust(8, b"\0")
+    else:
+        code, payload = b"\x10\x03", bytes(4) + data[: len(data) // 8 * 8]
+    body = code + len(payload).to_bytes(2, "little") + payload
+    return b"\xb5\x62" + body + _ublox_check(body)
+
+
+def _ublox_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
+    """Return each complete set of axes whose tags are close to the tag of its first measurement."""
+    is_meas = settings.get("message") == "esf-meas"
+    modulus, window = (1 << 32, 5) if is_meas else (1 << 24, 0)
+    partial: dict[int, float] = {}
+    first = 0
+    for tag, word in _ublox_measurements(stream, is_meas):
+        axis = UBLOX_AXES.get(word >> 24 & 63)
+        if axis is None:
+            continue
+        apart = abs(tag % modulus - first)
+        if axis in partial or min(apart, modulus - apart) > window:
+            partial = {}
+        if not partial:
+            first = tag % modulus
+        number = word % (1 << 24)
+        number -= (number >> 23) << 24
+        partial[axis] = number * (DEGREE / 4096 if axis < 3 else 1 / 1024)
+        if len(partial) == 6:
+            yield tuple(partial[i] for i in range(6))
+            partial = {}
+
+
+def _ublox_measurements(stream: bytes, is_meas: bool) -> Iterator[tuple[int, int]]:
+    """Yield the tags and words of all messages, without the messages inside of others."""
+    end = 0
+    for at in find_offsets(stream, b"\xb5\x62"):
+        size = int.from_bytes(stream[at + 4 : at + 6], "little")
+        frame = stream[at : at + 8 + size]
+        if at < end or len(frame) < 8 + size or size > 4096 or _ublox_check(frame[2:-2]) != frame[-2:]:
+            continue
+        payload = frame[6:-2]
+        if frame[2:4] == b"\x10\x03" and size % 8 == 4:
+            end = at + len(frame)
+            words = struct.unpack(f"<{size // 4}I", payload)
+            yield from () if is_meas else zip(words[2::2], words[1::2], strict=True)
+        elif frame[2:4] == b"\x10\x02" and size % 4 == 0 and size >= 8:
+            end = at + len(frame)
+            words = struct.unpack(f"<{size // 4}I", payload)
+            measured = words[2:-1] if payload[4] & 8 else words[2:]
+            yield from ((words[0], word) for word in measured) if is_meas else ()
+        elif frame[2:4] not in (b"\x10\x03", b"\x10\x02") and frame[2] in CLASSES:
+            end = at + len(frame)
+
+
 FRAMED_FORMATS: Final = {
     "aceinna_dmu": Format(_aceinna_wrap, _aceinna_readings),
     "bno08x_rvc": Format(_rvc_wrap, _rvc_readings),
+    "ublox_esf": Format(_ublox_wrap, _ublox_readings),
 }

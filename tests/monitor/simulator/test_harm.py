@@ -126,12 +126,22 @@ def count_needed_samples(kinds: np.ndarray, samples: int, fault: FaultKind) -> i
     return samples + int(np.flatnonzero((enough_faults & intact)[samples - 1 :])[0])
 
 
-WITH_COUNTER = ("aceinna_dmu", "bno08x_rvc", "vectornav_binary", "stim300", "xsens_mtdata2", "ros2_imu", "samples")
+WITH_COUNTER = (
+    "aceinna_dmu",
+    "bno08x_rvc",
+    "vectornav_binary",
+    "stim300",
+    "ublox_esf",
+    "xsens_mtdata2",
+    "ros2_imu",
+    "samples",
+)
 WITH_CHECKSUM = (
     "aceinna_dmu",
     "bno08x_rvc",
     "vectornav_binary",
     "stim300",
+    "ublox_esf",
     "xsens_mtdata2",
     "vectornav_ascii",
     "witmotion",
