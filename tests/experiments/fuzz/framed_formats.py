@@ -68,6 +68,49 @@ def _rvc_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
             yield (None, None, None, *(G * x / 1000 for x in struct.unpack_from("<3h", frame, 9)))
 
 
+# --- NovAtel
+
+
+def _novatel_check(body: bytes) -> bytes:
+    """Return the CRC-32, bit by bit."""
+    register = 0
+    for byte in body:
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ (0xEDB88320 if register & 1 else 0)
+    return register.to_bytes(4, "little")
+
+
+def _novatel_wrap(data: bytes, settings: Settings) -> bytes:
+    """Build a log of a STIM300 with any values and often a valid time, or another log."""
+    head, payload = data[:1], data[1:41].ljust(40, b"\0")
+    if head < b"\xc0":
+        payload = b"\0\x20" + payload[2:4] + struct.pack("<d", payload[4] * 2000.0) + payload[12:]
+    if head < b"\x80":
+        body = b"\xaa\x44\x13\x28" + struct.pack("<H", 1462) + bytes(6) + payload
+    elif head < b"\xe0":
+        body = b"\xaa\x44\x12\x1c" + struct.pack("<HHH", 1461, 0, 40) + bytes(18) + payload
+    else:
+        body = b"\xaa\x44\x13" + bytes([len(data[1:]) % 256]) + b"\1\2" + bytes(6) + data[1 : 1 + len(data[1:]) % 256]
+    return body + _novatel_check(body)
+
+
+def _novatel_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
+    gyro, accel = DEGREE * 125 / 2**21, 125 / 2**22
+    for at in find_offsets(stream, b"\xaa\x44"):
+        head = 12 if stream[at + 2 : at + 4] == b"\x13\x28" else stream[at + 3] if at + 3 < len(stream) else 0
+        is_long = stream[at + 2 : at + 3] == b"\x12" and head >= 28 and stream[at + 8 : at + 10] == b"\x28\0"
+        frame = stream[at : at + head + 44]
+        if not (is_long or stream[at + 2 : at + 4] == b"\x13\x28") or len(frame) < head + 44:
+            continue
+        if _novatel_check(frame[:-4]) != frame[-4:] or frame[4:6] not in (b"\xb6\5", b"\xb5\5"):
+            continue
+        info, kind, _, seconds, _, *numbers = struct.unpack("<BBHdI6i", frame[head:-4])
+        if kind == 32 and not info & 3 and 0 <= seconds < 604800:
+            az, ay, ax, gz, gy, gx = numbers
+            yield (gyro * gx, -gyro * gy, gyro * gz, accel * ax, -accel * ay, accel * az)
+
+
 # --- u-blox
 
 UBLOX_AXES: Final = {14: 0, 13: 1, 5: 2, 16: 3, 17: 4, 18: 5}
@@ -145,5 +188,6 @@ def _ublox_measurements(stream: bytes, is_meas: bool) -> Iterator[tuple[int, int
 FRAMED_FORMATS: Final = {
     "aceinna_dmu": Format(_aceinna_wrap, _aceinna_readings),
     "bno08x_rvc": Format(_rvc_wrap, _rvc_readings),
+    "novatel_rawimusx": Format(_novatel_wrap, _novatel_readings),
     "ublox_esf": Format(_ublox_wrap, _ublox_readings),
 }

@@ -129,6 +129,7 @@ def count_needed_samples(kinds: np.ndarray, samples: int, fault: FaultKind) -> i
 WITH_COUNTER = (
     "aceinna_dmu",
     "bno08x_rvc",
+    "novatel_rawimusx",
     "vectornav_binary",
     "stim300",
     "ublox_esf",
@@ -139,6 +140,7 @@ WITH_COUNTER = (
 WITH_CHECKSUM = (
     "aceinna_dmu",
     "bno08x_rvc",
+    "novatel_rawimusx",
     "vectornav_binary",
     "stim300",
     "ublox_esf",
