@@ -115,6 +115,8 @@ LISTED_EXAMPLES = (
     Example("witmotion", {"temperature": "jy61"}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 1 / 340, True),
     Example("ublox_esf", {}, DEGREE / 2**12, 2.0**-10, 0.01, checksum=True),
     Example("ublox_esf", {"message": "esf-meas"}, DEGREE / 2**12, 2.0**-10, 0.01, checksum=True),
+    Example("inertial_labs", {}, 1e-5 * DEGREE, 1e-6 * G, 0.1, checksum=True),
+    Example("inertial_labs", {"message": "calibrated-hr"}, 1e-5 * DEGREE, 1e-6 * G, 0.1, checksum=True),
     Example("novatel_rawimusx", {}, 125 * DEGREE / 2**21, 125 / 2**22, None, checksum=True),
     Example("dbc", {"signals": CAN_SIGNALS}, 2.0**-9, 2.0**-8, 2.0**-8),
     Example("ros2_imu", {}, 1e-15, 1e-14, None),

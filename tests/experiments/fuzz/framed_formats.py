@@ -68,6 +68,31 @@ def _rvc_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
             yield (None, None, None, *(G * x / 1000 for x in struct.unpack_from("<3h", frame, 9)))
 
 
+# --- Inertial Labs
+
+INERTIAL_LABS_PAYLOADS: Final = {0x8F: (32, 0, 26), 0x81: (52, 12, 46)}  # size, offset of the rates and of the status
+
+
+def _inertial_labs_wrap(data: bytes, settings: Settings) -> bytes:
+    code = 0x82 if data[:1] > b"\xe0" else 0x8F if data[:1] < b"\x80" else 0x81
+    size = INERTIAL_LABS_PAYLOADS.get(code, (len(data), 0, 0))[0]
+    body = bytes([1, code]) + (size + 6).to_bytes(2, "little") + data[1 : 1 + size].ljust(size, b"\0")
+    return b"\xaa\x55" + body + (sum(body) % 65536).to_bytes(2, "little")
+
+
+def _inertial_labs_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
+    for at in find_offsets(stream, b"\xaa\x55\1"):
+        size, start, status_at = INERTIAL_LABS_PAYLOADS.get(stream[at + 3] if at + 3 < len(stream) else 0, (0, 0, 0))
+        frame = stream[at : at + size + 8]
+        if not size or len(frame) < size + 8 or int.from_bytes(frame[4:6], "little") != size + 6:
+            continue
+        if (sum(frame[2:-2]) % 65536).to_bytes(2, "little") != frame[-2:]:
+            continue
+        numbers = struct.unpack_from("<6i", frame, 6 + start)
+        if not int.from_bytes(frame[6 + status_at : 8 + status_at], "little") & 0x1C2C:
+            yield (*(DEGREE * x / 1e5 for x in numbers[:3]), *(G * x / 1e6 for x in numbers[3:]))
+
+
 # --- NovAtel
 
 
@@ -188,6 +213,7 @@ def _ublox_measurements(stream: bytes, is_meas: bool) -> Iterator[tuple[int, int
 FRAMED_FORMATS: Final = {
     "aceinna_dmu": Format(_aceinna_wrap, _aceinna_readings),
     "bno08x_rvc": Format(_rvc_wrap, _rvc_readings),
+    "inertial_labs": Format(_inertial_labs_wrap, _inertial_labs_readings),
     "novatel_rawimusx": Format(_novatel_wrap, _novatel_readings),
     "ublox_esf": Format(_ublox_wrap, _ublox_readings),
 }

@@ -129,6 +129,7 @@ def count_needed_samples(kinds: np.ndarray, samples: int, fault: FaultKind) -> i
 WITH_COUNTER = (
     "aceinna_dmu",
     "bno08x_rvc",
+    "inertial_labs",
     "novatel_rawimusx",
     "vectornav_binary",
     "stim300",
@@ -140,6 +141,7 @@ WITH_COUNTER = (
 WITH_CHECKSUM = (
     "aceinna_dmu",
     "bno08x_rvc",
+    "inertial_labs",
     "novatel_rawimusx",
     "vectornav_binary",
     "stim300",
