@@ -30,7 +30,7 @@ def render_text(print_result: "Callable[[Console], None]") -> str:
     return "\n".join(line.rstrip() for line in text.getvalue().rstrip().splitlines())
 
 
-def render_html(text: str, figures: Sequence[str] = ()) -> str:
+def render_html(text: str, figures: Sequence[str] = (), width_em: float = 60.0) -> str:
     """Return HTML for a notebook that shows a text in a fixed-width font, followed by SVG elements.
 
     Parameters
@@ -39,8 +39,10 @@ def render_html(text: str, figures: Sequence[str] = ()) -> str:
         Text of the result.
     figures
         SVG elements.
+    width_em
+        Largest width of a figure, in multiples of the font size.
     """
-    drawn = "".join(f'<div style="max-width:60em;background:white">{figure}</div>' for figure in figures)
+    drawn = "".join(f'<div style="max-width:{width_em:g}em;background:white">{figure}</div>' for figure in figures)
     return f'<pre style="line-height:1.3">{html.escape(text)}</pre>{drawn}'
 
 

@@ -49,7 +49,15 @@ DECODERS = ROOT / "docs" / "decoders.md"
 CONNECTING_SENSORS = ROOT / "docs" / "connecting-sensors.md"
 VIEWER = ROOT / "docs" / "viewer.md"
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
-PAGES = sorted([README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted(
+    [
+        README,
+        ROOT / "CHANGELOG.md",
+        ROOT / "CONTRIBUTING.md",
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "docs").rglob("*.ipynb"),
+    ]
+)
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 ENDPOINT_IN_PAGES = "tcp/127.0.0.1:7450"
 

@@ -84,6 +84,19 @@ class LateFrameCountingDecoder(Protocol):
         """Message that states the delay of late frames and suggests a remedy; "" if no frame was late recently."""
 
 
+@runtime_checkable
+class FilterReportingDecoder(Protocol):
+    """Interface of a decoder for sensors that can send values which their own filter has corrected."""
+
+    @property
+    def on_board_filter_note(self) -> str:
+        """Note that the samples are corrected by a filter of the sensor; "" if they are not corrected."""
+
+
+ON_BOARD_FILTER_NOTE: Final = (
+    "the filter of the sensor has corrected these angular rates, which hides bias instability B and random walk K"
+)
+
 HINT_FRAMES: Final = 1000
 """Number of valid frames after which an earlier rejected frame is no longer reported."""
 

@@ -17,7 +17,7 @@ import numpy as np
 import drivers.decoders
 from drivers import module_lookup
 from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Timing, make_block, ns_to_seconds
-from drivers.decoders.base import Decoder, LateFrameCountingDecoder
+from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
@@ -195,6 +195,8 @@ def _describe_losses(blocks: list[SampleBlock], decoder: Decoder, clock: SampleC
     if isinstance(decoder, LateFrameCountingDecoder) and decoder.dropped_late_samples:
         hint = f": {decoder.late_frames_hint}" if decoder.late_frames_hint else ""
         yield f"{format_count(decoder.dropped_late_samples, 'sample')} left out because of late frames{hint}."
+    if isinstance(decoder, FilterReportingDecoder) and (note := decoder.on_board_filter_note):
+        yield f"{note[0].upper()}{note[1:]}."
     if clock.dropped_repeated_rows:
         yield f"{format_count(clock.dropped_repeated_rows, 'repeated sample')} left out."
     jumps = [event.text for event in clock.take_events(ended=True) if event.kind == "clock_jumped"]

@@ -349,6 +349,16 @@ def test_status_text_names_the_window_if_all_can_frames_are_late():
     assert rig.driver.text.endswith(f" bytes without a sample; {LATE_FRAME_HINT}")
 
 
+def test_status_names_the_decoder_that_fits_undecoded_bytes():
+    encoder = stim300.build(stim300.Settings())
+    with run_driver() as rig:
+        for chunk in encoder.encode(make_samples(0, 200, tick_s=1.0, modulus=256)):
+            rig.link.write(chunk.data)
+        rig.wait_until(lambda: 'the bytes fit decoder = "stim300"' in rig.driver.text)
+        rig.send(50)
+        rig.wait_until(lambda: rig.driver.state == "running" and not rig.driver.text)
+
+
 def test_times_are_unix_if_the_link_has_unix_times():
     rig = DriverRig()
     rig.link.epoch = "unix"

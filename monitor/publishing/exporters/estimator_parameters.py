@@ -235,7 +235,7 @@ PARAMETER_FILES: Final = (
         KALIBR_PARAMETERS,
         notes=(
             "Kalibr's wiki, IMU Noise Model: a sensor at rest at constant temperature has less noise; for the",
-            "lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
+            "lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (inflation 10)",
         ),
         before=KALIBR_LINES,
     ),

@@ -115,9 +115,9 @@ def create_figure(width: float, height: float, layout: Literal["constrained"] | 
         By default, matplotlib arranges the panels so that labels do not overlap. With None, panels keep their
         positions.
     """
-    from matplotlib.figure import Figure
+    from monitor.publishing.plots.notebook_figure import NotebookFigure
 
-    return Figure(figsize=(width, height), layout=layout)
+    return NotebookFigure(figsize=(width, height), layout=layout)
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
