@@ -1,7 +1,8 @@
 """u-blox receivers with an inertial sensor (NEO-M8U, NEO-M8L, ZED-F9R, ZED-F9K): UBX-ESF-RAW and UBX-ESF-MEAS.
 
 The format is ``B5 62 | class u8 | ID u8 | length u16 | payload | CK_A CK_B``, little-endian. The two checksum bytes are
-the Fletcher-8 sums over class, ID, length and payload. NMEA sentences between the messages are skipped. Payloads:
+the Fletcher-8 sums over class, ID, length and payload. Other UBX messages and NMEA sentences are ignored. Bytes of
+other protocols, such as RTCM, count as lost messages. Payloads:
 
 - ESF-MEAS (10 02): ``time tag u32 in ms | flags u16 | id u16 | measurements u32``. If bit 3 of the flags is set, the
   last u32 is a calibrated time tag and not a measurement.
@@ -89,9 +90,9 @@ class UbloxEsfDecoder(base.FrameStreamDecoder):
         if settings.clock == "time_tag":
             self.timing = CounterTimedFormat(self._modulus, tick_s)
         self._temperature_c = math.nan
-        self._forget_partial_sample()
+        self._forget_assembly_state()
 
-    def _forget_partial_sample(self) -> None:
+    def _forget_assembly_state(self) -> None:
         self._partial: dict[int, int] = {}  # measurements of the incomplete sample by column
         self._tag = NO_TICK  # time tag of the first of these measurements
         self._rejected = 0  # number of rejected frames since the last sample
@@ -103,7 +104,7 @@ class UbloxEsfDecoder(base.FrameStreamDecoder):
     def forget_stream_state(self) -> None:
         """Discard a partially received message and an incomplete sample."""
         super().forget_stream_state()
-        self._forget_partial_sample()
+        self._forget_assembly_state()
 
     @property
     def recent_problem(self) -> str:
