@@ -106,6 +106,7 @@ def _check_configured(config: Config) -> Iterator[Finding]:
     yield from _check_storage(config)
     yield from _check_metrics(config)
     yield from _check_influx(config)
+    yield from _check_ros2(config)
     yield from _check_reconcile(config)
     for hook in config.hooks:
         if hook.command:
@@ -327,6 +328,11 @@ def _check_influx(config: Config) -> Iterator[Finding]:
     if parts.scheme == "http" and not host.startswith(LOOPBACK):
         text = f"{host}: everyone on the network between can read the results and the token"
         yield _doubt("influx", text, "use https")
+
+
+def _check_ros2(config: Config) -> Iterator[Finding]:
+    for endpoint in config.ros2.connect if config.ros2 is not None else ():
+        yield _check_reachable("ros2", endpoint)
 
 
 def _check_reconcile(config: Config) -> Iterator[Finding]:

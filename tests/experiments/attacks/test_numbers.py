@@ -208,7 +208,7 @@ def iter_config_tables() -> Iterator[tuple[str, type[SettingsModel], str]]:
     yield DEVICE.format(keys="", driver=VIRTUAL + "\n{}"), driver_settings.VirtualTable, "virtual"
     for name, kind in (
         ("viewer", schema.ViewerTable), ("metrics", schema.MetricsTable), ("influx", schema.InfluxTable),
-        ("log", schema.LogTable),
+        ("ros2", schema.Ros2Table), ("log", schema.LogTable),
     ):  # fmt: skip
         yield virtual + f"[{name}]\n{{}}\n", kind, name
     yield virtual + '[storage]\nfolder = "kept"\n{}\n', schema.Storage, "storage"
@@ -258,7 +258,7 @@ def test_every_kind_of_numeric_key_is_found() -> None:
     for expected in (
         ("device", "rate"), ("device", "tau"), ("device", "refit"), ("device", "alarms_per_day"), ("limit", "hold"),
         ("faults", "jitter"), ("virtual", "seed"), ("virtual", "silence"), ("viewer", "memory"), ("viewer", "port"),
-        ("storage", "keep"), ("hook", "timeout"), ("metrics", "listen"), ("influx", "interval"),
+        ("storage", "keep"), ("hook", "timeout"), ("metrics", "listen"), ("influx", "interval"), ("ros2", "domain"),
         ("link serial", "baudrate"),
         ("link can", "bitrate"), ("link replay", "bytes_per_second"), ("decoder text", "scale"),
         ("decoder dbc", "tick"),

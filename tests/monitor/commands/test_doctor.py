@@ -237,6 +237,17 @@ def test_unprotected_listening_beyond_this_machine_is_found(tmp_path: Path) -> N
     assert "everyone who reaches this machine can read the metrics" in str(select_findings(found, "metrics"))
 
 
+def test_router_of_ros2_is_checked(tmp_path: Path) -> None:
+    def check(port: int) -> list[Finding]:
+        text = VIRTUAL + QUIET + f'[ros2]\ndomain = 0\nconnect = ["tcp/127.0.0.1:{port}"]\n'
+        return select_findings(examine_config(tmp_path, text), "ros2")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert [one.mark for one in check(port)] == ["well"]
+    assert [one.mark for one in check(port)] == ["doubt"]
+
+
 def test_influx_server_and_token_are_checked(tmp_path: Path) -> None:
     token = tmp_path / "token"
     token.write_text("s3cret")
