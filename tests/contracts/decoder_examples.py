@@ -43,7 +43,7 @@ class Example:
 
     name: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    gyro_step: float = 1e-3  # rad/s; value of the last bit or digit
+    gyro_step: float | None = 1e-3  # rad/s; value of the last bit or digit; None if the format has no angular rates
     accel_step: float = 1e-2  # m/s²
     temperature_step: float | None = 0.5  # °C; None if the format has no temperature
     checksum: bool = False  # True if every damaged byte is detected
@@ -82,6 +82,11 @@ XSENS = Example("xsens_mtdata2", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT3
 WITMOTION = Example("witmotion", {}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 0.01, checksum=True)
 
 LISTED_EXAMPLES = (
+    Example("aceinna_dmu", {}, 1260 * DEGREE / 2**16, 20 * G / 2**16, 200 / 2**16, checksum=True),
+    Example("aceinna_dmu", {"packet": "S0"}, 1260 * DEGREE / 2**16, 20 * G / 2**16, 200 / 2**16, checksum=True),
+    Example("aceinna_dmu", {"packet": "z1"}, DEGREE * 2.0**-17, 8 * FLOAT32_STEP, None, checksum=True),
+    Example("aceinna_dmu", {"packet": "s1", "accel_unit": "g"}, DEGREE * 2.0**-17, G * FLOAT32_STEP, 1e-5, True),
+    Example("bno08x_rvc", {}, None, 1e-3 * G, None, checksum=True),
     TEXT,
     Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),
     Example("text", {"columns": ("t", "-", *COLUMNS), "time_unit": "ms"}, 1e-14, 1e-13, 1e-13),
@@ -119,6 +124,11 @@ LISTED_EXAMPLES = (
     Example("sbg_ecom", {"message": "imu_data"}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
     Example("silicon_sensing_dmu", {}, FLOAT32_STEP, G * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
     Example("silicon_sensing_dmu", {"length": 40}, FLOAT32_STEP, G * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
+    Example("ublox_esf", {}, DEGREE / 2**12, 2.0**-10, 0.01, checksum=True),
+    Example("ublox_esf", {"message": "esf-meas"}, DEGREE / 2**12, 2.0**-10, 0.01, checksum=True),
+    Example("inertial_labs", {}, 1e-5 * DEGREE, 1e-6 * G, 0.1, checksum=True),
+    Example("inertial_labs", {"message": "calibrated-hr"}, 1e-5 * DEGREE, 1e-6 * G, 0.1, checksum=True),
+    Example("novatel_rawimusx", {}, 125 * DEGREE / 2**21, 125 / 2**22, None, checksum=True),
     Example("dbc", {"signals": CAN_SIGNALS}, 2.0**-9, 2.0**-8, 2.0**-8),
     Example("ros2_imu", {}, 1e-15, 1e-14, None),
     Example("samples", {}, 1e-15, 1e-14, 1e-14),

@@ -28,18 +28,20 @@ from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_
 from tests.experiments.fuzz.binary_formats import BINARY_FORMATS
 from tests.experiments.fuzz.checked_clock import CheckedClock
 from tests.experiments.fuzz.checks import feed_and_check, summarize_blocks
-from tests.experiments.fuzz.formats import FORMATS, is_subsequence
+from tests.experiments.fuzz.formats import FORMATS as BASIC_FORMATS
+from tests.experiments.fuzz.formats import is_subsequence
+from tests.experiments.fuzz.framed_formats import FRAMED_FORMATS
 from tests.experiments.fuzz.input_reader import InputReader, encode_pieces
 from tests.experiments.fuzz.target import Check, target
 from tests.support.settings import read_settings
 
+FORMATS: Final = BASIC_FORMATS | BINARY_FORMATS | FRAMED_FORMATS
 MAX_STREAM_BYTES: Final = 3000
 """Limit of the length of a stream in bytes, including repetitions."""
 MAX_CALLS: Final = 4
 MAX_TIMED_BLOCKS: Final = 6
 """Limit of the blocks that are passed to the clock, which has a separate target."""
 START_NS: Final = 1_000_000_000
-STREAM_FORMATS: Final = {**FORMATS, **BINARY_FORMATS}
 RATES_HZ: Final = (None, 100.0, 1000.0, 12.5)
 EXTRA_EXAMPLES: Final = (
     Example("vectornav_binary", {"compensated": True}),
@@ -103,7 +105,7 @@ def make_stream_check(name: str) -> Check:
         reader = InputReader(data)
         i = reader.read_byte() % len(_examples(name))
         settings = _examples(name)[i].settings
-        form = STREAM_FORMATS["text-nmea" if settings.get("nmea") else name]
+        form = FORMATS["text-nmea" if settings.get("nmea") else name]
         step, rate, pace = 1 + reader.read_byte(), reader.choose(RATES_HZ), reader.read_byte()
         build, keys = _settings(name, i)
         wire = _build_stream(reader, lambda part: form.wrap(part, settings), build(keys))
@@ -135,7 +137,7 @@ def make_wire_check(name: str) -> Check:
     def check(data: bytes) -> None:
         i = data[0] % len(_examples(name)) if data else 0
         settings = _examples(name)[i].settings
-        form = STREAM_FORMATS["text-nmea" if settings.get("nmea") else name]
+        form = FORMATS["text-nmea" if settings.get("nmea") else name]
         build, keys = _settings(name, i)
         one, wire = build(keys), data[1:]
         whole = feed_and_check(one, [[Chunk(wire, START_NS)]])
@@ -195,7 +197,11 @@ WORDS: Final = {
     "microstrain_mip": (b"\x75\x65\x80", b"\x0e\4", b"\x0e\5", b"\x0e\7", b"\x0e\x08", b"\x0a\xd6", b"\4\x18"),
     "sbg_ecom": (b"\xff\x5a\x2c\0\x20\0", b"\xff\x5a\3\0\x3a\0", b"\xff\5", b"\xff\3", b"\x33", b"\0\0\xc0\x7f"),
     "silicon_sensing_dmu": (b"\x55\xaa", b"\x7f\xc0\0\0", b"\xff\x80\0\0"),
+    "aceinna_dmu": (b"UUS0\x1e", b"UUS1\x18", b"UUz1\x28", b"UUs1\x34", b"\0\0\xc0\x7f"),
     "text": ("nan", "inf", "-inf", "1e308", "1e-320", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
+    "inertial_labs": (b"\xaa\x55\1\x8f\x26\0", b"\xaa\x55\1\x81\x3a\0"),
+    "novatel_rawimusx": (b"\xaa\x44\x13\x28\xb6\5", b"\xaa\x44\x12\x1c\xb5\5", b"\0\x20"),
+    "ublox_esf": (b"\xb5b\x10\3", b"\xb5b\x10\2", b"\0\0\0\x0e", b"\0\0\0\x0c", b"$GNGGA,", b"*47\r\n"),
     "vectornav_ascii": ("$VNIMU,", "$VNYMR,", "nan", "inf", "*XX", "\r\n", "1e999"),
     "xsens_mtdata2": (b"\xfa\xff\x36", b"\x40\x20\x0c", b"\x80\x20\x0c", b"\x10\x60\x04", b"\x08\x10\x04", b"\x7f\xc0"),
     "vectornav_binary": (b"\xfa\1\1\2", b"\xfa\1\1\6", b"\x7f\xc0\0\0", b"\0\0\xc0\x7f"),
