@@ -39,6 +39,7 @@ from drivers.recordings.file_formats.csv_header import (
     split_fields,
 )
 from drivers.recordings.reading_options import ReadingOptions
+from drivers.recordings.reading_progress import report_read_share
 from drivers.recordings.table_layout import find_layout
 
 READ_BYTES: Final = 1 << 20
@@ -113,14 +114,14 @@ def _file_source(path: Path) -> CsvSource:
 
 def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
     """Read the columns of a CSV file on disk or in an archive. See ``read_csv``."""
-    count_csv_source_rows(source)
+    lines = count_csv_source_rows(source)
     try:
-        return _read_columns(source, options, "i8")
+        return _read_columns(source, options, "i8", lines)
     except _FractionalTimeError:
-        return _read_columns(source, options, "f8")
+        return _read_columns(source, options, "f8", lines)
 
 
-def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str) -> table.Table:
+def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, lines: int) -> table.Table:
     """Read the columns of a CSV file. Raise _FractionalTimeError if a time does not have the type ``time_type``."""
     notes: list[str] = []
     bad = _BadLines()
@@ -136,7 +137,12 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str) ->
         )
         use = list(layout.columns.values())
         dtype = np.dtype([(name, time_type if name == "t" else "f8") for name in layout.columns])
-        parts = list(_parse_pieces(label, header, texts, use, dtype, bad))
+        parts: list[Rows] = []
+        read = 0
+        for part in _parse_pieces(label, header, texts, use, dtype, bad):
+            parts.append(part)
+            read += len(part)
+            report_read_share(read, lines)
     rows = np.concatenate(parts) if parts else np.empty(0, dtype)
     if 2 * bad.count > len(rows):
         raise _too_many_bad_lines(label, bad, len(rows))

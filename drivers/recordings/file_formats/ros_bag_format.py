@@ -27,6 +27,7 @@ from drivers.recordings.file_formats.ros_message_arrays import (
     decode_messages,
     iter_message_blocks,
 )
+from drivers.recordings.reading_progress import report_read_share
 from drivers.recordings.topics import Topic, join_topics, select_topics
 
 METADATA: Final = "metadata.yaml"
@@ -195,6 +196,7 @@ def _read_messages(
     for log_times, block in iter_message_blocks(bag.messages(connections)):
         start, end = end, end + len(block)
         limit.check_row_count(end)
+        report_read_share(end, rows)
         if end > len(t_ns):  # the index states too few messages
             t_ns, numbers = np.resize(t_ns, 2 * end), np.resize(numbers, (2 * end, numbers.shape[1]))
         stamps_ns, numbers[start:end] = decode_messages(block, kind, bag.cdr)

@@ -229,7 +229,11 @@ def iter_config_tables() -> Iterator[tuple[str, type[SettingsModel], str]]:
             f"link {name}",
         )
     for name in module_lookup.list_modules(drivers.decoders):
-        wanted = {"text": 'columns = ["gz"]\n', "dbc": 'file = "canmod_gps"\nsignals = { gz = "ImuData.GyroZ" }\n'}
+        wanted = {
+            "dbc": 'file = "canmod_gps"\nsignals = { gz = "ImuData.GyroZ" }\n',
+            "epson_uart": 'model = "g366pdg0"\n',
+            "text": 'columns = ["gz"]\n',
+        }
         driver = f'link = "virtual"\ndecoder = "{name}"\n[device.driver.decoder_options]\n{wanted.get(name, "")}{{}}'
         yield (
             DEVICE.format(keys="", driver=driver),

@@ -16,6 +16,7 @@ import pytest
 
 from drivers.data_types import make_block
 from drivers.driver import AxisMap
+from drivers.extras import install_command
 from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter
 from monitor.commands import doctor
@@ -192,7 +193,7 @@ def test_missing_package_of_a_can_interface_is_named(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "msgpack", None)  # as if it were not installed
     found = doctor.check_can_interface("device a", "udp_multicast", "239.74.163.2")
     assert (found.mark, found.text) == ("wrong", "CAN interface udp_multicast needs the package msgpack")
-    assert found.do == 'pip install "imu-monitor[multicast]"'
+    assert found.do == install_command("imu-monitor[multicast]")
 
 
 # --- outputs

@@ -203,7 +203,7 @@ INVALID_CONFIGS = {
     ),
     "protocol missing": (
         format_device(driver='driver = { link = "serial", port = "x" }'),
-        ["driver.decoder: missing; possible are dbc, "],
+        ["driver.decoder: missing; possible are aceinna_dmu, "],
     ),
     "decoder that is no text": (
         format_device(driver='driver = { link = "serial", port = "x", decoder = 3 }'),
