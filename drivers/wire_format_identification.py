@@ -30,6 +30,8 @@ MIN_MATCHING_LINES: Final = 0.9
 TEXT_DECODER: Final = "text"
 NMEA_SENTENCE: Final = re.compile(r"\$(.*)\*[0-9A-Fa-f]{2}")
 DELIMITERS: Final = (",", ";", "\t", " ")
+UNKNOWN: Final = "?"
+"""Value of an option that the bytes do not determine, such as the sensor model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,17 +68,20 @@ def identify_wire_format(data: bytes) -> IdentifiedFormat | None:
 
 
 def _list_option_sets(settings: type[SettingsModel]) -> Iterator[dict[str, Any]]:
-    """Yield no options, then each other value of every option that is a choice or a flag."""
-    yield {}
+    """Yield the required options, then also each other value of every option that is a choice or a flag.
+
+    A required option that is a choice has its first value.
+    """
+    choices: dict[str, tuple[Any, ...]] = {}
     for key, info in settings.model_fields.items():
-        choices: tuple[Any, ...] = ()
         if info.annotation is bool:
-            choices = (False, True)
+            choices[key] = (False, True)
         elif get_origin(info.annotation) is Literal:
-            choices = get_args(info.annotation)
-        for choice in choices:
-            if choice != info.default:
-                yield {key: choice}
+            choices[key] = get_args(info.annotation)
+    required = {key: values[0] for key, values in choices.items() if settings.model_fields[key].is_required()}
+    yield required
+    for key in [key for key in choices if key not in required]:
+        yield from ({**required, key: one} for one in choices[key] if one != settings.model_fields[key].default)
 
 
 def _decode(name: str, module: ModuleType, options: dict[str, Any], data: bytes) -> IdentifiedFormat | None:
@@ -89,7 +94,9 @@ def _decode(name: str, module: ModuleType, options: dict[str, Any], data: bytes)
         return None
     blocks = decoder.feed([Chunk(data, 0)])
     samples = sum(map(len, blocks))
-    return IdentifiedFormat(name, options, samples, decoder.bad, _measure_rate_hz(decoder, blocks))
+    fields = module.Settings.model_fields
+    known = {key: UNKNOWN if fields[key].is_required() else value for key, value in options.items()}
+    return IdentifiedFormat(name, known, samples, decoder.bad, _measure_rate_hz(decoder, blocks))
 
 
 def _measure_rate_hz(decoder: Decoder, blocks: list[SampleBlock]) -> float | None:
@@ -113,7 +120,7 @@ def _identify_text_lines(data: bytes) -> IdentifiedFormat | None:
         if columns >= MIN_TEXT_COLUMNS and matching >= max(MIN_SAMPLES, MIN_MATCHING_LINES * len(lines)):
             example = next(text for text in texts if _count_numbers(text, delimiter) == columns)
             nmea = {"nmea": True} if NMEA_SENTENCE.fullmatch(example) else {}
-            return IdentifiedFormat(TEXT_DECODER, {"columns": ["?"] * columns, **nmea}, matching, text_line=example)
+            return IdentifiedFormat(TEXT_DECODER, {"columns": [UNKNOWN] * columns, **nmea}, matching, text_line=example)
     return None
 
 

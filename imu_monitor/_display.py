@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError
+from drivers.extras import install_command
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,5 +58,5 @@ def build_dataframe(columns: Mapping[str, Any]) -> "pd.DataFrame":
     try:
         import pandas as pd
     except ImportError as error:
-        raise ConfigError("a DataFrame needs pandas: pip install pandas") from error
+        raise ConfigError(f"a DataFrame needs pandas: {install_command('pandas')}") from error
     return pd.DataFrame(dict(columns))

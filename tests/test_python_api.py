@@ -333,7 +333,7 @@ def test_errors_name_the_argument_in_one_line(
     assert "--" not in line
 
 
-@pytest.mark.parametrize(("option", "text"), [("pandas", "pip install pandas"), ("matplotlib", "imu-monitor[plot]")])
+@pytest.mark.parametrize(("option", "text"), [("pandas", 'pip install "pandas"'), ("matplotlib", "imu-monitor[plot]")])
 def test_missing_libraries_are_named(
     option: str, text: str, analysis: imu_monitor.Analysis, monkeypatch: pytest.MonkeyPatch
 ) -> None:

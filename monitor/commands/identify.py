@@ -11,7 +11,7 @@ import msgspec
 from drivers import file_access
 from drivers.errors import LinkLost, LinkUnavailable, NotReady
 from drivers.links import serial_link
-from drivers.wire_format_identification import TEXT_DECODER, IdentifiedFormat, identify_wire_format
+from drivers.wire_format_identification import TEXT_DECODER, UNKNOWN, IdentifiedFormat, identify_wire_format
 
 BAUD_RATES: Final = (115200, 460800, 921600, 230400, 9600, 57600, 38400, 19200, 374400, 1000000, 1843200, 2000000)
 """Baud rates of IMUs in bit/s, the most common first."""
@@ -121,6 +121,8 @@ def write_configuration(found: IdentifiedSource) -> str:
     if found.format.decoder == TEXT_DECODER:
         lines.append(f"# one line of the sensor: {found.format.text_line}")
         lines.append('# replace each "?" by gx gy gz ax ay az temperature t counter, or "-" to skip the column')
+    elif UNKNOWN in found.format.options.values():
+        lines.append('# replace "?"; imu-monitor check names the possible values')
     lines += [f"{key} = {_to_toml(value)}" for key, value in found.format.options.items()]
     return "\n".join(lines) + "\n"
 

@@ -16,7 +16,15 @@ import pytest
 from drivers import driver as driver_module
 from drivers.data_types import NO_TICK, Chunk, make_block
 from drivers.decoders import dbc
-from drivers.decoders.binary_frames import stim300, vectornav_binary
+from drivers.decoders.binary_frames import (
+    aceinna_dmu,
+    bno08x_rvc,
+    inertial_labs,
+    novatel_rawimusx,
+    stim300,
+    ublox_esf,
+    vectornav_binary,
+)
 from drivers.decoders.messages import samples as samples_decoder
 from drivers.decoders.text_lines import text
 from drivers.driver import MAX_UNDECODED_BYTES, AxisMap, Driver, parse_axis_map
@@ -243,17 +251,21 @@ def damage_stream(frames, broken, absent):
     return b"".join(parts)
 
 
-@pytest.mark.parametrize("name", ["vectornav_binary", "stim300"])
+@pytest.mark.parametrize(
+    "module",
+    [vectornav_binary, stim300, aceinna_dmu, bno08x_rvc, inertial_labs, novatel_rawimusx, ublox_esf],
+    ids=lambda module: module.__name__.rpartition(".")[2],
+)
 @pytest.mark.parametrize("pieces", [1, 7, 1000])
-def test_received_bad_and_lost_samples_add_up_to_the_sent_samples(name, pieces):
-    module = {"vectornav_binary": vectornav_binary, "stim300": stim300}[name]
+def test_received_bad_and_lost_samples_add_up_to_the_sent_samples(module, pieces):
     decoder, encoder = module.build(module.Settings()), module.build(module.Settings())
     timing = decoder.timing
     n = 2000
     rng = np.random.default_rng(4)
     broken = set(rng.choice(np.arange(20, n - 5), 60, replace=False).tolist())
     absent = set(rng.choice(np.arange(20, n - 5), 80, replace=False).tolist()) - broken
-    frames = [chunk.data for chunk in encoder.encode(make_samples(0, n, 500.0, timing.tick_s, timing.modulus))]
+    tick_s = timing.tick_s or 1.0 / 500.0  # a counter without a unit counts samples
+    frames = [chunk.data for chunk in encoder.encode(make_samples(0, n, 500.0, tick_s, timing.modulus))]
     data = damage_stream(frames, broken, absent)
     rig = DriverRig(decoder, 500.0)
     rig.thread.start()

@@ -212,7 +212,10 @@ KALIBR_PARAMETERS: Final = _noise_and_bias(
     "gyroscope_random_walk",
     "accelerometer_random_walk",
 )
-KALIBR_LINES: Final = ("rostopic: {rostopic}", "update_rate: {rate}  # Hz")
+KALIBR_LINES: Final = (
+    "rostopic: {rostopic}  # topic of the IMU in the bag for Kalibr",
+    "update_rate: {rate}  # Hz",
+)
 OPENCV_FIRST_LINES: Final = ("%YAML:1.0",)
 
 _IDENTITY: Final = ("[1.0, 0.0, 0.0]", "[0.0, 1.0, 0.0]", "[0.0, 0.0, 1.0]")

@@ -17,6 +17,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
+from drivers.extras import install_command
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,7 +31,7 @@ MINOR_GRID_COLOUR: Final = "#ececec"
 BAND_ALPHA: Final = 0.16
 DASHES: Final = (0, (4, 2))
 SMALL_TEXT: Final = 8.0  # points
-MISSING_MESSAGE: Final = 'matplotlib is not installed: pip install "imu-monitor[plot]"'
+MISSING_MESSAGE: Final = f"matplotlib is not installed: {install_command('imu-monitor[plot]')}"
 STYLE: Final[dict[Any, Any]] = {
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9.5,

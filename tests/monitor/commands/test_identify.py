@@ -15,7 +15,7 @@ from drivers.errors import LinkUnavailable, NotReady
 from monitor.cli import app
 from monitor.commands import identify
 from monitor.settings.loading import load_config
-from tests.contracts.decoder_examples import STIM300, TEXT, Example
+from tests.contracts.decoder_examples import EPSON, STIM300, TEXT, Example
 from tests.drivers.test_wire_format_identification import encode_capture
 
 
@@ -79,15 +79,16 @@ def test_missing_port_is_one_error() -> None:
         identify.identify_port("/dev/ttyNOTHERE", 0.01, lambda line: None)
 
 
-@pytest.mark.parametrize(("example", "decoder"), [(STIM300, "stim300"), (TEXT, "text")], ids=["stim300", "text"])
-def test_command_prints_the_configuration_of_a_capture(example: Example, decoder: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("example", [EPSON, STIM300, TEXT], ids=lambda example: example.name)
+def test_command_prints_the_configuration_of_a_capture(example: Example, tmp_path: Path) -> None:
     path = tmp_path / "capture.bin"
     path.write_bytes(encode_capture(example, tmp_path))
     result = CliRunner().invoke(app, ["identify", str(path)])
     assert result.exit_code == 0
-    assert f'decoder = "{decoder}"' in result.stdout
+    assert f'decoder = "{example.name}"' in result.stdout
     assert "found " in result.stderr
-    assert ('columns = ["?","?"' in result.stdout) == (decoder == "text")
+    assert ('columns = ["?","?"' in result.stdout) == (example.name == "text")
+    assert ('model = "?"' in result.stdout) == (example.name == "epson_uart")
 
 
 def test_file_without_samples_is_not_identified(tmp_path: Path) -> None:
