@@ -129,7 +129,10 @@ WRONG_FILES = {
     ),
     "protocol by number": (DEVICE + 'driver = { link = "virtual", decoder = 3 }\n', "driver.decoder: 3; possible are"),
     "unknown link": (DEVICE + 'driver = { link = "seral" }\n', 'driver.link: "seral"; possible are serial, '),
-    "no link": (DEVICE + "driver = {}\n", "driver.link: missing; possible are can, replay, serial, virtual, zenoh"),
+    "no link": (
+        DEVICE + "driver = {}\n",
+        "driver.link: missing; possible are can, iio, replay, serial, virtual, zenoh",
+    ),
     "no protocol": (
         DEVICE + 'driver = { link = "serial", port = "/dev/x" }\n',
         "driver.decoder: missing; possible are",
