@@ -142,6 +142,8 @@ COUNTER_MODULUS: Final = NumberRange("counts", 2, 1 << 62)
 """Number of counts after which a device counter wraps to 0."""
 COUNTER_STEP: Final = NumberRange("counts", 1e-9, 1 << 62)
 """Increase of a device counter from one sample to the next."""
+MAVLINK_ID: Final = NumberRange("", 0, 255)
+"""System, component or instance number of MAVLink."""
 SOURCE_ADDRESS: Final = NumberRange("", 0, 255)
 """Source address of SAE J1939."""
 HEADER_LINES: Final = NumberRange("lines", 0, 1_000_000)

@@ -213,6 +213,7 @@ class RawFrames:
         rejected = np.cumsum(self.bad_before)
         rejected_at = rejected[at]
         after = int(rejected[-1] if rejected.size else 0) - int(rejected_at[-1] if rejected_at.size else 0)
+        after += self.bad_after
         bad_before = np.diff(rejected_at, prepend=0)
         return RawFrames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 
@@ -483,6 +484,11 @@ def quantize(values: Floats, step: float, bits: int) -> Ints:
 def make_chunks(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
     """Return one chunk per frame, with the times ``t_ns`` [n]."""
     return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
+
+
+_BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
+BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
+"""Translation table that reverses the bits of each byte, which converts a reflected CRC to an unreflected one."""
 
 
 def xor_checksum(data: bytes) -> int:

@@ -75,6 +75,7 @@ FLOAT32_STEP = 2.0**-22  # step of a float32 for numbers from 2 to 4
 COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az", "temperature")
 TEXT = Example("text", {"columns": COLUMNS}, 1e-14, 1e-13, 1e-13)
 OTHER_UNITS = {"gyro_unit": "deg/s", "accel_unit": "mg", "temperature_unit": "K", "delimiter": ";"}
+RAW_UNITS = {"gyro_unit": "deg/s/131", "accel_unit": "g/16384"}
 STIM300 = Example("stim300", {}, DEGREE / 2**14, G / 2**19, 2.0**-8, checksum=True)
 VECTORNAV = Example("vectornav_binary", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
 XSENS = Example("xsens_mtdata2", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
@@ -109,6 +110,9 @@ LISTED_EXAMPLES = (
     WITMOTION,
     Example("witmotion", {"temperature": "jy61"}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 1 / 340, True),
     Example("dbc", {"signals": CAN_SIGNALS}, 2.0**-9, 2.0**-8, 2.0**-8),
+    Example("mavlink", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
+    Example("mavlink", {"message": "SCALED_IMU2", "clock": "arrival"}, 1e-3, 1e-3 * G, 0.01, checksum=True),
+    Example("mavlink", {"message": "RAW_IMU", **RAW_UNITS}, DEGREE / 131, G / 16384, 0.01, checksum=True),
     Example("ros2_imu", {}, 1e-15, 1e-14, None),
     Example("samples", {}, 1e-15, 1e-14, 1e-14),
 )

@@ -66,10 +66,6 @@ ERROR_BITS: Final = 0x80 | 0x40 | 0x10 | 0x08
 START_UP: Final = 0x40
 CHANNEL_ERROR: Final = 0x08
 
-_BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
-BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
-"""Translation table that reverses the bits of each byte. The CRC of zlib is reflected, but the STIM300 CRC is not."""
-
 
 def _check_identifier(identifier: int) -> None:
     if identifier not in IDENTIFIERS:
@@ -214,12 +210,13 @@ def _write_int24(data: base.Bytes, at: int, values: Floats, step: float) -> None
 
 def datagram_crc(body: bytes) -> bytes:
     """Return the four CRC bytes of a datagram."""
-    return _reflected_crc(body.translate(BIT_REVERSAL)).to_bytes(4, "little").translate(BIT_REVERSAL)
+    # The CRC of zlib is reflected, but the STIM300 CRC is not.
+    return _reflected_crc(body.translate(base.BIT_REVERSAL)).to_bytes(4, "little").translate(base.BIT_REVERSAL)
 
 
 def has_valid_crc(frame: bytes) -> bool:
     """Return True if the CRC of a complete datagram is correct."""
-    mirrored = frame.translate(BIT_REVERSAL)
+    mirrored = frame.translate(base.BIT_REVERSAL)
     return _reflected_crc(mirrored[:-4]) == int.from_bytes(mirrored[-4:], "little")
 
 

@@ -126,8 +126,8 @@ def count_needed_samples(kinds: np.ndarray, samples: int, fault: FaultKind) -> i
     return samples + int(np.flatnonzero((enough_faults & intact)[samples - 1 :])[0])
 
 
-WITH_COUNTER = ("vectornav_binary", "stim300", "xsens_mtdata2", "ros2_imu", "samples")
-WITH_CHECKSUM = ("vectornav_binary", "stim300", "xsens_mtdata2", "vectornav_ascii", "witmotion")
+WITH_COUNTER = ("mavlink", "vectornav_binary", "stim300", "xsens_mtdata2", "ros2_imu", "samples")
+WITH_CHECKSUM = ("mavlink", "vectornav_binary", "stim300", "xsens_mtdata2", "vectornav_ascii", "witmotion")
 
 
 @pytest.fixture(params=("vectornav_binary", "dbc", "ros2_imu", "samples", "text"))

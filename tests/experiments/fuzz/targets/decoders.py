@@ -180,6 +180,7 @@ def stream_seeds(name: str) -> Iterator[bytes]:
 
 
 WORDS: Final = {
+    "mavlink": (b"\xfd\x3d\0\0", b"\xfe\x3e", b"\x69\0\0", b"\x1a\0\0", b"\xc0\x7f", b"\x7f\x80"),
     "text": ("nan", "inf", "-inf", "1e308", "1e-320", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
     "vectornav_ascii": ("$VNIMU,", "$VNYMR,", "nan", "inf", "*XX", "\r\n", "1e999"),
     "xsens_mtdata2": (b"\xfa\xff\x36", b"\x40\x20\x0c", b"\x80\x20\x0c", b"\x10\x60\x04", b"\x08\x10\x04", b"\x7f\xc0"),
