@@ -126,7 +126,7 @@ TICK_S: Final = NumberRange("s", 1e-12, DAY_S)
 BIT_RATE: Final = NumberRange("bit/s", 1, 1_000_000_000)
 BYTE_RATE: Final = NumberRange("byte/s", 1.0, 1e9)
 PORT: Final = NumberRange("", 0, 65_535)
-"""TCP port."""
+"""TCP or UDP port."""
 SIZE_BYTES: Final = NumberRange("byte", 1e6, 1e15)
 """Memory limit."""
 
