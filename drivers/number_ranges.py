@@ -158,6 +158,8 @@ CLOCK_RATIO: Final = NumberRange("", 0.5, 2.0)
 INFLATION: Final = NumberRange("", 1.0, 1e6)
 SCALE: Final = NumberRange("", 1e-15, 1e15, signed=True)
 """Factor that converts the raw numbers of a device to a unit."""
+OFFSET: Final = NumberRange("", 1e-15, 1e15, zero=True, signed=True)
+"""Number that is added to the raw numbers of a device."""
 NOISE_RATIO: Final = NumberRange("times", 1e-6, 1e6)
 """Ratio of two noise levels."""
 

@@ -86,6 +86,7 @@ LISTED_EXAMPLES = (
     Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),
     Example("text", {"columns": ("t", "-", *COLUMNS), "time_unit": "ms"}, 1e-14, 1e-13, 1e-13),
     Example("text", {"columns": COLUMNS, **OTHER_UNITS}, 1e-13, 1e-13, 1e-12),
+    Example("text", {"columns": COLUMNS, "preset": "mpu6050_raw"}, 1e-13, 1e-12, 1e-12),
     Example("vectornav_ascii", {}, 1e-6, 1e-3, 0.1, checksum=True),
     Example("vectornav_ascii", {"sentence": "VNYMR"}, 1e-6, 1e-3, None, checksum=True),
     VECTORNAV,

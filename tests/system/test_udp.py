@@ -28,6 +28,15 @@ TEXT = (
     'decoder = "text", decoder_options = { columns = ["counter", "gx", "gy", "gz", "ax", "ay", "az"], nmea = true, '
     "counter_modulus = 65536 }"
 )
+LABELS = (
+    'decoder = "text", decoder_options = { columns = ["counter", "gx", "gy", "gz", "ax", "ay", "az"], '
+    'first_line = "keep" }'
+)
+PATTERN = (
+    'decoder = "text", decoder_options = { pattern = "no (?P<counter>[0-9]+): '
+    r"g = (?P<gx>\\S+) (?P<gy>\\S+) (?P<gz>\\S+), a = (?P<ax>\\S+) (?P<ay>\\S+) (?P<az>\\S+)$"
+    '", first_line = "keep" }'
+)
 
 
 def make_values() -> np.ndarray:
@@ -58,7 +67,23 @@ def build_text(values: np.ndarray) -> list[bytes]:
     return lines
 
 
-@pytest.mark.parametrize(("decoder", "build"), [(MAVLINK, build_mavlink), (TEXT, build_text)], ids=["mavlink", "text"])
+def build_labels(values: np.ndarray) -> list[bytes]:
+    names = ("counter", "gx", "gy", "gz", "ax", "ay", "az")
+    rows = [(i, *row.tolist()) for i, row in enumerate(values)]
+    return [("\t".join(f"{n}:{x!r}" for n, x in zip(names, row, strict=True)) + "\r\n").encode() for row in rows]
+
+
+def build_pattern(values: np.ndarray) -> list[bytes]:
+    rows = [row.tolist() for row in values]
+    text = "no {}: g = {!r} {!r} {!r}, a = {!r} {!r} {!r}\n"
+    return [text.format(i, *row).encode() for i, row in enumerate(rows)]
+
+
+@pytest.mark.parametrize(
+    ("decoder", "build"),
+    [(MAVLINK, build_mavlink), (TEXT, build_text), (LABELS, build_labels), (PATTERN, build_pattern)],
+    ids=["mavlink", "text", "labels", "pattern"],
+)
 def test_every_sample_is_received_lost_or_bad(tmp_path: Path, decoder: str, build) -> None:
     values = make_values()
     datagrams = build(values)
@@ -67,7 +92,7 @@ def test_every_sample_is_received_lost_or_bad(tmp_path: Path, decoder: str, buil
     for i in missing:
         datagrams[i] = b""
     for i in damaged:
-        datagrams[i] = datagrams[i][:-20] + bytes([datagrams[i][-20] ^ 1]) + datagrams[i][-19:]
+        datagrams[i] = datagrams[i][:-20] + b"?" + datagrams[i][-19:]
     with run_service(tmp_path, CONFIG.format(rate=RATE_HZ, decoder=decoder)) as run:
         driver = run.worker("autopilot").driver
         wait_for(lambda: driver.link._socket is not None, "the port")

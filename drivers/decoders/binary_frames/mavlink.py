@@ -121,13 +121,10 @@ class Settings(SettingsModel):
     )
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:
-        """Yield a conflict for each unit that RAW_IMU lacks, or that another message does not need."""
+        """Yield a conflict for each unit that RAW_IMU lacks."""
         for key, example in (("gyro_unit", '"mrad/s" or "deg/s/16.4"'), ("accel_unit", '"mg" or "g/2048"')):
-            given = getattr(self, key) is not None
-            if self.message == "RAW_IMU" and not given:
+            if self.message == "RAW_IMU" and getattr(self, key) is None:
                 yield Conflict(key, f"missing; RAW_IMU needs the unit of a count, such as {example}")
-            if self.message != "RAW_IMU" and given:
-                yield Conflict(key, f"only for RAW_IMU; the units of {self.message} are fixed")
 
 
 class MavlinkDecoder(base.FrameStreamDecoder):

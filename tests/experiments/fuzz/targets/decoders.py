@@ -23,6 +23,7 @@ from drivers.decoders.base import Decoder
 from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
+from drivers.decoders.text_lines.text import Settings as TextSettings
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
 from tests.experiments.fuzz.checked_clock import CheckedClock
@@ -181,7 +182,7 @@ def stream_seeds(name: str) -> Iterator[bytes]:
 
 WORDS: Final = {
     "mavlink": (b"\xfd\x3d\0\0", b"\xfe\x3e", b"\x69\0\0", b"\x1a\0\0", b"\xc0\x7f", b"\x7f\x80"),
-    "text": ("nan", "inf", "-inf", "1e308", "1e-320", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
+    "text": ("gx:", "az :", "nan", "-inf", "1e308", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
     "vectornav_ascii": ("$VNIMU,", "$VNYMR,", "nan", "inf", "*XX", "\r\n", "1e999"),
     "xsens_mtdata2": (b"\xfa\xff\x36", b"\x40\x20\x0c", b"\x80\x20\x0c", b"\x10\x60\x04", b"\x08\x10\x04", b"\x7f\xc0"),
     "vectornav_binary": (b"\xfa\1\1\2", b"\xfa\1\1\6", b"\x7f\xc0\0\0", b"\0\0\xc0\x7f"),
@@ -421,6 +422,21 @@ def wire_dbc(data: bytes) -> None:
     feed_and_check(decoder, [[Chunk(part[1:], START_NS, addresses[part[0] % len(addresses)]) for part in cut]])
 
 
+PATTERN: Final = "(?P<t>[0-9]+)[ ,](?:g=)?(?P<gx>[^ ,]*)[ ,](?:a=)?(?P<az>.*)( T(?P<temperature>.*))?"
+
+
+def wire_text_pattern(data: bytes) -> None:
+    """Check lines that are decoded with a regular expression, as a whole and in two halves."""
+    build, half = module_lookup.import_module(decoders, "text").build, len(data) // 2
+    keys = read_settings(TextSettings, {"pattern": PATTERN, "time_unit": "ms"})
+    one, other = build(keys), build(keys)
+    whole = feed_and_check(one, [[Chunk(data, START_NS)]])
+    parts = feed_and_check(other, [[Chunk(data[:half], START_NS)], [Chunk(data[half:], START_NS)]])
+    assert summarize_blocks(whole) == summarize_blocks(parts), "the samples depend on how the bytes are divided"
+    assert one.bad == other.bad, "the number of bad lines depends on how the bytes are divided"
+
+
+target("wire-text-pattern", (b"\n1 g=0.5 a=-9.8 T20\r\n2,,nan\n3 1 2\nx\n",), 250, WORDS["text"])(wire_text_pattern)
 target("wire-dbc", lambda: [bytes([i, *range(100)]) for i in range(len(CAN))], 100)(wire_dbc)
 for _name in ("ros2_imu", "samples"):
     target(f"wire-{_name}", partial(_message_seeds, _name), 512)(make_message_check(_name))
