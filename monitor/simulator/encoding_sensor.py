@@ -78,7 +78,7 @@ class SimulatedSensor:
     Raises
     ------
     ConfigError
-        If the noise model or an effect is invalid, or if the decoder cannot encode samples.
+        If the noise model or an effect is invalid.
     """
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str) -> None:
@@ -88,8 +88,6 @@ class SimulatedSensor:
         self._pending_effects = [(text, axis, effect) for text in table.effect for axis, effect in parse_effects(text)]
         # number of the sample at which the effects begin
         self._effects_begin_at = round(table.effect_at * self.rate_hz)
-        zero = np.zeros(1, np.int64)
-        copy.deepcopy(decoder).encode(make_block(zero, np.zeros((1, 6)), None, zero))  # reports that encoding fails
         self._decoder = copy.deepcopy(decoder)
         self._stream = self._create_stream(table.seed)
         self._unix_ns = 0  # time of the first sample

@@ -1,6 +1,7 @@
 """Tests of the decoder for text lines: columns, units, line ends, bad lines and wrong settings."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from drivers.decoders.text_lines.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
+from monitor.settings import loading
 from tests.support.nmea_sentences import make_sentence
 from tests.support.settings import read_settings
 
@@ -342,3 +344,11 @@ def test_wrong_pattern_preset_or_offset_is_refused(settings: dict, message: str)
 def test_pattern_cannot_be_encoded() -> None:
     with pytest.raises(ConfigError, match="use columns instead"):
         build(read_settings(Settings, {"pattern": "(?P<gx>a)"})).encode(decode_bytes(LINE))
+
+
+def test_simulated_sensor_with_a_pattern_is_refused_by_check(tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    driver = '{ link = "virtual", decoder = "text", decoder_options = { pattern = "(?P<gx>.)" } }'
+    path.write_text(f'[[device]]\nname = "a"\ndriver = {driver}\n')
+    (line,) = loading.examine_config_file(path).wrong
+    assert line.endswith("a simulated sensor cannot write lines for a pattern; use columns instead")
