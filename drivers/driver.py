@@ -16,10 +16,11 @@ from typing import Final, Literal
 import numpy as np
 
 from drivers.data_types import AXES, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
-from drivers.decoders.base import Decoder, LateFrameCountingDecoder
+from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import DropCountingLink, Link
 from drivers.timing.sample_clock import SampleClock
+from drivers.wire_format_identification import identify_wire_format
 
 READ_TIMEOUT_S: Final = 0.2
 """Longest time in s that one read waits for the first byte."""
@@ -29,6 +30,8 @@ MAX_RETRY_PAUSE_S: Final = 5.0
 """Longest pause between two attempts to open a link."""
 MAX_UNDECODED_BYTES: Final = 2000
 """Number of bytes without a sample after which the status names a probable cause, such as a wrong baud rate."""
+IDENTIFICATION_BYTES: Final = 4096
+"""Number of undecoded bytes from which the format is identified."""
 MIN_UNDECODED_S: Final = 3.0
 """Minimum time in s without a decoded sample after which a running device counts as lost.
 
@@ -122,6 +125,8 @@ class Driver:
         self._events: deque[Event] = deque(maxlen=MAX_QUEUED_EVENTS)
         self._stop = threading.Event()
         self._undecoded_bytes = 0
+        self._undecoded_capture = b""  # first bytes of a device whose bytes cannot be decoded
+        self._format_hint = ""
         self._counts_late = decoder if isinstance(decoder, LateFrameCountingDecoder) else None
         self._reported_drops = 0  # number of samples that the decoder dropped and that have been reported as missing
         self._last_data_s = 0.0
@@ -135,6 +140,11 @@ class Driver:
     def late_frames_hint(self) -> str:
         """Message that states the delay of late frames and suggests a remedy; "" if no frame was late recently."""
         return self._counts_late.late_frames_hint if self._counts_late else ""
+
+    @property
+    def on_board_filter_note(self) -> str:
+        """Note that the samples are corrected by a filter of the sensor; "" if they are not corrected."""
+        return self.decoder.on_board_filter_note if isinstance(self.decoder, FilterReportingDecoder) else ""
 
     def take_events(self) -> list[Event]:
         """Remove and return all queued events, oldest first."""
@@ -197,9 +207,10 @@ class Driver:
             self._keep(chunks)
         samples = self.decoder.feed(chunks)
         if not samples:
-            self._check_undecoded(sum(len(chunk.data) for chunk in chunks))
+            self._check_undecoded(b"".join(chunk.data for chunk in chunks))
             return
         self._last_sample_s, self._undecoded_bytes = self._last_data_s, 0
+        self._undecoded_capture, self._format_hint = b"", ""
         for one in samples:
             # A missing sample was either dropped by the decoder or sent in a message that did not arrive.
             dropped = min(one.lost, self._decoder_drops() - self._reported_drops)
@@ -257,20 +268,33 @@ class Driver:
         if self._silence_s and silent_s > self._silence_s:
             raise LinkLost(f"{self.link.name} silent for {silent_s:.1f} s")
 
-    def _check_undecoded(self, size: int) -> None:
+    def _check_undecoded(self, data: bytes) -> None:
         """Report a device whose bytes cannot be decoded."""
         self._count_decoder_drops()
-        self._undecoded_bytes += size
+        self._undecoded_bytes += len(data)
         mute_s = self._last_data_s - self._last_sample_s
         patience_s = max(MIN_UNDECODED_S, 10.0 / (self.clock.configured_or_measured_rate_hz or 10.0))
         if self._undecoded_bytes < MAX_UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
             return
         why = self.decoder.recent_problem or "wrong baud rate, or another protocol than the configured one"
-        self.text = f"{self.link.name}: {self._undecoded_bytes} bytes without a sample; {why}"
+        self._identify_undecoded(data)
+        self.text = f"{self.link.name}: {self._undecoded_bytes} bytes without a sample; {why}{self._format_hint}"
         if self.state == "running":
             self._event("link_lost", self.text)
             self.state = "lost"
             self.clock.count_next_gap_by_arrival()
+
+    def _identify_undecoded(self, data: bytes) -> None:
+        """Name the decoder that fits the undecoded bytes, once after enough bytes without a sample."""
+        missing = IDENTIFICATION_BYTES - len(self._undecoded_capture)
+        if self.link.carrier != "bytes" or missing <= 0:
+            return
+        self._undecoded_capture += data[:missing]
+        if len(data) < missing:
+            return
+        found = identify_wire_format(self._undecoded_capture)
+        if found is not None:
+            self._format_hint = f'; the bytes fit decoder = "{found.decoder}" (see imu-monitor identify)'
 
     def _handle_recovery(self) -> None:
         if self.state == "lost":

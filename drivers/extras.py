@@ -1,6 +1,10 @@
 """Check that the optional packages of an extra (``pip install imu-monitor[extra]``) are installed."""
 
 import importlib.util
+import os
+import shlex
+import shutil
+import sys
 from collections.abc import Mapping
 from typing import Final
 
@@ -22,6 +26,18 @@ def find_missing_packages(extra: str) -> tuple[str, ...]:
     return tuple(package for module, package in EXTRAS[extra].items() if importlib.util.find_spec(module) is None)
 
 
+def install_command(requirement: str) -> str:
+    """Return the command that installs a requirement into the environment of the program.
+
+    pip finds ``imu-monitor[extra]`` in an environment in which imu-monitor is installed, also from a clone of the
+    repository. The pip of another environment would search for imu-monitor on the package index.
+    """
+    pip = shutil.which("pip")
+    if pip is None or os.path.dirname(pip) != os.path.dirname(sys.executable):
+        return f'{shlex.quote(sys.executable)} -m pip install "{requirement}"'
+    return f'pip install "{requirement}"'
+
+
 def require_extra(extra: str, feature: str) -> None:
     """Check that all packages of an extra are installed.
 
@@ -38,4 +54,5 @@ def require_extra(extra: str, feature: str) -> None:
         If a package is missing. The error text contains the ``pip`` command.
     """
     if missing := find_missing_packages(extra):
-        raise ConfigError(f'{feature} needs {" and ".join(missing)}: pip install "imu-monitor[{extra}]"')
+        command = install_command(f"imu-monitor[{extra}]")
+        raise ConfigError(f"{feature} needs {' and '.join(missing)}: {command}")

@@ -127,6 +127,8 @@ BIT_RATE: Final = NumberRange("bit/s", 1, 1_000_000_000)
 BYTE_RATE: Final = NumberRange("byte/s", 1.0, 1e9)
 PORT: Final = NumberRange("", 0, 65_535)
 """TCP or UDP port."""
+ROS_DOMAIN: Final = NumberRange("", 0, 232)
+"""Domain of ROS 2. The maximum is that of DDS."""
 SIZE_BYTES: Final = NumberRange("byte", 1e6, 1e15)
 """Memory limit."""
 

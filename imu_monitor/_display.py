@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError
+from drivers.extras import install_command
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,7 +31,7 @@ def render_text(print_result: "Callable[[Console], None]") -> str:
     return "\n".join(line.rstrip() for line in text.getvalue().rstrip().splitlines())
 
 
-def render_html(text: str, figures: Sequence[str] = ()) -> str:
+def render_html(text: str, figures: Sequence[str] = (), width_em: float = 60.0) -> str:
     """Return HTML for a notebook that shows a text in a fixed-width font, followed by SVG elements.
 
     Parameters
@@ -39,8 +40,10 @@ def render_html(text: str, figures: Sequence[str] = ()) -> str:
         Text of the result.
     figures
         SVG elements.
+    width_em
+        Largest width of a figure, in multiples of the font size.
     """
-    drawn = "".join(f'<div style="max-width:60em;background:white">{figure}</div>' for figure in figures)
+    drawn = "".join(f'<div style="max-width:{width_em:g}em;background:white">{figure}</div>' for figure in figures)
     return f'<pre style="line-height:1.3">{html.escape(text)}</pre>{drawn}'
 
 
@@ -55,5 +58,5 @@ def build_dataframe(columns: Mapping[str, Any]) -> "pd.DataFrame":
     try:
         import pandas as pd
     except ImportError as error:
-        raise ConfigError("a DataFrame needs pandas: pip install pandas") from error
+        raise ConfigError(f"a DataFrame needs pandas: {install_command('pandas')}") from error
     return pd.DataFrame(dict(columns))

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 
+from drivers.errors import ConfigError
 from drivers.extras import require_extra
 from drivers.number_ranges import SEED
 from imu_monitor._display import build_dataframe, render_html, render_text
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from monitor.reconcile.result import Reconciliation as Result
+
+FIGURE_CAPTION: Final = (
+    "Allan plots of the axes that differ, and 95 % band of the model after the search. The orange numbers are the rows "
+    "of the\nfindings. They mark the averaging times at which a finding changes the Allan deviation most."
+)
+FIGURE_WIDTH_EM: Final = 40.0
 
 
 class Reconciliation:
@@ -111,7 +118,15 @@ class Reconciliation:
         return name_arguments(render_text(lambda console: print_reconciliation(self._result, console, details=True)))
 
     def _repr_html_(self) -> str:
-        return render_html(str(self))
+        """Return the text, and the Allan plot of each axis that differs if matplotlib is installed."""
+        from monitor.publishing.reports.reconcile_page import draw_differing_allan_deviations
+        from monitor.reconcile.summary.ranked_findings import rank_findings
+
+        try:
+            figures = draw_differing_allan_deviations(self._result, rank_findings(self._result))
+        except ConfigError:
+            figures = []
+        return render_html(f"{self}\n\n{FIGURE_CAPTION}" if figures else str(self), figures, FIGURE_WIDTH_EM)
 
 
 @errors_name_arguments()

@@ -46,8 +46,18 @@ EXPORT = ROOT / "docs" / "export.md"
 COMMANDS_PAGE = ROOT / "docs" / "commands.md"
 MESSAGES = ROOT / "docs" / "messages.md"
 DECODERS = ROOT / "docs" / "decoders.md"
+CONNECTING_SENSORS = ROOT / "docs" / "connecting-sensors.md"
+VIEWER = ROOT / "docs" / "viewer.md"
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
-PAGES = sorted([README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted(
+    [
+        README,
+        ROOT / "CHANGELOG.md",
+        ROOT / "CONTRIBUTING.md",
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "docs").rglob("*.ipynb"),
+    ]
+)
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 ENDPOINT_IN_PAGES = "tcp/127.0.0.1:7450"
 
@@ -128,7 +138,9 @@ def test_catalogue_lists_the_model_files() -> None:
 
 
 def test_configurations_show_every_link() -> None:
-    shown = {found for toml in find_code_blocks(README, "toml") for found in re.findall(r'link = "(\w+)"', toml)}
+    shown = {
+        found for toml in find_code_blocks(CONNECTING_SENSORS, "toml") for found in re.findall(r'link = "(\w+)"', toml)
+    }
     assert shown == {"serial", "can", "zenoh", "replay"}
 
 
@@ -147,8 +159,8 @@ def test_command_tables_are_complete() -> None:
     assert [name for name, _ in rows] == list(COMMANDS)
     assert [name for name, _ in re.findall(row, get_section(README, "Commands"), re.M)] == list(COMMANDS)
     of_tables = {OPTION_NAMES[name] for name in READING_OPTIONS} - {"--topic"}
-    everywhere = {"--help", "--seconds", "--viewer", *of_tables}
-    assert of_tables <= set(re.findall(r"--[a-z-]+", COMMANDS_PAGE.read_text("utf-8")))
+    everywhere = {"--help", "--seconds", "--viewer", "--units", *of_tables}
+    assert {"--units", *of_tables} <= set(re.findall(r"--[a-z-]+", COMMANDS_PAGE.read_text("utf-8")))
     for name, row in rows:
         assert list_options(name) - everywhere == set(re.findall(r"--[a-z-]+", row)), name
 
@@ -156,8 +168,8 @@ def test_command_tables_are_complete() -> None:
 def test_viewer_address_has_the_default_ports() -> None:
     own = loading.ViewerTable()
     page = f"http://127.0.0.1:{own.web_port}/?url={quote(server_url(own.port), safe='')}"
-    assert f"`{page}`" in README.read_text("utf-8")
-    assert f"-L {own.web_port}:127.0.0.1:{own.web_port} -L {own.port}:127.0.0.1:{own.port}" in README.read_text("utf-8")
+    assert f"`{page}`" in VIEWER.read_text("utf-8")
+    assert f"-L {own.web_port}:127.0.0.1:{own.web_port} -L {own.port}:127.0.0.1:{own.port}" in VIEWER.read_text("utf-8")
 
 
 # --- tables
@@ -189,7 +201,9 @@ def test_protocol_table_lists_every_decoder() -> None:
 
 
 def test_every_recording_format_is_named() -> None:
-    named = re.findall(r"\.[a-z0-9.]+", next(t for t in find_code_blocks(README, "toml") if "recording.csv" in t))
+    named = re.findall(
+        r"\.[a-z0-9.]+", next(t for t in find_code_blocks(CONNECTING_SENSORS, "toml") if "recording.csv" in t)
+    )
     assert set(FORMATS) <= set(named)
 
 
@@ -274,7 +288,7 @@ def read_first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]"
 
 @pytest.mark.parametrize(
     ("page", "word"),
-    [(README, "estimated"), (ROOT / "docs" / "samples-format.md", "9.81")],
+    [(MESSAGES, "estimated"), (ROOT / "docs" / "samples-format.md", "9.81")],
     ids=["coefficients", "samples"],
 )
 def test_subscriber_example_prints_the_published_results(page: Path, word: str) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.extras import EXTRAS
+from drivers.extras import EXTRAS, install_command
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -200,7 +200,7 @@ def test_offline_commands_except_reconcile_need_no_extra(tmp_path: Path) -> None
 
 def test_reconcile_without_scipy_names_the_missing_extra(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", fs=100.0, gx=np.random.default_rng(1).standard_normal(6000))
-    line = 'imu-monitor: reconcile needs SciPy: pip install "imu-monitor[reconcile]"\n'
+    line = f"imu-monitor: reconcile needs SciPy: {install_command('imu-monitor[reconcile]')}\n"
     assert run_program(tmp_path, "reconcile", "x.npz", "--out", "found", absent=("scipy",)) == (2, line)
     assert not (tmp_path / "found").exists()
 
@@ -208,9 +208,9 @@ def test_reconcile_without_scipy_names_the_missing_extra(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("name", "line"),
     [
-        ("x.bag", 'rosbags: pip install "imu-monitor[ros]"'),
-        ("x.ulg", 'pyulog: pip install "imu-monitor[px4]"'),
-        ("x.bin", 'pymavlink: pip install "imu-monitor[ardupilot]"'),
+        ("x.bag", f"rosbags: {install_command('imu-monitor[ros]')}"),
+        ("x.ulg", f"pyulog: {install_command('imu-monitor[px4]')}"),
+        ("x.bin", f"pymavlink: {install_command('imu-monitor[ardupilot]')}"),
     ],
 )
 def test_a_recording_without_its_extra_is_refused_in_one_line(tmp_path: Path, name: str, line: str) -> None:
@@ -248,8 +248,25 @@ def test_can_device_without_can_libraries_names_the_missing_extra(
     (tmp_path / "can.toml").write_text(CAN_DEVICE.format(link=link))
     status, stderr = run_program(tmp_path, name, "can.toml", absent=absent)
     assert status == 2
-    assert f'driver: {source} needs {packages}: pip install "imu-monitor[can]"' in stderr
+    assert f"driver: {source} needs {packages}: {install_command('imu-monitor[can]')}" in stderr
     assert "Traceback" not in stderr
+
+
+def test_install_command_belongs_to_the_environment_of_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The short form is right only if the shell finds the pip beside the Python of the program."""
+    own, other = tmp_path / "my env" / "bin", tmp_path / "other"
+    for folder in (own, other):
+        folder.mkdir(parents=True)
+        (folder / "pip").write_text("#!/bin/sh\n")
+        (folder / "pip").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(own / "python"))
+    monkeypatch.setenv("PATH", f"{own}:{other}")
+    assert install_command("imu-monitor[ros]") == 'pip install "imu-monitor[ros]"'
+    for path in (f"{other}:{own}", str(tmp_path)):
+        monkeypatch.setenv("PATH", path)
+        assert install_command("imu-monitor[ros]") == f"'{own}/python' -m pip install \"imu-monitor[ros]\""
 
 
 def test_extras_in_messages_agree_with_pyproject() -> None:

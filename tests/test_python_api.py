@@ -333,7 +333,7 @@ def test_errors_name_the_argument_in_one_line(
     assert "--" not in line
 
 
-@pytest.mark.parametrize(("option", "text"), [("pandas", "pip install pandas"), ("matplotlib", "imu-monitor[plot]")])
+@pytest.mark.parametrize(("option", "text"), [("pandas", 'pip install "pandas"'), ("matplotlib", "imu-monitor[plot]")])
 def test_missing_libraries_are_named(
     option: str, text: str, analysis: imu_monitor.Analysis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -363,6 +363,22 @@ def test_results_show_themselves_in_a_notebook(
     assert len(html) < 200_000
     assert "30000 samples" in recording._repr_html_()
     assert "angle_random_walk" in imu_monitor.load_model("mti-1")._repr_html_()
+    assert imu_monitor.plot_allan(analysis)._repr_png_().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("library", ["matplotlib", None])
+def test_reconciliation_shows_the_allan_plot_of_each_axis_that_differs(
+    recording: imu_monitor.Recording, library: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = {axis: np.array(recording[axis]) for axis in ("gx", "gz")}
+    values["gz"] += 3e-3 * np.sin(2.0 * np.pi * 17.0 / RATE_HZ * np.arange(len(recording)))
+    found = imu_monitor.reconcile(values, "mti-1", RATE_HZ)
+    if library is not None:
+        monkeypatch.setitem(sys.modules, library, None)
+    html = found._repr_html_()
+    assert "added sinusoidal" in html
+    assert html.count("<svg") == html.count("gz: Allan deviation before and after") == (library is None)
+    assert ("orange numbers" in html) == (library is None)
 
 
 def test_deviations_are_those_of_the_dictionary(analysis: imu_monitor.Analysis) -> None:

@@ -31,6 +31,13 @@ TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
 
 Bytes = NDArray[np.uint8]
 
+_BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
+BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
+"""Translation table that reverses the bits of each byte.
+
+The table converts between the reflected and the unreflected form of a CRC.
+"""
+
 
 class Decoder(Protocol):
     """Interface of a decoder, which converts between the bytes of one wire format and ``SampleBlock`` objects."""
@@ -83,6 +90,19 @@ class LateFrameCountingDecoder(Protocol):
     def late_frames_hint(self) -> str:
         """Message that states the delay of late frames and suggests a remedy; "" if no frame was late recently."""
 
+
+@runtime_checkable
+class FilterReportingDecoder(Protocol):
+    """Interface of a decoder for sensors that can send values which their own filter has corrected."""
+
+    @property
+    def on_board_filter_note(self) -> str:
+        """Note that the samples are corrected by a filter of the sensor; "" if they are not corrected."""
+
+
+ON_BOARD_FILTER_NOTE: Final = (
+    "the filter of the sensor has corrected these angular rates, which hides bias instability B and random walk K"
+)
 
 HINT_FRAMES: Final = 1000
 """Number of valid frames after which an earlier rejected frame is no longer reported."""
@@ -237,6 +257,8 @@ NEED_MORE or REJECT.
 
 MAX_BYTES_WITHOUT_FRAME: Final = 2000
 """Number of bytes without a valid frame after which a problem is reported. Every supported frame is shorter."""
+MAX_FRAMES_WITHOUT_SAMPLE: Final = 100
+"""Number of consecutive valid frames without a sample after which a problem is reported."""
 NO_OFFSET: Final = -(1 << 62)
 """Offset that is smaller than the stream offset of every received byte."""
 
@@ -409,6 +431,12 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
     def __init__(self, sync: bytes, match: FrameMatcher, longest: int) -> None:
         super().__init__()
         self._buffer = FrameBuffer(sync, match, longest)
+        self._frames_without_sample = 0  # number of valid frames since the last frame with a sample
+
+    @property
+    def _lacks_samples(self) -> bool:
+        """True if many valid frames contained no sample. The subclass has to use ``_build_measured_blocks``."""
+        return self._frames_without_sample > MAX_FRAMES_WITHOUT_SAMPLE
 
     @property
     def recent_problem(self) -> str:
@@ -429,6 +457,8 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
         self, frames: RawFrames, values: Floats, temperature_c: Floats, ticks: Ints
     ) -> tuple[list[SampleBlock], int | None]:
         rows = np.flatnonzero(~np.isnan(values).all(axis=1))
+        earlier = 0 if rows.size else self._frames_without_sample
+        self._frames_without_sample = earlier + len(values) - 1 - (int(rows[-1]) if rows.size else -1)
         if rows.size < len(values):
             frames = frames.select_frames(rows.tolist())
             values, temperature_c, ticks = values[rows], temperature_c[rows], ticks[rows]
@@ -484,11 +514,6 @@ def quantize(values: Floats, step: float, bits: int) -> Ints:
 def make_chunks(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
     """Return one chunk per frame, with the times ``t_ns`` [n]."""
     return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
-
-
-_BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
-BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
-"""Translation table that reverses the bits of each byte, which converts a reflected CRC to an unreflected one."""
 
 
 def xor_checksum(data: bytes) -> int:

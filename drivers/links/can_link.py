@@ -26,7 +26,7 @@ from pydantic import Field, SkipValidation
 
 from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
-from drivers.extras import require_extra
+from drivers.extras import install_command, require_extra
 from drivers.links.arrival_times import monotonic_arrival_ns
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.module_lookup import format_choices_by_similarity
@@ -233,7 +233,7 @@ def describe_missing_package(interface: str) -> str:
     module, package, requirement = PACKAGES.get(interface, ("", "", ""))
     if not module or importlib.util.find_spec(module) is not None:
         return ""
-    return f'CAN interface {interface} needs the package {package}: pip install "{requirement}"'
+    return f"CAN interface {interface} needs the package {package}: {install_command(requirement)}"
 
 
 def _probe_server(s: Settings) -> None:

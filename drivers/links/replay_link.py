@@ -42,6 +42,7 @@ from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, require_packages_of_format, segment_file
 from drivers.recordings.file_formats.ardupilot_log_format import is_ardupilot_log
 from drivers.recordings.reading_options import ReadingOptions
+from drivers.recordings.reading_progress import open_file_and_report_position
 from drivers.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
@@ -299,7 +300,7 @@ def _read_header(path: Path) -> str:
 
 
 def _open_binary(path: Path) -> IO[bytes]:
-    file = file_access.open_regular_file(path)
+    file = open_file_and_report_position(path)
     if path.suffix.lower() != ".gz":
         return file
     unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")

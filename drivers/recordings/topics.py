@@ -17,6 +17,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.module_lookup import format_choices_by_similarity
 from drivers.recordings.memory_check import RecordingSizeLimits
+from drivers.recordings.reading_progress import report_read_share
 from drivers.recordings.table import Columns, format_name_list
 
 JOIN: Final = "+"
@@ -109,7 +110,7 @@ def select_topics(
 
 
 def collect_columns(
-    rows: Iterable[Sequence[float]], names: Sequence[str], limit: RecordingSizeLimits
+    rows: Iterable[Sequence[float]], names: Sequence[str], limit: RecordingSizeLimits, expected_rows: int
 ) -> dict[str, Floats]:
     """Collect rows as arrays, block by block.
 
@@ -121,12 +122,15 @@ def collect_columns(
         Names of the columns.
     limit
         Limits on the number of rows.
+    expected_rows
+        Number of rows according to the index of the file, for the report of the progress.
     """
     blocks: list[Floats] = []
     count = 0
     for block in iter_row_blocks(rows):
         count += len(block)
         limit.check_row_count(count)
+        report_read_share(count, expected_rows)
         blocks.append(block)
     return {name: np.concatenate([np.empty(0), *(block[:, i] for block in blocks)]) for i, name in enumerate(names)}
 

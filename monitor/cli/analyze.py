@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from drivers.errors import ConfigError, NotReady, make_printable_and_shorten
+from drivers.errors import NotReady
 from monitor.cli.shared import options, output
 
 
@@ -27,13 +27,7 @@ def analyze(
         ),
     ] = None,
     rest: Annotated[bool, typer.Option("--rest", help="Leave out periods in which the sensor moved.")] = False,
-    units: Annotated[
-        str,
-        typer.Option(
-            metavar="imu|datasheet|si",
-            help="Units of table and plot: °/√h, with noise density in m°/s/√Hz, or rad/s/√Hz.",
-        ),
-    ] = "imu",
+    units: options.Units = "imu",
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     plot: Annotated[
         Path | None,
@@ -42,11 +36,9 @@ def analyze(
 ) -> None:
     """Print the Allan deviations, noise coefficients Q, N, B, K, R, motion and noise changes of a recording."""
     from monitor.commands import analyze as offline
-    from monitor.common.unit_formatting import UNIT_SYSTEMS
     from monitor.publishing.messages.analysis_json import AnalysisMessage, FailedAnalysisMessage
 
-    if units not in UNIT_SYSTEMS:
-        raise ConfigError(f'--units: "{make_printable_and_shorten(units)}"; possible are {", ".join(UNIT_SYSTEMS)}')
+    unit_system = options.parse_units(units)
     output.check_output_file("--plot", plot, ".png", ".html")
     window_s = options.parse_duration("--window", window)
     last_s = options.parse_duration("--last", last)
@@ -77,11 +69,11 @@ def analyze(
         )
         output.write_file_or_stdout("--json", json, message.encode() + b"\n")
     if plot is not None:
-        offline.save_plot_or_report(results, plot, recording.name, UNIT_SYSTEMS[units])
+        offline.save_plot_or_report(results, plot, recording.name, unit_system)
     if json != Path("-"):
         from monitor.publishing.terminal.coefficient_tables import print_analysis
 
         found = results.analysis
-        print_analysis(found.estimate, found.axes_of_temperature, found.notes, UNIT_SYSTEMS[units])
+        print_analysis(found.estimate, found.axes_of_temperature, found.notes, unit_system)
     if results.lacking:
         raise NotReady(results.lacking)

@@ -48,6 +48,7 @@ def history(
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Coefficients over time and events as a picture.")
     ] = None,
+    units: options.Units = "imu",
 ) -> None:
     """Print past coefficients, temperatures, lost samples and events, over periods from hours to years."""
     from rich.console import Console
@@ -62,6 +63,7 @@ def history(
 
     if axis is not None and axis not in AXES:
         raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')
+    unit_system = options.parse_units(units)
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--json", json)
     output.check_output_file("--out", out)
@@ -76,18 +78,22 @@ def history(
     asked = HistoryQuery(_span(since, until), step_s, PARTS, axes)
     get = _from_daemon(connect, zenoh, prefix, device) if live else _from_file(source, device)
     past = get(asked)
-    _save(past, asked, json, out, plot)
+    _save(past, asked, json, out)
+    if plot is not None:
+        from monitor.publishing.plots.history_plot import save_history_plot
+
+        save_history_plot(past, plot, asked.axes, unit_system)
     if json == Path("-"):
         return
     console = Console()
-    history_text.print_history_summary(past, axes, SYMBOLS if axis else history_text.LETTERS, console)
+    history_text.print_history_summary(past, axes, SYMBOLS if axis else history_text.LETTERS, console, unit_system)
     if axis is not None and len(past):
         few_s = max(width_of(past.span, None, MAX_TABLE_ROWS), past.step_s)
         few = past if few_s == past.step_s else get(HistoryQuery(asked.span, few_s, ("coefficients", "status"), axes))
-        history_text.print_axis_history(few, axis, SYMBOLS, console)
+        history_text.print_axis_history(few, axis, SYMBOLS, console, unit_system)
 
 
-def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:
+def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None) -> None:
     from monitor.publishing.messages.history import HistoryMessage
     from monitor.publishing.reports import history_file
 
@@ -97,10 +103,6 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
         output.write_file_or_stdout("--json", json, message.encode() + b"\n")
     if out is not None:
         history_file.save_history(past, out)
-    if plot is not None:
-        from monitor.publishing.plots.history_plot import save_history_plot
-
-        save_history_plot(past, plot, asked.axes)
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:

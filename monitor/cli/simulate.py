@@ -23,6 +23,8 @@ def simulate(
         Path | None, typer.Option(metavar="RECORDING", help="Use the temperature of this recording.")
     ] = None,
     reading: options.Reading = None,
+    decoder: options.DecoderName = None,
+    option: options.DecoderOptions = None,
     truth: Annotated[
         bool,
         typer.Option(
@@ -37,11 +39,14 @@ def simulate(
 
     length_s = options.parse_duration("--seconds", seconds)
     output.check_output_file("--json", json)
-    for option, path in (("--json", json), ("--temperature-from", temperature_from)):
+    for name, path in (("--json", json), ("--temperature-from", temperature_from)):
         if path is not None and real_path(path) == real_path(out):
-            raise ConfigError(f"{option}: {path} is also the output file of --out; choose another name")
+            raise ConfigError(f"{name}: {path} is also the output file of --out; choose another name")
     noise = load_model(model, Path.cwd())
-    request = simulation.SimulationRequest(noise, out, length_s, seed, rate, temperature_from, truth, model, reading)
+    choice = options.parse_decoder(decoder, option)
+    request = simulation.SimulationRequest(
+        noise, out, length_s, seed, rate, temperature_from, truth, model, reading, choice
+    )
     service_in_terminal.exit_on_sigterm()
     with output.show_progress_bar() as tell:
         result = simulation.run_simulation(request, tell)

@@ -41,9 +41,9 @@ def thermal_fit(
     output.check_output_file("--json", json)
     output.check_output_file("--out", out)
     interval_s, last_s = options.parse_duration("--interval", interval), options.parse_duration("--last", last)
-    study = thermal.fit_thermal_models(
-        recording, interval_s, rate, last_s, reading, options.parse_decoder(decoder, option)
-    )
+    choice = options.parse_decoder(decoder, option)
+    with output.show_progress_bar() as tell:
+        study = thermal.fit_thermal_models(recording, interval_s, rate, last_s, reading, choice, tell)
     if json is not None:
         output.write_file_or_stdout("--json", json, text.encode_thermal_fit(study) + b"\n")
     if not study.fits:
@@ -78,14 +78,10 @@ def thermal_predict(
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--json", json)
-    outlook = thermal.predict_bias_of_recording(
-        recording,
-        thermal.read_model_file(model),
-        rate,
-        options.parse_duration("--last", last),
-        reading,
-        options.parse_decoder(decoder, option),
-    )
+    models, last_s = thermal.read_model_file(model), options.parse_duration("--last", last)
+    choice = options.parse_decoder(decoder, option)
+    with output.show_progress_bar() as tell:
+        outlook = thermal.predict_bias_of_recording(recording, models, rate, last_s, reading, choice, tell)
     if json is not None:
         output.write_file_or_stdout("--json", json, text.encode_thermal_prediction(outlook) + b"\n")
     if not outlook.judged:

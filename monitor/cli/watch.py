@@ -14,9 +14,11 @@ def watch(
     connect: options.Connect = None,
     zenoh: options.ZenohFile = None,
     seconds: options.Seconds = None,
+    units: options.Units = "imu",
     json: Annotated[bool, typer.Option("--json", help="Print each message as one line of JSON.")] = False,
 ) -> None:
     """Show a live table of several daemons, whose results are received over zenoh."""
+    unit_system = options.parse_units(units)
     stop = threading.Event()
     service_in_terminal.install_signal_handlers(stop.set)
     if json:
@@ -28,4 +30,4 @@ def watch(
 
     from monitor.publishing.terminal.watch import watch as show
 
-    show(keyexpr, connect or (), stop, Console(), seconds, zenoh)
+    show(keyexpr, connect or (), stop, Console(), seconds, zenoh, unit_system)

@@ -27,7 +27,7 @@ from urllib.parse import urlsplit
 
 from drivers import file_access
 from drivers.errors import LinkUnavailable
-from drivers.extras import find_missing_packages
+from drivers.extras import find_missing_packages, install_command
 from drivers.links import udp_link
 from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
@@ -108,6 +108,7 @@ def _check_configured(config: Config) -> Iterator[Finding]:
     yield from _check_storage(config)
     yield from _check_metrics(config)
     yield from _check_influx(config)
+    yield from _check_ros2(config)
     yield from _check_reconcile(config)
     for hook in config.hooks:
         if hook.command:
@@ -312,7 +313,7 @@ def _check_viewer(config: Config) -> Iterator[Finding]:
         return
     if find_spec("rerun") is None:
         text = f'viewer.mode is "{mode}", but rerun-sdk is not installed: there will be no live view'
-        yield _doubt("viewer", text, 'pip install "imu-monitor[viewer]", or mode = "none"')
+        yield _doubt("viewer", text, f'{install_command("imu-monitor[viewer]")}, or mode = "none"')
     else:
         yield _well("viewer", f"rerun-sdk is installed, mode {mode}")
 
@@ -323,7 +324,7 @@ def _check_metrics(config: Config) -> Iterator[Finding]:
         return
     if find_spec("prometheus_client") is None:
         text = "metrics.listen is set, but prometheus-client is not installed"
-        yield _wrong("metrics", text, 'pip install "imu-monitor[metrics]"')
+        yield _wrong("metrics", text, install_command("imu-monitor[metrics]"))
         return
     host = f"[{own.host}]" if ":" in own.host else own.host
     yield check_port_free("metrics", f"tcp/{host}:{own.port}")
@@ -347,12 +348,17 @@ def _check_influx(config: Config) -> Iterator[Finding]:
         yield _doubt("influx", text, "use https")
 
 
+def _check_ros2(config: Config) -> Iterator[Finding]:
+    for endpoint in config.ros2.connect if config.ros2 is not None else ():
+        yield _check_reachable("ros2", endpoint)
+
+
 def _check_reconcile(config: Config) -> Iterator[Finding]:
     """If a folder for reports is configured, check that the packages for the command ``reconcile`` are installed."""
     missing = " and ".join(find_missing_packages("reconcile"))
     if missing and any(one.reconcile_folder for one in config.devices):
         text = f"reconcile_folder is set, but {missing} is not installed: the service refuses command/reconcile"
-        yield _doubt("reconcile", text, 'pip install "imu-monitor[reconcile]"')
+        yield _doubt("reconcile", text, install_command("imu-monitor[reconcile]"))
 
 
 def _check_storage(config: Config) -> Iterator[Finding]:
@@ -362,7 +368,7 @@ def _check_storage(config: Config) -> Iterator[Finding]:
         return
     if (own.record or own.raw) and find_spec("pyarrow") is None:
         text = "samples are to be recorded, but pyarrow is not installed"
-        yield _wrong("storage", text, 'pip install "imu-monitor[arrow]"')
+        yield _wrong("storage", text, install_command("imu-monitor[arrow]"))
     folder = next(one for one in (own.folder, *own.folder.parents) if os.path.exists(one))
     try:
         file_access.check_folder_or_absent(folder)
@@ -448,7 +454,7 @@ def check_library_versions() -> list[Finding]:
     """Check whether each installed library has a version that the program supports."""
     about, wrong, count = "libraries", [], 0
     for name, versions, optional in library_requirements():
-        install = f'pip install "{name}{versions}"'
+        install = install_command(f"{name}{versions}")
         try:
             there = metadata.version(name)
         except metadata.PackageNotFoundError:

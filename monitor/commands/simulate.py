@@ -16,10 +16,11 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import SAMPLE_COUNT
-from drivers.recordings import Recording, load_samples, open_recording_writer
+from drivers.recordings import Recording, open_recording_writer
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from monitor.noise.model import NoiseModel
 from monitor.noise.simulation import ModelStream, SimulatedSamples
 
@@ -41,6 +42,7 @@ class SimulationRequest:
     truth: bool = False  # True to write a file with the drawn random values
     name: str = "the model"  # name of the model in messages
     reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
+    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes with the temperature
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +179,9 @@ def run_simulation(request: SimulationRequest, report_progress: ProgressCallback
     grid = choose_sample_grid(request.model, request.seconds, request.rate_hz, request.name)
     rate_hz, n, axes = grid.rate_hz, grid.samples, grid.axes
     report_progress("preparing", None)
-    stream = start_stream(request.model, rate_hz, request.seed, _temperature(request, rate_hz, n), request.name)
+    stream = start_stream(
+        request.model, rate_hz, request.seed, _temperature(request, rate_hz, n, report_progress), request.name
+    )
     first = stream.draw_samples_with_temperature(min(n, CHUNK_ROWS))
     temperature = not bool(np.isnan(first.temperature_c).all())
     truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
@@ -204,14 +208,16 @@ def _write(result: SimulationResult, stream: ModelStream, first: SimulatedSample
         tell("finishing the file", None)  # some formats are compressed only at the end
 
 
-def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats | None:
+def _temperature(
+    request: SimulationRequest, rate_hz: float, n: int, report_progress: ProgressCallback
+) -> Floats | None:
     """Return the temperature [≤ n] in °C, interpolated to the times of the simulated samples.
 
     The result is None if no recording with a temperature is given.
     """
     if request.temperature_from is None:
         return None
-    found = _load_recording(request.temperature_from, request.rate_hz, request.reading)
+    found = _load_recording(request, request.temperature_from, report_progress)
     known = np.isfinite(found.temperature_c)
     if not known.any():
         raise ConfigError(f"{request.temperature_from}: has no temperature; a column temperature in °C is needed")
@@ -222,14 +228,14 @@ def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats |
     return np.interp(np.arange(length) / rate_hz, t_s[order], temperature_c[order])
 
 
-def _load_recording(path: Path, rate_hz: float | None, reading: ReadingOptions) -> Recording:
+def _load_recording(request: SimulationRequest, path: Path, report_progress: ProgressCallback) -> Recording:
     """Load the recording of the temperature. The requested sample rate is used if the recording has none."""
     try:
-        return load_samples(path, options=reading)
+        return load_recording(path, None, None, request.reading, request.decoder, report_progress)
     except ConfigError:
-        if rate_hz is None:
+        if request.rate_hz is None:
             raise
-        return load_samples(path, rate_hz, options=reading)
+        return load_recording(path, request.rate_hz, None, request.reading, request.decoder, report_progress)
 
 
 def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> bytes:

@@ -17,6 +17,7 @@ from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
+from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
@@ -64,6 +65,7 @@ def fit_thermal_models(
     last_s: float | None = None,
     reading: ReadingOptions = DEFAULT_OPTIONS,
     decoder: DecoderChoice | None = None,
+    report_progress: ProgressCallback = ignore_progress,
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
 
@@ -81,13 +83,15 @@ def fit_thermal_models(
         Topic, columns and units to read.
     decoder : DecoderChoice, optional
         Decoder of a CAN log or of captured bytes.
+    report_progress : callable, optional
+        Progress callback.
 
     Raises
     ------
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, reading, decoder)
+    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, reading, decoder, report_progress)
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -105,6 +109,7 @@ def predict_bias_of_recording(
     last_s: float | None = None,
     reading: ReadingOptions = DEFAULT_OPTIONS,
     decoder: DecoderChoice | None = None,
+    report_progress: ProgressCallback = ignore_progress,
 ) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models that were fitted to an earlier recording.
 
@@ -122,6 +127,8 @@ def predict_bias_of_recording(
         Topic, columns and units to read.
     decoder : DecoderChoice, optional
         Decoder of a CAN log or of captured bytes.
+    report_progress : callable, optional
+        Progress callback.
 
     Raises
     ------
@@ -129,7 +136,7 @@ def predict_bias_of_recording(
         If the recording cannot be read, or if it has no temperature.
     """
     interval = next(iter(models.values())).interval_s
-    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, reading, decoder)
+    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, reading, decoder, report_progress)
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
@@ -237,9 +244,10 @@ def _read_interval_means(
     last_s: float | None,
     reading: ReadingOptions,
     decoder: DecoderChoice | None,
+    report_progress: ProgressCallback,
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
     """Return the interval means of each recorded axis, and notes about the recording."""
-    found = load_recording(recording, rate_hz, last_s, reading, decoder)
+    found = load_recording(recording, rate_hz, last_s, reading, decoder, report_progress)
     values, temperature_c, rate, notes = place_samples_and_temperature_on_grid(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")

@@ -17,11 +17,12 @@ import numpy as np
 import drivers.decoders
 from drivers import module_lookup
 from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Timing, make_block, ns_to_seconds
-from drivers.decoders.base import Decoder, LateFrameCountingDecoder
+from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
+from drivers.recordings.reading_progress import listen_to_reading_progress
 from drivers.settings_model import TableError
 from drivers.timing.sample_clock import SampleClock
 from monitor.commands.progress import ProgressCallback, ignore_progress
@@ -79,7 +80,6 @@ def load_recording(
     ConfigError
         If the decoder is missing or does not fit, an option is wrong, or the samples do not fit into memory.
     """
-    report_progress("reading", None)
     kind = None
     with contextlib.suppress(ConfigError, OSError):  # load_samples describes an unknown or missing file
         kind = detect_file_kind(path) if path.exists() else None
@@ -87,18 +87,20 @@ def load_recording(
         if kind in CONTENTS:
             names = list_decoders(CARRIERS[kind]) if kind in CARRIERS else module_lookup.list_modules(drivers.decoders)
             raise ConfigError(f"{path}: contains {CONTENTS[kind]}; name the decoder with --decoder: {', '.join(names)}")
-        return load_samples(path, rate_hz, last_s, reading)
+        report_progress("reading", None)
+        with listen_to_reading_progress(lambda share: report_progress("reading", share)):
+            return load_samples(path, rate_hz, last_s, reading)
     if kind == "recording":
         raise ConfigError(f"{path}: contains samples, which need no decoder; leave out --decoder")
     if reading.topic is not None:
         raise ConfigError(f"{path}: contains no topics; leave out --topic")
-    found = _decode_file(path, decoder, rate_hz, report_progress)
+    report_progress("decoding", None)
+    with listen_to_reading_progress(lambda share: report_progress("decoding", share)):
+        found = _decode_file(path, decoder, rate_hz)
     return found if last_s is None else take_last(found, last_s)
 
 
-def _decode_file(
-    path: Path, choice: DecoderChoice, rate_hz: float | None, report_progress: ProgressCallback
-) -> Recording:
+def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Recording:
     link, decoder = _build(path, choice)
     clock = SampleClock(decoder.timing, rate_hz)
     untimed = link.epoch == "monotonic" and "bytes_per_second" not in choice.options
@@ -119,7 +121,6 @@ def _decode_file(
                     blocks += clock.assign_times(batch)
                 rows += len(timed)
             limit.check_row_count(rows)
-            report_progress(f"decoding, {rows} samples", None)
     except LinkEnded:
         pass  # the whole file has been decoded
     except LinkUnavailable as error:
@@ -195,6 +196,8 @@ def _describe_losses(blocks: list[SampleBlock], decoder: Decoder, clock: SampleC
     if isinstance(decoder, LateFrameCountingDecoder) and decoder.dropped_late_samples:
         hint = f": {decoder.late_frames_hint}" if decoder.late_frames_hint else ""
         yield f"{format_count(decoder.dropped_late_samples, 'sample')} left out because of late frames{hint}."
+    if isinstance(decoder, FilterReportingDecoder) and (note := decoder.on_board_filter_note):
+        yield f"{note[0].upper()}{note[1:]}."
     if clock.dropped_repeated_rows:
         yield f"{format_count(clock.dropped_repeated_rows, 'repeated sample')} left out."
     jumps = [event.text for event in clock.take_events(ended=True) if event.kind == "clock_jumped"]

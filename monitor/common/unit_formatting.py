@@ -1,12 +1,12 @@
 """Units of inertial navigation, data sheets and SI, and formatting of quantities, durations and numbers as text.
 
-The program computes in SI units. Terminal output and figures use the units of inertial navigation, unless ``analyze``
+The program computes in SI units. Terminal output and figures use the units of inertial navigation, unless a command
 is called with ``--units``. The conversion factors follow from 1
 rad = 180/π ° and standard gravity, 1 g = 9.80665 m/s² (CGPM 1901).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Final, Literal, NamedTuple
@@ -119,8 +119,8 @@ class UnitSystem:
         """Return the unit of Allan deviations, which is the unit of the bias instability B."""
         return self.coefficients[kind]["B"]
 
-    def columns(self, kind: Kind) -> list[CoefficientColumn]:
-        """Return the columns of a table of all coefficients.
+    def columns(self, kind: Kind, symbols: Sequence[str] = "QNBKR") -> list[CoefficientColumn]:
+        """Return the columns of a table of coefficients.
 
         >>> [f"{one.symbol} {one.unit.name}" for one in UNIT_SYSTEMS["datasheet"].columns("gyro")][:3]
         ['Q µrad', 'N °/√h', 'N m°/s/√Hz']
@@ -129,10 +129,12 @@ class UnitSystem:
         ----------
         kind : {"gyro", "accel"}
             Kind of sensor.
+        symbols : sequence of str, optional
+            Symbols of the coefficients. By default, all coefficients.
         """
         found = []
-        for symbol, name in COEFFICIENT_NAMES[kind].items():
-            found.append(CoefficientColumn(symbol, name, self.coefficients[kind][symbol]))
+        for symbol in symbols:
+            found.append(CoefficientColumn(symbol, COEFFICIENT_NAMES[kind][symbol], self.coefficients[kind][symbol]))
             if symbol == "N" and kind in self.densities:
                 found.append(CoefficientColumn(symbol, "noise density, one-sided", self.densities[kind]))
         return found
@@ -167,7 +169,7 @@ UNIT_SYSTEMS: Final = {
         }
     ),
 }
-"""Unit systems of ``analyze --units``. In SI, N and K are two-sided densities: rad/s/√Hz is the same as rad/√s."""
+"""Unit systems of the option ``--units``. In SI, N and K are two-sided densities: rad/s/√Hz is the same as rad/√s."""
 DEFAULT_UNITS: Final = UNIT_SYSTEMS["imu"]
 
 

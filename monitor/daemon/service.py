@@ -44,6 +44,7 @@ from monitor.settings.loading import Config, Device, Storage, VirtualTable
 if TYPE_CHECKING:
     from monitor.daemon.operations.prometheus_metrics import MetricsOutput
     from monitor.daemon.outputs.influx_output import InfluxOutput
+    from monitor.daemon.outputs.ros2_output import Ros2Output
     from monitor.publishing.rerun.queued_view import RerunView
 
 MAX_IDLE_S: Final = 0.05
@@ -113,15 +114,10 @@ class Service:
         self.hooks = Hooks(config.hooks, self.zenoh.publish_json_return_error)
         self.metrics = _build_metrics_output(config)
         self.influx = _build_influx_output(config)
-        self.outputs += [ZenohOutput(self.zenoh), self.hooks, *more]
-        if self.metrics is not None:
-            self.outputs.append(self.metrics)
-        if self.influx is not None:
-            self.outputs.append(self.influx)
-        if self.viewer is not None:
-            self.outputs.append(ViewerOutput(self.viewer))
-        if self.history is not None:
-            self.outputs.append(self.history)
+        self.ros2 = _build_ros2_output(config)
+        viewer = None if self.viewer is None else ViewerOutput(self.viewer)
+        optional = (self.metrics, self.influx, self.ros2, viewer, self.history)
+        self.outputs += [ZenohOutput(self.zenoh), self.hooks, *more, *(one for one in optional if one is not None)]
 
     def request_stop(self) -> None:
         """Request the end of the main loop, from any thread."""
@@ -143,7 +139,7 @@ class Service:
             self._close()
 
     def _start(self) -> None:
-        for output in (self.history, self.zenoh, self.metrics, self.influx, self.viewer):
+        for output in (self.history, self.zenoh, self.metrics, self.influx, self.ros2, self.viewer):
             if output is not None:
                 output.start()
         for worker in self.workers:
@@ -193,6 +189,7 @@ class Service:
             "history": self.history,
             "metrics": self.metrics,
             "influx": self.influx,
+            "ros2": self.ros2,
             "hook": self.hooks if self.hooks.hooks else None,
             **self._writers,
         }
@@ -262,6 +259,8 @@ class Service:
 
     def _start_added(self, worker: DeviceWorker) -> None:
         self.zenoh.add_device(worker.name)
+        if self.ros2 is not None:
+            self.ros2.add_device(worker.device)
         if self.recorder is not None:
             self.recorder.start_recordings(_segment_origins(self.config.storage, worker.device))
         worker.start_reader_and_resume_recording()
@@ -298,6 +297,8 @@ class Service:
         states, memory = self.output_states(), _measure_memory_bytes()
         self._announce_viewer_url()
         healths = {worker.name: worker.slew_and_publish_status(states, memory) for worker in self.workers}
+        if self.ros2 is not None:
+            self.ros2.publish_diagnostics()
         self._notify_systemd(healths, states)
 
     def _notify_systemd(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
@@ -337,7 +338,8 @@ class Service:
         finally:
             self._commands.abort_reconciliations()
             self._commands.publish_reconciled({worker.name: worker for worker in self.workers})
-            for output in (self.recorder, self.hooks, self.metrics, self.influx, self.viewer, self.zenoh, self.history):
+            exporters = (self.metrics, self.influx, self.ros2, self.viewer, self.zenoh)
+            for output in (self.recorder, self.hooks, *exporters, self.history):
                 if output is not None:
                     output.close()
 
@@ -400,6 +402,14 @@ def _build_influx_output(config: Config) -> "InfluxOutput | None":
     from monitor.daemon.outputs.influx_output import InfluxOutput  # imports http.client, so only if it is needed
 
     return InfluxOutput(settings.url, settings.token_file, settings.interval_s)
+
+
+def _build_ros2_output(config: Config) -> "Ros2Output | None":
+    if config.ros2 is None:
+        return None
+    from monitor.daemon.outputs.ros2_output import Ros2Output
+
+    return Ros2Output(config.ros2, config.devices)
 
 
 def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) -> "RerunView | None":

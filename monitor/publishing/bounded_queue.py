@@ -23,6 +23,7 @@ class BoundedQueue(Generic[T]):
         self._weight = 0
         self._ready = threading.Condition()
         self.dropped = 0  # number of items dropped since the queue was created
+        self.dropped_weight = 0
 
     def push(self, item: T, weight: int) -> None:
         """Add an item, and drop the oldest items while the total weight exceeds the limit.
@@ -40,7 +41,9 @@ class BoundedQueue(Generic[T]):
             self._items.append((item, weight))
             self._weight += weight
             while self._weight > self._limit and len(self._items) > 1:
-                self._weight -= self._items.popleft()[1]
+                _, oldest_weight = self._items.popleft()
+                self._weight -= oldest_weight
+                self.dropped_weight += oldest_weight
                 self.dropped += 1
             self._ready.notify()
 

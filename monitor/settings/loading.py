@@ -15,6 +15,7 @@ from drivers.zenoh.session_config import build_session_config, find_secret_files
 from monitor.settings import file_permissions, toml_parser
 from monitor.settings.driver_settings import BuiltLinkAndDecoder, FaultsTable, VirtualTable
 from monitor.settings.field_types import MetricsAddress, check_viewer_mode, parse_duration_s, parse_rate_as_period
+from monitor.settings.ros2_table import Ros2Table
 from monitor.settings.schema import (
     DEVICE_NAME,
     WINDOW_SAMPLES,
@@ -42,6 +43,7 @@ __all__ = [
     "Limit",
     "LogTable",
     "MetricsAddress",
+    "Ros2Table",
     "Storage",
     "ViewerTable",
     "VirtualTable",
@@ -68,6 +70,7 @@ class Config:
     hooks: tuple[Hook, ...] = ()
     metrics: MetricsAddress | None = None
     influx: InfluxTable | None = None  # None if nothing is sent
+    ros2: Ros2Table | None = None  # None if nothing is published
     path: Path | None = None  # of the file
     table: Mapping[str, Any] = dataclasses.field(
         default_factory=dict
@@ -154,7 +157,10 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
 def _configuration(file: ConfigFile) -> Config:
     storage = None if file.storage.folder == Path() else file.storage
     influx = None if file.influx.url is None else file.influx
-    return Config(file.devices, file.zenoh, file.viewer, file.log, storage, file.hooks, file.metrics.listen, influx)
+    ros2 = None if file.ros2.domain is None else file.ros2
+    return Config(
+        file.devices, file.zenoh, file.viewer, file.log, storage, file.hooks, file.metrics.listen, influx, ros2
+    )
 
 
 def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:

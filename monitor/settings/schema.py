@@ -20,6 +20,7 @@ from drivers.errors import ConfigError
 from drivers.links.base import Link
 from drivers.number_ranges import DAY_S, NumberRange
 from drivers.settings_model import Conflict, ConvertedFrom, KeywordOrType, ListOf, SettingsModel, checked_by, one_of
+from drivers.zenoh.ros2_imu_message import FRAME_ID
 from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings.driver_settings import BuiltLinkAndDecoder, VirtualTable, build_link_and_decoder
@@ -36,6 +37,7 @@ from monitor.settings.field_types import (
     check_viewer_mode,
     period_stated_as_rate_annotation,
 )
+from monitor.settings.ros2_table import ROS_NAME, FrameId, Ros2Table, ros_name
 
 WINDOW_SAMPLES: Final = (100, 10_000_000)
 """Smallest and largest number of samples in the sliding window."""
@@ -159,6 +161,7 @@ class Device(SettingsModel):
     reconcile_folder: RelativePath | None = Field(
         None, examples=["reports"], description="folder for the reports of command/reconcile; absent: they are not kept"
     )
+    frame_id: FrameId = Field(FRAME_ID, description="coordinate frame of the samples in ROS 2")
     axes: Annotated[AxisMap, ConvertedFrom(dict[str, str], lambda table, folder: parse_axis_map(table))] = Field(
         AxisMap(),
         examples=[{axis: axis for axis in AXES}],
@@ -400,6 +403,7 @@ class ConfigFile(SettingsModel):
     hooks: ListOf[Hook] = Field((), alias="hook", description="actions for events")
     metrics: MetricsTable = Field(MetricsTable(), description="numbers for Prometheus")
     influx: InfluxTable = Field(InfluxTable(), description="numbers for InfluxDB")
+    ros2: Ros2Table = Field(Ros2Table(), description="diagnostics and samples for ROS 2")
     log: LogTable = Field(LogTable(), description="messages of the service")
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:
@@ -422,3 +426,21 @@ class ConfigFile(SettingsModel):
         if self.viewer.history is not None and not (self.storage.history and self.storage.folder != Path()):
             text = "there is no history to show; add folder to [storage]"
             yield Conflict("viewer.history", text, ("storage",))
+        if self.ros2.domain is not None and self.ros2.imu != "none":
+            yield from self._find_ros2_conflicts()
+
+    def _find_ros2_conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict for each device whose samples cannot be published in ROS 2."""
+        devices: dict[str, str] = {}
+        for i, device in enumerate(self.devices):
+            name = ros_name(device.name)
+            if not ROS_NAME.fullmatch(name):
+                yield Conflict(
+                    f"device[{i}].name", f'"{device.name}" begins with a digit, which ROS 2 refuses', ("ros2",)
+                )
+            if devices.setdefault(name, device.name) != device.name:
+                text = f'"{device.name}" and "{devices[name]}" have the same name in ROS 2, {name}; change one of them'
+                yield Conflict(f"device[{i}].name", text, ("ros2",))
+            if self.ros2.imu == "compensated" and not device.compensate:
+                text = 'false, but ros2.imu is "compensated"; write ros2.imu = "raw", or remove this key'
+                yield Conflict(f"device[{i}].compensate", text, ("ros2",))

@@ -43,7 +43,7 @@ class Example:
 
     name: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    gyro_step: float = 1e-3  # rad/s; value of the last bit or digit
+    gyro_step: float | None = 1e-3  # rad/s; value of the last bit or digit; None if the format has no angular rates
     accel_step: float = 1e-2  # m/s²
     temperature_step: float | None = 0.5  # °C; None if the format has no temperature
     checksum: bool = False  # True if every damaged byte is detected
@@ -75,6 +75,7 @@ FLOAT32_STEP = 2.0**-22  # step of a float32 for numbers from 2 to 4
 COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az", "temperature")
 TEXT = Example("text", {"columns": COLUMNS}, 1e-14, 1e-13, 1e-13)
 OTHER_UNITS = {"gyro_unit": "deg/s", "accel_unit": "mg", "temperature_unit": "K", "delimiter": ";"}
+EPSON = Example("epson_uart", {"model": "g366pdg0"}, DEGREE / 66, 0.25e-3 * G, 2.0**-8, checksum=True)
 RAW_UNITS = {"gyro_unit": "deg/s/131", "accel_unit": "g/16384"}
 STIM300 = Example("stim300", {}, DEGREE / 2**14, G / 2**19, 2.0**-8, checksum=True)
 VECTORNAV = Example("vectornav_binary", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
@@ -82,6 +83,11 @@ XSENS = Example("xsens_mtdata2", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT3
 WITMOTION = Example("witmotion", {}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 0.01, checksum=True)
 
 LISTED_EXAMPLES = (
+    Example("aceinna_dmu", {}, 1260 * DEGREE / 2**16, 20 * G / 2**16, 200 / 2**16, checksum=True),
+    Example("aceinna_dmu", {"packet": "S0"}, 1260 * DEGREE / 2**16, 20 * G / 2**16, 200 / 2**16, checksum=True),
+    Example("aceinna_dmu", {"packet": "z1"}, DEGREE * 2.0**-17, 8 * FLOAT32_STEP, None, checksum=True),
+    Example("aceinna_dmu", {"packet": "s1", "accel_unit": "g"}, DEGREE * 2.0**-17, G * FLOAT32_STEP, 1e-5, True),
+    Example("bno08x_rvc", {}, None, 1e-3 * G, None, checksum=True),
     TEXT,
     Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),
     Example("text", {"columns": ("t", "-", *COLUMNS), "time_unit": "ms"}, 1e-14, 1e-13, 1e-13),
@@ -110,6 +116,21 @@ LISTED_EXAMPLES = (
     ),
     WITMOTION,
     Example("witmotion", {"temperature": "jy61"}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 1 / 340, True),
+    EPSON,
+    Example(
+        "epson_uart", {"model": "g364pdca", "bits": 32}, DEGREE * 0.00375 / 2**16, 0.125e-3 * G / 2**16, 1e-7, True
+    ),
+    Example("microstrain_mip", {}, FLOAT32_STEP, G * FLOAT32_STEP, None, checksum=True),
+    Example("microstrain_mip", {"increments": True}, 2 * FLOAT32_STEP, G * FLOAT32_STEP, None, checksum=True),
+    Example("sbg_ecom", {}, 2.0**-26, 2.0**-20, 2.0**-8, checksum=True),
+    Example("sbg_ecom", {"message": "imu_data"}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
+    Example("silicon_sensing_dmu", {}, FLOAT32_STEP, G * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
+    Example("silicon_sensing_dmu", {"length": 40}, FLOAT32_STEP, G * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
+    Example("ublox_esf", {}, DEGREE / 2**12, 2.0**-10, 0.01, checksum=True),
+    Example("ublox_esf", {"message": "esf-meas"}, DEGREE / 2**12, 2.0**-10, 0.01, checksum=True),
+    Example("inertial_labs", {}, 1e-5 * DEGREE, 1e-6 * G, 0.1, checksum=True),
+    Example("inertial_labs", {"message": "calibrated-hr"}, 1e-5 * DEGREE, 1e-6 * G, 0.1, checksum=True),
+    Example("novatel_rawimusx", {}, 125 * DEGREE / 2**21, 125 / 2**22, None, checksum=True),
     Example("dbc", {"signals": CAN_SIGNALS}, 2.0**-9, 2.0**-8, 2.0**-8),
     Example("mavlink", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
     Example("mavlink", {"message": "SCALED_IMU2", "clock": "arrival"}, 1e-3, 1e-3 * G, 0.01, checksum=True),

@@ -16,7 +16,15 @@ import pytest
 from drivers import driver as driver_module
 from drivers.data_types import NO_TICK, Chunk, make_block
 from drivers.decoders import dbc
-from drivers.decoders.binary_frames import stim300, vectornav_binary
+from drivers.decoders.binary_frames import (
+    aceinna_dmu,
+    bno08x_rvc,
+    inertial_labs,
+    novatel_rawimusx,
+    stim300,
+    ublox_esf,
+    vectornav_binary,
+)
 from drivers.decoders.messages import samples as samples_decoder
 from drivers.decoders.text_lines import text
 from drivers.driver import MAX_UNDECODED_BYTES, AxisMap, Driver, parse_axis_map
@@ -243,17 +251,21 @@ def damage_stream(frames, broken, absent):
     return b"".join(parts)
 
 
-@pytest.mark.parametrize("name", ["vectornav_binary", "stim300"])
+@pytest.mark.parametrize(
+    "module",
+    [vectornav_binary, stim300, aceinna_dmu, bno08x_rvc, inertial_labs, novatel_rawimusx, ublox_esf],
+    ids=lambda module: module.__name__.rpartition(".")[2],
+)
 @pytest.mark.parametrize("pieces", [1, 7, 1000])
-def test_received_bad_and_lost_samples_add_up_to_the_sent_samples(name, pieces):
-    module = {"vectornav_binary": vectornav_binary, "stim300": stim300}[name]
+def test_received_bad_and_lost_samples_add_up_to_the_sent_samples(module, pieces):
     decoder, encoder = module.build(module.Settings()), module.build(module.Settings())
     timing = decoder.timing
     n = 2000
     rng = np.random.default_rng(4)
     broken = set(rng.choice(np.arange(20, n - 5), 60, replace=False).tolist())
     absent = set(rng.choice(np.arange(20, n - 5), 80, replace=False).tolist()) - broken
-    frames = [chunk.data for chunk in encoder.encode(make_samples(0, n, 500.0, timing.tick_s, timing.modulus))]
+    tick_s = timing.tick_s or 1.0 / 500.0  # a counter without a unit counts samples
+    frames = [chunk.data for chunk in encoder.encode(make_samples(0, n, 500.0, tick_s, timing.modulus))]
     data = damage_stream(frames, broken, absent)
     rig = DriverRig(decoder, 500.0)
     rig.thread.start()
@@ -347,6 +359,16 @@ def test_status_text_names_the_window_if_all_can_frames_are_late():
     assert rig.driver.state == "waiting"
     assert rig.driver.text.startswith("loopback: ")
     assert rig.driver.text.endswith(f" bytes without a sample; {LATE_FRAME_HINT}")
+
+
+def test_status_names_the_decoder_that_fits_undecoded_bytes():
+    encoder = stim300.build(stim300.Settings())
+    with run_driver() as rig:
+        for chunk in encoder.encode(make_samples(0, 200, tick_s=1.0, modulus=256)):
+            rig.link.write(chunk.data)
+        rig.wait_until(lambda: 'the bytes fit decoder = "stim300"' in rig.driver.text)
+        rig.send(50)
+        rig.wait_until(lambda: rig.driver.state == "running" and not rig.driver.text)
 
 
 def test_times_are_unix_if_the_link_has_unix_times():

@@ -12,6 +12,7 @@ loopback.
 import argparse
 import base64
 import contextlib
+import io
 import json
 import os
 import secrets
@@ -403,6 +404,34 @@ def allan(out: Path, folder: Path) -> Path:
     return reduce_colours(run_analyze(recording(folder, HOUR_S), out / "allan-plot.png"))
 
 
+def live_notebook(out: Path, folder: Path) -> Path:
+    """Run the notebook about live data, and save its picture."""
+    return save_notebook_pictures("live_data_over_zenoh", folder, out / "notebook-live.png")
+
+
+def simulation_notebook(out: Path, folder: Path) -> Path:
+    """Run the notebook about simulations, and save its pictures side by side."""
+    return save_notebook_pictures("simulation_against_measurement", folder, out / "notebook-simulation.png")
+
+
+def save_notebook_pictures(name: str, folder: Path, path: Path) -> Path:
+    """Run a notebook of the documentation, and save all PNG pictures of its outputs side by side."""
+    from PIL import Image
+
+    from tests.support.notebooks import list_output_data, run_notebook
+
+    source = Path(__file__).parents[2] / "docs" / "notebooks" / f"{name}.ipynb"
+    with contextlib.chdir(folder):
+        notebook, _ = run_notebook(source)
+    encoded = [data["image/png"] for data in list_output_data(notebook) if "image/png" in data]
+    shown = [Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB") for text in encoded]
+    whole = Image.new("RGB", (sum(one.width for one in shown), max(one.height for one in shown)), "white")
+    for i, one in enumerate(shown):
+        whole.paste(one, (sum(left.width for left in shown[:i]), 0))
+    whole.save(path)
+    return reduce_colours(path)
+
+
 def dynamic(out: Path, folder: Path) -> Path:
     """Draw the plot of ``analyze --plot --window``."""
     return reduce_colours(
@@ -499,6 +528,8 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "report": report,
     "before": before,
     "after": after,
+    "live_notebook": live_notebook,
+    "simulation_notebook": simulation_notebook,
 }
 
 

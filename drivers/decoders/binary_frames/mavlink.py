@@ -58,14 +58,14 @@ CRC_OF_BYTE: Final = frozenset(binascii.crc_hqx(bytes([byte]), 0) for byte in ra
 
 @dataclass(frozen=True, slots=True)
 class ImuMessage:
-    """Layout and units of a message with IMU data. None as a unit means that the settings define the unit."""
+    """Layout and units of a message with IMU data."""
 
     number: int
     crc_extra: int
     layout: np.dtype[np.void]
     time_unit_s: float
-    gyro_unit: str | None
-    accel_unit: str | None
+    gyro_unit: str
+    accel_unit: str
     temperature_unit_c: float
 
 
@@ -93,7 +93,7 @@ MESSAGES: Final = {
     "SCALED_IMU": ImuMessage(26, 170, _SCALED_LAYOUT, 1e-3, "mrad/s", "mg", 0.01),
     "SCALED_IMU2": ImuMessage(116, 76, _SCALED_LAYOUT, 1e-3, "mrad/s", "mg", 0.01),
     "SCALED_IMU3": ImuMessage(129, 46, _SCALED_LAYOUT, 1e-3, "mrad/s", "mg", 0.01),
-    "RAW_IMU": ImuMessage(27, 144, _RAW_LAYOUT, 1e-6, None, None, 0.01),
+    "RAW_IMU": ImuMessage(27, 144, _RAW_LAYOUT, 1e-6, "mrad/s", "mg", 0.01),  # units of ArduPilot
 }
 CRC_EXTRA: Final = {message.number: bytes([message.crc_extra]) for message in MESSAGES.values()}
 NAMES: Final = {message.number: name for name, message in MESSAGES.items()}
@@ -135,8 +135,9 @@ class MavlinkDecoder(base.FrameStreamDecoder):
         self._settings = settings
         self._message = message = MESSAGES[settings.message]
         self._has_instance = "instance" in (message.layout.names or ())
-        self._gyro_factor = units.angular_rate_factor(message.gyro_unit or settings.gyro_unit or "")
-        self._accel_factor = units.acceleration_factor(message.accel_unit or settings.accel_unit or "")
+        raw = settings.message == "RAW_IMU"
+        self._gyro_factor = units.angular_rate_factor((raw and settings.gyro_unit) or message.gyro_unit)
+        self._accel_factor = units.acceleration_factor((raw and settings.accel_unit) or message.accel_unit)
         self._modulus = WRAP_US if message.layout["time"].itemsize == 8 else 1 << 32
         device_clock = settings.clock == "device"
         self.timing: Timing = (

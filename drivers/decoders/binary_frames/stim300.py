@@ -210,7 +210,6 @@ def _write_int24(data: base.Bytes, at: int, values: Floats, step: float) -> None
 
 def datagram_crc(body: bytes) -> bytes:
     """Return the four CRC bytes of a datagram."""
-    # The CRC of zlib is reflected, but the STIM300 CRC is not.
     return _reflected_crc(body.translate(base.BIT_REVERSAL)).to_bytes(4, "little").translate(base.BIT_REVERSAL)
 
 

@@ -77,6 +77,16 @@ def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.
         Structured dtype of a complete message with the fields time, gyro, accel and temperature. Fields that the
         message does not contain are omitted. The result is None if the header contains unknown groups or fields.
     """
+    offsets = _locate_fields(header)
+    if offsets is None:
+        return None
+    last = max(offsets, key=lambda field: offsets[field])
+    end = offsets[last] + FIELD_SIZES[last[0]][last[1]]
+    return _build_layout(offsets, end + 2, prefer_compensated)
+
+
+def _locate_fields(header: bytes) -> dict[tuple[int, int], int] | None:
+    """Return the offset of each field (group, bit), or None if the header contains unknown groups or fields."""
     groups = [g for g in range(1, 9) if header[0] >> (g - 1) & 1]
     masks = struct.unpack(f"<{len(groups)}H", header[1:])
     offsets: dict[tuple[int, int], int] = {}
@@ -89,7 +99,7 @@ def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.
             if mask >> bit & 1:
                 offsets[group, bit] = end
                 end += size
-    return _build_layout(offsets, end + 2, prefer_compensated)
+    return offsets
 
 
 def _build_layout(offsets: dict[tuple[int, int], int], length: int, prefer_compensated: bool) -> np.dtype[np.void]:
@@ -116,6 +126,16 @@ def _build_layout(offsets: dict[tuple[int, int], int], length: int, prefer_compe
     return np.dtype({"names": names, "formats": formats, "offsets": starts, "itemsize": length})
 
 
+@lru_cache(maxsize=256)
+def _contains_compensated_gyro(header: bytes, prefer_compensated: bool) -> bool:
+    """Return True if the angular rates of messages with this header are taken from a compensated field."""
+    fields = _locate_fields(header) or {}
+    compensated = any((group, bit) in fields for group, bit, _ in COMPENSATED_GYRO)
+    return compensated and (
+        prefer_compensated or all((group, bit) not in fields for group, bit, _ in UNCOMPENSATED_GYRO)
+    )
+
+
 def _header_end(groups: int) -> int:
     # Bit 7 announces a second group byte, which the decoder does not support.
     return 0 if groups == 0 or groups & 0x80 else 2 + 2 * groups.bit_count()
@@ -133,7 +153,12 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         self._compensated = settings.compensated
         self._uses_device_time = settings.clock == "time_startup"
         self.timing: Timing = CounterTimedFormat(TICKS, 1e-9) if self._uses_device_time else ArrivalTimedFormat()
-        self._time_missing = False
+        self._time_missing = self._reads_compensated_gyro = False
+
+    @property
+    def on_board_filter_note(self) -> str:
+        """Note that the newest message contained corrected angular rates; "" if they were not corrected."""
+        return f"{base.ON_BOARD_FILTER_NOTE}; select the field Imu" if self._reads_compensated_gyro else ""
 
     @property
     def recent_problem(self) -> str:
@@ -152,6 +177,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
             assert layout is not None, "the buffer accepts only messages with a known layout"
             messages = frames.stack_frames(rows).view(layout)[:, 0]
             fields = layout.names or ()
+            self._reads_compensated_gyro = _contains_compensated_gyro(header, self._compensated)
             if "gyro" in fields:
                 values[rows, :3] = base.nan_to_infinity(_as_float64(messages["gyro"]))
             if "accel" in fields:

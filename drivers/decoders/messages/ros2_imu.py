@@ -1,20 +1,8 @@
 """Decoder of ROS 2 ``sensor_msgs/msg/Imu`` messages over zenoh (rmw_zenoh, zenoh-bridge-ros2dds).
 
-Each message contains one sample. The payload is XCDR1 (OMG DDSI-RTPS 10.5). The first 4 bytes are the encapsulation:
-``00 01`` for little-endian or ``00 00`` for big-endian, and two bytes of options. The following fields are aligned from
-byte 4:
-
-- stamp.sec (i32) and stamp.nanosec (u32), the time of the sample;
-- frame_id (u32 length including the final NUL, then the characters), and padding to 8 bytes;
-- 37 float64: orientation x y z w, angular velocity x y z in rad/s and linear acceleration x y z in m/s², each followed
-  by 9 covariances.
-
-If the first covariance of a quantity is -1, the message does not provide the quantity (sensor_msgs/Imu.msg). The
-message contains no temperature.
-
-The attachment of an rmw_zenoh message has one of two layouts: labelled (77 bytes) or bare (33 bytes). Both layouts
-contain the identifier of the publisher and a sequence number (i64), which reveals lost messages. The attachment is
-optional.
+Each message contains one sample. ``drivers.zenoh.ros2_imu_message`` describes the payload. The message contains no
+temperature. The attachment of an rmw_zenoh message contains the identifier of the publisher and a sequence number,
+which reveals lost messages (``drivers.zenoh.rmw_attachment``). The attachment is optional.
 """
 
 import struct
@@ -28,26 +16,23 @@ from drivers.data_types import NO_TICK, Chunk, Floats, SampleBlock, SenderTimedF
 from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
 from drivers.settings_model import SettingsModel
+from drivers.zenoh.rmw_attachment import GID_BYTES, SEQUENCE_OFFSETS, encode_attachment
+from drivers.zenoh.ros2_imu_message import (
+    ACCEL,
+    ACCEL_COVARIANCE,
+    DOUBLES,
+    GYRO,
+    GYRO_COVARIANCE,
+    HEADER_BYTES,
+    NOT_PROVIDED,
+    S_TO_NS,
+    encode_imu_messages,
+)
 
-HEADER_BYTES: Final = 4
-DOUBLES: Final = 37
 BODY_BYTES: Final = 8 * DOUBLES
-GYRO: Final = slice(13, 16)
-GYRO_COVARIANCE: Final = 16
-ACCEL: Final = slice(25, 28)
-ACCEL_COVARIANCE: Final = 28
-NOT_PROVIDED: Final = -1.0
 MAX_FRAME_ID_BYTES: Final = 1024
-FRAME_ID: Final = b"imu_link\0"
-"""frame_id that ``encode`` writes (REP 145)."""
-SEQUENCE_OFFSETS: Final = {77: 16, 33: 0}
-"""Offset of the sequence number, by the length of the attachment in bytes.
-
-In the labelled layout, the string "sequence_number" with its length byte precedes the number.
-"""
 MAX_GAP_MESSAGES: Final = 1_000_000_000
 """Maximum number of lost messages (eleven days at 1 kHz). A larger step of the sequence number indicates a restart."""
-GID_BYTES: Final = 16  # the publisher identifier ends both attachment layouts
 BYTE_ORDERS: Final = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
@@ -117,10 +102,10 @@ class Ros2ImuDecoder(RejectingDecoder):
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return little-endian messages with the bare attachment. The sequence number is ``ticks`` if available."""
         chunks = []
-        for t_ns, values, tick in zip(samples.t_ns, samples.values, samples.ticks, strict=True):
+        payloads = encode_imu_messages(samples.t_ns, samples.values)
+        for t_ns, tick, payload in zip(samples.t_ns.tolist(), samples.ticks, payloads, strict=True):
             self._encoded = self._encoded + 1 if tick == NO_TICK else int(tick)
-            attachment = struct.pack("<qqB16s", self._encoded, int(t_ns), GID_BYTES, b"imu-monitor")
-            chunks.append(Chunk(_encode_payload(int(t_ns), values), int(t_ns), attachment=attachment))
+            chunks.append(Chunk(payload, t_ns, attachment=encode_attachment(self._encoded, t_ns, b"imu-monitor")))
         return chunks
 
     def _read_sequence(self, attachment: bytes) -> int:
@@ -145,12 +130,12 @@ def _parse_message(data: bytes) -> _Message:
     if len(data) < HEADER_BYTES + 12 + BODY_BYTES:
         raise DecodeError(f"{len(data)} bytes are too few for sensor_msgs/Imu")
     sec, nanosec, length = struct.unpack_from(f"{end}iII", data, HEADER_BYTES)
-    if nanosec >= 1_000_000_000 or length > MAX_FRAME_ID_BYTES:
+    if nanosec >= S_TO_NS or length > MAX_FRAME_ID_BYTES:
         raise DecodeError("the header is not that of sensor_msgs/Imu; check the type of the topic")
     start = HEADER_BYTES + (12 + length + 7) // 8 * 8
     if len(data) - start - BODY_BYTES not in range(4):  # up to 3 bytes of padding may follow
         raise DecodeError(f"{len(data)} bytes are not the length of sensor_msgs/Imu")
-    return _Message(sec * 1_000_000_000 + nanosec, data[start : start + BODY_BYTES], end == "<")
+    return _Message(sec * S_TO_NS + nanosec, data[start : start + BODY_BYTES], end == "<")
 
 
 def _read_values(messages: Sequence[_Message]) -> Floats:
@@ -162,21 +147,6 @@ def _read_values(messages: Sequence[_Message]) -> Floats:
     values[raw[:, GYRO_COVARIANCE] == NOT_PROVIDED, :3] = np.nan
     values[raw[:, ACCEL_COVARIANCE] == NOT_PROVIDED, 3:] = np.nan
     return values
-
-
-def _encode_payload(t_ns: int, values: Floats) -> bytes:
-    body = np.zeros(DOUBLES)
-    body[3] = 1.0  # orientation w
-    body[4] = NOT_PROVIDED
-    for part, covariance, axes in ((GYRO, GYRO_COVARIANCE, values[:3]), (ACCEL, ACCEL_COVARIANCE, values[3:])):
-        if np.isnan(axes).all():
-            body[covariance] = NOT_PROVIDED
-        else:
-            body[part] = axes
-    sec, nanosec = divmod(t_ns, 1_000_000_000)
-    head = struct.pack("<iII", sec, nanosec, len(FRAME_ID)) + FRAME_ID
-    head += bytes(-len(head) % 8)
-    return b"\x00\x01\x00\x00" + head + body.astype("<f8").tobytes()
 
 
 def build(settings: Settings) -> Decoder:

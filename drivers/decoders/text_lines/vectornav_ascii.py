@@ -62,6 +62,11 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
             return "sentences arrive, but none of the wanted kind: set the sensor's async output to VNIMU"
         return super().recent_problem
 
+    @property
+    def on_board_filter_note(self) -> str:
+        """Note that ``$VNYMR`` contains corrected values; "" for ``$VNIMU``."""
+        return f"{base.ON_BOARD_FILTER_NOTE}; select $VNIMU" if self._sentence == b"$VNYMR," else ""
+
     def forget_stream_state(self) -> None:
         """Discard a partially received sentence. With ``sentence = "auto"``, select the sentence type again."""
         super().forget_stream_state()

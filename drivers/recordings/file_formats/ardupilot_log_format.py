@@ -25,6 +25,7 @@ from drivers.data_types import AXES, Floats, Ints
 from drivers.errors import RecordingError, convert_library_errors
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
+from drivers.recordings.reading_progress import report_read_share
 from drivers.recordings.topics import BLOCK_ROWS, JOIN, Topic, join_topics, select_topics
 
 MAGIC: Final = b"\xa3\x95\x80"
@@ -118,7 +119,7 @@ def _open_log(path: Path, limit: memory_check.RecordingSizeLimits) -> Iterator[A
     vars(DFReader)["print"] = _discard  # pymavlink prints warnings about each damaged byte
     log: Any = Log.__new__(Log)
     try:
-        log.__init__(str(path))
+        log.__init__(str(path), progress_callback=lambda percent: report_read_share(percent, 100.0))
         yield log
     finally:
         for name in ("data_map", "filehandle"):

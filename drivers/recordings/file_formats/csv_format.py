@@ -36,6 +36,7 @@ from drivers.recordings.file_formats.csv_header import (
     split_fields,
 )
 from drivers.recordings.reading_options import ReadingOptions
+from drivers.recordings.reading_progress import report_read_share
 from drivers.recordings.table_layout import find_layout
 
 READ_BYTES: Final = 1 << 20
@@ -105,7 +106,7 @@ def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
     notes: list[str] = []
     bad = _BadLines()
     label = Path(source.label)
-    count_csv_source_rows(source)
+    lines = count_csv_source_rows(source)
     with source.open_stream() as file:
         texts = _whole_lines(_decompressed(file, notes), notes)
         header = csv_header.find_header(source.path, label, texts, options)
@@ -116,7 +117,12 @@ def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
             label, header.names, options, notes, f" in line {header.number}" if header.number else "", source.sensor
         )
         use = list(layout.columns.values())
-        parts = list(_parse_pieces(label, header, texts, use, bad))
+        parts: list[Floats] = []
+        read = 0
+        for part in _parse_pieces(label, header, texts, use, bad):
+            parts.append(part)
+            read += len(part)
+            report_read_share(read, lines)
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
     if 2 * bad.count > len(rows):
         raise _too_many_bad_lines(label, bad, len(rows))

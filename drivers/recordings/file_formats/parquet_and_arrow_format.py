@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
+from drivers.extras import install_command
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.file_formats.arrow_message_sizes import (
@@ -52,7 +53,7 @@ def import_pyarrow(path: Path) -> Any:
         import pyarrow as pa
     except ImportError as error:
         whole = Path(str(path).removesuffix(table.PARTIAL_SUFFIX))
-        raise ConfigError(f'{whole}: {whole.suffix} needs pyarrow: pip install "imu-monitor[arrow]"') from error
+        raise ConfigError(f"{whole}: {whole.suffix} needs pyarrow: {install_command('imu-monitor[arrow]')}") from error
     return pa
 
 

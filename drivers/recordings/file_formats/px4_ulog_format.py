@@ -23,6 +23,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import RecordingError, convert_library_errors
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
+from drivers.recordings.reading_progress import open_file_and_report_position
 from drivers.recordings.topics import JOIN, Topic, join_topics, select_topics
 
 _XYZ: Final = ("x", "y", "z")
@@ -101,7 +102,7 @@ def _load(path: Path, limit: memory_check.RecordingSizeLimits) -> Any:
         sizes: dict[str, int] = {}
         if any(_message_bytes(formats, name, sizes) > MAX_MESSAGE_BYTES for name in formats):
             raise RecordingError(f"{path}: is damaged: a message has more than {MAX_MESSAGE_BYTES} bytes")
-    with _pyulog_errors(path), open_regular_file(path) as file:
+    with _pyulog_errors(path), open_file_and_report_position(path) as file:
         return core.ULog(file, list(FIELDS))
 
 

@@ -170,7 +170,8 @@ def _read_topic(bag: _Bag, name: str, limit: memory_check.RecordingSizeLimits, n
     rows = (
         (log_ns * 1e-9, *_message_numbers(bag.deserialize(data, kind))) for _, log_ns, data in bag.messages(connections)
     )
-    columns = collect_columns(rows, ("log", "t", *COLUMNS_OF_TYPES[kind]), limit)
+    expected_rows = next(one.rows for one in bag.topics if one.name == name)
+    columns = collect_columns(rows, ("log", "t", *COLUMNS_OF_TYPES[kind]), limit, expected_rows)
     log_s, stamps = columns.pop("log"), columns["t"]
     missing = (stamps == 0.0) & (log_s >= MIN_LOG_S)
     unstamped = int(np.count_nonzero(missing))

@@ -24,6 +24,7 @@ from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
     from monitor.commands.wire_format_decoding import DecoderChoice
+    from monitor.common.unit_formatting import UnitSystem
     from monitor.drift.compensation.arma import Order
     from monitor.estimation.allan.batch import TauGrid
     from monitor.publishing.exporters import NoiseCoefficients
@@ -110,6 +111,14 @@ CorrelationTime = Annotated[
 ]
 Last = Annotated[
     str | None, typer.Option(metavar="S", help="Use only the last S seconds of the recording; also 1h, 1d.")
+]
+
+Units = Annotated[
+    str,
+    typer.Option(
+        metavar="imu|datasheet|si",
+        help="Units of tables and plots: °/√h, with noise density in m°/s/√Hz, or rad/s/√Hz.",
+    ),
 ]
 
 READING_OPTIONS = {
@@ -215,6 +224,21 @@ def parse_decoder(name: str | None, options: list[str] | None) -> "DecoderChoice
             raise ConfigError(f'--option: "{shown}": expected KEY=VALUE once per key, such as file=imu.dbc')
         table[key] = _parse_toml_value(value.strip()) if path != "channel" else value.strip()
     return DecoderChoice(name, tables)
+
+
+def parse_units(name: str) -> "UnitSystem":
+    """Return the unit system of the option ``--units``.
+
+    Raises
+    ------
+    ConfigError
+        If the name is unknown.
+    """
+    from monitor.common.unit_formatting import UNIT_SYSTEMS
+
+    if name not in UNIT_SYSTEMS:
+        raise ConfigError(f'--units: "{make_printable_and_shorten(name)}"; possible are {", ".join(UNIT_SYSTEMS)}')
+    return UNIT_SYSTEMS[name]
 
 
 def _parse_toml_value(text: str) -> Any:

@@ -73,9 +73,13 @@ def show_progress_bar() -> Iterator[ProgressCallback]:
         return
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("", total=None)
-        yield lambda what, share: bar.update(
-            task, description=what, total=None if share is None else 1.0, completed=share or 0.0
-        )
+
+        def show(step: str, share: float | None) -> None:
+            if bar.tasks[0].description != step:
+                bar.reset(task, description=step)  # the time left follows from the speed of this step alone
+            bar.update(task, total=None if share is None else 1.0, completed=share or 0.0)
+
+        yield show
 
 
 def compile_analysis_kernels(report_progress: ProgressCallback) -> None:

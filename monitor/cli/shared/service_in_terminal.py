@@ -20,6 +20,7 @@ from monitor.cli.shared.errors import name_option_in_config_errors
 if TYPE_CHECKING:
     from collections.abc import MutableMapping
 
+    from monitor.common.unit_formatting import UnitSystem
     from monitor.publishing.terminal.queued_writer import QueuedWriter
     from monitor.settings.loading import Config
 
@@ -27,7 +28,7 @@ STDOUT: Final = "standard output"
 STDERR: Final = "standard error"
 
 
-def run_service(config: "Config", seconds: float | None, viewer_mode: str | None) -> None:
+def run_service(config: "Config", seconds: float | None, viewer_mode: str | None, units: "UnitSystem") -> None:
     """Run the service with a live table in a terminal, or with log lines if standard output is not a terminal.
 
     Without a terminal, the final table is printed when the service ends.
@@ -40,6 +41,8 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
         Duration in seconds. If None, the service runs until a signal is received or all replays have ended.
     viewer_mode : str or None
         Viewer mode that replaces the configured mode. None keeps the configured mode.
+    units : UnitSystem
+        Units of the table.
 
     Raises
     ------
@@ -64,7 +67,7 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     unit = SystemdNotifier.from_environment(os.environ)
     config = _with_viewer(config, viewer_mode)
     console, board, asked = Console(file=sys.stdout), RemoteDeviceRegistry(), threading.Event()
-    table, terminal = LiveTable(console), console.is_terminal
+    table, terminal = LiveTable(console, units=units), console.is_terminal
     screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
     writers = {"terminal": screen} if terminal else {}
     shared = terminal and _same_file(sys.stdout, sys.stderr)

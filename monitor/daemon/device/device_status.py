@@ -81,7 +81,8 @@ class DeviceStatus:
         lacking = self._missing_estimate_text() if driver.state in ("running", "ended") else ""
         if driver.text or driver.state != "running":
             return f"{driver.text.rstrip('.')}; {lacking}" if lacking else driver.text
-        return lacking or driver.late_frames_hint or self._publisher.timeline.host_clock_offset_text()
+        offset_text = self._publisher.timeline.host_clock_offset_text()
+        return lacking or driver.late_frames_hint or offset_text or driver.on_board_filter_note
 
     def _missing_estimate_text(self) -> str:
         """Return the reason why coefficients cannot be estimated, or ""."""

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.extras import install_command
 from monitor.daemon.outputs.newest_metrics import NewestMetrics
 from monitor.settings.loading import MetricsAddress
 
@@ -28,7 +29,7 @@ PAUSE_S: Final = 0.1
 """Pause after a failed connection."""
 PATH: Final = "/metrics"
 """Path of the metrics in the URL."""
-MISSING_LIBRARY_TEXT: Final = 'prometheus-client is not installed: pip install "imu-monitor[metrics]"'
+MISSING_LIBRARY_TEXT: Final = f"prometheus-client is not installed: {install_command('imu-monitor[metrics]')}"
 """Status message if the library is not installed."""
 
 

@@ -1,4 +1,4 @@
-"""Base class of the receivers of the results: zenoh, viewer, history, log, table, metrics, InfluxDB and hooks."""
+"""Base class of the receivers of the results: zenoh, viewer, history, log, table, metrics, InfluxDB, ROS 2, hooks."""
 
 from typing import Any
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import ConfigError, NotReady
+from drivers.extras import install_command
 from monitor.common.compiled import compiled
 from monitor.common.distributions import NORMAL_QUARTILE
 
@@ -27,7 +28,7 @@ MAX_NOISE_LAG: Final = 2
 WAVELET: Final = "db4"
 MAX_DOUBLINGS: Final = 60
 MAX_LEVELS: Final = 8
-MISSING_PACKAGES: Final = 'EMD-signal and PyWavelets are not installed: pip install "imu-monitor[denoise]"'
+MISSING_PACKAGES: Final = f"EMD-signal and PyWavelets are not installed: {install_command('imu-monitor[denoise]')}"
 
 ReferenceMethod = Callable[[Floats, Floats], Floats]
 """Function that filters a rate [n], given samples at rest [m]. The mean at rest has been subtracted from both."""

@@ -212,7 +212,10 @@ KALIBR_PARAMETERS: Final = _noise_and_bias(
     "gyroscope_random_walk",
     "accelerometer_random_walk",
 )
-KALIBR_LINES: Final = ("rostopic: {rostopic}", "update_rate: {rate}  # Hz")
+KALIBR_LINES: Final = (
+    "rostopic: {rostopic}  # topic of the IMU in the bag for Kalibr",
+    "update_rate: {rate}  # Hz",
+)
 OPENCV_FIRST_LINES: Final = ("%YAML:1.0",)
 
 _IDENTITY: Final = ("[1.0, 0.0, 0.0]", "[0.0, 1.0, 0.0]", "[0.0, 0.0, 1.0]")
@@ -235,7 +238,7 @@ PARAMETER_FILES: Final = (
         KALIBR_PARAMETERS,
         notes=(
             "Kalibr's wiki, IMU Noise Model: a sensor at rest at constant temperature has less noise; for the",
-            "lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
+            "lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (inflation 10)",
         ),
         before=KALIBR_LINES,
     ),

@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
 from drivers.number_ranges import DAY_S
-from monitor.common.unit_formatting import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
+from monitor.common.unit_formatting import (
+    COEFFICIENT_NAMES,
+    DEFAULT_UNITS,
+    KIND_NAMES,
+    KINDS,
+    Kind,
+    UnitSystem,
+    axes_of,
+)
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.history.bucketed_history import HistoryTable
 from monitor.history.history_row import COUNTS, STATES
@@ -46,7 +54,9 @@ MIN_LABEL_DISTANCE: Final = 0.055  # smallest distance between two labels of eve
 PRIORITY_KINDS: Final = ("noise_changed", "bias_stepped", "limit_crossed", "model_disagrees")
 
 
-def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES) -> None:
+def save_history_plot(
+    past: HistoryTable, path: Path, axes: Sequence[str] = AXES, units: UnitSystem = DEFAULT_UNITS
+) -> None:
     """Write the plot of the stored results of a device to a file.
 
     Parameters
@@ -57,6 +67,8 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
         File to write. The suffix selects the format.
     axes
                 Names of the axes to draw.
+    units
+        Units of the coefficients.
 
     Raises
     ------
@@ -80,7 +92,7 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
         panels = figure.subplots(rows, len(kinds), squeeze=False, sharex=True)
         for column, kind in enumerate(kinds):
             for panel, letter in zip(panels[:, column], letters, strict=False):
-                _draw_coefficient(panel, past, kind, letter, drawn[kind])
+                _draw_coefficient(panel, past, kind, letter, drawn[kind], units)
             panels[0, column].set_title(KIND_NAMES[kind], fontweight="bold", pad=TITLE_PAD_POINTS)
         temperature, losses = panels.ravel()[-2:]
         _draw_temperature(temperature, past)
@@ -97,8 +109,12 @@ def _estimated_coefficients(past: HistoryTable, axis: str) -> list[str]:
     return [letter for letter in SYMBOLS if np.isfinite(past.select_column(f"{axis}.{letter}").last).any()]
 
 
-def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str, axes: Sequence[str]) -> None:
-    unit = COEFFICIENT_UNITS[kind][letter]
+def _draw_coefficient(
+    panel: "Axes", past: HistoryTable, kind: Kind, letter: str, axes: Sequence[str], units: UnitSystem
+) -> None:
+    _, _, unit = units.columns(kind, letter)[
+        -1
+    ]  # the noise density rather than the random walk, if the units have both
     lows, highs = [], []
     for axis in axes:
         column, colour = past.select_column(f"{axis}.{letter}"), style.axis_colour(axis)

@@ -17,6 +17,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
+from drivers.extras import install_command
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,7 +31,7 @@ MINOR_GRID_COLOUR: Final = "#ececec"
 BAND_ALPHA: Final = 0.16
 DASHES: Final = (0, (4, 2))
 SMALL_TEXT: Final = 8.0  # points
-MISSING_MESSAGE: Final = 'matplotlib is not installed: pip install "imu-monitor[plot]"'
+MISSING_MESSAGE: Final = f"matplotlib is not installed: {install_command('imu-monitor[plot]')}"
 STYLE: Final[dict[Any, Any]] = {
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9.5,
@@ -115,9 +116,9 @@ def create_figure(width: float, height: float, layout: Literal["constrained"] | 
         By default, matplotlib arranges the panels so that labels do not overlap. With None, panels keep their
         positions.
     """
-    from matplotlib.figure import Figure
+    from monitor.publishing.plots.notebook_figure import NotebookFigure
 
-    return Figure(figsize=(width, height), layout=layout)
+    return NotebookFigure(figsize=(width, height), layout=layout)
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

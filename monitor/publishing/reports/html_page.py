@@ -3,8 +3,9 @@
 from typing import Any, Final
 
 from drivers.errors import ConfigError
+from drivers.extras import install_command
 
-MISSING_MESSAGE: Final = 'Jinja2 is not installed: pip install "imu-monitor[plot]"'
+MISSING_MESSAGE: Final = f"Jinja2 is not installed: {install_command('imu-monitor[plot]')}"
 
 
 def render_template(name: str, **values: Any) -> str:

@@ -58,10 +58,10 @@ def render_page(r: Reconciliation, title: str = "") -> str:
         summary=summarize(r),
         ranking=ranking,
         summary_words=summary_sentences,
-        draw_allan=lambda result: _draw_allan(result, ranking),
+        allan_figures=draw_differing_allan_deviations(r, ranking),
         title=title or "Recording",
         r=r,
-        results=[r.axes[axis] for axis in AXES if axis in r.axes],
+        results=_sort_by_axis(r),
         facts=(
             ("rate", f"{r.rate_hz:.6g} Hz"),
             ("samples", f"{r.samples:,}"),
@@ -80,6 +80,29 @@ def render_page(r: Reconciliation, title: str = "") -> str:
         draw_pairs=_draw_pairs,
         draw_singles=_draw_singles,
     )
+
+
+def draw_differing_allan_deviations(r: Reconciliation, ranking: GapRanking) -> list[str]:
+    """Draw the Allan deviation of each axis that differs from the model, before and after the search, as SVG elements.
+
+    Parameters
+    ----------
+    r
+        Result of the reconciliation.
+    ranking
+        Ranked findings, whose numbers mark the averaging times at which they change the Allan deviation most.
+
+    Raises
+    ------
+    ConfigError
+        If matplotlib is not installed.
+    """
+    drawn = (_draw_allan(result, ranking) for result in _sort_by_axis(r) if result.verdict != "agrees")
+    return [figure for figure in drawn if figure is not None]
+
+
+def _sort_by_axis(r: Reconciliation) -> list[AxisResult]:
+    return [r.axes[axis] for axis in AXES if axis in r.axes]
 
 
 def _draw_allan(result: AxisResult, ranking: GapRanking) -> str | None:

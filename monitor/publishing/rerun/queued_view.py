@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.extras import install_command
 from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.bounded_queue import BoundedQueue
 from monitor.publishing.rerun.viewer_settings_and_errors import (
@@ -38,7 +39,7 @@ STALL_TIMEOUT_S: Final = 2.0  # a Rerun call that takes longer shows that the vi
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
 PLOTS_PER_S: Final = 8.0  # number of Allan plots of all devices that are drawn per second
 MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes earlier does not work on this machine
-MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
+MISSING: Final = f"rerun-sdk is not installed: {install_command('imu-monitor[viewer]')}"
 
 HistorySource = Callable[[str], HistoryTable | None]
 """Function that returns the stored history of a device, or None if there is none."""

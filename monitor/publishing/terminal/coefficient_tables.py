@@ -101,30 +101,30 @@ def coefficient_tables(
     parts: list[RenderableType] = [legend]
     for kind in KINDS:
         if set(axes_of(kind)) & set(coefficients.axes):
-            wide, narrow = (
-                _kind_table(coefficients, kind, stacked, axes_of_temperature, units) for stacked in (False, True)
-            )
-            parts.append(WidthDependentTable(wide, narrow))
+            layouts = (_kind_table(coefficients, kind, lines, axes_of_temperature, units) for lines in (1, 2, 3))
+            parts.append(WidthDependentTable(*layouts))
     return parts
 
 
 def _kind_table(
-    known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_temperature: Collection[str], units: UnitSystem
+    known: DeviceCoefficients, kind: Kind, lines: int, axes_of_temperature: Collection[str], units: UnitSystem
 ) -> Table:
-    table = plain_table(kind if stacked else KIND_NAMES[kind])
+    """Return a table with one to three lines for each axis: value, and lower and upper end of the interval."""
+    table = plain_table(KIND_NAMES[kind] if lines == 1 else kind, gap=2 if lines < 3 else 1)
     columns = units.columns(kind)
     for one in columns:
         table.add_column(f"{one.symbol} {one.unit.name}", justify="right", no_wrap=True)
-    separator = "\n" if stacked else " "
     for axis in (axis for axis in axes_of(kind) if axis in known.axes):
-        cells = [_cell(known, column, axis, separator) for column in columns]
+        cells = [_cell(known, column, axis, lines) for column in columns]
         table.add_row(Text(mark_temperature_axis(axis, axes_of_temperature), style="bold"), *cells)
     return table
 
 
-def _cell(known: DeviceCoefficients, column: CoefficientColumn, axis: str, separator: str) -> Text:
+def _cell(known: DeviceCoefficients, column: CoefficientColumn, axis: str, lines: int) -> Text:
     one = format_coefficient(known.coefficients, column.symbol, axis, unit=column.unit)
-    small = [f"[{one.interval}]"] if one.interval else []
+    interval = one.interval.replace(" … ", " …\n") if lines == 3 else one.interval
+    separator = " " if lines == 1 else "\n"
+    small = [f"[{interval}]"] if interval else []
     if axis in known.k_or_r and column.symbol in ("K", "R"):
         small.append(K_OR_R)
     return Text.assemble(one.value, *((separator + part, "dim") for part in small))

@@ -15,15 +15,19 @@ from rich.text import Text
 
 from drivers.data_types import Floats
 from monitor.common.unit_formatting import (
+    DEFAULT_UNITS,
     KIND_NAMES,
     KINDS,
     NO_VALUE,
+    CoefficientColumn,
     Kind,
+    Unit,
+    UnitSystem,
     axes_of,
-    coefficient_unit,
     format_duration_in_largest_unit,
     format_number,
     format_utc,
+    sensor_kind,
 )
 from monitor.history.bucketed_history import ColumnStatistics, HistoryTable
 from monitor.history.history_row import COUNTS, STATES
@@ -40,7 +44,11 @@ MAX_EVENTS: Final = 20
 
 
 def print_history_summary(
-    past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str, ...], console: Console
+    past: HistoryTable,
+    axes: tuple[str, ...],
+    symbols: tuple[str, ...],
+    console: Console,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> None:
     """Print a line for each axis and coefficient, followed by the status and the events.
 
@@ -54,18 +62,22 @@ def print_history_summary(
         Symbols of the coefficients to print.
     console
         Console that receives the output.
+    units
+        Units of the coefficients.
     """
     console.print(summary_line(past), highlight=False, soft_wrap=True)
     for kind in KINDS:
         shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.list_axes()]
         if shown:
-            console.print(Padding(_summary(past, kind, shown, symbols), (1, 0, 0, 0)))
+            console.print(Padding(_summary(past, kind, shown, units.columns(kind, symbols)), (1, 0, 0, 0)))
     for line in _temperature_and_loss_lines(past):
         console.print(line, highlight=False)
     _print_events(past, console)
 
 
-def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], console: Console) -> None:
+def print_axis_history(
+    past: HistoryTable, axis: str, symbols: tuple[str, ...], console: Console, units: UnitSystem = DEFAULT_UNITS
+) -> None:
     """Print the history of one axis with one line for each time interval.
 
     Parameters
@@ -78,15 +90,17 @@ def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], 
         Coefficients to print.
     console
         Console that receives the output.
+    units
+        Units of the coefficients.
     """
-    table = plain_table("UTC")
-    for symbol in symbols:
-        table.add_column(f"{symbol} {coefficient_unit(symbol, axis).name}", justify="right", no_wrap=True)
+    table, columns = plain_table("UTC"), units.columns(sensor_kind(axis), symbols)
+    for one in columns:
+        table.add_column(f"{one.symbol} {one.unit.name}", justify="right", no_wrap=True)
     for name in ("°C", "lost", "state"):
         table.add_column(name, justify="right")
     temperature = past.select_column("temperature")
     for p in range(len(past)):
-        cells = [_cell(past, axis, symbol, p) for symbol in symbols]
+        cells = [_cell(past, axis, one, p) for one in columns]
         lost = int(past.counts[p, COUNTS.index("lost")])
         table.add_row(
             format_utc(float(past.start_s[p]))[:16],
@@ -173,7 +187,7 @@ def sparkline(values: Floats, t_s: Floats, range_s: tuple[float, float], width: 
     return "".join(next(marks) if some else GAP for some in count)
 
 
-def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str, ...]) -> Table:
+def _summary(past: HistoryTable, kind: Kind, axes: list[str], columns: list[CoefficientColumn]) -> Table:
     table = plain_table(KIND_NAMES[kind])
     for name in ("first", "last", "lowest", "highest"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -181,33 +195,33 @@ def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str
     span = (float(past.start_s[0]), float(past.end_s[-1])) if len(past) else (0.0, 0.0)
     middle_s = past.start_s + 0.5 * past.width_s
     for axis in axes:
-        for symbol in symbols:
-            column, unit = past.select_column(f"{axis}.{symbol}"), coefficient_unit(symbol, axis)
+        for symbol, _, unit in columns:
+            column = past.select_column(f"{axis}.{symbol}")
             label = Text.assemble((f"{axis} {symbol}", "bold"), f"  {unit.name}")
             there = column.last[np.isfinite(column.last)]
             if not there.size:
-                table.add_row(label, NO_VALUE, *_bound(past, axis, symbol), "")
+                table.add_row(label, NO_VALUE, *_bound(past, axis, symbol, unit), "")
                 continue
             numbers = [float(one) * unit.factor for one in (there[0], there[-1], *_extremes(column))]
             table.add_row(label, *(format_number(one) for one in numbers), sparkline(column.last, middle_s, span))
     return table
 
 
-def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
-    bound, unit = past.select_column(f"{axis}.{symbol}.bound"), coefficient_unit(symbol, axis)
+def _bound(past: HistoryTable, axis: str, symbol: str, unit: Unit) -> tuple[str, str, str]:
+    bound = past.select_column(f"{axis}.{symbol}.bound")
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
         return NO_VALUE, NO_VALUE, NO_VALUE
     return f"≤ {format_number(float(there[-1]) * unit.factor)}", NO_VALUE, NO_VALUE
 
 
-def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
-    column, unit = past.select_column(f"{axis}.{symbol}"), coefficient_unit(symbol, axis)
+def _cell(past: HistoryTable, axis: str, shown: CoefficientColumn, p: int) -> str:
+    column, unit = past.select_column(f"{axis}.{shown.symbol}"), shown.unit
     low, high, last = (float(part[p]) * unit.factor for part in (column.low, column.high, column.last))
     if math.isfinite(last):
         alike = format_number(low) == format_number(high)
         return format_number(last) if alike else f"{format_number(last)} [{format_number(low)} … {format_number(high)}]"
-    bound = float(past.select_column(f"{axis}.{symbol}.bound").last[p]) * unit.factor
+    bound = float(past.select_column(f"{axis}.{shown.symbol}.bound").last[p]) * unit.factor
     return f"≤ {format_number(bound)}" if math.isfinite(bound) else NO_VALUE
 
 

@@ -18,9 +18,12 @@ from rich.table import Table
 from rich.text import Text
 
 from monitor.common.unit_formatting import (
-    COEFFICIENT_UNITS,
+    DEFAULT_UNITS,
+    KINDS,
     NO_VALUE,
+    CoefficientColumn,
     Kind,
+    UnitSystem,
     axes_of,
     format_age,
     format_count,
@@ -38,7 +41,8 @@ MAX_PROBLEM_LINES: Final = 6
 HEADER_LINES: Final = 6
 """Number of lines for the summary, the note, the table header and blank lines."""
 MIN_ROWS: Final = 3
-TABLE_COEFFICIENTS: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
+TABLE_COEFFICIENTS: Final[dict[Kind, str]] = {"gyro": "NB", "accel": "N"}
+"""Symbols of the coefficients of each kind of sensor that the device table shows."""
 STATES: Final = {
     "running": ("●", "green"),
     "waiting": ("◌", "yellow"),
@@ -81,10 +85,15 @@ class LiveTable:
                 Console with the width, height and colours of the terminal.
     states : RemoteDeviceRegistry or None
         State of all devices. If None, only log lines are written.
+    units : UnitSystem, optional
+        Units of the table.
     """
 
-    def __init__(self, console: Console, states: RemoteDeviceRegistry | None = None) -> None:
+    def __init__(
+        self, console: Console, states: RemoteDeviceRegistry | None = None, units: UnitSystem = DEFAULT_UNITS
+    ) -> None:
         self.states = states
+        self._units = units
         self._console = console
         self._live: Live | None = None
         self._ended = False
@@ -113,17 +122,17 @@ class LiveTable:
             if log_lines:
                 self._console.print(Text.from_ansi("".join(log_lines)))
             if not is_last and self._live is not None and self.states is not None:
-                self._live.update(device_overview(self.states, time.monotonic()), refresh=True)
+                self._live.update(device_overview(self.states, time.monotonic(), self._units), refresh=True)
             if is_last and not self._ended:
                 self._ended = True
                 if self._live is not None:
                     self._live.stop()
                 if self.states is not None:
-                    self._console.print(device_overview(self.states, time.monotonic()))
+                    self._console.print(device_overview(self.states, time.monotonic(), self._units))
         return captured.get()
 
 
-def device_overview(states: RemoteDeviceRegistry, now_s: float) -> RenderableType:
+def device_overview(states: RemoteDeviceRegistry, now_s: float, units: UnitSystem = DEFAULT_UNITS) -> RenderableType:
     """Return a summary, the device table, problems and events. For a single device, add a table of coefficients.
 
     Parameters
@@ -132,15 +141,17 @@ def device_overview(states: RemoteDeviceRegistry, now_s: float) -> RenderableTyp
         State of all devices.
     now_s
                 Current time [s] on the clock of ``states``.
+    units
+        Units of the coefficients.
     """
     devices, events = states.devices_with_problems_first(now_s), states.recent_events_in_time_order()
     names = _display_names([*(one.key for one in devices), *(key for key, _ in events)])
     parts: list[RenderableType] = [_summary(states, devices, now_s)]
     if devices:
-        parts.append(_FittedDeviceRows(devices, now_s))
+        parts.append(_FittedDeviceRows(devices, now_s, units))
     parts += _with_blank_line(_problem_lines(devices, now_s))
     if len(devices) == 1 and devices[0].coefficients is not None:
-        parts += _with_blank_line(coefficient_tables(devices[0].coefficients))
+        parts += _with_blank_line(coefficient_tables(devices[0].coefficients, units=units))
     parts += _with_blank_line([_event_line(names[key], event) for key, event in events])
     return Group(*parts)
 
@@ -148,14 +159,15 @@ def device_overview(states: RemoteDeviceRegistry, now_s: float) -> RenderableTyp
 class _FittedDeviceRows:
     """Device table that chooses the most detailed layout that fits the terminal."""
 
-    def __init__(self, devices: list[RemoteDevice], now_s: float) -> None:
+    def __init__(self, devices: list[RemoteDevice], now_s: float, units: UnitSystem) -> None:
         self._devices = devices
         self._now_s = now_s
+        self._units = units
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for layout in (*LAYOUTS, NARROW_LAYOUT):
             count = self._visible_rows(layout, console)
-            table = _device_rows(self._devices[:count], self._now_s, layout)
+            table = _device_rows(self._devices[:count], self._now_s, layout, self._units)
             if layout is NARROW_LAYOUT or unwrapped_table_width(table, console, options) <= options.max_width:
                 break
         yield table
@@ -170,11 +182,16 @@ class _FittedDeviceRows:
         return max(lines // (3 if layout.stacked else 1), MIN_ROWS)
 
 
-def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: DeviceTableLayout) -> Table:
+def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: DeviceTableLayout, units: UnitSystem) -> Table:
     table = plain_table("device", "state", gap=layout.gap)
-    shown = [pair for pair in TABLE_COEFFICIENTS if any(_measures(one, pair[0]) for one in devices)]
-    columns = [_coefficient_column(devices, kind, symbol, layout) for kind, symbol in shown]
-    if layout.stacked and shown:
+    columns = [
+        _coefficient_column(devices, kind, column, layout)
+        for kind in KINDS
+        if any(_measures(one, kind) for one in devices)
+        for symbol in TABLE_COEFFICIENTS[kind]
+        for column in units.columns(kind, symbol)[-1:]  # of random walk and noise density, only the density
+    ]
+    if layout.stacked and columns:
         columns.insert(0, (Text(), [Text("x\ny\nz" if one.coefficients else "", style="bold") for one in devices]))
     heads: list[str | Text] = ["Hz", "received", "lost", "bad", *(title for title, _ in columns), "p99 ms", "age"]
     for head in heads:
@@ -234,24 +251,25 @@ def _measures(one: RemoteDevice, kind: Kind) -> bool:
 
 
 def _coefficient_column(
-    devices: Sequence[RemoteDevice], kind: Kind, symbol: str, layout: DeviceTableLayout
+    devices: Sequence[RemoteDevice], kind: Kind, column: CoefficientColumn, layout: DeviceTableLayout
 ) -> tuple[Text, list[Text]]:
     axes = axes_of(kind)
-    rows = [[_value(one, symbol, axis, layout.digits) for axis in axes] for one in devices]
-    head = f"{symbol} {COEFFICIENT_UNITS[kind][symbol].name}"
+    rows = [[_value(one, column, axis, layout.digits) for axis in axes] for one in devices]
+    head = f"{column.symbol} {column.unit.name}"
     if layout.stacked:
         return Text(head), [Text("\n".join(row) if any(row) else "") for row in rows]
-    widths = [max(map(len, column)) for column in zip(axes, *rows, strict=True)]
+    widths = [max(map(len, cells)) for cells in zip(axes, *rows, strict=True)]
     lines = [
         " ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in [list(axes), *rows]
     ]
     return Text(f"{head}\n{lines[0]}"), [Text(line) for line in lines[1:]]
 
 
-def _value(one: RemoteDevice, symbol: str, axis: str, digits: int) -> str:
+def _value(one: RemoteDevice, column: CoefficientColumn, axis: str, digits: int) -> str:
     if one.coefficients is None or axis not in one.coefficients.axes:
         return ""
-    return format_coefficient(one.coefficients.coefficients, symbol, axis, digits).value.replace("≤ ", "≤")
+    text = format_coefficient(one.coefficients.coefficients, column.symbol, axis, digits, column.unit)
+    return text.value.replace("≤ ", "≤")
 
 
 def _with_blank_line(lines: Sequence[RenderableType]) -> list[RenderableType]:

@@ -50,11 +50,11 @@ def unwrapped_table_width(table: Table, console: Console, options: ConsoleOption
 
 
 class WidthDependentTable:
-    """Wide table that is replaced by a narrow table if the wide table does not fit the terminal."""
+    """The first of several tables that fits the terminal, or the last table. The widest table is the first."""
 
-    def __init__(self, wide: Table, narrow: Table) -> None:
-        self._wide = wide
-        self._narrow = narrow
+    def __init__(self, *tables: Table) -> None:
+        self._tables = tables
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield self._wide if unwrapped_table_width(self._wide, console, options) <= options.max_width else self._narrow
+        fitting = (one for one in self._tables if unwrapped_table_width(one, console, options) <= options.max_width)
+        yield next(fitting, self._tables[-1])

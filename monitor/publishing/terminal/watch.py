@@ -9,6 +9,7 @@ from typing import Final, TextIO, cast
 
 from rich.console import Console
 
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.publishing.remote_device_states import RemoteDeviceRegistry
 from monitor.publishing.terminal.live_device_table import LiveTable, device_overview
 from monitor.publishing.terminal.queued_writer import QueuedWriter
@@ -29,6 +30,7 @@ def watch(
     console: Console | None = None,
     once_s: float | None = None,
     file: Path | None = None,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> None:
     """Show the table of devices until ``stop`` is set or Ctrl-C is pressed.
 
@@ -48,6 +50,8 @@ def watch(
         Time [s] for which messages are collected before the table is printed once. By default, the table is updated.
     file
         zenoh configuration file.
+    units
+        Units of the table.
 
     Raises
     ------
@@ -66,10 +70,10 @@ def watch(
         if once_s is not None:
             stop.wait(once_s)
             _receive_messages(states, subscriber)
-            with QueuedWriter(stream, STDOUT, LiveTable(console, states).render) as writer:
+            with QueuedWriter(stream, STDOUT, LiveTable(console, states, units).render) as writer:
                 writer.wait_until_written(stop)
         elif console.is_terminal:
-            with QueuedWriter(stream, STDOUT, LiveTable(console, states).render, REFRESH_PERIOD_S) as writer:
+            with QueuedWriter(stream, STDOUT, LiveTable(console, states, units).render, REFRESH_PERIOD_S) as writer:
                 while not stop.wait(REFRESH_PERIOD_S) and writer.error is None:
                     _receive_messages(states, subscriber)
                     writer.request_redraw()
@@ -78,7 +82,7 @@ def watch(
                 while not stop.wait(PLAIN_PERIOD_S) and writer.error is None:
                     _receive_messages(states, subscriber)
                     with console.capture() as captured:
-                        console.print(device_overview(states, time.monotonic()))
+                        console.print(device_overview(states, time.monotonic(), units))
                     writer.put(captured.get())
 
 

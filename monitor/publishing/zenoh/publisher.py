@@ -215,7 +215,7 @@ class ZenohPublisher(RetriedSession):
     def _report_failure(self, error: Exception) -> None:
         self._session_state = f"{self._find_refusal() or format_zenoh_error(error)}; trying again"
 
-    def _monitor_connection(self) -> None:
+    def _work_until_closed(self) -> None:
         while self._connect and not self.closing.wait(REFUSAL_CHECK_S):
             session = self._session
             self._refusal = self._find_refusal() if session is not None and is_unconnected(session) else ""

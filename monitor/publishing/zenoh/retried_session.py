@@ -48,12 +48,12 @@ class RetriedSession:
         """Store the reason why the session could not be opened."""
         raise NotImplementedError
 
-    def _monitor_connection(self) -> None:
-        """Monitor the connection until the session is closed."""
+    def _work_until_closed(self) -> None:
+        """Monitor the connection or send messages until the session is closed."""
         raise NotImplementedError
 
     def _keep_open(self) -> None:
-        """Open the session, repeat failed attempts, and then monitor the connection."""
+        """Open the session, repeat failed attempts, and then work until the session is closed."""
         errors: tuple[type[Exception], ...] = (*zenoh_errors(), OSError)
         while not self.closing.is_set():
             try:
@@ -64,7 +64,7 @@ class RetriedSession:
                 self.closing.wait(RETRY_S)
             else:
                 break
-        self._monitor_connection()
+        self._work_until_closed()
         if self.closing.is_set():  # close() may have returned before the session was open
             self._close_session()
 

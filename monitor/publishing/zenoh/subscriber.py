@@ -207,7 +207,7 @@ class _EndpointSession(RetriedSession):
     def _report_failure(self, _error: Exception) -> None:
         self.refusal = explain_refusal(self._endpoint, self._config)
 
-    def _monitor_connection(self) -> None:
+    def _work_until_closed(self) -> None:
         """Report all liveliness tokens as lost if the endpoint is lost, because zenoh does not report them."""
         checked_s = -REFUSAL_CHECK_S
         while not self.closing.wait(CONNECTION_CHECK_S):

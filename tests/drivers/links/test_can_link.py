@@ -22,6 +22,7 @@ import pytest
 from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_blocks
 from drivers.decoders import dbc
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
+from drivers.extras import install_command
 from drivers.links import arrival_times, can_link
 from drivers.links.can_link import CanLink
 from tests.support.settings import read_settings
@@ -237,7 +238,7 @@ def test_error_names_the_missing_package_and_the_command_that_installs_it(
     monkeypatch.setitem(sys.modules, module, None)  # as if it were not installed
     with pytest.raises(LinkUnavailable) as raised:
         build(interface=interface, channel="239.74.163.2").open()
-    expected = f'CAN interface {interface} needs the package {package}: pip install "{requirement}"'
+    expected = f"CAN interface {interface} needs the package {package}: {install_command(requirement)}"
     assert str(raised.value) == expected
 
 

@@ -208,7 +208,7 @@ def iter_config_tables() -> Iterator[tuple[str, type[SettingsModel], str]]:
     yield DEVICE.format(keys="", driver=VIRTUAL + "\n{}"), driver_settings.VirtualTable, "virtual"
     for name, kind in (
         ("viewer", schema.ViewerTable), ("metrics", schema.MetricsTable), ("influx", schema.InfluxTable),
-        ("log", schema.LogTable),
+        ("ros2", schema.Ros2Table), ("log", schema.LogTable),
     ):  # fmt: skip
         yield virtual + f"[{name}]\n{{}}\n", kind, name
     yield virtual + '[storage]\nfolder = "kept"\n{}\n', schema.Storage, "storage"
@@ -230,7 +230,11 @@ def iter_config_tables() -> Iterator[tuple[str, type[SettingsModel], str]]:
             f"link {name}",
         )
     for name in module_lookup.list_modules(drivers.decoders):
-        wanted = {"text": 'columns = ["gz"]\n', "dbc": 'file = "canmod_gps"\nsignals = { gz = "ImuData.GyroZ" }\n'}
+        wanted = {
+            "dbc": 'file = "canmod_gps"\nsignals = { gz = "ImuData.GyroZ" }\n',
+            "epson_uart": 'model = "g366pdg0"\n',
+            "text": 'columns = ["gz"]\n',
+        }
         driver = f'link = "virtual"\ndecoder = "{name}"\n[device.driver.decoder_options]\n{wanted.get(name, "")}{{}}'
         yield (
             DEVICE.format(keys="", driver=driver),
@@ -259,7 +263,7 @@ def test_every_kind_of_numeric_key_is_found() -> None:
     for expected in (
         ("device", "rate"), ("device", "tau"), ("device", "refit"), ("device", "alarms_per_day"), ("limit", "hold"),
         ("faults", "jitter"), ("virtual", "seed"), ("virtual", "silence"), ("viewer", "memory"), ("viewer", "port"),
-        ("storage", "keep"), ("hook", "timeout"), ("metrics", "listen"), ("influx", "interval"),
+        ("storage", "keep"), ("hook", "timeout"), ("metrics", "listen"), ("influx", "interval"), ("ros2", "domain"),
         ("link serial", "baudrate"),
         ("link can", "bitrate"), ("link replay", "bytes_per_second"), ("decoder text", "scale"),
         ("decoder dbc", "tick"),

@@ -326,13 +326,17 @@ def test_check_prints_the_keys_of_one_link_and_one_decoder(run_program: RunProgr
     assert run_program("check", "--decoder", "text").status == 2
 
 
-def test_completion_lists_commands_and_options() -> None:
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_lists_commands_and_options(shell: str) -> None:
     for words, number, expected in (("imu-monitor an", 1, "analyze"), ("imu-monitor export --fo", 2, "--format")):
-        variables = {"_IMU_MONITOR_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(number)}
+        variables = {"_IMU_MONITOR_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+        variables |= {"COMP_WORDS": words, "COMP_CWORD": str(number), "_TYPER_COMPLETE_ARGS": words}
         done = subprocess.run(
             [*PROGRAM], env=os.environ | variables, capture_output=True, text=True, timeout=PATIENCE_S, check=True
         )
-        assert done.stdout.split() == [expected]
+        assert expected in done.stdout
+        assert "reconcile" not in done.stdout
+        assert "--inflation" not in done.stdout
 
 
 def test_version_option_prints_the_package_version(run_program: RunProgram) -> None:

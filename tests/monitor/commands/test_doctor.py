@@ -16,6 +16,7 @@ import pytest
 
 from drivers.data_types import make_block
 from drivers.driver import AxisMap
+from drivers.extras import install_command
 from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter
 from monitor.commands import doctor
@@ -207,7 +208,7 @@ def test_missing_package_of_a_can_interface_is_named(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "msgpack", None)  # as if it were not installed
     found = doctor.check_can_interface("device a", "udp_multicast", "239.74.163.2")
     assert (found.mark, found.text) == ("wrong", "CAN interface udp_multicast needs the package msgpack")
-    assert found.do == 'pip install "imu-monitor[multicast]"'
+    assert found.do == install_command("imu-monitor[multicast]")
 
 
 # --- outputs
@@ -250,6 +251,17 @@ def test_unprotected_listening_beyond_this_machine_is_found(tmp_path: Path) -> N
         select_findings(found, "zenoh")
     )
     assert "everyone who reaches this machine can read the metrics" in str(select_findings(found, "metrics"))
+
+
+def test_router_of_ros2_is_checked(tmp_path: Path) -> None:
+    def check(port: int) -> list[Finding]:
+        text = VIRTUAL + QUIET + f'[ros2]\ndomain = 0\nconnect = ["tcp/127.0.0.1:{port}"]\n'
+        return select_findings(examine_config(tmp_path, text), "ros2")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert [one.mark for one in check(port)] == ["well"]
+    assert [one.mark for one in check(port)] == ["doubt"]
 
 
 def test_influx_server_and_token_are_checked(tmp_path: Path) -> None:

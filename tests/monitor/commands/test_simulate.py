@@ -14,6 +14,7 @@ from drivers.recordings import load_samples, save_samples
 from drivers.recordings.formats import WRITABLE_TABLES
 from monitor.commands import analyze
 from monitor.commands.simulate import CHUNK_ROWS, SimulationRequest, run_simulation
+from monitor.commands.wire_format_decoding import DecoderChoice
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 
@@ -107,6 +108,20 @@ def test_temperature_is_taken_from_a_recording(tmp_path: Path) -> None:
     since_s = np.arange(1500) / 50.0
     assert recording.temperature_c == pytest.approx(20.0 + np.minimum(since_s, 19.5))  # the last temperature continues
     assert recording.values[:, 3] == pytest.approx(1e-2 * (recording.temperature_c - 25.0))
+
+
+def test_temperature_is_taken_from_captured_bytes(tmp_path: Path) -> None:
+    (tmp_path / "oven.txt").write_text("".join(f"0.0 {20.0 + 0.1 * i:.1f}\n" for i in range(300)))
+    run_simulation(
+        SimulationRequest(
+            TEMPERATURE_MODEL, tmp_path / "x.npz", 4.0, rate_hz=50.0, seed=1, temperature_from=tmp_path / "oven.txt",
+            decoder=DecoderChoice("text", {"columns": ["gx", "temperature"], "gyro_unit": "rad/s"}),
+        )
+    )  # fmt: skip
+    assert load_samples(tmp_path / "x.npz").temperature_c == pytest.approx(
+        20.1 + 0.1 * np.arange(200),
+        abs=1e-6,  # a capture may begin within a line, so that its first line is left out
+    )
 
 
 def test_temperature_recording_keeps_its_own_rate(tmp_path: Path) -> None:

@@ -189,6 +189,13 @@ class TestCaptures:
         np.testing.assert_allclose(found.t_s, np.arange(N) / 50.0, atol=1e-6)
         assert found.axes == ("gx", "gy", "gz")
 
+    def test_values_of_an_on_board_filter_are_noted(self, tmp_path: Path) -> None:
+        path = tmp_path / "capture.txt"
+        example = Example("vectornav_ascii", {"sentence": "VNYMR"})
+        write_capture(path, encode(example, tmp_path))
+        found = load_recording(path, RATE_HZ, decoder=DecoderChoice("vectornav_ascii"))
+        assert any("hides bias instability B and random walk K; select $VNIMU" in note for note in found.notes)
+
     def test_stated_byte_rate_gives_the_times(self, tmp_path: Path) -> None:
         path = tmp_path / "capture.txt"
         chunks = encode(TEXT, tmp_path)

@@ -11,7 +11,7 @@ from rich.console import Console
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings.formats import WRITABLE_TABLES
-from monitor.common.unit_formatting import coefficient_unit
+from monitor.common.unit_formatting import UNIT_SYSTEMS, coefficient_unit
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.history.bucketed_history import HistoryTable, build_table
 from monitor.history.history_row import STATES, HistoryRow
@@ -83,6 +83,26 @@ def test_axis_history_has_one_line_per_bucket() -> None:
     assert lines[7].split()[3].startswith(f"{1e-4 * coefficient_unit('N', 'gz').factor:.1f}")
     assert "…" in lines[7]
     assert lines[9].split()[-2:] == ["12", "lost"]
+
+
+def test_tables_and_plot_have_the_units_of_data_sheets(tmp_path: Path) -> None:
+    history, units = make_history(), UNIT_SYSTEMS["datasheet"]
+    text = render_text(
+        lambda past, console: history_text.print_history_summary(past, AXES, ("N",), console, units), history
+    )
+    rows = [line.split() for line in text.splitlines() if line.startswith("gz N")]
+    assert [row[2] for row in rows] == ["°/√h", "m°/s/√Hz"]
+    first = float(history.select_column("gz.N").last[0])
+    assert float(rows[1][3]) == pytest.approx(first * math.sqrt(2.0) * math.degrees(1e3), rel=0.01)
+    text = render_text(
+        lambda past, console: history_text.print_axis_history(past, "gz", ("N", "B"), console, units), history
+    )
+    assert "N °/√h" in text
+    assert "N m°/s/√Hz" in text
+    save_history_plot(history, tmp_path / "past.svg", units=units)
+    svg = (tmp_path / "past.svg").read_text()
+    assert "N, m°/s/√Hz" in svg
+    assert "N, °/√h" not in svg
 
 
 def test_events_without_rows_are_printed() -> None:

@@ -203,7 +203,7 @@ INVALID_CONFIGS = {
     ),
     "protocol missing": (
         format_device(driver='driver = { link = "serial", port = "x" }'),
-        ["driver.decoder: missing; possible are dbc, "],
+        ["driver.decoder: missing; possible are aceinna_dmu, "],
     ),
     "decoder that is no text": (
         format_device(driver='driver = { link = "serial", port = "x", decoder = 3 }'),
@@ -409,6 +409,7 @@ VALID_CONFIG = {
     "hook": [{"on": ["*"], "key": "x"}],
     "metrics": {},
     "influx": {},
+    "ros2": {},
     "log": {},
 }
 MISTAKES = [
@@ -484,6 +485,11 @@ MISTAKES = [
     (("metrics", "listen"), "9464"),
     (("influx", "url"), "127.0.0.1:8086"),
     (("influx", "interval"), "often"),
+    (("device", 0, "frame_id"), "/imu_link"),
+    (("ros2", "domain"), 233),
+    (("ros2", "connect"), ["7447"]),
+    (("ros2", "namespace"), "robot-1"),
+    (("ros2", "imu"), "data"),
     (("log", "level"), "loud"),
     (("log", "format"), 3),
 ]

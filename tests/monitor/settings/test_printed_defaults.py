@@ -22,6 +22,7 @@ from monitor.settings.schema import (
     Limit,
     LogTable,
     MetricsTable,
+    Ros2Table,
     Storage,
     ViewerTable,
     ZenohTable,
@@ -38,7 +39,19 @@ def get_decoder_settings_class(name: str) -> type[SettingsModel]:
 
 
 MODELS = [
-    *(ConfigFile, Device, Limit, Hook, ZenohTable, ViewerTable, Storage, MetricsTable, LogTable, FaultsTable),
+    *(
+        ConfigFile,
+        Device,
+        Limit,
+        Hook,
+        ZenohTable,
+        ViewerTable,
+        Storage,
+        MetricsTable,
+        Ros2Table,
+        LogTable,
+        FaultsTable,
+    ),
     *(SignalSettings, *map(link_settings_class, LINKS), *map(get_decoder_settings_class, DECODERS)),
 ]
 

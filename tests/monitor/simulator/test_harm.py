@@ -126,8 +126,32 @@ def count_needed_samples(kinds: np.ndarray, samples: int, fault: FaultKind) -> i
     return samples + int(np.flatnonzero((enough_faults & intact)[samples - 1 :])[0])
 
 
-WITH_COUNTER = ("mavlink", "vectornav_binary", "stim300", "xsens_mtdata2", "ros2_imu", "samples")
-WITH_CHECKSUM = ("mavlink", "vectornav_binary", "stim300", "xsens_mtdata2", "vectornav_ascii", "witmotion")
+WITH_COUNTER = (
+    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "mavlink", "microstrain_mip"),
+    *(
+        "novatel_rawimusx",
+        "sbg_ecom",
+        "silicon_sensing_dmu",
+        "stim300",
+        "ublox_esf",
+        "vectornav_binary",
+        "xsens_mtdata2",
+    ),
+    *("ros2_imu", "samples"),
+)
+WITH_CHECKSUM = (
+    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "mavlink", "microstrain_mip"),
+    *(
+        "novatel_rawimusx",
+        "sbg_ecom",
+        "silicon_sensing_dmu",
+        "stim300",
+        "ublox_esf",
+        "vectornav_binary",
+        "xsens_mtdata2",
+    ),
+    *("vectornav_ascii", "witmotion"),
+)
 
 
 @pytest.fixture(params=("vectornav_binary", "dbc", "ros2_imu", "samples", "text"))

@@ -111,6 +111,25 @@ def test_setting_selects_compensated_or_uncompensated_values() -> None:
     assert corrected.values.tolist() == [[1, 1, 1, 2, 2, 2]]
 
 
+@pytest.mark.parametrize(
+    ("fields", "compensated", "noted"),
+    [
+        (1 << 5 | 1 << 8, False, True),
+        (1 << 5 | 1 << 9, False, False),
+        (1 << 5 | 1 << 9, True, True),
+        (1 << 9, True, False),
+    ],
+    ids=["only compensated", "raw of both", "compensated of both", "only raw"],
+)
+def test_note_says_that_the_filter_has_corrected_the_rates(fields: int, compensated: bool, noted: bool) -> None:
+    decoder = build(Settings(compensated=compensated))
+    assert decoder.on_board_filter_note == ""
+    decoder.feed(
+        [Chunk(make_message({1: fields}, pack_floats(*range(9 if fields & 1 << 5 and fields & 1 << 9 else 6))), 0)]
+    )
+    assert ("hides bias instability" in decoder.on_board_filter_note) == noted
+
+
 @pytest.mark.parametrize("masks", [{4: 1}, {6: 3}, {1: 0x8001}, {1: 0}, {3: 0x0800}])
 def test_messages_with_fields_of_unknown_size_are_ignored(masks: dict[int, int]) -> None:
     assert decode_bytes(make_message(masks, bytes(30))) is None

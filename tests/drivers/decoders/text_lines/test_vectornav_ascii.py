@@ -51,6 +51,13 @@ def test_ymr_sentence_is_decoded(line: bytes, row: list[float]) -> None:
     assert np.isnan(got.temperature_c).all()
 
 
+@pytest.mark.parametrize(("line", "noted"), [(YMR_SENTENCE, True), (IMU_SENTENCE, False)], ids=["VNYMR", "VNIMU"])
+def test_note_says_that_the_filter_has_corrected_the_rates(line: bytes, noted: bool) -> None:
+    decoder = build(Settings())
+    decoder.feed([Chunk(line, 77)])
+    assert ("select $VNIMU" in decoder.on_board_filter_note) == noted
+
+
 def test_auto_uses_only_the_first_kind_of_sentence() -> None:
     first = decode_bytes(YMR_SENTENCE + IMU_SENTENCE + YMR_SENTENCE_2)
     assert first is not None

@@ -26,13 +26,17 @@ from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.decoders.text_lines.text import Settings as TextSettings
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
+from tests.experiments.fuzz.binary_formats import BINARY_FORMATS
 from tests.experiments.fuzz.checked_clock import CheckedClock
 from tests.experiments.fuzz.checks import feed_and_check, summarize_blocks
-from tests.experiments.fuzz.formats import FORMATS, is_subsequence
+from tests.experiments.fuzz.formats import FORMATS as BASIC_FORMATS
+from tests.experiments.fuzz.formats import is_subsequence
+from tests.experiments.fuzz.framed_formats import FRAMED_FORMATS
 from tests.experiments.fuzz.input_reader import InputReader, encode_pieces
 from tests.experiments.fuzz.target import Check, target
 from tests.support.settings import read_settings
 
+FORMATS: Final = BASIC_FORMATS | BINARY_FORMATS | FRAMED_FORMATS
 MAX_STREAM_BYTES: Final = 3000
 """Limit of the length of a stream in bytes, including repetitions."""
 MAX_CALLS: Final = 4
@@ -172,17 +176,34 @@ def stream_seeds(name: str) -> Iterator[bytes]:
         yield head + encode_pieces(encoded, b"\0")
         yield head + b"\5\x18" + rng.bytes(24) + b"\0\x09rubbish\r\n" + b"\5\x18" + rng.bytes(24)
         yield head + b"\1\x20" + rng.bytes(32) + b"\4\1\7" + b"\2\x20" + rng.bytes(32) + b"\3\x20" + rng.bytes(32)
-        inner = {"vectornav_binary": encoded[1:-2], "xsens_mtdata2": encoded[4:-1], "stim300": encoded[:-4]}.get(
-            name, encoded
-        )
+        inner = encoded[CONTENT.get(name, slice(None))]
         if example.name in ("text", "vectornav_ascii"):
             inner = inner.strip().strip(b"$").partition(b"\r")[0].rpartition(b"*")[0] or inner
         yield head + b"".join(b"\1" + bytes([len(part)]) + part for part in [inner[:190]] * 4)
 
 
+CONTENT: Final = {
+    "epson_uart": slice(1, -3),
+    "microstrain_mip": slice(4, -2),
+    "sbg_ecom": slice(6, -3),
+    "silicon_sensing_dmu": slice(2, -2),
+    "stim300": slice(0, -4),
+    "vectornav_binary": slice(1, -2),
+    "xsens_mtdata2": slice(4, -1),
+}
+"""Part of an encoded frame that ``Format.wrap`` takes."""
+
 WORDS: Final = {
+    "epson_uart": (b"\x80", b"\x0d", b"\xfe\0", b"\xfe\1"),
     "mavlink": (b"\xfd\x3d\0\0", b"\xfe\x3e", b"\x69\0\0", b"\x1a\0\0", b"\xc0\x7f", b"\x7f\x80"),
+    "microstrain_mip": (b"\x75\x65\x80", b"\x0e\4", b"\x0e\5", b"\x0e\7", b"\x0e\x08", b"\x0a\xd6", b"\4\x18"),
+    "sbg_ecom": (b"\xff\x5a\x2c\0\x20\0", b"\xff\x5a\3\0\x3a\0", b"\xff\5", b"\xff\3", b"\x33", b"\0\0\xc0\x7f"),
+    "silicon_sensing_dmu": (b"\x55\xaa", b"\x7f\xc0\0\0", b"\xff\x80\0\0"),
+    "aceinna_dmu": (b"UUS0\x1e", b"UUS1\x18", b"UUz1\x28", b"UUs1\x34", b"\0\0\xc0\x7f"),
     "text": ("gx:", "az :", "nan", "-inf", "1e308", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
+    "inertial_labs": (b"\xaa\x55\1\x8f\x26\0", b"\xaa\x55\1\x81\x3a\0"),
+    "novatel_rawimusx": (b"\xaa\x44\x13\x28\xb6\5", b"\xaa\x44\x12\x1c\xb5\5", b"\0\x20"),
+    "ublox_esf": (b"\xb5b\x10\3", b"\xb5b\x10\2", b"\0\0\0\x0e", b"\0\0\0\x0c", b"$GNGGA,", b"*47\r\n"),
     "vectornav_ascii": ("$VNIMU,", "$VNYMR,", "nan", "inf", "*XX", "\r\n", "1e999"),
     "xsens_mtdata2": (b"\xfa\xff\x36", b"\x40\x20\x0c", b"\x80\x20\x0c", b"\x10\x60\x04", b"\x08\x10\x04", b"\x7f\xc0"),
     "vectornav_binary": (b"\xfa\1\1\2", b"\xfa\1\1\6", b"\x7f\xc0\0\0", b"\0\0\xc0\x7f"),

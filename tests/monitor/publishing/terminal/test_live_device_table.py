@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import threading
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from rich.console import Console
 from drivers.data_types import Event
 from drivers.errors import ConfigError
 from monitor.common import topics
+from monitor.common.unit_formatting import DEFAULT_UNITS, KINDS, UNIT_SYSTEMS, UnitSystem
 from monitor.publishing import remote_device_states
 from monitor.publishing.messages.results import CoefficientsMessage, EventMessage, ModelGapMessage, StatusMessage
 from monitor.publishing.remote_device_states import MAX_EVENTS, RemoteDeviceRegistry
@@ -62,10 +64,15 @@ def send_event(registry: RemoteDeviceRegistry, device: str, text: str) -> None:
 
 
 def render_table(
-    registry: RemoteDeviceRegistry, width: int = 120, now_s: float = NOW_S, height: int = 50, is_terminal: bool = False
+    registry: RemoteDeviceRegistry,
+    width: int = 120,
+    now_s: float = NOW_S,
+    height: int = 50,
+    is_terminal: bool = False,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> str:
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=is_terminal, record=True)
-    console.print(live_device_table.device_overview(registry, now_s))
+    console.print(live_device_table.device_overview(registry, now_s, units))
     return console.export_text()
 
 
@@ -105,6 +112,31 @@ def test_nothing_is_cut_off_at_usual_widths(registry: RemoteDeviceRegistry, widt
     assert "…" not in text
     assert all(head in text for head in ("N °/√h", "B °/h", "N m/s/√h", "received", "p99 ms"))
     assert ("0.515" in text) == (width != 100)  # at width 100, only two digits fit in a line
+
+
+@pytest.mark.parametrize("units", UNIT_SYSTEMS)
+def test_tables_of_all_units_fit_80_columns(registry: RemoteDeviceRegistry, units: str) -> None:
+    """The coefficient tables contain the same numbers at 80 columns and at 200 columns, where nothing is cut off."""
+    send_status(registry, "bench-1")
+    send_coefficients(registry, "bench-1", seconds=600.0)
+    narrow, wide = (
+        render_table(registry, width, units=UNIT_SYSTEMS[units]).partition("bound;")[2] for width in (80, 200)
+    )
+    numbers = re.compile(r"\d[\d.e-]*")
+    assert sorted(numbers.findall(narrow)) == sorted(numbers.findall(wide))
+    for kind in KINDS:
+        for column in UNIT_SYSTEMS[units].columns(kind):
+            assert f"{column.symbol} {column.unit.name}" in narrow
+
+
+def test_device_row_shows_the_noise_density_of_data_sheets(registry: RemoteDeviceRegistry) -> None:
+    send_status(registry, "bench-1")
+    send_coefficients(registry, "bench-1")
+    found = [
+        float(find_row(render_table(registry, 160, units=UNIT_SYSTEMS[name]), "bench-1").split()[7])
+        for name in ("datasheet", "si")
+    ]
+    assert found == pytest.approx([1.5e-4 * np.sqrt(2.0) * np.degrees(1e3), 1.5e-4], rel=0.01)
 
 
 def test_devices_have_one_line_each_from_100_columns(registry: RemoteDeviceRegistry) -> None:

@@ -1,0 +1,131 @@
+"""Identification of the wire format on a serial port or in a file of captured bytes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+from typing import Final
+
+import msgspec
+
+from drivers import file_access
+from drivers.errors import LinkLost, LinkUnavailable, NotReady
+from drivers.links import serial_link
+from drivers.wire_format_identification import TEXT_DECODER, UNKNOWN, IdentifiedFormat, identify_wire_format
+
+BAUD_RATES: Final = (115200, 460800, 921600, 230400, 9600, 57600, 38400, 19200, 374400, 1000000, 1843200, 2000000)
+"""Baud rates of IMUs in bit/s, the most common first."""
+MAX_BYTES: Final = 16384
+"""Number of bytes that are examined, which is 0.2 s at the highest baud rate."""
+NO_BYTES_ADVICE: Final = "check the power, the wiring of TX and RX, and whether the sensor sends without a request"
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifiedSource:
+    """Port or file whose wire format has been identified."""
+
+    source: str  # port or path
+    format: IdentifiedFormat
+    baudrate: int | None = None  # None for a file
+
+
+def identify_file(path: Path) -> IdentifiedSource:
+    """Identify the wire format in a file of captured bytes.
+
+    Raises
+    ------
+    NotReady
+        If no decoder finds samples.
+    """
+    with file_access.open_regular_file(path) as file:
+        data = file.read(MAX_BYTES)
+    found = identify_wire_format(data)
+    if found is None:
+        raise NotReady(f"{path}: no decoder finds samples in the first {len(data)} bytes")
+    return IdentifiedSource(str(path), found)
+
+
+def identify_port(port: str, listen_s: float, report: Callable[[str], None]) -> IdentifiedSource:
+    """Listen to a serial port at each baud rate until a wire format is identified.
+
+    Parameters
+    ----------
+    port
+        Device or URL of pyserial. A network connection has no baud rate, so it is read once.
+    listen_s
+        Maximum time in s to listen at each baud rate.
+    report
+        Function that receives one line of text for each baud rate without a result.
+
+    Raises
+    ------
+    LinkUnavailable
+        If the port cannot be opened.
+    NotReady
+        If no decoder finds samples at any baud rate.
+    """
+    received = 0
+    for baudrate in BAUD_RATES[:1] if "://" in port else BAUD_RATES:
+        try:
+            data, seconds = _listen(port, baudrate, listen_s)
+        except LinkUnavailable as error:
+            if baudrate == BAUD_RATES[0]:
+                raise
+            report(f"{baudrate} baud: {error}")  # the port does not support this baud rate
+            continue
+        received += len(data)
+        found = identify_wire_format(data)
+        if found is not None:
+            rate_hz = found.rate_hz or (found.samples / seconds if seconds > 0.0 else None)
+            return IdentifiedSource(port, replace(found, rate_hz=rate_hz), baudrate)
+        report(f"{baudrate} baud: {len(data)} bytes, no known format")
+    if not received:
+        raise NotReady(f"{port}: no bytes at any baud rate; {NO_BYTES_ADVICE}")
+    raise NotReady(f"{port}: no decoder finds samples at any baud rate; try a longer time with --seconds")
+
+
+def _listen(port: str, baudrate: int, listen_s: float) -> tuple[bytes, float]:
+    """Return the received bytes and the time in s from the first to the last byte."""
+    link = serial_link.build(serial_link.Settings(port=port, baudrate=baudrate))
+    data = b""
+    first_s = last_s = 0.0
+    link.open()
+    try:
+        until_s = monotonic() + listen_s
+        while len(data) < MAX_BYTES and (now_s := monotonic()) < until_s:
+            chunks = link.wait_for_chunks_or_timeout(until_s - now_s)
+            if chunks:
+                last_s = monotonic()
+                first_s = first_s or last_s
+                data += b"".join(chunk.data for chunk in chunks)
+    except LinkLost as error:
+        raise LinkUnavailable(str(error)) from error
+    finally:
+        link.close()
+    return data, last_s - first_s
+
+
+def write_configuration(found: IdentifiedSource) -> str:
+    """Return the configuration of a device with the identified wire format as TOML."""
+    lines = ["[[device]]", 'name = "imu"']
+    if found.format.rate_hz is not None:
+        lines.append(f"# rate = {found.format.rate_hz:.4g}  # Hz, as measured; the program measures it again")
+    lines += ["", "[device.driver]"]
+    if found.baudrate is None:
+        lines += ['link = "replay"', f"path = {_to_toml(found.source)}"]
+    else:
+        lines += ['link = "serial"', f"port = {_to_toml(found.source)}", f"baudrate = {found.baudrate}"]
+    lines.append(f'decoder = "{found.format.decoder}"')
+    if found.format.options:
+        lines += ["", "[device.driver.decoder_options]"]
+    if found.format.decoder == TEXT_DECODER:
+        lines.append(f"# one line of the sensor: {found.format.text_line}")
+        lines.append('# replace each "?" by gx gy gz ax ay az temperature t counter, or "-" to skip the column')
+    elif UNKNOWN in found.format.options.values():
+        lines.append('# replace "?"; imu-monitor check names the possible values')
+    lines += [f"{key} = {_to_toml(value)}" for key, value in found.format.options.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _to_toml(value: object) -> str:
+    return msgspec.json.encode(value).decode()

@@ -1,0 +1,97 @@
+"""Tests of identifying the wire format in captured bytes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.data_types import NO_TICK, CounterTimedFormat, make_block
+from drivers.wire_format_identification import MIN_SAMPLES, TEXT_DECODER, identify_wire_format
+from tests.contracts.decoder_examples import EXAMPLES, Example
+
+STREAMS = [example for example in EXAMPLES if example.carrier == "bytes"]
+RATE_HZ = 100.0
+BAUD_RATES = (9600, 38400, 115200, 230400, 460800, 921600)
+
+
+def encode_capture(example: Example, folder: Path, samples: int = 60) -> bytes:
+    """Return the bytes of a sensor at rest that sends 100 samples per second."""
+    decoder = example.build(folder)
+    rng = np.random.default_rng(7)
+    values = np.concatenate([rng.normal(0.0, 0.01, (samples, 3)), rng.normal(0.0, 0.05, (samples, 3))], axis=1)
+    values[:, 5] += 9.81
+    t_ns = np.arange(samples, dtype=np.int64) * 10_000_000
+    ticks = np.full(samples, NO_TICK, np.int64)
+    if isinstance(decoder.timing, CounterTimedFormat):
+        step = 1 if decoder.timing.tick_s is None else round(1.0 / (RATE_HZ * decoder.timing.tick_s))
+        ticks = np.arange(samples, dtype=np.int64) * step % decoder.timing.modulus
+    block = make_block(t_ns, values, np.full(samples, 25.0), ticks)
+    return b"".join(chunk.data for chunk in decoder.encode(block))
+
+
+def read_at_wrong_baud_rate(data: bytes, sent_baud: int, read_baud: int) -> bytes:
+    """Return the bytes that a UART reads at another baud rate. Each byte has a start bit, 8 bits and a stop bit."""
+    bits = np.unpackbits(np.frombuffer(data, np.uint8)[:, None], axis=1, bitorder="little")
+    line = np.hstack([np.zeros((len(bits), 1), np.uint8), bits, np.ones((len(bits), 1), np.uint8)]).ravel()
+    line = np.concatenate([line, np.ones(64, np.uint8)])
+    ratio = sent_baud / read_baud  # bits of the sender in one bit of the reader
+    at, read = 0.0, bytearray()
+    while at + 10 * ratio < line.size:
+        if line[int(at)]:  # the line is idle
+            at += ratio / 16
+            continue
+        samples = line[(at + ratio * (np.arange(1, 10) + 0.5)).astype(int)]
+        if samples[8]:
+            read.append(int(np.packbits(samples[:8], bitorder="little")[0]))
+        at += ratio * 9.75
+    return bytes(read)
+
+
+@pytest.mark.parametrize("example", STREAMS, ids=str)
+def test_capture_of_every_decoder_is_identified(example: Example, tmp_path: Path) -> None:
+    data = encode_capture(example, tmp_path)
+    found = identify_wire_format(b"\x00\xff noise" + data[len(data) // 7 :])
+    assert found is not None
+    assert found.decoder == example.name
+    assert found.samples >= 40
+    if not example.settings:
+        assert found.rate_hz in (None, pytest.approx(RATE_HZ, rel=0.01))
+
+
+@pytest.mark.parametrize("example", STREAMS, ids=str)
+def test_capture_at_a_wrong_baud_rate_is_never_identified(example: Example, tmp_path: Path) -> None:
+    data = encode_capture(example, tmp_path)
+    for sent_baud, read_baud in [(a, b) for a in BAUD_RATES for b in BAUD_RATES if 1 / 5 < a / b < 5 and a != b]:
+        assert identify_wire_format(read_at_wrong_baud_rate(data, sent_baud, read_baud)) is None
+
+
+def test_simulated_uart_reads_the_sent_bytes_at_the_right_baud_rate() -> None:
+    data = bytes(range(256))
+    assert read_at_wrong_baud_rate(data, 115200, 115200)[:255] == data[:255]
+
+
+def test_random_bytes_are_not_identified() -> None:
+    rng = np.random.default_rng(3)
+    assert not any(identify_wire_format(rng.bytes(4096)) for _ in range(20))
+
+
+@pytest.mark.long
+def test_a_thousand_noise_captures_are_not_identified() -> None:
+    rng = np.random.default_rng(4)
+    for i in range(1000):
+        data = rng.bytes(4096)
+        if i % 2:  # printable noise, as of a terminal or a boot log
+            data = bytes(32 + byte % 96 for byte in data).replace(b"~", b"\n")
+        assert identify_wire_format(data) is None
+
+
+@pytest.mark.parametrize(("line", "columns"), [("0.01,-0.02, 9.81", 3), ("1\t2\t3\t4\t5\t6", 6), ("17 1e-3 2 nan", 4)])
+def test_lines_of_numbers_are_identified_as_text(line: str, columns: int) -> None:
+    found = identify_wire_format((line + "\r\n").encode() * 20)
+    assert found is not None
+    assert (found.decoder, found.options, found.text_line) == (TEXT_DECODER, {"columns": ["?"] * columns}, line)
+
+
+@pytest.mark.parametrize("text", ["starting\nready\n" * 20, "1,2\n" * 20, "1,2,3\n" * MIN_SAMPLES])
+def test_other_text_is_not_identified(text: str) -> None:
+    assert identify_wire_format(text.encode()) is None
