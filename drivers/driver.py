@@ -18,7 +18,7 @@ import numpy as np
 from drivers.data_types import AXES, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
-from drivers.links.base import Link
+from drivers.links.base import DropCountingLink, Link
 from drivers.timing.sample_clock import SampleClock
 from drivers.wire_format_identification import identify_wire_format
 
@@ -133,6 +133,7 @@ class Driver:
         self._last_sample_s = 0.0
         self._newest_t_ns = 0
         self._unreported_samples = self._unreported_gaps = 0  # missing samples and gaps since the last report
+        self._reported_datagrams = 0  # number of dropped datagrams that have been reported
         self._last_report_s = -LOSS_REPORT_INTERVAL_S
 
     @property
@@ -252,9 +253,15 @@ class Driver:
         if not self._unreported_samples or time.monotonic() - self._last_report_s < LOSS_REPORT_INTERVAL_S:
             return
         places = "" if self._unreported_gaps == 1 else f" in {self._unreported_gaps} places"
-        self._event("samples_lost", f"{self._unreported_samples} samples missing{places}")
+        self._event("samples_lost", f"{self._unreported_samples} samples missing{places}{self._describe_dropped()}")
         self._unreported_samples = self._unreported_gaps = 0
         self._last_report_s = time.monotonic()
+
+    def _describe_dropped(self) -> str:
+        """Return the end of a message about missing samples if the receive buffer of the link was full."""
+        total = self.link.dropped_datagrams if isinstance(self.link, DropCountingLink) else 0
+        dropped, self._reported_datagrams = total - self._reported_datagrams, total
+        return f"; {dropped} datagrams were dropped because the receive buffer was full" if dropped else ""
 
     def _check_silence(self) -> None:
         silent_s = time.monotonic() - self._last_data_s

@@ -16,6 +16,7 @@ EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
     "ros": {"rosbags": "rosbags"},
     "px4": {"pyulog": "pyulog"},
     "ardupilot": {"pymavlink": "pymavlink"},
+    "pattern": {"re2": "google-re2"},
 }
 """Modules that each extra provides, with the name of the package that contains each module."""
 

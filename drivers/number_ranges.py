@@ -126,7 +126,7 @@ TICK_S: Final = NumberRange("s", 1e-12, DAY_S)
 BIT_RATE: Final = NumberRange("bit/s", 1, 1_000_000_000)
 BYTE_RATE: Final = NumberRange("byte/s", 1.0, 1e9)
 PORT: Final = NumberRange("", 0, 65_535)
-"""TCP port."""
+"""TCP or UDP port."""
 ROS_DOMAIN: Final = NumberRange("", 0, 232)
 """Domain of ROS 2. The maximum is that of DDS."""
 SIZE_BYTES: Final = NumberRange("byte", 1e6, 1e15)
@@ -144,6 +144,8 @@ COUNTER_MODULUS: Final = NumberRange("counts", 2, 1 << 62)
 """Number of counts after which a device counter wraps to 0."""
 COUNTER_STEP: Final = NumberRange("counts", 1e-9, 1 << 62)
 """Increase of a device counter from one sample to the next."""
+MAVLINK_ID: Final = NumberRange("", 0, 255)
+"""System, component or instance number of MAVLink."""
 SOURCE_ADDRESS: Final = NumberRange("", 0, 255)
 """Source address of SAE J1939."""
 HEADER_LINES: Final = NumberRange("lines", 0, 1_000_000)
@@ -158,6 +160,8 @@ CLOCK_RATIO: Final = NumberRange("", 0.5, 2.0)
 INFLATION: Final = NumberRange("", 1.0, 1e6)
 SCALE: Final = NumberRange("", 1e-15, 1e15, signed=True)
 """Factor that converts the raw numbers of a device to a unit."""
+OFFSET: Final = NumberRange("", 1e-15, 1e15, zero=True, signed=True)
+"""Number that is added to the raw numbers of a device."""
 NOISE_RATIO: Final = NumberRange("times", 1e-6, 1e6)
 """Ratio of two noise levels."""
 

@@ -56,6 +56,8 @@ def identify_wire_format(data: bytes) -> IdentifiedFormat | None:
     """
     found: list[IdentifiedFormat] = []
     for name in module_lookup.list_modules(decoders):
+        if name == TEXT_DECODER:
+            continue
         module = module_lookup.import_module(decoders, name)
         for options in _list_option_sets(module.Settings):
             result = _decode(name, module, options, data)
@@ -86,17 +88,27 @@ def _list_option_sets(settings: type[SettingsModel]) -> Iterator[dict[str, Any]]
 
 def _decode(name: str, module: ModuleType, options: dict[str, Any], data: bytes) -> IdentifiedFormat | None:
     """Decode the bytes with one decoder. The result is None if the decoder reads no bytes or needs further options."""
-    try:
-        decoder: Decoder = module.build(module.Settings(**options))
-    except (ConfigError, ValueError):  # a required option is missing, or options contradict each other
-        return None
-    if decoder.carrier != "bytes":
+    decoder = _build_decoder(module, options)
+    if decoder is None or decoder.carrier != "bytes":
         return None
     blocks = decoder.feed([Chunk(data, 0)])
     samples = sum(map(len, blocks))
     fields = module.Settings.model_fields
     known = {key: UNKNOWN if fields[key].is_required() else value for key, value in options.items()}
     return IdentifiedFormat(name, known, samples, decoder.bad, _measure_rate_hz(decoder, blocks))
+
+
+def _build_decoder(module: ModuleType, options: dict[str, Any]) -> Decoder | None:
+    """Build a decoder. If an option such as a unit is missing, use the examples of the other options."""
+    fields = module.Settings.model_fields.items()
+    examples = {key: info.examples[0] for key, info in fields if info.examples and not info.is_required()}
+    for others in ({}, examples):
+        try:
+            decoder: Decoder = module.build(module.Settings(**{**others, **options}))
+        except (ConfigError, ValueError):  # a required option is missing, or options contradict each other
+            continue
+        return decoder
+    return None
 
 
 def _measure_rate_hz(decoder: Decoder, blocks: list[SampleBlock]) -> float | None:

@@ -26,7 +26,7 @@ from tests.support.zenoh_sessions import open_session
 ROOT = Path(__file__).parents[1]
 OPTIONAL = {
     "scipy", "can", "cantools", "rerun", "matplotlib", "jinja2", "pyarrow", "PyEMD", "pywt", "prometheus_client",
-    "msgpack", "rosbags", "pyulog", "pymavlink",
+    "msgpack", "rosbags", "pyulog", "pymavlink", "re2",
 }  # fmt: skip
 """Modules that only extras install."""
 SERVICES = {"http.server", "socketserver"}

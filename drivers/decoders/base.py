@@ -234,6 +234,7 @@ class RawFrames:
         rejected = np.cumsum(self.bad_before)
         rejected_at = rejected[at]
         after = int(rejected[-1] if rejected.size else 0) - int(rejected_at[-1] if rejected_at.size else 0)
+        after += self.bad_after
         bad_before = np.diff(rejected_at, prepend=0)
         return RawFrames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 

@@ -128,3 +128,10 @@ class AddressFilteringLink(Protocol):
 
     def set_address_filter(self, addresses: Sequence[int]) -> None:
         """Receive only chunks with these addresses after the next call of ``open``."""
+
+
+@runtime_checkable
+class DropCountingLink(Protocol):
+    """Interface of a link that knows how many datagrams were dropped before they could be read."""
+
+    dropped_datagrams: int  # since the link was created

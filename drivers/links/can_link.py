@@ -27,6 +27,7 @@ from pydantic import Field, SkipValidation
 from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.extras import install_command, require_extra
+from drivers.links.arrival_times import monotonic_arrival_ns
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BIT_RATE, format_value
@@ -49,9 +50,6 @@ MAX_WAIT_S: Final = 0.1
 """Longest single wait for a frame in s. A blocked read returns within this time after the link has been closed."""
 HOST_STAMPED_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces that stamp a frame with the system clock of the host when the frame arrives."""
-MAX_FRAME_AGE_S: Final = 1.0
-CLOCK_PAIRS: Final = 3
-"""Number of times that the Unix clock and the monotonic clock are read. The fastest reading is used."""
 PROBE_TIMEOUT_S: Final = 2.0
 BUS_OFF_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose error frames contain the SocketCAN error classes in the identifier."""
@@ -208,11 +206,9 @@ class CanLink(PolledLink):
 
     def _arrival_ns(self, message: "can.Message") -> int:
         """Return the monotonic arrival time of a CAN frame, or the current time if the time stamp is unusable."""
-        now_ns = time.monotonic_ns()
         if self._settings.interface not in HOST_STAMPED_INTERFACES:
-            return now_ns
-        age_ns = now_ns + _unix_minus_monotonic_ns() - round(message.timestamp * 1e9)
-        return now_ns - age_ns if 0 <= age_ns <= MAX_FRAME_AGE_S * 1e9 else now_ns
+            return time.monotonic_ns()
+        return monotonic_arrival_ns(round(message.timestamp * 1e9))
 
     def _count_error_frame(self, message: "can.Message") -> None:
         """Count an error frame. Raise LinkLost if the error frame reports bus-off."""
@@ -238,19 +234,6 @@ def describe_missing_package(interface: str) -> str:
     if not module or importlib.util.find_spec(module) is not None:
         return ""
     return f"CAN interface {interface} needs the package {package}: {install_command(requirement)}"
-
-
-def _unix_minus_monotonic_ns() -> int:
-    """Return Unix time minus monotonic time in ns.
-
-    Both clocks are read several times, because the thread may be interrupted between two readings. The fastest pair of
-    readings is used.
-    """
-    pairs = []
-    for _ in range(CLOCK_PAIRS):
-        before_ns, unix_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        pairs.append((after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2))
-    return min(pairs)[1]
 
 
 def _probe_server(s: Settings) -> None:

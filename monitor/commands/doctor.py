@@ -1,7 +1,7 @@
 """Command ``doctor``: checks a machine and a configuration for unattended operation.
 
 Each check returns findings with advice and never raises an error. The checks briefly bind ports, connect to zenoh
-routers, and create and remove an empty file in the storage folder. No device is opened.
+routers, and create and remove an empty file in the storage folder. No device is opened, except UDP ports.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from urllib.parse import urlsplit
 from drivers import file_access
 from drivers.errors import LinkUnavailable
 from drivers.extras import find_missing_packages, install_command
-from drivers.links import iio_link
+from drivers.links import iio_link, udp_link
 from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
 from drivers.number_ranges import DAY_S
@@ -152,6 +152,8 @@ def _check_device(name: str, driver: Mapping[str, Any]) -> Iterator[Finding]:
             yield check_can_interface(about, interface, channel)
         case "iio":
             yield check_iio_device(about, str(driver.get("device")), bool(driver.get("enable", False)))
+        case "udp":
+            yield _check_udp_port(about, {key: driver[key] for key in ("host", "port") if key in driver})
         case "zenoh":
             for endpoint in driver.get("connect", []):
                 yield _check_reachable(about, str(endpoint))
@@ -178,6 +180,20 @@ def _check_serial_port(about: str, port: str) -> Finding:
         do = "if this is not the service itself, end it: only one program can read a port"
         return _doubt(about, f"{port}: in use by {holders}", do)
     return _well(about, f"{port}: exists, is readable, and no visible program uses it")
+
+
+def _check_udp_port(about: str, keys: Mapping[str, Any]) -> Finding:
+    """Check that a UDP port can be opened, by opening it briefly."""
+    link = udp_link.build(udp_link.Settings(**keys))
+    try:
+        link.open()
+    except LinkUnavailable as error:
+        text = str(error)
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRINUSE:
+            return _doubt(about, text, "if this is not the service itself, end it, or choose another port")
+        return _wrong(about, text)
+    link.close()
+    return _well(about, f"{link.name}: free")
 
 
 def _processes_using(port: Path) -> Iterator[str]:

@@ -4,6 +4,7 @@ Each link module and decoder module defines configuration keys. Only the modules
 imported.
 """
 
+import copy
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,11 +12,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Final
 
+import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo
 
 import drivers.decoders
 import drivers.links
 from drivers import module_lookup, number_ranges
+from drivers.data_types import make_block
 from drivers.decoders.base import AddressFilteringDecoder, Decoder
 from drivers.errors import ConfigError
 from drivers.links.base import AddressFilteringLink, Link, LinkSettings
@@ -202,6 +205,13 @@ def _read_decoder(
         fitting = ", ".join(list_decoders(carrier))
         text = f"{name} reads {_carrier_of(module)}, link {link_name} provides {carrier}: possible are {fitting}"
         problems.append(Problem("decoder", text))
+    if link_name == VIRTUAL and decoder is not None:
+        try:
+            copy.deepcopy(decoder).encode(
+                make_block(np.zeros(1, np.int64), np.zeros((1, 6)), ticks=np.zeros(1, np.int64))
+            )
+        except ConfigError as error:
+            problems += (Problem("decoder_options", line) for line in error.mistake_lines)
     return decoder
 
 

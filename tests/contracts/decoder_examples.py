@@ -76,6 +76,7 @@ COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az", "temperature")
 TEXT = Example("text", {"columns": COLUMNS}, 1e-14, 1e-13, 1e-13)
 OTHER_UNITS = {"gyro_unit": "deg/s", "accel_unit": "mg", "temperature_unit": "K", "delimiter": ";"}
 EPSON = Example("epson_uart", {"model": "g366pdg0"}, DEGREE / 66, 0.25e-3 * G, 2.0**-8, checksum=True)
+RAW_UNITS = {"gyro_unit": "deg/s/131", "accel_unit": "g/16384"}
 STIM300 = Example("stim300", {}, DEGREE / 2**14, G / 2**19, 2.0**-8, checksum=True)
 VECTORNAV = Example("vectornav_binary", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
 XSENS = Example("xsens_mtdata2", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True)
@@ -91,6 +92,7 @@ LISTED_EXAMPLES = (
     Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),
     Example("text", {"columns": ("t", "-", *COLUMNS), "time_unit": "ms"}, 1e-14, 1e-13, 1e-13),
     Example("text", {"columns": COLUMNS, **OTHER_UNITS}, 1e-13, 1e-13, 1e-12),
+    Example("text", {"columns": COLUMNS, "preset": "mpu6050_raw"}, 1e-13, 1e-12, 1e-12),
     Example("vectornav_ascii", {}, 1e-6, 1e-3, 0.1, checksum=True),
     Example("vectornav_ascii", {"sentence": "VNYMR"}, 1e-6, 1e-3, None, checksum=True),
     VECTORNAV,
@@ -130,6 +132,9 @@ LISTED_EXAMPLES = (
     Example("inertial_labs", {"message": "calibrated-hr"}, 1e-5 * DEGREE, 1e-6 * G, 0.1, checksum=True),
     Example("novatel_rawimusx", {}, 125 * DEGREE / 2**21, 125 / 2**22, None, checksum=True),
     Example("dbc", {"signals": CAN_SIGNALS}, 2.0**-9, 2.0**-8, 2.0**-8),
+    Example("mavlink", {}, FLOAT32_STEP, 8 * FLOAT32_STEP, 32 * FLOAT32_STEP, checksum=True),
+    Example("mavlink", {"message": "SCALED_IMU2", "clock": "arrival"}, 1e-3, 1e-3 * G, 0.01, checksum=True),
+    Example("mavlink", {"message": "RAW_IMU", **RAW_UNITS}, DEGREE / 131, G / 16384, 0.01, checksum=True),
     Example("ros2_imu", {}, 1e-15, 1e-14, None),
     Example("samples", {}, 1e-15, 1e-14, 1e-14),
 )

@@ -6,6 +6,7 @@ A test fails if a link has no rig in ``RIGS``.
 import contextlib
 import itertools
 import os
+import socket
 import threading
 import time
 import tty
@@ -126,6 +127,20 @@ def zenoh_rig(tmp_path: Path) -> Iterator[LinkRig]:
 
 
 @contextlib.contextmanager
+def udp_rig(tmp_path: Path) -> Iterator[LinkRig]:
+    link = build("udp", port=0)
+    absent = build("udp", host="192.0.2.1", port=9)  # an address that is reserved for documentation
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+
+        def send() -> None:
+            sender.sendto(DATA, link._socket.getsockname())  # type: ignore[attr-defined]
+
+        why_not_lost = "UDP has no connections, so a lost sender only causes silence, see LinkSettings.silence"
+        yield LinkRig(link, send, None, absent, why_not_lost)
+        link.close()
+
+
+@contextlib.contextmanager
 def replay_rig(tmp_path: Path) -> Iterator[LinkRig]:
     path = tmp_path / "frames.csv"
     path.write_text(f"t,id_hex,data_hex\n0.0,9,{DATA.hex()}\n1000.0,9,{DATA.hex()}\n")
@@ -159,6 +174,7 @@ RIGS: dict[str, Callable[[Path], AbstractContextManager[LinkRig]]] = {
     "iio": iio_rig,
     "zenoh": zenoh_rig,
     "replay": replay_rig,
+    "udp": udp_rig,
     "loopback": loopback_rig,
 }
 

@@ -451,3 +451,18 @@ def test_gaps_are_reported_once_per_second(monkeypatch):
     driver._report_lost()
     assert [event.text for event in driver.take_events()] == ["3 samples missing", "4 samples missing in 2 places"]
     assert driver.counts.lost == 7
+
+
+def test_report_of_missing_samples_names_dropped_datagrams(monkeypatch):
+    now_s = [1000.0]
+    monkeypatch.setattr(driver_module, "time", SimpleNamespace(monotonic=lambda: now_s[0], monotonic_ns=lambda: 0))
+    rig = DriverRig()
+    driver = rig.driver
+    rig.link.dropped_datagrams = 0
+    for dropped in (2, 2, 5):
+        rig.link.dropped_datagrams = dropped
+        driver._count_samples(make_block(np.zeros(1, np.int64), np.zeros((1, 6)), lost=9), 0)
+        driver._report_lost()
+        now_s[0] += 1.0
+    text = "9 samples missing; {} datagrams were dropped because the receive buffer was full"
+    assert [event.text for event in driver.take_events()] == [text.format(2), "9 samples missing", text.format(3)]

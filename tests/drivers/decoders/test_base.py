@@ -132,6 +132,8 @@ def test_deselected_frames_count_as_bad_before_the_next_selected_frame() -> None
     )
     none = frames.select_frames([])
     assert (none.data, none.t_ns.size, none.bad_before.size, none.bad_after) == ([], 0, 0, 15)
+    again = frames.select_frames([1, 2]).select_frames([0])
+    assert (again.bad_before.sum(), again.bad_after) == (kept.bad_before[0], kept.bad_before[1] + kept.bad_after)
 
 
 def make_rows(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -114,6 +114,60 @@ def _i24(frame: bytes, at: int) -> int:
     return int.from_bytes(frame[at : at + 3], "big", signed=True)
 
 
+# --- MAVLink
+
+MAVLINK_IMU: Final = {"HIGHRES_IMU": 105, "SCALED_IMU": 26, "SCALED_IMU2": 116, "SCALED_IMU3": 129, "RAW_IMU": 27}
+MAVLINK_CRC_EXTRA: Final = {105: 93, 26: 170, 116: 76, 129: 46, 27: 144}
+
+
+def compute_reflected_crc(data: bytes) -> int:
+    """Return the CRC-16/MCRF4XX, with the least significant bit first."""
+    register = 0xFFFF
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ (0x8408 if register & 1 else 0)
+    return register
+
+
+def _mavlink_wrap(data: bytes, settings: Settings) -> bytes:
+    kind, payload = (data[0] if data else 0), data[1:256]
+    numbers = (MAVLINK_IMU[settings.get("message", "HIGHRES_IMU")], *MAVLINK_CRC_EXTRA, 0, 30)
+    number = numbers[kind % 8]
+    if kind & 16:
+        head, tail = bytes([0xFE, len(payload), kind, 1, 1, number]), b""
+    else:
+        head = bytes([0xFD, len(payload), kind >> 7, 0, kind, 1, 1, number, 0, 0])
+        tail = bytes(13 * (kind >> 7))
+    crc = compute_reflected_crc(head[1:] + payload + bytes([MAVLINK_CRC_EXTRA.get(number, 50)]))
+    return head + payload + crc.to_bytes(2, "little") + tail
+
+
+def _mavlink_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
+    wanted = MAVLINK_IMU[settings.get("message", "HIGHRES_IMU")]
+    for at, first in enumerate(stream):
+        header = {0xFD: 10, 0xFE: 6}.get(first)
+        if header is None or len(stream) < at + header:
+            continue
+        frame = stream[at : at + header + stream[at + 1] + 2]
+        number = int.from_bytes(frame[7:10], "little") if first == 0xFD else frame[5]
+        if number != wanted or len(frame) < header + frame[1] + 2:
+            continue
+        if compute_reflected_crc(frame[1:-2] + bytes([MAVLINK_CRC_EXTRA[number]])).to_bytes(2, "little") != frame[-2:]:
+            continue
+        payload = frame[header:-2].ljust(63, b"\0")
+        row: list[float | None]
+        if number == 105:
+            row = list(struct.unpack_from("<3f", payload, 20) + struct.unpack_from("<3f", payload, 8))
+            row = [x if payload[60] >> bit & 1 else None for x, bit in zip(row, (3, 4, 5, 0, 1, 2), strict=True)]
+        else:
+            counts = struct.unpack_from("<6h", payload, 8 if number == 27 else 4)
+            gyro, accel = (DEGREE / 131, G / 16384) if number == 27 else (1e-3, 1e-3 * G)
+            row = [gyro * x for x in counts[3:]] + [accel * x for x in counts[:3]]
+        if has_finite_values(row):
+            yield tuple(row)
+
+
 # --- VectorNav
 
 
@@ -307,6 +361,7 @@ def _text_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
 
 
 FORMATS: Final = {
+    "mavlink": Format(_mavlink_wrap, _mavlink_readings),
     "stim300": Format(_stim300_wrap, _stim300_readings),
     "text": Format(_text_wrap, None),
     "text-nmea": Format(_text_wrap, _text_readings),

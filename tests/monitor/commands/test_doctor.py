@@ -169,6 +169,21 @@ def test_unreadable_port_names_the_group_to_join(tmp_path: Path, port: str) -> N
     assert pwd.getpwuid(os.geteuid()).pw_name in found.do
 
 
+def examine_udp_port(folder: Path, port: int, host: str = "127.0.0.1") -> Finding:
+    driver = f'link = "udp", host = "{host}", port = {port}, decoder = "mavlink"'
+    return require_one_finding(examine_config(folder, DEVICE.format(driver) + QUIET), "device a")
+
+
+def test_udp_port_must_be_free_and_local(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", 0))
+        found = examine_udp_port(tmp_path, holder.getsockname()[1])
+        assert (found.mark, "used by another program" in found.text) == ("doubt", True)
+    assert examine_udp_port(tmp_path, 0).mark == "well"
+    found = examine_udp_port(tmp_path, 9, "192.0.2.1")
+    assert (found.mark, "no address of this computer" in found.text) == ("wrong", True)
+
+
 @pytest.mark.skipif(not hasattr(socket, "AF_CAN"), reason="no socketcan here")
 def test_can_interface_must_exist_and_be_up(tmp_path: Path) -> None:
     def write_interface(name: str, kind: str, flags: str) -> None:

@@ -127,13 +127,29 @@ def count_needed_samples(kinds: np.ndarray, samples: int, fault: FaultKind) -> i
 
 
 WITH_COUNTER = (
-    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "microstrain_mip", "novatel_rawimusx"),
-    *("sbg_ecom", "silicon_sensing_dmu", "stim300", "ublox_esf", "vectornav_binary", "xsens_mtdata2"),
+    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "mavlink", "microstrain_mip"),
+    *(
+        "novatel_rawimusx",
+        "sbg_ecom",
+        "silicon_sensing_dmu",
+        "stim300",
+        "ublox_esf",
+        "vectornav_binary",
+        "xsens_mtdata2",
+    ),
     *("ros2_imu", "samples"),
 )
 WITH_CHECKSUM = (
-    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "microstrain_mip", "novatel_rawimusx"),
-    *("sbg_ecom", "silicon_sensing_dmu", "stim300", "ublox_esf", "vectornav_binary", "xsens_mtdata2"),
+    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "mavlink", "microstrain_mip"),
+    *(
+        "novatel_rawimusx",
+        "sbg_ecom",
+        "silicon_sensing_dmu",
+        "stim300",
+        "ublox_esf",
+        "vectornav_binary",
+        "xsens_mtdata2",
+    ),
     *("vectornav_ascii", "witmotion"),
 )
 

@@ -1,6 +1,7 @@
 """Tests of the decoder for text lines: columns, units, line ends, bad lines and wrong settings."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from drivers.decoders.text_lines.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
+from monitor.settings import loading
 from tests.support.nmea_sentences import make_sentence
 from tests.support.settings import read_settings
 
@@ -198,3 +200,155 @@ def test_all_wrong_settings_are_reported() -> None:
         read_settings(Settings, settings)
     keys = [line.partition(": ")[0] for line in caught.value.mistake_lines]
     assert sorted(keys) == ["columns", "columns", "delimiter", "gyro_unit", "scale.gw", "scale.gx"]
+
+
+# --- labels of Arduino's Serial Plotter (arduino/Arduino, build/shared/ArduinoSerialPlotterProtocol.md)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"gx:1,gy:2,gz:3,ax:4,ay:5,az:6",
+        b"gx:1\tgy:2\tgz:3\tax:4\tay:5\taz:6",
+        b"gx:1 gy:2 gz:3 ax:4 ay:5 az:6",
+        b"gx: 1 gy: 2 gz: 3 ax: 4 ay: 5 az: 6",
+        b"Gyro X : 1, Gyro Y : 2, Gyro Z : 3, Accel X : 4, Accel Y : 5, Accel Z : 6",
+        b"gyro:1,2,3,accel:4,5,6",
+        b"1,2,gz:3,4,5,6",
+    ],
+)
+def test_labels_in_front_of_numbers_are_ignored(line: bytes) -> None:
+    assert decode_bytes((line + b"\r\n") * 3 + LINE).values.tolist() == [[1, 2, 3, 4, 5, 6]] * 4
+
+
+@pytest.mark.parametrize(
+    "line", [b"gy:1,gx:2,gz:3,ax:4,ay:5,az:6", b"gx:1,gy:2,0:3,4,5,6", b"gx:,gy:x,gz:3,4,5,6", b"gx:1 2 3 4 5 6 7"]
+)
+def test_line_with_wrong_labels_is_bad(line: bytes) -> None:
+    assert decode_and_count(LINE + line + b"\n" + LINE) == [(1, 0), (1, 1)]
+
+
+def test_label_in_a_field_of_its_own_can_be_skipped() -> None:
+    for rest in (b"", b"IMU: 1 2\n"):  # a bad line in the same chunk makes no difference
+        decoder = build(Settings(columns=("-", "gx", "gy", "gz"), first_line="keep"))
+        (first, *_) = decoder.feed([Chunk(b"IMU: 1 2 3\n" + rest, 1)])
+        assert first.values[0, :3].tolist() == [1, 2, 3]
+
+
+# --- offset and presets
+
+
+def test_offset_is_added_after_the_scale_and_before_the_unit() -> None:
+    got = decode_bytes(
+        b"-2000,180\n",
+        columns=("temperature", "gx"),
+        scale={"temperature": 1 / 340},
+        offset={"temperature": 36.53, "gx": -90.0},
+        gyro_unit="deg/s",
+    )
+    assert got.temperature_c[0] == pytest.approx(-2000 / 340 + 36.53)
+    assert got.values[0, 0] == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize(("gyro_range", "gyro_counts"), [(250, 131.0), (500, 65.5), (1000, 32.8), (2000, 16.4)])
+@pytest.mark.parametrize(("accelerometer_range", "accel_counts"), [(2, 16384), (4, 8192), (8, 4096), (16, 2048)])
+def test_preset_of_the_mpu6050(
+    gyro_range: int, gyro_counts: float, accelerometer_range: int, accel_counts: int
+) -> None:
+    """The lines are those of the sketch MPU6050_raw of jrowberg/i2cdevlib, and of sketches without its label."""
+    settings = read_settings(
+        Settings, {"preset": "mpu6050_raw", "gyro_range": gyro_range, "accelerometer_range": accelerometer_range}
+    )
+    row = np.array([131 * 2, 0, -131, 16384, -8192, 4096])
+    for line in (b"a/g:\t16384\t-8192\t4096\t262\t0\t-131\r\n", b"16384 -8192 4096 262 0 -131\r\n"):
+        (block,) = build(settings).feed([Chunk(b"\n" + line, 1)])
+        factors = np.repeat([math.pi / 180 / gyro_counts, 9.80665 / accel_counts], 3)
+        np.testing.assert_allclose(block.values[0], row * factors, rtol=1e-12)
+
+
+def test_given_keys_take_precedence_over_a_preset() -> None:
+    columns = ["ax", "ay", "az", "temperature", "gx", "gy", "gz"]  # order of the registers
+    settings = read_settings(Settings, {"preset": "mpu6050_raw", "columns": columns, "gyro_unit": "mrad/s"})
+    (block,) = build(settings).feed([Chunk(b"\n0,0,16384,-521,1,2,3\n", 1)])
+    assert block.values[0].tolist() == pytest.approx([1e-3, 2e-3, 3e-3, 0, 0, 9.80665])
+    assert block.temperature_c[0] == pytest.approx(-521 / 340 + 36.53)  # the formula of the register map, 35 °C
+
+
+# --- patterns
+
+MPU6050_PATTERN = (
+    r"AcX = (?P<ax>\S+) \| AcY = (?P<ay>\S+) \| AcZ = (?P<az>\S+) \| Tmp = (?P<temperature>\S+) "
+    r"\| GyX = (?P<gx>\S+) \| GyY = (?P<gy>\S+) \| GyZ = (?P<gz>\S+)"
+)
+"""Lines of the short example sketch of the MPU-6050 in the Arduino Playground."""
+
+
+def decode_pattern(data: bytes, pattern: str, **settings: object) -> list[SampleBlock]:
+    keys = {"pattern": pattern, "first_line": "keep", **settings}
+    return build(read_settings(Settings, keys)).feed([Chunk(data, 77)])
+
+
+def test_named_groups_of_a_pattern_are_the_columns() -> None:
+    line = b"AcX = -1024 | AcY = 2048 | AcZ = 16384 | Tmp = 25.50 | GyX = 131 | GyY = -262 | GyZ = 0\r\n"
+    blocks = decode_pattern(line * 2 + b"Calibrating...\r\n" + line, MPU6050_PATTERN, preset="mpu6050_raw", scale={
+        "temperature": 1.0}, offset={"temperature": 0.0})  # fmt: skip
+    assert [(len(b), b.lost) for b in blocks] == [(2, 0), (1, 1)]
+    degree, count = math.pi / 180, 9.80665 / 16384
+    for block in blocks:
+        np.testing.assert_allclose(
+            block.values, [[degree, -2 * degree, 0, -1024 * count, 2048 * count, 9.80665]] * len(block), atol=1e-15
+        )
+        assert block.temperature_c.tolist() == [25.5] * len(block)
+
+
+def test_group_without_text_means_not_measured() -> None:
+    (block,) = decode_pattern(b"g=1;a=\ng=2\n", r"g=(?P<gx>\d+)(;a=(?P<ax>\d*))?")
+    assert block.values[:, 0].tolist() == [1, 2]
+    assert np.isnan(block.values[:, 3]).all()
+
+
+def test_clock_and_checksum_can_be_used_with_a_pattern() -> None:
+    line = make_sentence(b"IMU t=12 g=1.5")
+    (block,) = decode_pattern(line * 2, r"t=(?P<t>\d+) g=(?P<gx>\S+)", nmea=True, time_unit="ms")
+    assert block.ticks.tolist() == [12_000_000] * 2
+
+
+@pytest.mark.parametrize("pattern", [r"^(a+)+(?P<gx>\d)$", r"(?P<gx>.*.*.*.*.*.*)x", r"^(a|aa|aaa)*(?P<gx>b)$"])
+def test_pattern_that_would_backtrack_needs_linear_time(pattern: str) -> None:
+    """With exponential backtracking, 4096 characters would take longer than the time limit of the tests."""
+    decoder = build(read_settings(Settings, {"pattern": pattern}))
+    assert decoder.feed([Chunk(b"\n" + b"a" * MAX_LINE_BYTES + b"!\n" + b"a" * (MAX_LINE_BYTES - 1) + b"!\n", 1)]) == []
+    assert decoder.bad == 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "columns: missing; give columns"),
+        ({"columns": ["gx"], "pattern": "(?P<gx>a)"}, "pattern: give either columns or pattern"),
+        ({"pattern": "(?P<gx>a"}, "pattern: not a regular expression of RE2 .*missing"),
+        ({"pattern": r"(?P<gx>a)\1"}, "not a regular expression of RE2"),
+        ({"pattern": "(?P<gyro>a)"}, 'unknown column "gyro"'),
+        ({"pattern": "(?P<t>a)"}, "none of gx, gy, gz, ax, ay, az is given"),
+        ({"preset": "mpu6051"}, "mpu6050_raw"),
+        ({"preset": "mpu6050_raw", "gyro_range": 300}, "gyro_range"),
+        ({"columns": ["gx"], "offset": {"gw": 1.0}}, "gw"),
+    ],
+)
+def test_wrong_pattern_preset_or_offset_is_refused(settings: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as raised:
+        read_settings(Settings, settings)
+    assert "\n" not in str(raised.value)
+
+
+def test_pattern_cannot_be_encoded() -> None:
+    with pytest.raises(ConfigError, match="use columns instead"):
+        build(read_settings(Settings, {"pattern": "(?P<gx>a)"})).encode(decode_bytes(LINE))
+
+
+def test_simulated_sensor_with_a_pattern_is_refused_by_check(tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    driver = '{ link = "virtual", decoder = "text", decoder_options = { pattern = "(?P<gx>.)" } }'
+    path.write_text(f'[[device]]\nname = "a"\ndriver = {driver}\n')
+    (line,) = loading.examine_config_file(path).wrong
+    assert line.endswith("a simulated sensor cannot write lines for a pattern; use columns instead")

@@ -24,6 +24,7 @@ from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.decoders.messages.iio import AXIS_CHANNELS
+from drivers.decoders.text_lines.text import Settings as TextSettings
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
 from tests.experiments.fuzz.binary_formats import BINARY_FORMATS
@@ -195,11 +196,12 @@ CONTENT: Final = {
 
 WORDS: Final = {
     "epson_uart": (b"\x80", b"\x0d", b"\xfe\0", b"\xfe\1"),
+    "mavlink": (b"\xfd\x3d\0\0", b"\xfe\x3e", b"\x69\0\0", b"\x1a\0\0", b"\xc0\x7f", b"\x7f\x80"),
     "microstrain_mip": (b"\x75\x65\x80", b"\x0e\4", b"\x0e\5", b"\x0e\7", b"\x0e\x08", b"\x0a\xd6", b"\4\x18"),
     "sbg_ecom": (b"\xff\x5a\x2c\0\x20\0", b"\xff\x5a\3\0\x3a\0", b"\xff\5", b"\xff\3", b"\x33", b"\0\0\xc0\x7f"),
     "silicon_sensing_dmu": (b"\x55\xaa", b"\x7f\xc0\0\0", b"\xff\x80\0\0"),
     "aceinna_dmu": (b"UUS0\x1e", b"UUS1\x18", b"UUz1\x28", b"UUs1\x34", b"\0\0\xc0\x7f"),
-    "text": ("nan", "inf", "-inf", "1e308", "1e-320", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
+    "text": ("gx:", "az :", "nan", "-inf", "1e308", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
     "inertial_labs": (b"\xaa\x55\1\x8f\x26\0", b"\xaa\x55\1\x81\x3a\0"),
     "novatel_rawimusx": (b"\xaa\x44\x13\x28\xb6\5", b"\xaa\x44\x12\x1c\xb5\5", b"\0\x20"),
     "ublox_esf": (b"\xb5b\x10\3", b"\xb5b\x10\2", b"\0\0\0\x0e", b"\0\0\0\x0c", b"$GNGGA,", b"*47\r\n"),
@@ -478,6 +480,21 @@ def wire_dbc(data: bytes) -> None:
     feed_and_check(decoder, [[Chunk(part[1:], START_NS, addresses[part[0] % len(addresses)]) for part in cut]])
 
 
+PATTERN: Final = "(?P<t>[0-9]+)[ ,](?:g=)?(?P<gx>[^ ,]*)[ ,](?:a=)?(?P<az>.*)( T(?P<temperature>.*))?"
+
+
+def wire_text_pattern(data: bytes) -> None:
+    """Check lines that are decoded with a regular expression, as a whole and in two halves."""
+    build, half = module_lookup.import_module(decoders, "text").build, len(data) // 2
+    keys = read_settings(TextSettings, {"pattern": PATTERN, "time_unit": "ms"})
+    one, other = build(keys), build(keys)
+    whole = feed_and_check(one, [[Chunk(data, START_NS)]])
+    parts = feed_and_check(other, [[Chunk(data[:half], START_NS)], [Chunk(data[half:], START_NS)]])
+    assert summarize_blocks(whole) == summarize_blocks(parts), "the samples depend on how the bytes are divided"
+    assert one.bad == other.bad, "the number of bad lines depends on how the bytes are divided"
+
+
+target("wire-text-pattern", (b"\n1 g=0.5 a=-9.8 T20\r\n2,,nan\n3 1 2\nx\n",), 250, WORDS["text"])(wire_text_pattern)
 target("wire-dbc", lambda: [bytes([i, *range(100)]) for i in range(len(CAN))], 100)(wire_dbc)
 for _name in ("iio", "ros2_imu", "samples"):
     target(f"wire-{_name}", partial(_message_seeds, _name), 512)(make_message_check(_name))

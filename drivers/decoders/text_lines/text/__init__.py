@@ -2,11 +2,16 @@
 
 The format has no standard. ``columns`` names the content of each column, and the numbers are converted from the
 configured units to SI. A line ends in LF, CR or CR LF. With ``delimiter = "auto"``, fields are separated by commas,
-semicolons or tabs. In a line without commas, semicolons or tabs, fields are separated by blanks. An empty field or
-``nan`` means that the value was not measured. Empty lines and lines that begin with the comment prefix are skipped. A
-line is rejected if it has the wrong number of columns, or if a field is not a number. With ``nmea = true``, a line is
-``$fields*CC``. The checksum CC is the exclusive or of the characters between ``$`` and ``*``, in two hexadecimal
-digits. A line with a wrong checksum is rejected.
+semicolons or tabs. In a line without commas, semicolons or tabs, fields are separated by blanks. A field may begin with
+a label and a colon, as in ``gx:0.01``, which is the format of Arduino's Serial Plotter. Labels are ignored, but a line
+is rejected if a label is the name of another column. An empty field or ``nan`` means that the value was not measured.
+Empty lines and lines that begin with the comment prefix are skipped. A line is rejected if it has the wrong number of
+columns, or if a field is not a number. With ``nmea = true``, a line is ``$fields*CC``. The checksum CC is the exclusive
+or of the characters between ``$`` and ``*``, in two hexadecimal digits. A line with a wrong checksum is rejected.
+
+For lines in another format, the named groups of the regular expression ``pattern`` contain the fields. The library RE2
+finds the groups in a time that is proportional to the length of the line, which is at most MAX_LINE_BYTES. No pattern
+can therefore stop the reader. A line without a match is rejected.
 
 The first line that arrives after the link was opened is often incomplete. For example, ``-0.012`` without the first
 characters is read as ``12``. The first line is therefore skipped without being counted as bad. A first line with a
@@ -14,103 +19,37 @@ correct checksum is kept, and ``first_line = "keep"`` keeps every first line. ``
 first line of a block, so that only an empty line is skipped.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Annotated, ClassVar, Final, Literal
+import re
+from collections.abc import Sequence
+from typing import Any, ClassVar, Final
 
 import numpy as np
-from pydantic import AfterValidator, Field
 
 from drivers import units
 from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
+from drivers.decoders.text_lines.text.settings import (
+    SKIP,
+    TICK_S,
+    Settings,
+    apply_preset,
+    compile_pattern,
+    compute_factors_and_offsets,
+)
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices_by_similarity
-from drivers.number_ranges import COUNTER_MODULUS, HEADER_LINES, SCALE
-from drivers.settings_model import ListOf, SettingsModel, checked_by, one_of
 
+LABEL: Final = re.compile(rb"([^:]*[A-Za-z][^:]*):(.*)", re.DOTALL)
+"""Regular expression that matches the label and the number of a field."""
+COLON: Final = re.compile(rb"[ \t]*:[ \t]*")
 MAX_LINE_BYTES: Final = 4096
 """Maximum length of a line in bytes. Longer text without a line end is discarded."""
 OVERLONG_LINE: Final = b"\0"
 """Replacement for an overlong line. The replacement is not a number, so the line is rejected."""
 OVERLONG_HINT: Final = f"more than {MAX_LINE_BYTES} bytes without a line end: is the baud rate right?"
-SKIP: Final = "-"
-COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)
-TICK_S: Final = 1e-9
-"""Duration of one tick in s. The time in the column ``t`` is converted to ticks of 1 ns."""
 DEVICE_WRAP: Final = 1 << 32
 """Number of counts after which ``millis()`` and ``micros()`` of Arduino boards wrap to 0."""
 UNWRAPPED_TICKS: Final = 1 << 62
 """Modulus in ticks for a device clock that does not wrap. The modulus corresponds to 146 years."""
-
-
-def _check_columns(columns: tuple[str, ...]) -> None:
-    given = [name for name in columns if name != SKIP]
-    wrong = [
-        f'unknown column "{name}"{format_choices_by_similarity(name, COLUMNS)}' for name in given if name not in COLUMNS
-    ]
-    if len(given) != len(set(given)):
-        wrong.append("a name is given twice")
-    if not set(given) & set(AXES):
-        wrong.append(f"none of {', '.join(AXES)} is given")
-    if {"t", "counter"} <= set(given):
-        wrong.append('give one of t and counter, and "-" for the other')
-    if wrong:
-        raise ConfigError(*wrong)
-
-
-def _unit(look_up: Callable[[str], object], axis: str) -> AfterValidator:
-    """Return a validator for the unit of a column. The error message also explains the conversion of raw counts."""
-
-    def check_unit(unit: str) -> None:
-        try:
-            look_up(unit)
-        except ConfigError as error:
-            counts = f"name one of these units, and the size of a count: scale = {{ {axis} = 0.0305 }}"
-            raise ConfigError(f"{error}; for raw counts {counts}") from error
-
-    return checked_by(check_unit)
-
-
-def _check_delimiter(delimiter: str) -> None:
-    if not delimiter or not delimiter.isascii() or set(delimiter) & set("\r\n"):
-        raise ConfigError(f"{delimiter!r}; it is auto, or ASCII text within a line")
-
-
-class Settings(SettingsModel):
-    """Keys of ``[device.driver.decoder_options]``."""
-
-    columns: Annotated[ListOf[str], checked_by(_check_columns)] = Field(
-        examples=[["gx", "gy", "gz", "ax", "ay", "az"]],
-        description="content of each column: gx gy gz ax ay az temperature t counter, - to skip a column",
-    )
-    delimiter: Annotated[str, checked_by(_check_delimiter)] = Field(
-        "auto",
-        description='text between two fields, " " = any number of blanks; auto: comma, semicolon, tab or blanks',
-    )
-    gyro_unit: Annotated[str, _unit(units.angular_rate_factor, "gx")] = Field(
-        "rad/s", description="unit of gx gy gz: rad/s, mrad/s, deg/s, dps, deg/h, ..."
-    )
-    accel_unit: Annotated[str, _unit(units.acceleration_factor, "ax")] = Field(
-        "m/s²", description="unit of ax ay az: m/s², g, mg, ..."
-    )
-    temperature_unit: Annotated[str, _unit(units.temperature_factor_and_offset, "temperature")] = Field(
-        "°C", description="unit of the temperature: °C, K, °F"
-    )
-    scale: dict[Annotated[str, one_of(COLUMNS)], Annotated[float, SCALE]] = Field(
-        {},
-        examples=[{"gx": 0.0305}],
-        description="factor of a column before its unit is applied, such as the size of a raw count; absent: 1",
-    )
-    comment: str = Field("#", description='lines that begin with this text are skipped; "" = none')
-    header: Annotated[int, HEADER_LINES] = Field(0, description="number of lines to skip after the link was opened")
-    first_line: Literal["drop", "keep"] = Field(
-        "drop", description="drop: the first line after the link was opened is skipped, since its start may be missing"
-    )
-    nmea: bool = Field(False, description="true: lines have the form $fields*CC with a checksum")
-    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="unit of column t, the clock of the device")
-    counter_modulus: Annotated[int, COUNTER_MODULUS] = Field(
-        1 << 32, description="counts after which column counter starts again at 0"
-    )
 
 
 class TextDecoder(base.RejectingDecoder):
@@ -121,11 +60,13 @@ class TextDecoder(base.RejectingDecoder):
     def __init__(self, settings: Settings) -> None:
         super().__init__()
         self._settings = settings
-        self._column = {name: i for i, name in enumerate(settings.columns) if name != SKIP}
+        self._pattern = compile_pattern(settings.pattern) if settings.pattern else None
+        self._names = settings.columns if self._pattern is None else tuple(self._pattern.groupindex)
+        self._column = {name: i for i, name in enumerate(self._names) if name != SKIP}
         self._wanted = frozenset(self._column.values())
-        self._width = len(settings.columns)
-        self._factor, self._offset = _scales(settings)
-        self.timing: Timing = _timing(settings)
+        self._width = len(self._names)
+        self._factor, self._offset = compute_factors_and_offsets(settings, self._names)
+        self.timing: Timing = _timing(settings, self._names)
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
         self.forget_stream_state()
@@ -209,7 +150,9 @@ class TextDecoder(base.RejectingDecoder):
         return np.array(rows).reshape(-1, self._width)
 
     def _parse_regular_lines(self, bodies: list[bytes | None]) -> Floats | None:
-        """Return the numbers [n, columns], or None if a field is missing or is not a number."""
+        """Return the numbers [n, columns], or None if a field is missing or is not a number without a label."""
+        if self._pattern is not None:
+            return None
         separated = [self._comma_separated(body) for body in bodies if body is not None]
         joined = b",".join(separated)
         regular = all(body.count(b",") == self._width - 1 for body in separated)
@@ -236,13 +179,36 @@ class TextDecoder(base.RejectingDecoder):
         """Return the numbers of a line and an empty text, or None and the reason if the line is rejected."""
         if body == OVERLONG_LINE:
             return None, OVERLONG_HINT
-        fields = self._comma_separated(body).split(b",")
+        fields = self._find_groups(self._pattern, body) if self._pattern else self._split_fields(body)
+        if fields is None:
+            return None, f"a line does not match the pattern: {body[:60]!r}"
         if len(fields) != self._width:
             return None, f"a line has {len(fields)} columns, expected {self._width}: {body[:60]!r}"
         try:
-            return [_parse_number(f) if at in self._wanted else 0.0 for at, f in enumerate(fields)], ""
+            return [self._parse_field(f, at) if at in self._wanted else 0.0 for at, f in enumerate(fields)], ""
         except ValueError:
             return None, f"a field is not a number: {body[:60]!r}"
+
+    def _find_groups(self, pattern: Any, body: bytes) -> list[bytes] | None:
+        """Return the text of each named group, or None if the line does not match the pattern."""
+        match = pattern.search(body.decode("ascii", "replace"))
+        return None if match is None else [(match[name] or "").encode() for name in self._names]
+
+    def _split_fields(self, body: bytes) -> list[bytes]:
+        fields = self._comma_separated(body).split(b",")
+        if len(fields) != self._width and b":" in body:  # blanks around a colon do not separate fields
+            fields = self._comma_separated(COLON.sub(b":", body)).split(b",")
+        return fields
+
+    def _parse_field(self, field: bytes, at: int) -> float:
+        """Return the number in a field of the column ``at``. Raise ValueError if the label names another column."""
+        labelled = LABEL.fullmatch(field) if self._pattern is None else None
+        if labelled is None:
+            return _parse_number(field)
+        label = labelled[1].strip().decode("ascii", "replace")
+        if label in self._column and self._column[label] != at:
+            raise ValueError(label)
+        return _parse_number(labelled[2])
 
     def _build_blocks(self, table: Floats, t_ns: Ints) -> list[SampleBlock]:
         n = len(table)
@@ -263,7 +229,15 @@ class TextDecoder(base.RejectingDecoder):
         return self._builder.build_plausible_blocks(t_ns, values, temperature_c, ticks)
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Encode each sample as one line with the configured columns and units, in full precision."""
+        """Encode each sample as one line with the configured columns and units, in full precision.
+
+        Raises
+        ------
+        ConfigError
+            If the settings contain a pattern, because a regular expression does not define how to write a line.
+        """
+        if self._pattern is not None:
+            raise ConfigError("a simulated sensor cannot write lines for a pattern; use columns instead")
         n = len(samples)
         table = np.zeros((n, self._width))
         for name, at in self._column.items():
@@ -304,31 +278,14 @@ def _nmea_body(line: bytes) -> bytes | None:
         return None
 
 
-def _scales(settings: Settings) -> tuple[Floats, Floats]:
-    """Return the factors and offsets that convert columns to SI units. The column ``t`` is converted to ticks."""
-    factors, offsets = np.ones(len(settings.columns)), np.zeros(len(settings.columns))
-    for i, name in enumerate(settings.columns):
-        factor, offset = 1.0, 0.0
-        if name in AXES[:3]:
-            factor = units.angular_rate_factor(settings.gyro_unit)
-        elif name in AXES[3:]:
-            factor = units.acceleration_factor(settings.accel_unit)
-        elif name == "temperature":
-            factor, offset = units.temperature_factor_and_offset(settings.temperature_unit)
-        elif name == "t":
-            factor = round(units.time_factor(settings.time_unit) / TICK_S)
-        factors[i], offsets[i] = factor * settings.scale.get(name, 1.0), offset
-    return factors, offsets
-
-
-def _timing(settings: Settings) -> Timing:
-    if "t" in settings.columns:
+def _timing(settings: Settings, columns: Sequence[str]) -> Timing:
+    if "t" in columns:
         unit_ticks = round(units.time_factor(settings.time_unit) / TICK_S)
         wraps = settings.time_unit in ("ms", "us")
         return CounterTimedFormat(DEVICE_WRAP * unit_ticks if wraps else UNWRAPPED_TICKS, TICK_S)
-    return CounterTimedFormat(settings.counter_modulus) if "counter" in settings.columns else ArrivalTimedFormat()
+    return CounterTimedFormat(settings.counter_modulus) if "counter" in columns else ArrivalTimedFormat()
 
 
 def build(settings: Settings) -> base.Decoder:
     """Return a decoder of text lines with the given settings."""
-    return TextDecoder(settings)
+    return TextDecoder(apply_preset(settings))
