@@ -35,7 +35,7 @@ MESSAGE: Final = np.dtype(
 )  # fmt: skip
 """Message in XCDR1 with the frame_id ``imu_link``. Nine covariances follow each quantity."""
 READ_FUNCTIONS: Final = """
-import resource, sys, time
+import re, sys, time
 from pathlib import Path
 import psutil
 
@@ -71,7 +71,8 @@ before = psutil.Process().memory_info().rss
 start_s = time.process_time()
 found = read(Path(sys.argv[3]))
 seconds = time.process_time() - start_s
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+# Unlike ru_maxrss, VmHWM does not include the memory of the parent process before the program was loaded.
+peak = 1024 * int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 print(*found, seconds, peak - before, sep=";")
 """
 
