@@ -31,7 +31,7 @@ MAX_RETRY_PAUSE_S: Final = 5.0
 MAX_UNDECODED_BYTES: Final = 2000
 """Number of bytes without a sample after which the status names a probable cause, such as a wrong baud rate."""
 IDENTIFICATION_BYTES: Final = 4096
-"""Number of undecoded bytes from which the format is identified."""
+"""Number of undecoded bytes used to identify the format."""
 MIN_UNDECODED_S: Final = 3.0
 """Minimum time in s without a decoded sample after which a running device counts as lost.
 
@@ -258,7 +258,8 @@ class Driver:
         self._last_report_s = time.monotonic()
 
     def _describe_dropped(self) -> str:
-        """Return the end of a message about missing samples if the receive buffer of the link was full."""
+        """Return a text that is appended to a message about missing samples if the receive buffer of the link was
+        full."""
         total = self.link.dropped_datagrams if isinstance(self.link, DropCountingLink) else 0
         dropped, self._reported_datagrams = total - self._reported_datagrams, total
         return f"; {dropped} datagrams were dropped because the receive buffer was full" if dropped else ""
@@ -285,7 +286,7 @@ class Driver:
             self.clock.count_next_gap_by_arrival()
 
     def _identify_undecoded(self, data: bytes) -> None:
-        """Name the decoder that fits the undecoded bytes, once after enough bytes without a sample."""
+        """After enough bytes without a sample, state once which decoder fits these bytes."""
         missing = IDENTIFICATION_BYTES - len(self._undecoded_capture)
         if self.link.carrier != "bytes" or missing <= 0:
             return

@@ -30,7 +30,7 @@ def install_command(requirement: str) -> str:
     """Return the command that installs a requirement into the environment of the program.
 
     pip finds ``imu-monitor[extra]`` in an environment in which imu-monitor is installed, also from a clone of the
-    repository. The pip of another environment would search for imu-monitor on the package index.
+    repository. pip in another environment would look for imu-monitor on the package index.
     """
     pip = shutil.which("pip")
     if pip is None or os.path.dirname(pip) != os.path.dirname(sys.executable):

@@ -16,9 +16,8 @@ def list_modules(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
     Parameters
     ----------
     package
-        Package that contains the modules. If it has the attribute ``SUBPACKAGES``, the modules of these are included.
-    suffix
-        End of the module names, such as "_link". The suffix is removed from the returned names.
+        Package that contains the modules. If it has the attribute ``SUBPACKAGES``, the modules of those subpackages are
+        included. suffix End of the module names, such as "_link". The suffix is removed from the returned names.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Identification of the wire format in captured bytes.
 
-Every decoder of byte streams decodes the bytes. The decoder that finds the most samples identifies the format. Lines of
-numbers, which the decoder ``text`` reads, are identified by their number of fields.
+Every decoder of byte streams is tried. The decoder that finds the most samples identifies the format. Lines of numbers,
+which the decoder ``text`` reads, are identified by their number of fields.
 """
 
 import re
@@ -22,16 +22,16 @@ from drivers.settings_model import SettingsModel
 MIN_SAMPLES: Final = 5
 """Minimum number of samples or text lines that identify a format.
 
-Random bytes contain two samples in a row even of a format with an 8-bit checksum less than once in 10⁹ bytes.
+Even for a format with an 8-bit checksum, random bytes look like two consecutive samples less than once in 10⁹ bytes.
 """
 MIN_TEXT_COLUMNS: Final = 3
 MIN_MATCHING_LINES: Final = 0.9
-"""Minimum share of the lines that have the most common number of fields."""
+"""Minimum fraction of lines that must have the most common number of fields."""
 TEXT_DECODER: Final = "text"
 NMEA_SENTENCE: Final = re.compile(r"\$(.*)\*[0-9A-Fa-f]{2}")
 DELIMITERS: Final = (",", ";", "\t", " ")
 UNKNOWN: Final = "?"
-"""Value of an option that the bytes do not determine, such as the sensor model."""
+"""Placeholder for an option that cannot be determined from the bytes, such as the sensor model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +70,9 @@ def identify_wire_format(data: bytes) -> IdentifiedFormat | None:
 
 
 def _list_option_sets(settings: type[SettingsModel]) -> Iterator[dict[str, Any]]:
-    """Yield the required options, then also each other value of every option that is a choice or a flag.
+    """Yield the required options, then every other value of each option that is a choice or a flag.
 
-    A required option that is a choice has its first value.
+    A required option with a fixed set of choices is set to the first choice.
     """
     choices: dict[str, tuple[Any, ...]] = {}
     for key, info in settings.model_fields.items():
@@ -99,7 +99,7 @@ def _decode(name: str, module: ModuleType, options: dict[str, Any], data: bytes)
 
 
 def _build_decoder(module: ModuleType, options: dict[str, Any]) -> Decoder | None:
-    """Build a decoder. If an option such as a unit is missing, use the examples of the other options."""
+    """Build a decoder with these options. If it needs further options, use their examples."""
     fields = module.Settings.model_fields.items()
     examples = {key: info.examples[0] for key, info in fields if info.examples and not info.is_required()}
     for others in ({}, examples):

@@ -94,7 +94,7 @@ class LateFrameCountingDecoder(Protocol):
 
 @runtime_checkable
 class FilterReportingDecoder(Protocol):
-    """Interface of a decoder for sensors that can send values which their own filter has corrected."""
+    """Decoder interface for sensors that can send values already corrected by their own filter."""
 
     @property
     def on_board_filter_note(self) -> str:

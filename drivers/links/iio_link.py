@@ -66,7 +66,7 @@ class Settings(LinkSettings):
     )
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:
-        """Yield a conflict if an attribute shall be set although the link may not write."""
+        """Yield a conflict if an attribute is to be set but the link is not allowed to write."""
         for key in ("trigger", "sampling_frequency"):
             if getattr(self, key) and not self.enable:
                 yield Conflict(key, "the link writes nothing to the device unless enable = true")
@@ -187,7 +187,7 @@ class IioLink(PolledLink):
         if file is not None:
             os.close(file)
         previous, self._previous = self._previous, {}
-        # The first written attribute enables the buffer, and it is restored last.
+        # The attribute that is written first enables the buffer, and it is restored last.
         for path, value in [*((path, "0") for path in [*previous][:1]), *reversed(previous.items())]:
             with contextlib.suppress(OSError):  # the attributes of an unplugged device do not exist
                 path.write_text(f"{value}\n")

@@ -37,7 +37,7 @@ BATCH_WAIT_S: Final = 0.01
 MAX_WAIT_S: Final = 0.1
 """Longest single wait for a datagram in s. A blocked read returns within this time after the link has been closed."""
 
-# Linux (asm-generic/socket.h). Python does not define these constants.
+# Constants of Linux (asm-generic/socket.h), which Python does not define.
 SO_TIMESTAMPNS: Final = 35
 SO_RXQ_OVFL: Final = 40
 TIMESPEC: Final = struct.Struct("@ll")

@@ -110,7 +110,7 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
 
 
 def assemble_recording(path: Path, table: Table, rate_hz: float | None, options: ReadingOptions) -> Recording:
-    """Return the recording that consists of the columns of a file.
+    """Return a recording built from the columns of a file.
 
     Parameters
     ----------

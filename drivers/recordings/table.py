@@ -65,7 +65,7 @@ def column_dtype(name: str) -> np.dtype[Any]:
 
 
 def to_column(quantity: str, numbers: NDArray[Any]) -> Times:
-    """Return numbers as float64, or integers of the quantity ``t`` as int64, because float64 would round Unix times."""
+    """Return numbers as float64, or integer times (``t``) as int64, because float64 would round Unix times."""
     return integers_to_ns(numbers, 1) if quantity == "t" and numbers.dtype.kind in "iu" else numbers.astype(np.float64)
 
 

@@ -19,7 +19,7 @@ FRAME_ID: Final = re.compile(r"(?!/)[!-~]{1,255}")
 
 
 def ros_name(device: str) -> str:
-    """Return the name of a device with ``_`` for ``-``, which is not valid in ROS.
+    """Return a device name with each ``-`` replaced by ``_``, because ROS does not allow ``-``.
 
     >>> ros_name("bench-1")
     'bench_1'

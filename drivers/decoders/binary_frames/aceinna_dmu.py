@@ -1,8 +1,8 @@
 """Memsic / Aceinna DMU380, IMU380 and IMU381 (packets S0, S1) and OpenIMU (packets z1, s1) over UART.
 
 The format is ``55 55 | type, two ASCII characters | length u8 | payload | CRC u16be``. The CRC-16 has the polynomial
-0x1021 and the initial value 0x1D0F, and covers type, length and payload. Published commands of both families confirm
-the CRC.
+0x1021 and the initial value 0x1D0F, and covers type, length and payload. Published example commands of both families
+confirm the CRC.
 
 ==== ================================================================================================================
 type payload
@@ -14,13 +14,13 @@ s1   little-endian: u32 time in ms, float64 time in s; float32: acceleration, ra
 ==== ================================================================================================================
 
 The resolution of S0 and S1 is 20/65536 g, 1260/65536 °/s and 200/65536 °C. The time of S0 consists of the two low bytes
-of a time in ms. The temperature is the mean of the three rate sensors. A sample is bad if BIT reports a fatal error
-(bit 0) or a sensor over its range (bit 12). Sources: DMU380SA manual 7430-0026 (packets, tables 9 and 15), the scripts
-Aceinna/python-imu380 and Aceinna/python-openimu, and the OpenIMU documentation.
+of a time in ms. The temperature is the mean of the temperatures of the three rate sensors. A sample is bad if BIT
+reports a fatal error (bit 0) or a sensor over its range (bit 12). Sources: DMU380SA manual 7430-0026 (packets, tables 9
+and 15), the scripts Aceinna/python-imu380 and Aceinna/python-openimu, and the OpenIMU documentation.
 
 The sources disagree about the acceleration in z1: the OpenIMU documentation states g, and the description of the
-released IMU application states m/s². The key ``accel_unit`` selects the unit. The counter and the time of a packet are
-the device clock. The type is therefore an option, and packets of other types are ignored.
+released IMU application states m/s². The key ``accel_unit`` selects the unit. The counter and the time in each packet
+serve as the device clock. The type is therefore an option, and packets of other types are ignored.
 """
 
 import binascii
@@ -46,7 +46,7 @@ TEMPERATURE_STEP: Final = 200.0 / 2**16
 
 @dataclass(frozen=True)
 class PacketType:
-    """Payload of a packet type and the steps of its integers; a step of 1 marks floating-point numbers."""
+    """Payload layout of a packet type, and the resolution of its integers, which is 1 for floating-point numbers."""
 
     payload: np.dtype[np.void]
     modulus: int

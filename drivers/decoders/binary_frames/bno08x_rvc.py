@@ -2,7 +2,7 @@
 
 The format is ``AA AA | index u8 | yaw, pitch, roll i16le in 0.01° | acceleration xyz i16le in mg | 3 reserved bytes |
 checksum``, 19 bytes. The checksum is the low byte of the sum of all bytes between the header and the checksum. The
-index counts the frames. Source: BNO080 data sheet 1000-3927, section 1.3.5.2, whose example frame is a test.
+index counts the frames. Source: BNO080 data sheet 1000-3927, section 1.3.5.2, whose example frame is used as a test.
 
 The frames contain no angular rates, so the gyroscope axes are marked as not measured. The resolution of 1 mg is coarse
 compared with the noise of the sensor. The angles come from the orientation filter and are ignored.

@@ -1,20 +1,21 @@
 """Epson inertial sensors M-G3xx and M-G570 in UART auto mode.
 
 A burst is big-endian: ``80 | fields | checksum u16 | 0D``. The registers BURST_CTRL1 and BURST_CTRL2 of the sensor
-select the fields and their widths, which therefore must be configured here as well. The fields always have the order of
-the table ``FIELDS``. The checksum is the sum of the 16-bit words between header and checksum, modulo 65536. Sources:
+select the fields and their widths, which therefore must be configured here as well. The fields are always in the order
+of the table ``FIELDS``. The checksum is the sum of the 16-bit words between header and checksum, modulo 65536. Sources:
 data sheet of the M-G362 (rev. 20131217, tables 6.7 and 6.14), and Epson's public drivers cubicleguy/ess_imu_driver,
 cubicleguy/py_esensorlib and cubicleguy/su_arduino_uart. The M-V340 has another format without a checksum and is not
 supported.
 
 The value of one LSB depends on the model. The table ``MODELS`` contains the values for 16-bit numbers. One LSB of a
-32-bit number is smaller by the factor 65536. Some models have two accelerometer ranges, so the range must be
+32-bit number is smaller by a factor of 65536. Some models have two accelerometer ranges, so the range must be
 configured. The drivers state the scale of some gyroscopes either as 1/66 °/s or as the rounded number 0.0151515 °/s.
 The decoder uses 1/66 °/s. The driver py_esensorlib 2.1.0 and this decoder return the same values for every model.
 
 The field ``count`` is a 16-bit counter of samples. The public sources do not state whether each output sample advances
 the counter by one, so missing samples are computed from the usual step. If an external signal resets the counter,
-``count`` is a time since the last reset in steps of 16 µs or 21.3 µs. In this case the key ``clock`` must be "arrival".
+``count`` is the time since the last reset in steps of 16 µs or 21.3 µs. In this case the key ``clock`` must be
+"arrival".
 
 Bit 0 of the flags reports an error of the sensor. A sample with this bit is bad. Bits 15 to 9 mark new data and are not
 used, because the sensor sends each sample once in auto mode.
@@ -46,7 +47,7 @@ NUMBERS: Final = {
     "quaternion": 4,
     "attitude": 3,
 }
-"""Count of numbers in each field whose numbers have 16 or 32 bits."""
+"""Number of values in each field of 16-bit or 32-bit values."""
 FIELDS: Final = ("flags", *NUMBERS, "gpio", "count")
 """Fields of a burst in the order of transmission. Fields that are not in ``NUMBERS`` have 16 bits."""
 NEW_DATA_FLAGS: Final = 0xFE00

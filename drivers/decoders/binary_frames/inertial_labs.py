@@ -11,9 +11,9 @@ The resolution is 1e-5 °/s, 1e-6 g and 0.1 °C. The payloads are those of the h
 KERNEL IMU protocol. Length, checksum and status are those of ArduPilot's public driver of the Inertial Labs INS. The
 decoder uses g = 9.80665 m/s². The ArduPilot driver uses 9.8106 m/s², which it takes from the documentation of the INS.
 
-The counter counts internal computations of the device, and the clock measures their number per sample. A sample is bad
-if the status reports a failure of a gyroscope (bit 2), an accelerometer (bit 3) or the electronics (bit 5), or an
-angular rate above the range (bits 10 to 12). Other messages are ignored.
+The counter counts internal computations of the device. The clock determines their number per sample. A sample is bad if
+the status reports a failure of a gyroscope (bit 2), an accelerometer (bit 3) or the electronics (bit 5), or an angular
+rate above the range (bits 10 to 12). Other messages are ignored.
 """
 
 from typing import Final, Literal
@@ -29,7 +29,7 @@ from drivers.units import DEGREE, G0
 
 SYNC: Final = b"\xaa\x55\x01"
 OVERHEAD: Final = 8
-"""Bytes of a message in addition to its payload."""
+"""Number of bytes in a message besides its payload."""
 MAX_PAYLOAD: Final = 512
 LONGEST: Final = OVERHEAD + MAX_PAYLOAD
 MEASURED: Final = [("gyro", "<i4", 3), ("accel", "<i4", 3)]

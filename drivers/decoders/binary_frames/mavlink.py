@@ -8,13 +8,13 @@ CRC_EXTRA, which depends on the message. Signatures are not verified. Source: MA
 and the messages of the dialect common.xml.
 
 The CRC_EXTRA of messages without IMU data is unknown to the decoder. Their CRC is therefore accepted if it is correct
-for any CRC_EXTRA, so 8 bits of the CRC are checked. MAVLink versions are not mixed: the first valid frame selects the
-version until MAX_BYTES_WITHOUT_FRAME bytes arrive without a valid frame of this version.
+for any value of CRC_EXTRA, which leaves 8 checked bits. MAVLink versions are not mixed: the first valid frame selects
+the version until MAX_BYTES_WITHOUT_FRAME bytes arrive without a valid frame of this version.
 
 The sequence number counts all messages of a sender, so it does not show how many samples are missing. Missing samples
-are counted by the time in the message. With ``clock = "arrival"``, they are counted by the arrival times. A rejected
-frame counts as bad, even if it might have been a message without IMU data. The sequence numbers before and after
-damaged bytes limit the number of rejected frames.
+are counted from the times in the messages. With ``clock = "arrival"``, they are counted from the arrival times. A
+rejected frame counts as bad, even if it might have been a message without IMU data. The sequence numbers before and
+after damaged bytes limit the number of rejected frames.
 
 The resolution of SCALED_IMU, SCALED_IMU2 and SCALED_IMU3 is 1 mrad/s and 1 mg, which is coarser than the noise of most
 sensors. RAW_IMU contains counts in a unit that depends on the sender. ArduPilot uses mrad/s and mg.
@@ -42,13 +42,13 @@ LONGEST: Final = HEADER_BYTES[VERSION_2] + 255 + CRC_BYTES + SIGNATURE_BYTES
 SIGNED: Final = 0x01
 """Incompatibility flag of a frame with a signature. Frames with any other incompatibility flag are rejected."""
 WRAP_US: Final = 1 << 52
-"""Modulus of the time in µs. The lowest 52 bits of a time in ns fit into int64 and wrap after 142 years."""
+"""Modulus of the time in µs. The lowest 52 bits, converted to ns, fit into int64. They wrap after 142 years."""
 MAX_OTHER_MESSAGES: Final = 100
 """Number of consecutive messages without a sample after which a problem is reported."""
 MAX_SENDERS: Final = 100
 """Maximum number of senders whose sequence numbers are known."""
 MAX_LISTED_SOURCES: Final = 5
-"""Maximum number of sources of IMU messages in the text of a problem."""
+"""Maximum number of IMU message sources listed in a problem report."""
 UPDATED_BITS: Final = np.array([3, 4, 5, 0, 1, 2])
 """Bits of the field ``fields_updated`` in the order of AXES."""
 TEMPERATURE_UPDATED: Final = 1 << 12
@@ -161,7 +161,7 @@ class MavlinkDecoder(base.FrameStreamDecoder):
         return super().recent_problem
 
     def forget_stream_state(self) -> None:
-        """Discard a partially received frame. The next selected message determines the sender again."""
+        """Discard a partially received frame. The next selected message then selects a sender again."""
         super().forget_stream_state()
         self._forget_sources()
 
@@ -199,7 +199,7 @@ class MavlinkDecoder(base.FrameStreamDecoder):
         return (sequence - last - 1) % 256
 
     def _select_payload(self, frame: bytes) -> bytes | None:
-        """Return the payload with its omitted zeros, or None if the settings do not select the message."""
+        """Return the payload with the omitted zeros restored, or None if the settings do not select the message."""
         number, system, component, payload = split_frame(frame)
         if number not in CRC_EXTRA:
             return None
@@ -314,7 +314,7 @@ def compute_crc(body: bytes, crc_extra: int) -> bytes:
 def has_valid_crc(frame: bytes) -> bool:
     """Return True if the CRC of a frame without signature is correct.
 
-    If the message contains no IMU data, the CRC is correct if it results from any CRC_EXTRA.
+    If the message contains no IMU data, the CRC is accepted if any value of CRC_EXTRA yields it.
     """
     # crc_hqx computes an unreflected CRC, but the CRC of MAVLink is reflected. All bytes are therefore bit-reversed.
     mirrored = frame[1:].translate(base.BIT_REVERSAL)

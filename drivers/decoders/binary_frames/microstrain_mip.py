@@ -13,10 +13,10 @@ Packets of the descriptor set 0x80 (sensor data) contain samples. Packets of oth
 - 0xD5 is the reference time of the sample in ns. The time never jumps.
 - 0x18 contains the overrange bits of accelerometers (0 to 2) and gyroscopes (4 to 6). A sample with such a bit is bad.
 
-A sample with a number that is not finite is bad. If a packet contains only accelerations or only angular rates, the
+A sample that contains a non-finite number is bad. If a packet contains only accelerations or only angular rates, the
 other axes are marked as not measured. Field 0x14 contains the lowest, highest and mean temperature since the last
-reset. None of them is the present temperature, so samples have no temperature. The z axis points down and measures
--1 g at rest.
+reset. None of them is the current temperature, so the samples contain no temperature. The z axis points down and
+measures -1 g at rest.
 """
 
 import struct
@@ -59,7 +59,7 @@ TICKS: Final = 1 << 62
 The reference time is an unsigned 64-bit integer. Its lowest 62 bits fit into int64 and wrap after 146 years.
 """
 ENCODED_DELTA_NS: Final = 10_000_000
-"""Duration in ns that a simulated sensor states for its increments."""
+"""Duration in ns that a simulated sensor reports for its increments."""
 
 Layout = tuple[tuple[tuple[int, int], int], ...]
 """Descriptor, size and offset of the data of each field of a packet."""
@@ -114,7 +114,7 @@ class MicrostrainMipDecoder(base.FrameStreamDecoder):
         return blocks
 
     def _read_values(self, packets: base.Bytes, offsets: dict[tuple[int, int], int]) -> Floats:
-        """Return the values [n, 6] of packets with equal fields. Invalid values are infinite."""
+        """Return the values [n, 6] of packets that have the same fields. Invalid values are infinite."""
         values = np.full((len(packets), 6), np.nan)
         scale: Floats | float = 1.0
         if self._increments:
@@ -167,7 +167,7 @@ def _read_triples(packets: base.Bytes, at: int) -> Floats:
 
 
 def _read_integers(packets: base.Bytes, at: int) -> Ints:
-    """Return an unsigned 64-bit integer of each packet [n]. Values above the range of int64 are negative."""
+    """Return an unsigned 64-bit integer from each packet [n]. Values above the range of int64 are negative."""
     return np.ascontiguousarray(packets[:, at : at + 8]).view(">i8")[:, 0].astype(np.int64)
 
 

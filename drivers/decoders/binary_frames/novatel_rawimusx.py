@@ -3,19 +3,19 @@
 The format is little-endian. RAWIMUSX (message 1462) usually has the short header ``AA 44 13 | length u8 | ID u16 |
 week u16 | ms u32``, and RAWIMUX (message 1461) the long header ``AA 44 12 | header length u8 | ID u16 | ... | length
 u16 | ...``. Both headers are accepted for both messages. The payload has 40 bytes: ``IMU info u8 | IMU type u8 | GPS
-week u16 | seconds of the week float64 | IMU status u32 | acceleration Z, -Y, X i32 | rate Z, -Y, X i32``. After the
-payload follows the CRC-32 of all preceding bytes, which is reflected, with the polynomial 0x04C11DB7, the initial value
-0 and no final inversion. Other binary logs are ignored. The port must send no ASCII logs, because their bytes count as
-lost logs.
+week u16 | seconds of the week float64 | IMU status u32 | acceleration Z, -Y, X i32 | rate Z, -Y, X i32``. The payload
+is followed by a CRC-32 of all preceding bytes (reflected, polynomial 0x04C11DB7, initial value 0, no final inversion).
+Other binary logs are ignored. The port must not send ASCII logs, because their bytes would be counted as lost logs.
 
-The six numbers are changes of velocity and angle during one period of the IMU. The type of the IMU determines their
-scale and the data rate, whose product converts a number to an acceleration or an angular rate. If the type is not in
-the table, the keys ``accel_scale`` and ``gyro_scale`` are needed. Sources: NovAtel OEM7 manual (RAWIMUSX, Raw IMU Scale
-Factors), public driver novatel/novatel_oem7_driver. The driver converts feet with 3.2808, the decoder with the exact
-0.3048 m, which differs by 1e-5. Published logs of types 11, 32 and 41 at rest yield 9.79, 9.82 and 9.86 m/s².
+The six numbers are changes of velocity and angle during one period of the IMU. The type of the IMU determines the scale
+and the data rate. A number times both is an acceleration or an angular rate. If the type is not in the table, the keys
+``accel_scale`` and ``gyro_scale`` are needed. Sources: NovAtel OEM7 manual (RAWIMUSX, Raw IMU Scale Factors), public
+driver novatel/novatel_oem7_driver. The driver converts feet with the factor 3.2808 and the decoder with exactly 0.3048
+m, a relative difference of 1e-5. Published logs of types 11, 32 and 41 at rest yield 9.79, 9.82 and 9.86 m/s².
 
 A sample is bad if bit 0 (error) or bit 1 (encrypted data) of the IMU info is set. The meaning of the IMU status depends
-on the type, so the status is not evaluated. GPS week and seconds are the device clock, with a resolution of 1 µs.
+on the type, so the status is not evaluated. The GPS week and seconds serve as the device clock, with a resolution of 1
+µs.
 """
 
 import struct

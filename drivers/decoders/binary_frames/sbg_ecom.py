@@ -10,14 +10,14 @@ Two messages of class 0 contain samples, and both begin with ``time stamp u32 [�
 - ``imu_short`` (message 44): ``acceleration 3 x i32 | rate 3 x i32 | temperature i16``. The scales are 1048576 LSB for
   1 m/s², 67108864 LSB for 1 rad/s and 256 LSB for 1 °C. If bit 10 of the status is set, the scale of the rates is
   12304174 LSB for 1 rad/s. The C library calls the fields delta velocity and delta angle. The manual and the library
-  divide them by the same scales and not by a duration, so the fields are accelerations and rates.
+  divide the fields by these scales but not by a duration, so the fields are already accelerations and rates.
 - ``imu_data`` (message 3): ``acceleration 3 x f32 | rate 3 x f32 | temperature f32 | the same six values again``. The C
   library states that most products extrapolate these values to the time of the navigation filter. The extrapolation
   adds noise, so ``imu_short`` is recommended.
 
 All other messages are ignored. Both messages contain values that the navigation filter has not corrected. Bits 0 to 9
-of the status are 1 if the communication, the self-tests of the IMU and of each axis, and the ranges are in order. A
-sample is bad if one of these bits is 0.
+of the status are 1 if the communication and all self-tests have passed and all values are in range. A sample is bad if
+one of these bits is 0.
 """
 
 import binascii
@@ -72,7 +72,7 @@ GYRO_SCALE, HIGH_RANGE_GYRO_SCALE = 67108864.0, 12304174.0
 TEMPERATURE_SCALE: Final = 256.0
 """Number of LSB for 1 °C."""
 VALID: Final = 0x3FF
-"""Status bits that are 1 if the IMU is in order."""
+"""Status bits that are 1 if the IMU is working correctly."""
 SELF_TEST_BITS: Final = np.array([1 << 5, 1 << 6, 1 << 7, 1 << 2, 1 << 3, 1 << 4])
 """Status bit of the self-test of each axis [6] in the order of ``AXES``."""
 HIGH_RANGE: Final = 1 << 10
@@ -156,7 +156,7 @@ class SbgEcomDecoder(base.FrameStreamDecoder):
 
 
 def encode_frame(content: bytes) -> bytes:
-    """Return a frame whose bytes from the message identifier to the end of the data are given."""
+    """Build a frame from its bytes between the start of the message identifier and the end of the data."""
     return SYNC + content + frame_crc(content) + bytes([END])
 
 

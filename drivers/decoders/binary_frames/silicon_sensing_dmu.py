@@ -8,7 +8,7 @@ nor the increments. The sum of all words, including the checksum, is 0 modulo 65
 
 Sources: two public drivers that quote the data sheet DMU11-00-0100-132 revision 3 (drivers for ArduPilot with 68 and
 with 40 bytes), and lisusdaniil/dmu_ros, which reads a DMU11 and a DMU41. leo-drive/dmu11_ros2_driver differs from these
-sources: it reads the y acceleration before the y rate. The decoder follows the data sheet as quoted.
+sources: it reads the y acceleration before the y rate. The decoder follows the quoted data sheet.
 
 The drivers for ArduPilot change the sign of all six axes, and the two other drivers change none. This decoder keeps the
 signs of the message. The table ``[device.axes]`` changes signs, for example ``gx = "-gx"``. The public sources do not
@@ -31,7 +31,7 @@ HEADER: Final = b"\x55\xaa"
 
 
 def _message_layout(length: int, temperature_at: int) -> np.dtype[np.void]:
-    """Return the structured dtype of messages with ``length`` bytes. The values are rates and accelerations in turn."""
+    """Return the structured dtype of messages with ``length`` bytes. Rates and accelerations alternate."""
     fields = {
         "header": ("S2", 0),
         "count": (">u2", 2),

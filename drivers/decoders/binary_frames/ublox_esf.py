@@ -8,18 +8,19 @@ other protocols, such as RTCM, count as lost messages. Payloads:
   last u32 is a calibrated time tag and not a measurement.
 - ESF-RAW (10 03): 4 bytes that are ignored, then pairs of ``measurement u32 | sensor time tag u32``.
 
-Bits 24 to 29 of a measurement are its type, and bits 0 to 23 a signed number. Types 14, 13 and 5 are the angular rates
-x, y and z in 2^-12 °/s. Types 16, 17 and 18 are the accelerations x, y and z in 2^-10 m/s². Type 12 is the temperature
-of the gyroscope in 0.01 °C. Other types are wheel speeds and are ignored. Sources: u-blox 8/M8 receiver description
-UBX-13003221, ZED-F9K integration manual (table 11), pyubx2.
+Bits 24 to 29 of a measurement are its type, and bits 0 to 23 a signed number. Types 14, 13 and 5 contain the x, y and z
+angular rates in units of 2^-12 °/s. Types 16, 17 and 18 are the accelerations x, y and z in 2^-10 m/s². Type 12 is the
+temperature of the gyroscope in 0.01 °C. Other types are wheel speeds and are ignored. Sources: u-blox 8/M8 receiver
+description UBX-13003221, ZED-F9K integration manual (table 11), pyubx2.
 
-A sample is complete if all six axes have arrived. In ESF-MEAS, gyroscope and accelerometer have separate messages.
-Their time tags are equal in published messages of a ZED-F9R, but 5 ms apart in the recorded messages of pyubx2. The key
-``window`` is the largest difference within a sample. All measurements of one sample in ESF-RAW have the same tag.
+A sample is complete if all six axes have arrived. In ESF-MEAS, the gyroscope and the accelerometer values are sent in
+separate messages. Their time tags are equal in published messages of a ZED-F9R, but 5 ms apart in the recorded messages
+of pyubx2. The key ``window`` sets the largest time difference allowed within a sample. All measurements of one sample
+in ESF-RAW have the same tag.
 
 u-blox does not specify the unit of the sensor time tag in ESF-RAW. The converter of Swift Navigation uses 39.0625 µs
-and 24 bits for a NEO-M8L. The decoder therefore uses the low 24 bits. Unless the key ``tick`` states the unit, the
-clock measures the number of units per sample.
+and 24 bits for a NEO-M8L. The decoder therefore uses the low 24 bits. Unless the key ``tick`` states the duration of
+one unit, only the number of units between two samples is known.
 """
 
 import math
@@ -42,10 +43,10 @@ MESSAGES: Final = {"esf-raw": b"\x10\x03", "esf-meas": b"\x10\x02"}
 CLASSES: Final = bytes.fromhex("01 02 04 05 06 09 0A 0B 0D 10 13 21 27 28 29")
 """Classes of all messages of u-blox receivers, from NAV to NAV2."""
 MAX_PAYLOAD: Final = 4096
-"""Maximum payload in bytes. The largest message of a receiver, RXM-RAWX, has about 3 kB."""
+"""Maximum payload in bytes. The largest message of a receiver, RXM-RAWX, is about 3 kB long."""
 LONGEST: Final = 8 + MAX_PAYLOAD
 SENTENCE: Final = re.compile(rb"\$([ -)+-~]{1,200})\*([0-9A-F]{2})\r\n")
-"""NMEA sentence with its content and its checksum."""
+"""NMEA sentence, with groups for its content and its checksum."""
 START_OF_SENTENCE: Final = re.compile(rb"\$[ -~]{0,203}\r?")
 
 GYRO_STEP: Final = DEGREE / 2**12

@@ -1,7 +1,7 @@
 """Decoder of the scans that the link ``iio`` reads from a Linux IIO device.
 
 Each message contains one or more complete scans, and its attachment contains their layout
-(``drivers.iio_scan_layout``). The kernel states angular rates in rad/s, accelerations in m/s² and temperatures in m°C.
+(``drivers.iio_scan_layout``). The kernel reports angular rates in rad/s, accelerations in m/s² and temperatures in m°C.
 Other channels are ignored, and an axis without a channel is not measured.
 
 The time of a sample is the time stamp of the kernel. The time stamps must be on the clock ``realtime``, which is the
@@ -40,9 +40,9 @@ CELSIUS_PER_UNIT: Final = 1e-3
 CLOCK: Final = "realtime"
 """Name of the Unix clock in the sysfs attribute ``current_timestamp_clock``."""
 ENCODED_SCALES: Final = (1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 1e-5)
-"""Value of one bit of each axis in encoded scans, in rad/s and m/s²."""
+"""Size of one bit of each axis in encoded scans, in rad/s and m/s²."""
 ENCODED_TEMPERATURE_SCALE: Final = 10.0
-"""Value of one bit of the temperature in encoded scans, in m°C."""
+"""Size of one bit of the temperature in encoded scans, in m°C."""
 ENCODED_LAYOUT: Final = ScanLayout(
     CLOCK,
     [
@@ -76,7 +76,7 @@ class IioDecoder(RejectingDecoder):
         self._scan_bytes = 0
 
     def forget_stream_state(self) -> None:
-        """Do not count samples as missing that were rejected before the link was reopened."""
+        """Do not count samples that were rejected before the link was reopened as missing."""
         self._builder.forget_missing_samples()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
@@ -167,7 +167,7 @@ def _extract_numbers(scans: Bytes, number: StoredNumber) -> Ints:
 
 
 def _check_times(t_ns: Ints) -> Ints:
-    """Return the times [n]. Raise ``DecodeError`` if a time is no plausible Unix time."""
+    """Return the times [n]. Raise ``DecodeError`` if a time is not a plausible Unix time."""
     if t_ns.min() < 0 or t_ns.max() >= T_LIMIT_S * NS_PER_S:
         raise DecodeError("a time stamp of the kernel is no Unix time")
     return t_ns

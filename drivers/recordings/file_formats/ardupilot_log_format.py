@@ -39,7 +39,8 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """For each column of a recording: the names of the field in new and in old logs."""
 TIMES: Final = {"SampleUS": 1_000, "TimeUS": 1_000, "TimeMS": 1_000_000}
-"""Fields that contain the time since the start of the autopilot, with the unit in ns. The first known field is used."""
+"""Fields that contain the time since the autopilot started, with the duration of one unit in ns. The first known field
+is used."""
 INSTANCE: Final = "I"
 INDEX_BYTES_PER_MESSAGE: Final = 40
 """Memory in bytes that pymavlink needs for the position of a message."""

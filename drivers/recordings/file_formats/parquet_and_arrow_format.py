@@ -250,7 +250,7 @@ def _build_table(
     for name, key in chosen.items():
         column = data.column(key)
         if name == "t" and pa.types.is_integer(column.type):
-            # The largest number of int64 or uint64 is out of the range of times, like a missing time.
+            # The largest int64 or uint64 number is not a possible time and is treated as a missing time.
             whole = column if pa.types.is_uint64(column.type) else column.cast(pa.int64())
             missing = int(np.iinfo(whole.type.to_pandas_dtype()).max)
             columns[name] = table.to_column(name, whole.fill_null(missing).to_numpy())

@@ -38,7 +38,7 @@ COLUMNS_OF_TYPES: Final[Mapping[str, tuple[str, ...]]] = {
     TEMPERATURE_TYPE: ("temperature",),
 }
 MIN_LOG_NS: Final = 1_000_000_000
-"""Log time in ns from which a stamp of 0 counts as missing. The times of a simulation begin at 0."""
+"""Log time in ns at and after which a stamp of 0 counts as missing. The times of a simulation begin at 0."""
 MAX_METADATA_BYTES: Final = 4_000_000
 EXPECTED: Final = "messages of type sensor_msgs/Imu"
 REPAIRS: Final[Mapping[str, str]] = {
@@ -187,7 +187,7 @@ def _read_messages(
 ) -> tuple[Ints, Floats, int]:
     """Return the times [n] in ns, the numbers [n, columns], and the number of messages without a header stamp.
 
-    The arrays are allocated only once, so that the memory above their size does not grow with the length of the bag.
+    The arrays are allocated only once, so the additional memory does not grow with the length of the bag.
     """
     connections = [one for one in bag.connections if one.topic == name and one.msgtype == kind]
     rows = sum(one.rows for one in bag.topics if one.name == name and one.message_type == kind)

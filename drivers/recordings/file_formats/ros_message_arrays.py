@@ -1,8 +1,8 @@
 """Decoding of ROS messages of type ``sensor_msgs/Imu`` and ``sensor_msgs/Temperature``, many messages at once.
 
 Both types begin with a header: the time stamp, and the text ``frame_id`` with its length. All other fields are float64
-at fixed offsets after the text. Consecutive messages of a topic usually have the same text, so that their bytes form a
-structured array.
+at fixed offsets after the text. Consecutive messages of a topic usually contain the same text, so their bytes can be
+read as a structured array.
 
 ROS 2 messages are XCDR1 (OMG DDSI-RTPS 10.5): 4 bytes of encapsulation, whose second byte is 1 for little-endian, then
 fields that are aligned from byte 4. ROS 1 messages are little-endian without alignment and begin with a sequence
@@ -91,7 +91,7 @@ def decode_messages(block: Sequence[bytes], message_type: str, cdr: bool) -> tup
 
 
 def _message_layout(data: bytes, message_type: str, cdr: bool) -> np.dtype[Any]:
-    """Return the layout of a message, which also applies to messages with equal ``byte_order`` and ``text_bytes``."""
+    """Return the layout of a message. It also applies to messages with the same ``byte_order`` and ``text_bytes``."""
     order = ">" if cdr and data[1:2] == b"\0" else "<"
     text_bytes = int.from_bytes(data[TEXT_OFFSET - 4 : TEXT_OFFSET], "little" if order == "<" else "big")
     start = TEXT_OFFSET + text_bytes

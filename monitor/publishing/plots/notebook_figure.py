@@ -1,4 +1,4 @@
-"""Figure of matplotlib that a notebook displays as a picture. This module imports matplotlib."""
+"""Matplotlib figure that a notebook displays as an image. This module imports matplotlib."""
 
 import io
 from typing import Final

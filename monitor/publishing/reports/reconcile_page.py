@@ -83,7 +83,7 @@ def render_page(r: Reconciliation, title: str = "") -> str:
 
 
 def draw_differing_allan_deviations(r: Reconciliation, ranking: GapRanking) -> list[str]:
-    """Draw the Allan deviation of each axis that differs from the model, before and after the search, as SVG elements.
+    """For each axis that differs from the model, draw the Allan deviation before and after the search as SVG elements.
 
     Parameters
     ----------

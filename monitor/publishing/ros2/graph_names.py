@@ -13,7 +13,8 @@ NODE: Final = "imu_monitor"
 NODE_ID: Final = 0
 ENCLAVE: Final = "/"
 QOS: Final = "::,10:,:,:,,"
-"""Quality of service in a token: reliable, volatile, the last 10 messages. A field is empty if it has its default."""
+"""Quality of service as encoded in a token: reliable, volatile, the last 10 messages. A field is empty if its value is
+the default."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,9 @@
 """Publisher of ROS 2 messages over zenoh, as a node of rmw_zenoh.
 
 The zenoh session is a client of the router of rmw_zenoh (``ros2 run rmw_zenoh_cpp rmw_zenohd``), because a router does
-not forward data from one peer to another peer. A thread opens the session, encodes the messages and sends them. A full
-zenoh queue delays each message by a millisecond before the message is dropped, so the thread that processes samples
-does not send. Between both threads is a bounded queue that drops the oldest messages and counts them.
+not forward data from one peer to another peer. A thread opens the session, encodes the messages and sends them. If the
+queue of zenoh is full, each message blocks for a millisecond before it is dropped. Messages are therefore not sent by
+the thread that processes samples. A bounded queue between the two threads drops the oldest messages and counts them.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ class _DeclaredPublisher:
 
 
 class Ros2Publisher(RetriedSession):
-    """Node of ROS 2 that publishes messages on any number of topics.
+    """ROS 2 node that publishes messages on any number of topics.
 
     Parameters
     ----------

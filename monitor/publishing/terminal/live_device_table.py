@@ -42,7 +42,7 @@ HEADER_LINES: Final = 6
 """Number of lines for the summary, the note, the table header and blank lines."""
 MIN_ROWS: Final = 3
 TABLE_COEFFICIENTS: Final[dict[Kind, str]] = {"gyro": "NB", "accel": "N"}
-"""Symbols of the coefficients of each kind of sensor that the device table shows."""
+"""Symbols of the coefficients shown in the device table, for each kind of sensor."""
 STATES: Final = {
     "running": ("●", "green"),
     "waiting": ("◌", "yellow"),

@@ -53,7 +53,7 @@ class RetriedSession:
         raise NotImplementedError
 
     def _keep_open(self) -> None:
-        """Open the session, repeat failed attempts, and then work until the session is closed."""
+        """Open the session, retrying on failure, and then run until the session is closed."""
         errors: tuple[type[Exception], ...] = (*zenoh_errors(), OSError)
         while not self.closing.is_set():
             try:

@@ -9,9 +9,9 @@ Empty lines and lines that begin with the comment prefix are skipped. A line is 
 columns, or if a field is not a number. With ``nmea = true``, a line is ``$fields*CC``. The checksum CC is the exclusive
 or of the characters between ``$`` and ``*``, in two hexadecimal digits. A line with a wrong checksum is rejected.
 
-For lines in another format, the named groups of the regular expression ``pattern`` contain the fields. The library RE2
-finds the groups in a time that is proportional to the length of the line, which is at most MAX_LINE_BYTES. No pattern
-can therefore stop the reader. A line without a match is rejected.
+For lines in another format, the named groups of the regular expression ``pattern`` contain the fields. The RE2 library
+matches the groups in time proportional to the length of the line, which is at most MAX_LINE_BYTES. No pattern can
+therefore stop the reader. A line without a match is rejected.
 
 The first line that arrives after the link was opened is often incomplete. For example, ``-0.012`` without the first
 characters is read as ``12``. The first line is therefore skipped without being counted as bad. A first line with a
@@ -150,7 +150,7 @@ class TextDecoder(base.RejectingDecoder):
         return np.array(rows).reshape(-1, self._width)
 
     def _parse_regular_lines(self, bodies: list[bytes | None]) -> Floats | None:
-        """Return the numbers [n, columns], or None if a field is missing or is not a number without a label."""
+        """Return the numbers [n, columns], or None if a field is missing, is not a number or has a label."""
         if self._pattern is not None:
             return None
         separated = [self._comma_separated(body) for body in bodies if body is not None]
@@ -201,7 +201,8 @@ class TextDecoder(base.RejectingDecoder):
         return fields
 
     def _parse_field(self, field: bytes, at: int) -> float:
-        """Return the number in a field of the column ``at``. Raise ValueError if the label names another column."""
+        """Return the number in the field of the column with the index ``at``. Raise ValueError if the label names
+        another column."""
         labelled = LABEL.fullmatch(field) if self._pattern is None else None
         if labelled is None:
             return _parse_number(field)

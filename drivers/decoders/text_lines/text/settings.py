@@ -140,7 +140,7 @@ class Settings(SettingsModel):
 
 
 def apply_preset(settings: Settings) -> Settings:
-    """Return the settings in which the preset replaces each key that has its default value."""
+    """Return the settings with the values of the preset for all keys that have their default values."""
     if settings.preset == "none":
         return settings
     preset = {
