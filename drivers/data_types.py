@@ -8,13 +8,15 @@ the source provides Unix times, ``t_ns`` is a Unix time; otherwise it is a time 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Times = Floats | Ints
+"""Times of the samples of a recording: int64 in ns, or float64 in s."""
 
 AXES: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 """Column order of every array with six columns: three gyroscope axes, then three accelerometer axes."""
@@ -193,3 +195,13 @@ def ns_to_seconds(t_ns: Ints) -> Floats:
     whole, rest = np.divmod(t_ns, 1_000_000_000)
     result: Floats = whole + rest * 1e-9
     return result
+
+
+def times_to_seconds(times: Times) -> Floats:
+    """Return the times of a recording [n] in s."""
+    return ns_to_seconds(cast(Ints, times)) if times.dtype == np.int64 else cast(Floats, times)
+
+
+def times_to_ns(times: Times) -> Ints:
+    """Return the times of a recording [n] in whole nanoseconds. Times in s are rounded."""
+    return cast(Ints, times) if times.dtype == np.int64 else seconds_to_ns(cast(Floats, times))

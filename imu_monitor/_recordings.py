@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drivers import recordings
-from drivers.data_types import AXES, Floats
+from drivers.data_types import AXES, Floats, Times, times_to_seconds
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
 from drivers.number_ranges import RATE_HZ, NumberRange
 from drivers.recordings.reading_options import create_reading_options
-from drivers.recordings.table import ALIASES, COLUMNS
+from drivers.recordings.table import ALIASES, COLUMNS, TIME_NS, integers_to_ns
 from imu_monitor._display import build_dataframe, render_html
 from imu_monitor._messages import errors_name_arguments, name_arguments
 from monitor.commands.analyze import check_averaging_times
@@ -37,8 +37,11 @@ class Recording(recordings.Recording):
 
     Attributes
     ----------
-    t_s : ndarray of float64, shape (n,), or None
-        Times in s, with any origin. None if only the sample rate is known.
+    times : ndarray of float64 or int64, shape (n,), or None
+        Times as stored, with any origin: float64 in s, or int64 in ns if the source contains whole ns, µs or ms. None
+        if only the sample rate is known.
+    t_s, t_ns : ndarray of float64 or int64, shape (n,), or None
+        Times in s or in ns. They are computed at each access if the stored times have the other unit.
     values : ndarray of float64, shape (n, 6)
         Angular rates in rad/s and accelerations in m/s², in the order gx, gy, gz, ax, ay, az. NaN means missing.
     temperature_c : ndarray of float64, shape (n,)
@@ -73,14 +76,16 @@ class Recording(recordings.Recording):
         """Duration in s: the number of samples times the sample interval or the mean step of the times."""
         if self.rate_hz is not None:
             return len(self) / self.rate_hz
-        if self.t_s is None or len(self) < 2:
+        if self.times is None or len(self) < 2:
             return 0.0
-        return float(self.t_s[-1] - self.t_s[0]) * len(self) / (len(self) - 1)
+        first_s, last_s = times_to_seconds(self.times[[0, -1]])
+        return float(last_s - first_s) * len(self) / (len(self) - 1)
 
     def to_dict(self) -> dict[str, Floats]:
         """Return the columns of the recording: ``t`` in s, the measured axes, and ``temperature`` in °C if measured."""
-        t_s = np.arange(len(self)) / (self.rate_hz or 1.0) if self.t_s is None else self.t_s
-        columns = {"t": t_s, **{axis: self[axis] for axis in self.axes}}
+        t_s = self.t_s
+        columns = {"t": np.arange(len(self)) / (self.rate_hz or 1.0) if t_s is None else t_s}
+        columns |= {axis: self[axis] for axis in self.axes}
         return columns | ({} if np.isnan(self.temperature_c).all() else {"temperature": self.temperature_c})
 
     def to_dataframe(self) -> "pd.DataFrame":
@@ -95,7 +100,7 @@ class Recording(recordings.Recording):
 
     @errors_name_arguments()
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the recording to a file without loss of precision.
+        """Write the recording to a file without loss of precision. MCAP stores times in whole nanoseconds.
 
         Parameters
         ----------
@@ -108,7 +113,8 @@ class Recording(recordings.Recording):
             If the suffix is unknown, a library is missing, or the file cannot be written.
         """
         columns = self.to_dict()
-        recordings.save_samples(Path(path), columns["t"], self.values, columns.get("temperature"), self.axes)
+        times = columns["t"] if self.times is None else self.times
+        recordings.save_samples(Path(path), times, self.values, columns.get("temperature"), self.axes)
 
     def __repr__(self) -> str:
         duration = format_duration(self.duration_s)
@@ -248,7 +254,7 @@ def to_recording(values: Samples, rate_hz: float | None = None, axes: str | Sequ
         columns = _named_columns(values)
     else:
         columns = _array_columns(values, axes)
-    if rate_hz is None and "t" not in columns:
+    if rate_hz is None and not {"t", TIME_NS} & {*columns}:
         raise ConfigError("rate_hz: is needed, because the samples have no times")
     return to_public(recordings.create_recording(columns, rate_hz))
 
@@ -291,19 +297,24 @@ def to_tau_grid(tau: Literal["octave", "decade10"] | Sequence[float]) -> TauGrid
     return grid
 
 
-def _named_columns(values: Any) -> dict[str, Floats]:
-    """Return the known columns of a mapping or a pandas DataFrame."""
-    columns = {}
+def _named_columns(values: Any) -> dict[str, Times]:
+    """Return the known columns of a mapping or a pandas DataFrame. Integer times in ns precede times in s."""
+    columns: dict[str, Times] = {}
     for name in values.keys():  # noqa: SIM118 - iteration over a pandas DataFrame gives the same names
         known = ALIASES.get(name, name)
         if known in COLUMNS:
             columns[known] = _to_floats(values[name], f"values: {name}", 1)
+        elif known == TIME_NS:
+            t_ns = np.asarray(values[name])
+            if t_ns.dtype.kind not in "iu" or t_ns.ndim != 1:
+                raise ConfigError(f"values: {name}: {t_ns.dtype} of shape {t_ns.shape}, expected integers (n,)")
+            columns[TIME_NS] = integers_to_ns(t_ns, 1)
     if not set(columns) & set(AXES):
         raise ConfigError(f"values: no column is an axis; possible are {' '.join(AXES)}")
     return columns
 
 
-def _array_columns(values: ArrayLike, axes: str | Sequence[str] | None) -> dict[str, Floats]:
+def _array_columns(values: ArrayLike, axes: str | Sequence[str] | None) -> dict[str, Times]:
     """Return the columns of an array [n, k], or of an array [n] with the samples of one axis."""
     named = check_axes(axes)
     array = _to_floats(values, "values", 2)

@@ -141,7 +141,7 @@ def test_configurations_show_every_link() -> None:
     shown = {
         found for toml in find_code_blocks(CONNECTING_SENSORS, "toml") for found in re.findall(r'link = "(\w+)"', toml)
     }
-    assert shown == {"serial", "can", "zenoh", "replay"}
+    assert shown == {"serial", "can", "iio", "zenoh", "replay"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=get_title)

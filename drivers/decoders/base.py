@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import ClassVar, Final, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -529,3 +530,13 @@ def xor_checksum(data: bytes) -> int:
         bits >>= 1
         folded = (folded >> bits) ^ (folded & ((1 << bits) - 1))
     return folded
+
+
+def fletcher_checksum(data: bytes) -> bytes:
+    """Return the two 8-bit Fletcher sums of the data.
+
+    >>> fletcher_checksum(bytes.fromhex("06 00 00 00")).hex()
+    '0618'
+    """
+    sums = list(accumulate(data))
+    return bytes([sums[-1] & 0xFF, sum(sums) & 0xFF])

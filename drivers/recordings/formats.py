@@ -67,8 +67,9 @@ def _log_format(
     """Return the format of a log that contains topics. The messages of the log determine the columns."""
 
     def check_topic(path: Path, options: ReadingOptions) -> str | None:
-        if options.columns:
-            raise ConfigError(f"{path}: the messages of this log determine the columns; leave out --columns")
+        for option, given in (("--columns", options.columns), ("--time-unit", options.time_unit)):
+            if given:
+                raise ConfigError(f"{path}: the messages of this log determine columns and times; leave out {option}")
         return options.topic
 
     return Format(
@@ -156,11 +157,11 @@ def find_writer(path: Path, any_columns: bool = False) -> OpenWriter:
     ConfigError
         If the program does not write this format.
     """
-    found = find_format(path)
-    if any_columns and not found.any_columns:
-        raise ConfigError(f"{path}: tables are written as {' '.join(WRITABLE_TABLES)}")
-    if found.open_writer is None:
-        raise ConfigError(f"{path}: this format is only read; recordings are written as {' '.join(WRITABLE)}")
+    found = FORMATS.get(_suffix(path))
+    if found is None or found.open_writer is None or (any_columns and not found.any_columns):
+        what = "the suffix is unknown" if found is None else "this format is not written"
+        content, suffixes = ("tables", WRITABLE_TABLES) if any_columns else ("recordings", WRITABLE)
+        raise ConfigError(f"{path}: {what}; {content} are written as {' '.join(suffixes)}")
     return found.open_writer
 
 

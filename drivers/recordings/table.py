@@ -4,15 +4,25 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from drivers.data_types import AXES, Floats
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.data_types import AXES, NS_PER_S, Floats, Ints, Times, times_to_seconds
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check
 
 COLUMNS: Final = ("t", *AXES, "temperature")
 """Names of the columns that the readers recognize."""
+
+TIME_NS: Final = "t_ns"
+"""Column of the times in ns as int64. It replaces ``t`` if the source contains times in whole ns, µs or ms, because
+float64 would round Unix times to 0.24 µs."""
+
+NO_TIME_NS: Final = int(np.iinfo(np.int64).min)
+"""Value of a missing time in the column ``t_ns``."""
 
 ALIASES: Final = {"temp": "temperature"}
 """Alternative column names, each mapped to the name in COLUMNS."""
@@ -29,8 +39,8 @@ T_LIMIT_S: Final = 4.6e9
 PARTIAL_SUFFIX: Final = ".part"
 """Suffix that is added to a file name while the file is being written."""
 
-Columns = Mapping[str, Floats]
-"""Mapping from names in COLUMNS to float64 arrays [n] of equal length."""
+Columns = Mapping[str, Times]
+"""Mapping from names in COLUMNS to float64 arrays [n] of equal length, and from TIME_NS to an int64 array."""
 
 AppendColumns = Callable[[Columns], None]
 """Function that appends rows to a file that is being written."""
@@ -43,10 +53,49 @@ OpenWriter = Callable[[Path, Sequence[str]], AbstractContextManager[AppendColumn
 class Table:
     """Columns and stated sample rate of a recording file, and notes about irregularities."""
 
-    columns: dict[str, Floats]  # float64 arrays [n]; the keys are names in COLUMNS; NaN = missing
+    columns: dict[str, Times]  # arrays [n] as in ``Columns``; NaN = missing; ``t`` may be int64 in the unit of the file
     fs: float | None  # sample rate in Hz; None if the file states no rate
     notes: list[str]
     units: Mapping[str, str] = field(default_factory=dict)  # units that the file states
+
+
+def column_dtype(name: str) -> np.dtype[Any]:
+    """Return the type of the numbers in a column of a file that this program writes."""
+    return np.dtype("<i8" if name == TIME_NS else "<f8")
+
+
+def to_column(quantity: str, numbers: NDArray[Any]) -> Times:
+    """Return numbers as float64, or integers of the quantity ``t`` as int64, because float64 would round Unix times."""
+    return integers_to_ns(numbers, 1) if quantity == "t" and numbers.dtype.kind in "iu" else numbers.astype(np.float64)
+
+
+def integers_to_ns(numbers: NDArray[Any], ns_per_unit: int) -> Ints:
+    """Convert integer times to ns.
+
+    Parameters
+    ----------
+    numbers
+        [n] integers of any type.
+    ns_per_unit
+        Unit of the numbers in ns.
+
+    Returns
+    -------
+    Ints
+        [n] times in ns, NO_TIME_NS where a time is out of range.
+    """
+    limit = int(T_LIMIT_S * NS_PER_S) // ns_per_unit
+    usable = (numbers > -limit) & (numbers < limit)
+    result: Ints = np.where(usable, numbers, 0).astype(np.int64) * ns_per_unit
+    result[~usable] = NO_TIME_NS
+    return result
+
+
+def column_seconds(columns: Columns) -> Floats:
+    """Return the times of columns in s, from ``t_ns`` or ``t``. NaN means missing."""
+    if TIME_NS not in columns:
+        return times_to_seconds(columns["t"])
+    return np.where(columns[TIME_NS] == NO_TIME_NS, np.nan, times_to_seconds(columns[TIME_NS]))
 
 
 def check_column_count(path: Path, columns: int) -> None:

@@ -20,21 +20,24 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 
 from drivers import units
-from drivers.data_types import AXES, Floats
+from drivers.data_types import AXES, NS_PER_S, Floats, Times
 from drivers.errors import ConfigError, RecordingError
 from drivers.module_lookup import format_suggestion
 from drivers.recordings.reading_options import NOT_READ, ReadingOptions
 from drivers.recordings.table import (
     COLUMNS,
+    NO_TIME_NS,
+    TIME_NS,
     Table,
     check_column_count,
     describe_suffix_mismatch,
     format_name_list,
+    integers_to_ns,
 )
 
 
@@ -129,7 +132,7 @@ class ColumnName:
     """Meaning of a column name."""
 
     quantity: str  # name in COLUMNS
-    rank: int  # 0 for the names of this program; a lower rank is preferred
+    rank: int  # at most 0 for the names of this program; a lower rank is preferred
     unit: str | None  # unit that the name states; None if it states none
     assumed: str | None = None  # unit of the column if nothing states it; None for the SI unit
 
@@ -203,7 +206,7 @@ def find_layout(
 
 
 def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
-    """Return a table with columns in SI units and °C.
+    """Return a table with columns in SI units and °C. Integer times in ns, µs or ms become the column ``t_ns``.
 
     A unit in the options takes precedence over the unit that the file states.
 
@@ -212,18 +215,21 @@ def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
     ConfigError
         If the file states an unknown unit.
     """
-    columns, notes = dict(table.columns), list(table.notes)
+    columns, notes = {}, list(table.notes)
+    for quantity, column in table.columns.items():
+        if quantity == TIME_NS:
+            columns[TIME_NS] = column
+            continue
+        kind = KIND_OF[quantity]
+        try:
+            factor, offset = kind.convert(find_unit(table, options, quantity))
+        except ConfigError as error:
+            raise ConfigError(f"{path}: column of {quantity}: {error}; state the unit with {kind.option}") from None
+        name, numbers = _convert(quantity, column, factor, offset)
+        columns[name] = numbers
     for kind in KINDS:
-        quantities = [one for one in kind.quantities if one in columns]
-        for quantity in quantities:
-            try:
-                factor, offset = kind.convert(find_unit(table, options, quantity))
-            except ConfigError as error:
-                raise ConfigError(f"{path}: column of {quantity}: {error}; state the unit with {kind.option}") from None
-            with np.errstate(invalid="ignore", over="ignore"):  # a huge number becomes infinite
-                columns[quantity] = _convert(columns[quantity], factor, offset)
         given = getattr(options, kind.key)
-        contradicted = sorted({table.units[one] for one in quantities if one in table.units} - {given})
+        contradicted = sorted({table.units[one] for one in kind.quantities if one in table.units} - {given})
         if given is not None and contradicted:
             notes.append(f"The file states {', '.join(contradicted)}; the requested {given} is used.")
     return Table(columns, table.fs, notes, table.units)
@@ -256,6 +262,8 @@ def parse_column_name(name: str, sensor: str = "") -> ColumnName | None:
     """
     if name in COLUMNS:
         return ColumnName(name, 0, None)
+    if name == TIME_NS:
+        return ColumnName("t", -1, "ns")
     stem, unit = _split_unit(name)
     words = [] if stem.strip() == "T" else _split_words(stem)  # T is a time or a temperature
     for at in range(len(words), 0, -1):
@@ -398,7 +406,19 @@ def _correct_case(unit: str, kind: QuantityKind) -> str:
     return unit
 
 
-def _convert(column: Floats, factor: float, offset: float) -> Floats:
+def _convert(quantity: str, column: Times, factor: float, offset: float) -> tuple[str, Times]:
+    """Return the name of the converted column, and its numbers."""
+    if column.dtype.kind in "iu":
+        if factor < 1.0:
+            t_ns = integers_to_ns(column, round(factor * NS_PER_S))
+            if 2 * np.count_nonzero(t_ns == NO_TIME_NS) <= t_ns.size:
+                return TIME_NS, t_ns
+        column = np.where(column == NO_TIME_NS, np.nan, column.astype(np.float64))
+    with np.errstate(invalid="ignore", over="ignore"):  # a huge number becomes infinite
+        return quantity, _scale(cast(Floats, column), factor, offset)
+
+
+def _scale(column: Floats, factor: float, offset: float) -> Floats:
     if (factor, offset) == (1.0, 0.0):
         return column
     divisor = round(1.0 / factor) if factor < 1.0 else 0

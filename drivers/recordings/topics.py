@@ -4,21 +4,18 @@ A log of a robot or of an autopilot contains messages of many kinds. A topic is 
 as the ROS topic ``/imu/data`` or the second instance of the PX4 topic ``sensor_gyro``.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.data_types import AXES, Floats
+from drivers.data_types import AXES, Floats, Times
 from drivers.errors import ConfigError, RecordingError
 from drivers.module_lookup import format_choices_by_similarity
-from drivers.recordings.memory_check import RecordingSizeLimits
-from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.table import Columns, format_name_list
+from drivers.recordings.table import TIME_NS, Columns, column_seconds, format_name_list
 
 JOIN: Final = "+"
 """Separator of two topics that are read as one IMU."""
@@ -109,40 +106,7 @@ def select_topics(
     return names
 
 
-def collect_columns(
-    rows: Iterable[Sequence[float]], names: Sequence[str], limit: RecordingSizeLimits, expected_rows: int
-) -> dict[str, Floats]:
-    """Collect rows as arrays, block by block.
-
-    Parameters
-    ----------
-    rows
-        Rows with one number per column.
-    names
-        Names of the columns.
-    limit
-        Limits on the number of rows.
-    expected_rows
-        Number of rows according to the index of the file, for the report of the progress.
-    """
-    blocks: list[Floats] = []
-    count = 0
-    for block in iter_row_blocks(rows):
-        count += len(block)
-        limit.check_row_count(count)
-        report_read_share(count, expected_rows)
-        blocks.append(block)
-    return {name: np.concatenate([np.empty(0), *(block[:, i] for block in blocks)]) for i, name in enumerate(names)}
-
-
-def iter_row_blocks(rows: Iterable[Sequence[float]]) -> Iterator[Floats]:
-    """Yield arrays [n, columns] of up to BLOCK_ROWS rows."""
-    iterator = iter(rows)
-    while block := list(islice(iterator, BLOCK_ROWS)):
-        yield np.array(block, np.float64)
-
-
-def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Floats]:
+def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Times]:
     """Join the columns of several topics.
 
     The first topic determines the rows. The gyroscope comes from the first topic that contains one, and the
@@ -154,7 +118,7 @@ def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Floats]:
     path
         Path of the file, used in error messages.
     tables
-        Columns of each topic, which include ``t``. The first topic contains at least one axis.
+        Columns of each topic, which include ``t`` or ``t_ns``. The first topic contains at least one axis.
 
     Raises
     ------
@@ -165,13 +129,14 @@ def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Floats]:
     joined = dict(tables[first])
     for name in others:
         columns = tables[name]
+        t_s, other_s = column_seconds(joined), column_seconds(columns)
         if any(axis in columns for axis in AXES):
-            _check_equal_rates(path, {one: tables[one]["t"] for one in (first, name)})
-            rows = _nearest_rows(joined["t"], columns["t"])
+            _check_equal_rates(path, {first: t_s, name: other_s})
+            rows = _nearest_rows(t_s, other_s)
         else:
-            rows = _preceding_rows(joined["t"], columns["t"])
+            rows = _preceding_rows(t_s, other_s)
         for key, column in columns.items():
-            if key == "t" or (key in GYROS and key in joined):
+            if key in ("t", TIME_NS) or (key in GYROS and key in joined):
                 continue
             joined[key] = np.where(rows < 0, np.nan, column[rows])
     return joined

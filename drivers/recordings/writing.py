@@ -12,22 +12,22 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers.data_types import AXES, Floats
+from drivers.data_types import AXES, Floats, Times, times_to_seconds
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings.formats import find_writer
-from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_name_list
+from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, TIME_NS, column_dtype, format_name_list
 
 
 class AppendSamples(Protocol):
     """Function that appends rows to a recording."""
 
-    def __call__(self, t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
+    def __call__(self, times: Times, values: Floats, temperature_c: Floats | None = None) -> None:
         """Append samples to the recording.
 
         Parameters
         ----------
-        t_s
-            [n] float64, times in s.
+        times
+            [n] times of the type that the file was opened with: float64 in s, or int64 in ns.
         values
             [n, 6] float64 in the order of AXES, rad/s and m/s².
         temperature_c
@@ -36,7 +36,9 @@ class AppendSamples(Protocol):
 
 
 @contextmanager
-def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[AppendSamples]:
+def open_recording_writer(
+    path: Path, axes: Sequence[str], temperature: bool, *, times_in_ns: bool = False
+) -> Iterator[AppendSamples]:
     """Create a recording file and yield a function that appends samples. The file suffix determines the format.
 
     Parameters
@@ -47,6 +49,8 @@ def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) ->
         Axes to write, a subset of AXES.
     temperature
         True if a temperature column is written.
+    times_in_ns
+        True if the times are int64 in ns. The file then contains the column ``t_ns`` instead of ``t``.
 
     Raises
     ------
@@ -60,22 +64,23 @@ def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) ->
         what = f"unknown axis {format_name_list(unknown)}" if unknown else "no axis has a value"
         raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
     open_writer = find_writer(path)
-    names = ["t", *axes, *(["temperature"] if temperature else [])]
+    time_name = TIME_NS if times_in_ns else "t"
+    names = [time_name, *axes, *(["temperature"] if temperature else [])]
     with atomic_write_path(path) as part, open_writer(part, names) as append_columns:
 
-        def append_samples(t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
-            _check_arrays(path, t_s, values, temperature_c)
-            table = {"t": t_s} | {axis: values[:, AXES.index(axis)] for axis in axes}
+        def append_samples(times: Times, values: Floats, temperature_c: Floats | None = None) -> None:
+            _check_arrays(path, times, values, temperature_c)
+            table = {time_name: times} | {axis: values[:, AXES.index(axis)] for axis in axes}
             if temperature:
-                table["temperature"] = np.full(len(t_s), np.nan) if temperature_c is None else temperature_c
-            append_columns({name: np.asarray(column, np.float64) for name, column in table.items()})
+                table["temperature"] = np.full(len(times), np.nan) if temperature_c is None else temperature_c
+            append_columns({name: np.asarray(column, column_dtype(name)) for name, column in table.items()})
 
         yield append_samples
 
 
 def save_samples(
     path: Path,
-    t_s: Floats,
+    times: Times,
     values: Floats,
     temperature_c: Floats | None = None,
     axes: Sequence[str] | None = None,
@@ -86,8 +91,8 @@ def save_samples(
     ----------
     path
         File to write.
-    t_s
-        [n] float64, times in s.
+    times
+        [n] float64, times in s, or int64, times in ns.
     values
         [n, 6] float64 in the order of AXES, rad/s and m/s².
     temperature_c
@@ -102,12 +107,12 @@ def save_samples(
     RecordingError
         If the arrays have different lengths, an axis is unknown, or a time is missing.
     """
-    _check_arrays(path, t_s, values, temperature_c)
+    _check_arrays(path, times, values, temperature_c)
     if axes is None:
         axes = [axis for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()]
     temperature = temperature_c is not None and not np.isnan(temperature_c).all()
-    with open_recording_writer(path, axes, temperature) as append_samples:
-        append_samples(t_s, values, temperature_c)
+    with open_recording_writer(path, axes, temperature, times_in_ns=times.dtype == np.int64) as append_samples:
+        append_samples(times, values, temperature_c)
 
 
 @contextmanager
@@ -144,12 +149,12 @@ def atomic_write_path(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def _check_arrays(path: Path, t_s: Floats, values: Floats, temperature_c: Floats | None) -> None:
+def _check_arrays(path: Path, times: Times, values: Floats, temperature_c: Floats | None) -> None:
     """Raise RecordingError if the arrays have different lengths, or if a time is missing."""
-    n = len(t_s)
+    n = len(times)
     if n == 0 or values.shape != (n, len(AXES)):
         raise RecordingError(f"{path}: {n} times and values of shape {values.shape}, expected shape [n, 6] with n ≥ 1")
     if temperature_c is not None and temperature_c.shape != (n,):
         raise RecordingError(f"{path}: {n} times and {temperature_c.size} temperatures, expected equal numbers")
-    if not np.all(np.abs(t_s) < T_LIMIT_S):
+    if not np.all(np.abs(times_to_seconds(times)) < T_LIMIT_S):
         raise RecordingError(f"{path}: a time is missing or not in seconds")

@@ -101,7 +101,7 @@ def run_compensation(
     judged_axes: dict[str, AxisCompensation] = {
         str(axis): _evaluate_axis(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
     }
-    start_s = 0.0 if found.t_s is None else float(found.t_s[0])
+    start_s = 0.0 if (t_s := found.t_s) is None else float(t_s[0])
     _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, report_progress)
     return DriftCompensationResult(
         recording=request.recording.name,

@@ -35,8 +35,8 @@ class ConversionRequest:
 def run_conversion(request: ConversionRequest, report_progress: ProgressCallback = ignore_progress) -> Recording:
     """Read a recording, write its samples, and return the recording.
 
-    Times and values are written without rounding if the format stores 64-bit floats. If the recording has no times, the
-    times begin at 0 and follow from the sample rate.
+    Times and values are written without rounding, except that MCAP stores times in whole nanoseconds. If the recording
+    has no times, the times begin at 0 and follow from the sample rate.
 
     Parameters
     ----------
@@ -57,16 +57,17 @@ def run_conversion(request: ConversionRequest, report_progress: ProgressCallback
         request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
     )
     axes = [axis for axis in found.axes if not np.isnan(found.values[:, AXES.index(axis)]).all()] or found.axes
-    with open_recording_writer(request.out, axes, has_temperature(found)) as append_samples:
+    in_ns = found.times is not None and found.times.dtype == np.int64
+    with open_recording_writer(request.out, axes, has_temperature(found), times_in_ns=in_ns) as append_samples:
         for start in range(0, len(found), BLOCK_ROWS):
             report_progress("writing", start / len(found))
             part = slice(start, min(start + BLOCK_ROWS, len(found)))
-            if found.t_s is not None:
-                t_s = found.t_s[part]
+            if found.times is not None:
+                times = found.times[part]
             else:
                 assert found.rate_hz is not None
-                t_s = np.arange(part.start, part.stop) / found.rate_hz
-            append_samples(t_s, found.values[part], found.temperature_c[part])
+                times = np.arange(part.start, part.stop) / found.rate_hz
+            append_samples(times, found.values[part], found.temperature_c[part])
         report_progress("finishing the file", None)  # some formats are compressed only at the end
     if has_temperature(found) and request.out.suffix.lower() == ".mcap":
         topic = JOIN.join((IMU_TOPIC, TEMPERATURE_TOPIC))

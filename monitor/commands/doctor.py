@@ -28,7 +28,7 @@ from urllib.parse import urlsplit
 from drivers import file_access
 from drivers.errors import LinkUnavailable
 from drivers.extras import find_missing_packages, install_command
-from drivers.links import udp_link
+from drivers.links import iio_link, udp_link
 from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
 from drivers.number_ranges import DAY_S
@@ -150,6 +150,8 @@ def _check_device(name: str, driver: Mapping[str, Any]) -> Iterator[Finding]:
         case "can":
             interface, channel = str(driver.get("interface", "socketcan")), str(driver.get("channel", "can0"))
             yield check_can_interface(about, interface, channel)
+        case "iio":
+            yield check_iio_device(about, str(driver.get("device")), bool(driver.get("enable", False)))
         case "udp":
             yield _check_udp_port(about, {key: driver[key] for key in ("host", "port") if key in driver})
         case "zenoh":
@@ -237,6 +239,36 @@ def check_can_interface(subject: str, interface: str, channel: str, sysfs: Path 
     if not flags & 1:  # the flag IFF_UP is not set
         return _wrong(subject, f"{channel}: is down", up)
     return _well(subject, f"{channel}: is up")
+
+
+def check_iio_device(subject: str, device: str, enable: bool, root: Path = iio_link.ROOT) -> Finding:
+    """Check that an IIO device exists and that the user may read it and, if necessary, enable its buffer.
+
+    Parameters
+    ----------
+    subject : str
+        Subject of the finding, shown before the result.
+    device : str
+        Name or number of the device.
+    enable : bool
+        True if the link enables the buffer.
+    root : Path, optional
+        Folder that contains the folders ``sys`` and ``dev`` of the kernel.
+    """
+    try:
+        folder, node = iio_link.find_device(device, root)
+        enabled = folder / "buffer" / "enable"
+        running = iio_link.read_attribute(enabled) == "1"
+    except LinkUnavailable as error:
+        return _wrong(subject, str(error), "load the driver of the sensor, or correct the key device")
+    user, advice = _user(os.geteuid()), iio_link.PERMISSION_ADVICE
+    if not os.access(node, os.R_OK):
+        return _wrong(subject, f"{node}: does not exist, or {user} cannot read it", advice)
+    if enable and not os.access(enabled, os.W_OK):
+        return _wrong(subject, f"{enabled}: {user} cannot write it, as enable = true needs", advice)
+    if not enable and not running:
+        return _doubt(subject, f"{node}: its buffer is not enabled", "set enable = true, or let a program enable it")
+    return _well(subject, f"{node}: exists, and {user} has the necessary permissions")
 
 
 # --- outputs

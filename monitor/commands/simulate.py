@@ -221,7 +221,8 @@ def _temperature(
     known = np.isfinite(found.temperature_c)
     if not known.any():
         raise ConfigError(f"{request.temperature_from}: has no temperature; a column temperature in °C is needed")
-    t_s = np.arange(len(found)) / (found.rate_hz or rate_hz) if found.t_s is None else found.t_s - found.t_s[0]
+    stored_s = found.t_s
+    t_s = np.arange(len(found)) / (found.rate_hz or rate_hz) if stored_s is None else stored_s - stored_s[0]
     t_s, temperature_c = t_s[known], found.temperature_c[known]
     order = np.argsort(t_s, kind="stable")
     length = min(n, int(t_s.max() * rate_hz) + 1)

@@ -16,13 +16,14 @@ import numpy as np
 
 import drivers.decoders
 from drivers import module_lookup
-from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Timing, make_block, ns_to_seconds
+from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Times, Timing, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.reading_progress import listen_to_reading_progress
+from drivers.recordings.table import TIME_NS
 from drivers.settings_model import TableError
 from drivers.timing.sample_clock import SampleClock
 from monitor.commands.progress import ProgressCallback, ignore_progress
@@ -132,7 +133,7 @@ def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Re
         content = f"{received_bytes} bytes contain no sample; {why}" if received_bytes else "the file contains no data"
         raise RecordingError(" ".join((f"{path}: {content}.", *link.notes)).rstrip("."))
     clock.compare_rates_at_end()
-    columns = {"t": ns_to_seconds(np.concatenate([one.t_ns for one in blocks]))}
+    columns: dict[str, Times] = {TIME_NS: np.concatenate([one.t_ns for one in blocks])}
     values = np.concatenate([one.values for one in blocks])
     columns |= {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
     columns["temperature"] = np.concatenate([one.temperature_c for one in blocks])

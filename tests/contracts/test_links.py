@@ -22,7 +22,9 @@ import pytest
 from drivers import links, module_lookup
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
+from drivers.links import iio_link
 from drivers.links.base import Link, LinkSettings
+from tests.support.fake_iio_device import FakeIioDevice
 from tests.support.loopback_link import LoopbackLink
 from tests.support.ports import free_endpoint
 from tests.support.settings import read_settings
@@ -149,6 +151,16 @@ def replay_rig(tmp_path: Path) -> Iterator[LinkRig]:
 
 
 @contextlib.contextmanager
+def iio_rig(tmp_path: Path) -> Iterator[LinkRig]:
+    device = FakeIioDevice(tmp_path, "bmi160", {"in_timestamp": "le:s64/64>>0"}, enabled=True)
+    link = iio_link.IioLink(iio_link.Settings(device="bmi160"), tmp_path)
+    absent = iio_link.IioLink(iio_link.Settings(device="lsm6dsr_gyro"), tmp_path)
+    yield LinkRig(link, lambda: device.write(DATA), device.unplug, absent)
+    link.close()
+    device.unplug()
+
+
+@contextlib.contextmanager
 def loopback_rig(tmp_path: Path) -> Iterator[LinkRig]:
     link, absent = LoopbackLink(), LoopbackLink()
     absent.absent = True
@@ -159,6 +171,7 @@ RIGS: dict[str, Callable[[Path], AbstractContextManager[LinkRig]]] = {
     "serial": serial_rig,
     "can": can_virtual_rig,
     "can-slcan": can_slcan_rig,
+    "iio": iio_rig,
     "zenoh": zenoh_rig,
     "replay": replay_rig,
     "udp": udp_rig,

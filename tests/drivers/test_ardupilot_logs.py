@@ -67,10 +67,10 @@ class TestSamples:
     def test_a_log_gives_the_result_of_the_npz_of_its_samples(self, tmp_path: Path) -> None:
         t_us, values = times_us(8000), noise(8000)
         path = write_dataflash(tmp_path / "x.BIN", imu(t_us, values))
-        save_samples(tmp_path / "same.npz", t_us * 1e-6, values, np.full(8000, 35.0))
+        save_samples(tmp_path / "same.npz", 1000 * t_us, values, np.full(8000, 35.0))
         found, same = load_samples(path), load_samples(tmp_path / "same.npz")
-        assert found.t_s is not None
-        assert found.t_s.tobytes() == same.t_s.tobytes()
+        assert found.t_ns is not None
+        assert found.t_ns.tolist() == same.t_ns.tolist() == (1000 * t_us).tolist()
         assert found.values.tobytes() == same.values.tobytes()
         assert found.temperature_c.tobytes() == same.temperature_c.tobytes()
         assert (found.axes, found.notes) == (AXES, ())
@@ -85,8 +85,8 @@ class TestSamples:
         path = write_dataflash(tmp_path / "x.bin", gyro, raw_sensor("ACC", t_us + 100, values[:, 3:]))
         found = load_samples(path)
         assert found.values.tobytes() == values.tobytes()
-        assert found.t_s is not None
-        assert found.t_s.tolist() == (t_us * 1e-6).tolist()
+        assert found.t_ns is not None
+        assert found.t_ns.tolist() == (1000 * t_us).tolist()
         assert load_samples(path, options=ReadingOptions(topic="ACC")).axes == ACCELS
 
     def test_fixed_point_numbers_are_scaled(self, tmp_path: Path) -> None:

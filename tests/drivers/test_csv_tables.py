@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import imu_monitor
-from drivers.data_types import AXES, Floats, concatenate_blocks
+from drivers.data_types import AXES, Floats, Times, concatenate_blocks
 from drivers.decoders.messages import samples
 from drivers.errors import ConfigError, ImuError, LinkEnded
 from drivers.links import replay_link
@@ -52,15 +52,17 @@ def lines(header: str, *columns: Any, separator: str = ",", comma: bool = False)
     return f"{header}\n{body.replace('.', ',') if comma else body}\n"
 
 
-def require_same_analysis(found: Recording, t_s: Floats, values: Floats, tmp_path: Path) -> None:
+def require_same_analysis(found: Recording, times: Times, values: Floats, tmp_path: Path) -> None:
     """Require that a recording is bit by bit that of an .npz file with the samples, and has the same analysis."""
     measured = [AXES.index(axis) for axis in found.axes]
     path = tmp_path / "same.npz"
-    np.savez(path, t=t_s, **{axis: values[:, AXES.index(axis)] for axis in found.axes})
+    name = "t" if times.dtype == np.float64 else "t_ns"
+    np.savez(path, **{name: times}, **{axis: values[:, AXES.index(axis)] for axis in found.axes})
     same = load_samples(path)
-    assert found.t_s is not None
-    assert same.t_s is not None
-    assert found.t_s.tobytes() == same.t_s.tobytes()
+    assert found.times is not None
+    assert same.times is not None
+    assert found.times.dtype == same.times.dtype == times.dtype
+    assert found.times.tobytes() == same.times.tobytes() == times.tobytes()
     assert found.values[:, measured].tobytes() == same.values[:, measured].tobytes()
     first, second = (analyze_recording(one, "octave").analysis.estimate for one in (found, same))
     assert np.array_equal(first.coefficients.value, second.coefficients.value, equal_nan=True)
@@ -79,7 +81,7 @@ class TestLayouts:
         t_ns, values = START_NS + 5_000_064 * np.arange(N), noise()
         found = read(tmp_path / "data.csv", lines(ASL_HEADER, t_ns, *values.T))
         assert found.notes == ()
-        require_same_analysis(found, t_ns / 1e9, values, tmp_path)
+        require_same_analysis(found, t_ns, values, tmp_path)
 
     @pytest.mark.parametrize(("separator", "comma"), [(",", False), ("\t", False), (";", True), ("\t", True)])
     def test_phyphox(self, tmp_path: Path, separator: str, comma: bool) -> None:
@@ -114,7 +116,7 @@ class TestLayouts:
         found = read(tmp_path / "LOG00007.01.csv", f"{header}\n{text}")
         assert any("gyroADC is read in deg/s and accSmooth in g/2048" in note for note in found.notes)
         values = counts * np.repeat([DEGREE, G0 / 2048], 3)
-        require_same_analysis(found, t_us / 1e6, values, tmp_path)
+        require_same_analysis(found, 1000 * t_us, values, tmp_path)
         given = read(tmp_path / "y.csv", f"{header}\n{text}", gyro_unit="deg/s/10", accel_unit="g/4096")
         assert not any("Betaflight" in note for note in given.notes)
         assert np.allclose(given.values, values / [10, 10, 10, 2, 2, 2], rtol=1e-15)
@@ -332,8 +334,10 @@ def test_each_mistake_is_one_line(tmp_path: Path, text: str, options: dict[str, 
 
 def test_logs_have_no_columns_to_choose(tmp_path: Path) -> None:
     (tmp_path / "x.ulg").write_bytes(b"ULog\x01\x12\x35")
-    with pytest.raises(ConfigError, match="the messages of this log determine the columns; leave out --columns"):
+    with pytest.raises(ConfigError, match="determine columns and times; leave out --columns"):
         load_samples(tmp_path / "x.ulg", options=create_reading_options({"columns": {"gx": 1}}))
+    with pytest.raises(ConfigError, match="determine columns and times; leave out --time-unit"):
+        load_samples(tmp_path / "x.ulg", options=create_reading_options({"time_unit": "ms"}))
 
 
 def test_the_replay_has_the_same_keys(tmp_path: Path) -> None:

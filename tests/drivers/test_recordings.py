@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 from drivers.data_types import AXES, concatenate_blocks
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recordings import (
-    MAX_VALUE,
     Recording,
     is_recording,
     iter_blocks,
@@ -38,6 +37,7 @@ from drivers.recordings.file_formats.arrow_message_sizes import (
 )
 from drivers.recordings.file_formats.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recordings.formats import WRITABLE_TABLES
+from drivers.recordings.recording import MAX_VALUE
 from drivers.recordings.writing import atomic_write_path
 from tests.support.recordings import recordings
 
@@ -206,7 +206,7 @@ class TestPieceByPiece:
 
 class TestSaveRefuses:
     def test_unknown_suffix(self, tmp_path):
-        with pytest.raises(ConfigError, match=r"x\.xls: the suffix is not that of a recording; known are \.csv"):
+        with pytest.raises(ConfigError, match=r"x\.xls: the suffix is unknown; recordings are written as \.csv"):
             save_samples(tmp_path / "x.xls", *samples())
 
     def test_missing_folder(self, path):

@@ -17,8 +17,8 @@ from drivers.errors import ConfigError, ImuError, LinkEnded, LinkUnavailable, Re
 from drivers.links import replay_link
 from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
 from drivers.recordings.file_formats import ros_bag_format, ros_bag_readers
-from drivers.recordings.topics import iter_row_blocks
 from monitor.commands.analyze import AnalysisRequest, run_analysis
+from tests.support.program import exit_status
 from tests.support.ros_bags import KINDS, imu_topic, storage_file, temperature_topic, text_topic, write_bag
 
 START_NS = 1_763_700_000_123_456_789
@@ -60,6 +60,13 @@ def attempt(path: Path) -> None:
     assert "\n" not in line
 
 
+def remove_index(file: Path) -> None:
+    """Remove the summary section of an MCAP file."""
+    data = file.read_bytes()
+    (summary,) = struct.unpack_from("<Q", data, len(data) - 28)
+    file.write_bytes(data[:summary] + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + data[-8:])
+
+
 @pytest.fixture(params=KINDS)
 def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
@@ -69,10 +76,10 @@ class TestSamples:
     def test_a_bag_gives_the_result_of_the_npz_of_its_samples(self, kind: str, tmp_path: Path) -> None:
         t_ns, values = times_ns(6000), noise(6000)
         bag = write_bag(tmp_path, kind, {"/imu/data": imu_topic(t_ns, values), "/text": text_topic(t_ns[::50], "x")})
-        save_samples(tmp_path / "same.npz", seconds(t_ns), values)
+        save_samples(tmp_path / "same.npz", t_ns, values)
         found, same = load_samples(bag), load_samples(tmp_path / "same.npz")
-        assert found.t_s is not None
-        assert found.t_s.tobytes() == same.t_s.tobytes()
+        assert found.t_ns is not None
+        assert found.t_ns.tolist() == same.t_ns.tolist() == t_ns.tolist()
         assert found.values.tobytes() == same.values.tobytes()
         assert (found.axes, found.notes) == (AXES, ())
         of_bag, of_npz = (run_analysis(AnalysisRequest(one)).analysis for one in (bag, tmp_path / "same.npz"))
@@ -106,8 +113,8 @@ class TestSamples:
         t_ns = times_ns(20)
         bag = write_bag(tmp_path, kind, {"/imu": imu_topic(0 * t_ns, noise(20), log_ns=t_ns)})
         found = load_samples(bag)
-        assert found.t_s is not None
-        np.testing.assert_allclose(found.t_s, t_ns * 1e-9, rtol=0.0, atol=1e-6)
+        assert found.t_ns is not None
+        assert found.t_ns.tolist() == t_ns.tolist()
         assert found.notes == ("20 of 20 messages of /imu have no header stamp; the times of the log are used.",)
 
     def test_a_message_without_a_stamp_is_left_out(self, tmp_path: Path) -> None:
@@ -240,10 +247,7 @@ class TestDamage:
 
     def test_an_mcap_file_without_an_index(self, tmp_path: Path) -> None:
         file = storage_file(write_bag(tmp_path, "mcap", {"/imu": imu_topic(times_ns(20), noise(20))}))
-        data = file.read_bytes()
-        (summary,) = struct.unpack_from("<Q", data, len(data) - 28)
-        footer = struct.pack("<BQQQI", 2, 20, 0, 0, 0) + data[-8:]
-        file.write_bytes(data[:summary] + footer)
+        remove_index(file)
         assert refusal(file).endswith(
             "is not indexed; expected an MCAP file with a summary section that lists schemas and chunks; "
             "`mcap recover run.mcap -o indexed.mcap` writes an indexed copy"
@@ -342,10 +346,40 @@ class TestMemory:
         with pytest.raises(ConfigError, match=r"more than 0\.0 GB of memory would be needed"):
             load_samples(bag)
 
-    def test_blocks_of_rows(self) -> None:
-        blocks = list(iter_row_blocks((float(i), 1.0) for i in range(10_000)))
-        assert max(map(len, blocks)) <= 4096
-        assert np.concatenate(blocks)[:, 0].tolist() == list(range(10_000))
+
+@pytest.mark.parametrize(
+    ("topic", "message"),
+    [
+        (None, "run.mcap: contains 3 IMU topics: /left/imu, /right/imu, /slow/imu; choose with --topic"),
+        ("/left/im", 'contains no topic "/left/im"; possible are /left/imu, '),
+        ("/text", 'topic "/text" contains std_msgs/msg/String, expected messages of type sensor_msgs/Imu; possible'),
+        ("/left/imu+/slow/imu", "mixed rates: /left/imu 100 Hz and /slow/imu 50 Hz; only topics with equal rates"),
+        ("truncated", "run.mcap: is cut off: the end of the MCAP file is missing; `mcap recover run.mcap"),
+        ("unindexed", "run.mcap: is not indexed; expected an MCAP file with a summary section"),
+    ],
+)
+def test_commands_print_one_line(
+    topic: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    topics = {
+        **{name: imu_topic(times_ns(100), noise(100)) for name in ("/left/imu", "/right/imu")},
+        "/slow/imu": imu_topic(times_ns(50, 50.0), noise(50)),
+        "/text": text_topic(times_ns(5)),
+    }
+    file = storage_file(write_bag(tmp_path, "mcap", topics))
+    if topic == "truncated":
+        file.write_bytes(file.read_bytes()[:20_000])
+    elif topic == "unindexed":
+        remove_index(file)
+    options = [] if topic is None or "/" not in topic else ["--topic", topic]
+    for command in (["analyze", file], ["convert", file, tmp_path / "out.csv"]):
+        assert exit_status(*command, *options) == 2
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        (line,) = printed.err.splitlines()
+        assert line.startswith(f"imu-monitor: {file}: ")
+        assert message in line
+    assert not (tmp_path / "out.csv").exists()
 
 
 def test_the_replay_of_a_bag(tmp_path: Path) -> None:

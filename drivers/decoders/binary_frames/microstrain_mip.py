@@ -20,7 +20,6 @@ reset. None of them is the present temperature, so samples have no temperature. 
 """
 
 import struct
-from itertools import accumulate
 from typing import Final, Literal
 
 import numpy as np
@@ -187,13 +186,7 @@ def encode_packet(descriptor_set: int, payload: bytes) -> bytes:
         Encoded fields, at most 255 bytes.
     """
     body = SYNC + bytes([descriptor_set, len(payload)]) + payload
-    return body + fletcher_checksum(body)
-
-
-def fletcher_checksum(data: bytes) -> bytes:
-    """Return the two checksum bytes of a packet."""
-    sums = list(accumulate(data))
-    return bytes([sums[-1] & 0xFF, sum(sums) & 0xFF])
+    return body + base.fletcher_checksum(body)
 
 
 def _match_packet(buffer: bytes, at: int) -> int:
@@ -202,7 +195,7 @@ def _match_packet(buffer: bytes, at: int) -> int:
     end = at + 4 + buffer[at + 3]
     if len(buffer) < end + 2:
         return base.NEED_MORE
-    return end + 2 - at if fletcher_checksum(buffer[at:end]) == buffer[end : end + 2] else base.REJECT
+    return end + 2 - at if base.fletcher_checksum(buffer[at:end]) == buffer[end : end + 2] else base.REJECT
 
 
 def build(settings: Settings) -> base.Decoder:

@@ -26,7 +26,6 @@ import math
 import re
 import struct
 from collections.abc import Iterator
-from itertools import accumulate
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -217,17 +216,7 @@ def encode_message(code: bytes, payload: bytes) -> bytes:
         Content of at most 65535 bytes.
     """
     body = code + len(payload).to_bytes(2, "little") + payload
-    return SYNC + body + fletcher_checksum(body)
-
-
-def fletcher_checksum(data: bytes) -> bytes:
-    """Return the two Fletcher-8 sums of the data.
-
-    >>> fletcher_checksum(bytes.fromhex("06 00 00 00")).hex()
-    '0618'
-    """
-    sums = [*accumulate(data)]
-    return bytes([sums[-1] & 0xFF, sum(sums) & 0xFF])
+    return SYNC + body + base.fletcher_checksum(body)
 
 
 def _match_message(buffer: bytes, at: int) -> int:
@@ -244,7 +233,7 @@ def _match_message(buffer: bytes, at: int) -> int:
     end = at + 8 + length
     if len(buffer) < end:
         return base.NEED_MORE
-    return end - at if fletcher_checksum(buffer[at + 2 : end - 2]) == buffer[end - 2 : end] else base.REJECT
+    return end - at if base.fletcher_checksum(buffer[at + 2 : end - 2]) == buffer[end - 2 : end] else base.REJECT
 
 
 def _is_possible_length(code: bytes, length: int) -> bool:

@@ -38,7 +38,8 @@ class Settings(SettingsModel):
 
     file: FileOrName = Field(
         examples=["xsens_mti"],
-        description="path of a DBC file, or j1939_imu, j1939_imu_xyz, canmod_gps, xsens_mti, bosch_mm7",
+        description="path of a DBC file, or j1939_imu, j1939_imu_xyz, bosch_mm7, canmod_gps, dis_qg65d, oxts_rt, "
+        "sick_tmm61, xsens_mti",
     )
     signals: dict[Annotated[str, one_of(COLUMNS)], Annotated[SignalSettings, BeforeValidator(_signal)]] = Field(
         examples=[{"gx": "RateOfTurn.RateX", "gy": "-RateOfTurn.RateY", "gz": {"signal": "RateOfTurn.RateZ"}}],

@@ -17,11 +17,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
-from drivers.data_types import AXES, Floats, Ints
+from drivers.data_types import AXES, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
@@ -38,8 +38,8 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     "temperature": ("T", "Temp"),
 }
 """For each column of a recording: the names of the field in new and in old logs."""
-TIMES: Final = {"SampleUS": 1e-6, "TimeUS": 1e-6, "TimeMS": 1e-3}
-"""Fields that contain the time since the start of the autopilot, with the unit in s. The first known field is used."""
+TIMES: Final = {"SampleUS": 1_000, "TimeUS": 1_000, "TimeMS": 1_000_000}
+"""Fields that contain the time since the start of the autopilot, with the unit in ns. The first known field is used."""
 INSTANCE: Final = "I"
 INDEX_BYTES_PER_MESSAGE: Final = 40
 """Memory in bytes that pymavlink needs for the position of a message."""
@@ -230,16 +230,18 @@ def _iter_blocks(log: Any, messages: _Messages) -> Iterator[np.ndarray[Any, np.d
         yield rows.view(messages.layout)[:, 0]
 
 
-def _read_columns(log: Any, messages: _Messages) -> dict[str, Floats]:
-    """Return the columns of a topic in SI units."""
+def _read_columns(log: Any, messages: _Messages) -> dict[str, Times]:
+    """Return the columns of a topic in SI units, with the times in ns."""
     time = next((name for name in TIMES if name in (messages.layout.names or ())), None)
     if time is None:
         raise ValueError(f"{messages.name} has no time")
-    fields = {"t": time, **_known_fields(messages)}
-    columns: dict[str, list[Floats]] = {name: [] for name in fields}
+    fields = {table.TIME_NS: time, **_known_fields(messages)}
+    columns: dict[str, list[Times]] = {name: [] for name in fields}
     with np.errstate(invalid="ignore"):  # a damaged log may contain signalling NaN
         for block in _iter_blocks(log, messages):
             for column, field in fields.items():
-                factor = TIMES[time] if column == "t" else messages.factors.get(field, 1.0)
-                columns[column].append(block[field].astype(np.float64) * factor)
-    return {name: np.concatenate(parts) for name, parts in columns.items()}
+                if field == time:
+                    columns[column].append(table.integers_to_ns(block[field], TIMES[time]))
+                else:
+                    columns[column].append(block[field].astype(np.float64) * messages.factors.get(field, 1.0))
+    return {name: cast(Times, np.concatenate(parts)) for name, parts in columns.items()}

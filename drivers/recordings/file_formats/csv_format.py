@@ -3,6 +3,8 @@
 An empty field or ``nan`` is a missing value. Blank lines and comment lines are skipped. ``csv_header`` finds the header
 line and the separator, and ``table_layout`` the columns that are read.
 
+Times are read as integers if all of them are integers, because float64 would round Unix times in ns.
+
 NumPy parses text in large pieces. A piece with a damaged line is parsed line by line, so that only the damaged line is
 lost. If the last line has no line ending, it is skipped, because its last number may be incomplete.
 
@@ -12,17 +14,18 @@ Lines are counted before parsing, so that ``drivers.recordings.memory_check`` ca
 import gzip
 import io
 import re
+import warnings
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import IO, Final, cast
+from typing import IO, Any, Final, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drivers.data_types import Floats
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
@@ -55,6 +58,14 @@ Damage to a file loses at most this many compressed bytes.
 GZIP_MAGIC: Final = b"\x1f\x8b"
 GZIP_LEVEL: Final = 1
 """Level of gzip compression. Level 6 reduces the size of noise data by a further 6 % but takes eight times as long."""
+
+
+Rows = NDArray[np.void]
+"""Structured array [lines] with a field for each quantity."""
+
+
+class _FractionalTimeError(Exception):
+    """A time is a number but not an integer."""
 
 
 @dataclass(slots=True)
@@ -103,10 +114,18 @@ def _file_source(path: Path) -> CsvSource:
 
 def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
     """Read the columns of a CSV file on disk or in an archive. See ``read_csv``."""
+    lines = count_csv_source_rows(source)
+    try:
+        return _read_columns(source, options, "i8", lines)
+    except _FractionalTimeError:
+        return _read_columns(source, options, "f8", lines)
+
+
+def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, lines: int) -> table.Table:
+    """Read the columns of a CSV file. Raise _FractionalTimeError if a time does not have the type ``time_type``."""
     notes: list[str] = []
     bad = _BadLines()
     label = Path(source.label)
-    lines = count_csv_source_rows(source)
     with source.open_stream() as file:
         texts = _whole_lines(_decompressed(file, notes), notes)
         header = csv_header.find_header(source.path, label, texts, options)
@@ -117,13 +136,14 @@ def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
             label, header.names, options, notes, f" in line {header.number}" if header.number else "", source.sensor
         )
         use = list(layout.columns.values())
-        parts: list[Floats] = []
+        dtype = np.dtype([(name, time_type if name == "t" else "f8") for name in layout.columns])
+        parts: list[Rows] = []
         read = 0
-        for part in _parse_pieces(label, header, texts, use, bad):
+        for part in _parse_pieces(label, header, texts, use, dtype, bad):
             parts.append(part)
             read += len(part)
             report_read_share(read, lines)
-    rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
+    rows = np.concatenate(parts) if parts else np.empty(0, dtype)
     if 2 * bad.count > len(rows):
         raise _too_many_bad_lines(label, bad, len(rows))
     if bad.count:
@@ -131,7 +151,7 @@ def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
     if not len(rows):
         what = f". {notes[-1]}" if notes else ""
         raise RecordingError(f"{label}: has a header line but no complete line of samples after it{what}")
-    return table.Table({name: rows[:, i] for i, name in enumerate(layout.columns)}, None, notes, layout.units)
+    return table.Table({name: rows[name] for name in layout.columns}, None, notes, layout.units)
 
 
 def count_csv_source_rows(source: CsvSource) -> int:
@@ -216,17 +236,17 @@ def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
 
 
 def _parse_pieces(
-    path: Path, header: CsvHeader, texts: Iterable[bytes], use: Sequence[int], bad: _BadLines
-) -> Iterator[Floats]:
-    """Yield a float array [lines, used columns] for each piece of CSV text."""
+    path: Path, header: CsvHeader, texts: Iterable[bytes], use: Sequence[int], dtype: np.dtype[Any], bad: _BadLines
+) -> Iterator[Rows]:
+    """Yield the rows of each piece of CSV text."""
     number, rows = header.rest_number, 0
     for text in chain((header.rest,), texts):
         text = text.replace(b"\r\n", b"\n")
         if text.strip():
-            part = _parse_regular_lines(text, header, use)
+            part = _parse_regular_lines(text, header, use, dtype)
             if part is None and (samples := NOT_SAMPLES.sub(b"", text)) != text and samples:
-                part = _parse_regular_lines(samples, header, use)
-            part = _parse_line_by_line(text, number, header, use, bad) if part is None else part
+                part = _parse_regular_lines(samples, header, use, dtype)
+            part = _parse_line_by_line(text, number, header, use, dtype, bad) if part is None else part
             rows += len(part)
             if bad.count > MAX_BAD_LINES and 2 * bad.count > rows:
                 raise _too_many_bad_lines(path, bad, rows)
@@ -234,8 +254,8 @@ def _parse_pieces(
         number += text.count(b"\n")
 
 
-def _parse_regular_lines(text: bytes, header: CsvHeader, use: Sequence[int]) -> Floats | None:
-    """Return a float array [lines, used columns], or None if any line is irregular."""
+def _parse_regular_lines(text: bytes, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any]) -> Rows | None:
+    """Return the rows of lines, or None if any line is irregular."""
     if header.separator in DECIMAL_COMMA_SEPARATORS and b"," in text:
         text = text.replace(b",", b".")
     codes = np.frombuffer(text, np.uint8)
@@ -252,37 +272,54 @@ def _parse_regular_lines(text: bytes, header: CsvHeader, use: Sequence[int]) -> 
         return None
     lines = text.decode("utf-8", errors="replace").split("\n")[:-1]
     try:
-        return np.loadtxt(lines, delimiter=header.separator or None, comments=None, usecols=use, ndmin=2)
-    except ValueError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # some versions of NumPy read 1.5 as the integer 1
+            return np.loadtxt(lines, dtype, delimiter=header.separator or None, comments=None, usecols=use, ndmin=1)
+    except (ValueError, DeprecationWarning):
         return None
 
 
-def _parse_line_by_line(text: bytes, number: int, header: CsvHeader, use: Sequence[int], bad: _BadLines) -> Floats:
-    """Return a float array [lines, used columns]. Invalid lines become rows of NaN. Comment lines are skipped."""
-    missing = [np.nan] * len(use)
-    rows: list[list[float]] = []
+def _parse_line_by_line(
+    text: bytes, number: int, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any], bad: _BadLines
+) -> Rows:
+    """Return the rows of lines. Invalid lines become missing values. Comment lines are skipped."""
+    missing = tuple(table.NO_TIME_NS if dtype[i].kind == "i" else np.nan for i in range(len(use)))
+    rows: list[tuple[float, ...]] = []
     for offset, line in enumerate(text.decode("utf-8", errors="replace").split("\n")[:-1]):
         if not line.strip() or line.lstrip().startswith(COMMENT_MARKS):
             continue
         try:
-            rows.append(_parse_sample(line, header, use))
+            rows.append(_parse_sample(line, header, use, dtype))
         except ValueError as error:
             bad.record_bad_line(number + offset, str(error))
             rows.append(missing)
-    return np.array(rows).reshape(len(rows), len(use))
+    return np.array(rows, dtype)
 
 
-def _parse_sample(line: str, header: CsvHeader, use: Sequence[int]) -> list[float]:
+def _parse_sample(line: str, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any]) -> tuple[float, ...]:
     fields = split_fields(line, header.separator)
     if len(fields) != len(header.names):
         raise ValueError(f"{len(fields)} fields where the header has {len(header.names)}")
-    row = []
-    for i in use:
+    row: list[float] = []
+    for column, i in enumerate(use):
         number = parse_number(fields[i], header.separator)
         if number is None:
             raise ValueError(f"{header.names[i]} is {fields[i].strip()[:20]!a}")
-        row.append(number)
-    return row
+        row.append(_whole_time(fields[i], number) if dtype[column].kind == "i" else number)
+    return tuple(row)
+
+
+def _whole_time(field: str, number: float) -> int:
+    """Return an integer time, or NO_TIME_NS if the time is missing or out of range.
+
+    Raise _FractionalTimeError for any other number.
+    """
+    if not abs(number) < -table.NO_TIME_NS:  # also True for NaN
+        return table.NO_TIME_NS
+    try:
+        return int(field)
+    except ValueError:
+        raise _FractionalTimeError from None
 
 
 @contextmanager
@@ -301,7 +338,7 @@ def open_csv_writer(path: Path, names: Sequence[str], use_gzip: bool = False) ->
 
         def append_rows(columns: table.Columns) -> None:
             for start in range(0, columns[names[0]].size, table.BATCH_ROWS):
-                # repr gives the shortest text that converts back to the same float64.
+                # repr gives the shortest text that converts back to the same number.
                 fields = [map(repr, columns[name][start : start + table.BATCH_ROWS].tolist()) for name in names]
                 file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
 

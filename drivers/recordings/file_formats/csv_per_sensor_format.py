@@ -60,7 +60,7 @@ def read_sensor_files(path: Path, options: ReadingOptions) -> table.Table:
     with _open_sources(path) as sources:
         for name in _select(path, sources, options, notes):
             found = convert_to_si(path, read_csv_source(sources[name], options), options)
-            if "t" not in found.columns:
+            if not {"t", table.TIME_NS} & {*found.columns}:
                 raise RecordingError(f"{sources[name].label}: has no times, expected a column such as seconds_elapsed")
             tables[name] = found.columns
             stated |= found.units

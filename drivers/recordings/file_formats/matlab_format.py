@@ -59,7 +59,7 @@ def read_matlab(path: Path, options: ReadingOptions) -> table.Table:
     columns, fs = _load_columns(path, notes)
     names = list(columns)
     layout = find_layout(path, names, options, notes)
-    found = {quantity: columns[names[i]].astype(np.float64) for quantity, i in layout.columns.items()}
+    found = {quantity: table.to_column(quantity, columns[names[i]]) for quantity, i in layout.columns.items()}
     return table.Table(found, fs, notes, layout.units)
 
 

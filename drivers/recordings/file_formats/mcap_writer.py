@@ -1,7 +1,7 @@
 """Writing of recordings to MCAP files with ROS 2 messages of type ``sensor_msgs/Imu``, by the library rosbags.
 
-The header stamps are the times of the samples, rounded to 1 ns. The log times increase strictly, because readers return
-messages in the order of the log times, and a recording may contain equal times and backward steps.
+The header stamps are the times of the samples. Times in s are rounded to 1 ns. The log times increase strictly, because
+readers return messages in the order of the log times, and a recording may contain equal times and backward steps.
 """
 
 import os
@@ -13,18 +13,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from drivers.data_types import AXES, Floats, Ints
+from drivers.data_types import AXES, Ints, times_to_ns
 from drivers.errors import RecordingError
 from drivers.extras import require_extra
 from drivers.recordings import table
-from drivers.recordings.file_formats.ros_bag_format import IMU_TYPE, NOT_PROVIDED, TEMPERATURE_TYPE
+from drivers.recordings.file_formats.ros_message_arrays import IMU_TYPE, NOT_PROVIDED, SECOND_NS, TEMPERATURE_TYPE
 
 IMU_TOPIC: Final = "/imu/data"
 TEMPERATURE_TOPIC: Final = "/imu/temperature"
 FRAME: Final = "imu"
 MAX_TIME_S: Final = (1 << 31) - 1
 """Largest time in s of ``builtin_interfaces/Time``, whose seconds are int32."""
-SECOND_NS: Final = 1_000_000_000
 
 
 @contextmanager
@@ -61,8 +60,9 @@ def open_mcap_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendC
 
             def append_rows(columns: table.Columns) -> None:
                 nonlocal newest_ns
-                stamps = split_times(whole, columns["t"])
-                log_ns = _increasing_times(stamps, newest_ns)
+                t_ns = times_to_ns(columns[table.TIME_NS if table.TIME_NS in columns else "t"])
+                stamps = split_times(whole, t_ns)
+                log_ns = _increasing_times(t_ns, newest_ns)
                 newest_ns = int(log_ns[-1])
                 absent = np.full(len(stamps), np.nan)
                 rows = np.column_stack([columns.get(axis, absent) for axis in AXES]).tolist()
@@ -78,39 +78,35 @@ def open_mcap_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendC
         os.replace(bag / f"{bag.name}.mcap", path)
 
 
-def split_times(path: Path, t_s: Floats) -> Ints:
+def split_times(path: Path, t_ns: Ints) -> Ints:
     """Return times as seconds and nanoseconds of ``builtin_interfaces/Time``, shape [n, 2].
-
-    The whole seconds are split off first, because the product ``t_s * 1e9`` would round Unix times to 256 ns.
 
     Parameters
     ----------
     path
         Path of the file, used in error messages.
-    t_s
-        [n] times in s.
+    t_ns
+        [n] times in ns.
 
     Raises
     ------
     RecordingError
         If a time is negative or too large.
     """
-    outside = t_s[~((t_s >= 0.0) & (t_s <= MAX_TIME_S))]
+    stamps = np.column_stack(np.divmod(t_ns, SECOND_NS))
+    outside = t_ns[(stamps[:, 0] < 0) | (stamps[:, 0] > MAX_TIME_S)]
     if outside.size:
         raise RecordingError(
-            f"{path}: t = {outside[0]:.9g} s cannot be stored in a ROS 2 message, whose times are 0 to {MAX_TIME_S} s; "
-            "write another format"
+            f"{path}: t = {outside[0] / SECOND_NS:.9g} s cannot be stored in a ROS 2 message, whose times are 0 to "
+            f"{MAX_TIME_S} s; write another format"
         )
-    whole_s = np.floor(t_s)
-    nanoseconds = np.rint((t_s - whole_s) * SECOND_NS).astype(np.int64)
-    carried, nanoseconds = np.divmod(nanoseconds, SECOND_NS)
-    return np.column_stack((whole_s.astype(np.int64) + carried, nanoseconds))
+    return stamps
 
 
-def _increasing_times(stamps: Ints, newest_ns: int) -> Ints:
-    """Return strictly increasing times in ns that are at least the stamps and later than ``newest_ns``."""
-    index = np.arange(len(stamps))
-    times_ns: Ints = stamps[:, 0] * SECOND_NS + stamps[:, 1]
+def _increasing_times(t_ns: Ints, newest_ns: int) -> Ints:
+    """Return strictly increasing times in ns that are at least ``t_ns`` and later than ``newest_ns``."""
+    index = np.arange(len(t_ns))
+    times_ns = t_ns.copy()
     times_ns[0] = max(int(times_ns[0]), newest_ns + 1)
     result: Ints = np.maximum.accumulate(times_ns - index) + index
     return result

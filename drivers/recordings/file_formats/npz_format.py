@@ -35,7 +35,6 @@ from drivers.recordings.table_layout import TableLayout, find_layout, is_known_c
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # local file header, PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
-ITEM_DTYPE: Final = np.dtype("<f8")
 NPY_ERRORS: Final = (
     ValueError, TypeError, SyntaxError, EOFError, MemoryError, OverflowError, RuntimeError, TokenError, zlib.error
 )  # fmt: skip
@@ -101,7 +100,7 @@ def read_npz(path: Path, options: ReadingOptions) -> table.Table:
                 _check_columns(path, archive, names, layout)
                 with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
                     columns = {
-                        quantity: _read_array(path, archive, names[i]).astype(np.float64)
+                        quantity: table.to_column(quantity, _read_array(path, archive, names[i]))
                         for quantity, i in layout.columns.items()
                     }
                 return table.Table(columns, _read_fs(path, archive, notes), notes, layout.units)
@@ -256,12 +255,13 @@ def _table_of_recovered(
     for name, key in ((quantity, names[i]) for quantity, i in layout.columns.items()):
         if arrays[key].ndim != 1:
             raise RecordingError(f"{path}: {key} has shape {arrays[key].shape}, expected one dimension")
-        columns[name] = arrays[key].astype(np.float64)
+        columns[name] = table.to_column(name, arrays[key])
     short = next((quantity for quantity, i in layout.columns.items() if names[i] == cut), None)
     if short is not None:
         column = columns[short]
         n = max(other.size for other in columns.values())
-        columns[short] = np.concatenate([column, np.full(n - column.size, np.nan)])
+        rest = np.full(n - column.size, np.nan if column.dtype == np.float64 else table.NO_TIME_NS)
+        columns[short] = np.concatenate([column, rest])
     fs = _single_number(arrays["fs"], notes) if "fs" in arrays else None
     return table.Table(columns, fs, notes, layout.units)
 
@@ -380,7 +380,7 @@ def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendCo
 
         def append_rows(columns: table.Columns) -> None:
             for name, file in collected.items():
-                file.write(np.ascontiguousarray(columns[name]).data)
+                file.write(np.ascontiguousarray(columns[name], table.column_dtype(name)).data)
 
         yield append_rows
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -390,11 +390,12 @@ def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendCo
 
 def _write_array(archive: zipfile.ZipFile, name: str, numbers: IO[bytes]) -> None:
     """Write an array like ``numpy.savez_compressed``, but copy the numbers from a file instead of from memory."""
-    shape = (numbers.tell() // ITEM_DTYPE.itemsize,)
+    dtype = table.column_dtype(name)
+    shape = (numbers.tell() // dtype.itemsize,)
     numbers.seek(0)
     member = zipfile.ZipInfo(f"{name}.npy")  # a constant date, so that equal columns give equal bytes
     member.compress_type = zipfile.ZIP_DEFLATED
     with archive.open(member, "w", force_zip64=True) as file:
-        header = {"descr": ITEM_DTYPE.str, "fortran_order": False, "shape": shape}
+        header = {"descr": dtype.str, "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(cast(Any, file), header)
         shutil.copyfileobj(numbers, file, COPY_BYTES)

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from drivers.data_types import Times
 from drivers.errors import ConfigError, RecordingError
 from drivers.extras import install_command
 from drivers.file_access import open_regular_file
@@ -70,7 +71,7 @@ def read_parquet(path: Path, options: ReadingOptions) -> table.Table:
     notes: list[str] = []
     with _open_parquet(path) as file:
         chosen, units, _ = _check_parquet(path, file, options, notes)
-        return _float_table(path, file.read(columns=list(chosen.values())), chosen, units, notes)
+        return _build_table(path, file.read(columns=list(chosen.values())), chosen, units, notes)
 
 
 def count_parquet_rows(path: Path, options: ReadingOptions) -> int:
@@ -164,7 +165,7 @@ def read_ipc(path: Path, options: ReadingOptions) -> table.Table:
         except (pa.ArrowException, OSError) as error:
             notes.append(f"Only {len(batches)} complete batches could be read: {first_message_line(error)}.")
     schema = batches[0].schema if batches else schema
-    return _float_table(path, pa.Table.from_batches(batches, schema), chosen, units, notes)
+    return _build_table(path, pa.Table.from_batches(batches, schema), chosen, units, notes)
 
 
 def count_ipc_rows(path: Path) -> int:
@@ -240,13 +241,22 @@ def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
             raise RecordingError(f"{path}: {key} contains {type_}, expected numbers{unit}")
 
 
-def _float_table(
+def _build_table(
     path: Path, data: Any, chosen: Mapping[str, str], units: Mapping[str, str], notes: list[str]
 ) -> table.Table:
-    """Return the chosen columns of a pyarrow table as float64 arrays. Null values become NaN."""
-    float64 = import_pyarrow(path).float64()
-    columns = {name: data.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
-    return table.Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes, units)
+    """Return the chosen columns of a pyarrow table. Null values become NaN, or NO_TIME_NS in integer times."""
+    pa = import_pyarrow(path)
+    columns: dict[str, Times] = {}
+    for name, key in chosen.items():
+        column = data.column(key)
+        if name == "t" and pa.types.is_integer(column.type):
+            # The largest number of int64 or uint64 is out of the range of times, like a missing time.
+            whole = column if pa.types.is_uint64(column.type) else column.cast(pa.int64())
+            missing = int(np.iinfo(whole.type.to_pandas_dtype()).max)
+            columns[name] = table.to_column(name, whole.fill_null(missing).to_numpy())
+        else:
+            columns[name] = np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), np.float64)
+    return table.Table(columns, None, notes, units)
 
 
 def first_message_line(error: Exception) -> str:
@@ -260,7 +270,7 @@ def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.Appe
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
-    schema = _float_schema(pa, names)
+    schema = _column_schema(pa, names)
     with parquet.ParquetWriter(path, schema) as file:
         yield lambda columns: file.write_table(pa.table(dict(columns), schema))
 
@@ -269,10 +279,10 @@ def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.Appe
 def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[table.AppendColumns]:
     """Open an Arrow file (Feather version 2) for writing, or an Arrow stream if ``stream`` is True."""
     pa = import_pyarrow(path)
-    schema = _float_schema(pa, names)
+    schema = _column_schema(pa, names)
     with (pa.ipc.new_stream if stream else pa.ipc.new_file)(str(path), schema) as file:
         yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=table.BATCH_ROWS)
 
 
-def _float_schema(pa: Any, names: Sequence[str]) -> Any:
-    return pa.schema([(name, pa.float64()) for name in names])
+def _column_schema(pa: Any, names: Sequence[str]) -> Any:
+    return pa.schema([(name, pa.from_numpy_dtype(table.column_dtype(name))) for name in names])

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from drivers.data_types import AXES, Floats
+from drivers.data_types import AXES, Times
 from drivers.errors import RecordingError, convert_library_errors
 from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
@@ -43,6 +43,8 @@ FIELDS: Final[Mapping[str, Mapping[str, str]]] = {
 """For each topic: the field that contains each column of a recording."""
 TIMES: Final = ("timestamp_sample", "timestamp")
 """Fields that contain the time since the start of the autopilot in µs. The first field is the time of the sample."""
+US_NS: Final = 1000
+"""One microsecond in ns."""
 INTEGRATION_TIMES: Final = {"delta_angle": ("delta_angle_dt", "dt"), "delta_velocity": ("delta_velocity_dt", "dt")}
 """For each integral: the fields that contain the integration time in µs, in new and in old logs."""
 ACCEL_TIME: Final = "accelerometer_timestamp_relative"
@@ -171,11 +173,11 @@ def _list_imus(data: Mapping[str, Any]) -> Sequence[Sequence[str]]:
 # --- messages ------------------------------------------------------------------------------------
 
 
-def _read_columns(data: Any) -> dict[str, Floats]:
-    """Return the columns of a topic in SI units."""
+def _read_columns(data: Any) -> dict[str, Times]:
+    """Return the columns of a topic in SI units, with the times in ns."""
     fields = data.data
     times = next(fields[name] for name in TIMES if name in fields and (name == TIMES[-1] or np.all(fields[name] > 0)))
-    columns = {"t": times * 1e-6}
+    columns: dict[str, Times] = {table.TIME_NS: table.integers_to_ns(times, US_NS)}
     for column in _known_columns(data):
         field = FIELDS[data.name][column]
         with np.errstate(invalid="ignore"):  # a damaged log may contain signalling NaN

@@ -4,8 +4,8 @@ Topics of type ``sensor_msgs/Imu`` contain values in rad/s and m/s². If the fir
 message does not provide the quantity (sensor_msgs/Imu.msg). Topics of type ``sensor_msgs/Temperature`` contain values
 in °C and can be joined to an IMU.
 
-Messages are decoded block by block. The times are the header stamps. If most messages have no header stamp, the times
-of the log are used instead.
+Messages are decoded block by block (``ros_message_arrays``). The times are the header stamps. If most messages have no
+header stamp, the times of the log are used instead.
 """
 
 from collections import defaultdict
@@ -17,25 +17,28 @@ from typing import Any, Final
 
 import numpy as np
 
-from drivers.data_types import AXES, Floats
+from drivers.data_types import AXES, Floats, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
 from drivers.file_access import check_regular_file, open_regular_file
 from drivers.recordings import memory_check, table
-from drivers.recordings.topics import Topic, collect_columns, join_topics, select_topics
+from drivers.recordings.file_formats.ros_message_arrays import (
+    IMU_TYPE,
+    TEMPERATURE_TYPE,
+    decode_messages,
+    iter_message_blocks,
+)
+from drivers.recordings.reading_progress import report_read_share
+from drivers.recordings.topics import Topic, join_topics, select_topics
 
 METADATA: Final = "metadata.yaml"
 """File that identifies a folder as a ROS 2 bag."""
 STORAGE_SUFFIXES: Final = (".db3", ".mcap", ".zstd")
-IMU_TYPE: Final = "sensor_msgs/msg/Imu"
-TEMPERATURE_TYPE: Final = "sensor_msgs/msg/Temperature"
 COLUMNS_OF_TYPES: Final[Mapping[str, tuple[str, ...]]] = {
     IMU_TYPE: AXES,
     TEMPERATURE_TYPE: ("temperature",),
 }
-NOT_PROVIDED: Final = -1.0
-MIN_LOG_S: Final = 1.0
-"""Log time in s from which a stamp of 0 counts as missing. The times of a simulation begin at 0."""
-MISSING: Final = (float("nan"),) * 3
+MIN_LOG_NS: Final = 1_000_000_000
+"""Log time in ns from which a stamp of 0 counts as missing. The times of a simulation begin at 0."""
 MAX_METADATA_BYTES: Final = 4_000_000
 EXPECTED: Final = "messages of type sensor_msgs/Imu"
 REPAIRS: Final[Mapping[str, str]] = {
@@ -71,7 +74,7 @@ def read_ros_bag(path: Path, topic: str | None) -> table.Table:
     with _bag_errors(path), _open_bag(path) as (bag, limit):
         names = bag.select(path, topic, notes)
         limit.check_row_count(sum(one.rows for one in bag.topics if one.name in names))
-        tables = {name: _read_topic(bag, name, limit, notes) for name in names}
+        tables: dict[str, table.Columns] = {name: _read_topic(bag, name, limit, notes) for name in names}
     return table.Table(join_topics(path, tables), None, notes)
 
 
@@ -89,7 +92,7 @@ class _Bag:
     connections: Sequence[Any]
     topics: Sequence[Topic]
     messages: Callable[[Sequence[Any]], Iterable[tuple[Any, int, bytes]]]
-    deserialize: Callable[[bytes, str], Any]
+    cdr: bool  # True for messages of ROS 2, False for messages of ROS 1
 
     def select(self, path: Path, topic: str | None, notes: list[str]) -> list[str]:
         """Return the names of the topics to read."""
@@ -100,8 +103,6 @@ class _Bag:
 @contextmanager
 def _open_bag(path: Path) -> Iterator[tuple[_Bag, memory_check.RecordingSizeLimits]]:
     """Check the files of a bag and open the bag."""
-    from rosbags.typesys import Stores, get_typestore
-
     from drivers.recordings.file_formats import ros_bag_readers as readers
 
     limit = _check_files(path)
@@ -109,13 +110,11 @@ def _open_bag(path: Path) -> Iterator[tuple[_Bag, memory_check.RecordingSizeLimi
     if path.suffix.lower() == ".bag":
         with readers.Ros1Reader(path) as bag1:
             topics = _list_topics(bag1.connections, bag1.count_messages())
-            store = get_typestore(Stores.ROS1_NOETIC)
-            yield _Bag(bag1.connections, topics, bag1.messages, store.deserialize_ros1), limit
+            yield _Bag(bag1.connections, topics, bag1.messages, cdr=False), limit
     else:
         with readers.Ros2Reader(path) as bag2:
             topics = _list_topics(bag2.connections, {one.id: one.msgcount for one in bag2.connections})
-            store = get_typestore(Stores.ROS2_HUMBLE)
-            yield _Bag(bag2.connections, topics, bag2.messages, store.deserialize_cdr), limit
+            yield _Bag(bag2.connections, topics, bag2.messages, cdr=True), limit
 
 
 def _bag_errors(path: Path) -> AbstractContextManager[None]:
@@ -163,26 +162,19 @@ def _check_files(path: Path) -> memory_check.RecordingSizeLimits:
 # --- messages ------------------------------------------------------------------------------------
 
 
-def _read_topic(bag: _Bag, name: str, limit: memory_check.RecordingSizeLimits, notes: list[str]) -> dict[str, Floats]:
-    """Return the columns of a topic. Quantities that no message provides are absent."""
-    connections = [one for one in bag.connections if one.topic == name and one.msgtype in COLUMNS_OF_TYPES]
-    kind = connections[0].msgtype
-    rows = (
-        (log_ns * 1e-9, *_message_numbers(bag.deserialize(data, kind))) for _, log_ns, data in bag.messages(connections)
-    )
-    expected_rows = next(one.rows for one in bag.topics if one.name == name)
-    columns = collect_columns(rows, ("log", "t", *COLUMNS_OF_TYPES[kind]), limit, expected_rows)
-    log_s, stamps = columns.pop("log"), columns["t"]
-    missing = (stamps == 0.0) & (log_s >= MIN_LOG_S)
-    unstamped = int(np.count_nonzero(missing))
-    if 2 * unstamped > stamps.size:
-        what = f"{unstamped} of {stamps.size} messages of {name} have no header stamp"
+def _read_topic(bag: _Bag, name: str, limit: memory_check.RecordingSizeLimits, notes: list[str]) -> dict[str, Times]:
+    """Return the columns of a topic, with the times in ns. Quantities that no message provides are absent."""
+    kind = next(one.message_type for one in bag.topics if one.name == name and one.columns)
+    t_ns, numbers, unstamped = _read_messages(bag, name, kind, limit, use_log_times=False)
+    if 2 * unstamped > t_ns.size:
+        what = f"{unstamped} of {t_ns.size} messages of {name} have no header stamp"
         notes.append(f"{what}; the times of the log are used.")
-        columns["t"] = log_s
-    elif unstamped:
-        columns["t"] = np.where(missing, np.nan, stamps)
+        t_ns, numbers, _ = _read_messages(bag, name, kind, limit, use_log_times=True)
+    columns: dict[str, Times] = {table.TIME_NS: t_ns}
+    columns |= {column: numbers[:, i] for i, column in enumerate(COLUMNS_OF_TYPES[kind])}
     if kind == IMU_TYPE:
-        absent = [axis for axis in AXES if np.isnan(columns[axis]).all()]
+        # The maximum is NaN only if all values are. A mask of all rows would need more memory.
+        absent = [axis for axis in AXES if np.isnan(np.fmax.reduce(columns[axis]))]
         if absent:
             notes.append(f"The messages of {name} do not provide {' '.join(absent)}.")
         for axis in absent:
@@ -190,17 +182,26 @@ def _read_topic(bag: _Bag, name: str, limit: memory_check.RecordingSizeLimits, n
     return columns
 
 
-def _message_numbers(message: Any) -> tuple[float, ...]:
-    """Return the header stamp in s and the values of a message. Values that are not provided are NaN."""
-    stamp = message.header.stamp
-    t_s = stamp.sec + stamp.nanosec * 1e-9
-    if hasattr(message, "temperature"):
-        return t_s, message.temperature
-    gyro, accel = message.angular_velocity, message.linear_acceleration
-    has_gyro = message.angular_velocity_covariance[0] != NOT_PROVIDED
-    has_accel = message.linear_acceleration_covariance[0] != NOT_PROVIDED
-    return (
-        t_s,
-        *((gyro.x, gyro.y, gyro.z) if has_gyro else MISSING),
-        *((accel.x, accel.y, accel.z) if has_accel else MISSING),
-    )
+def _read_messages(
+    bag: _Bag, name: str, kind: str, limit: memory_check.RecordingSizeLimits, use_log_times: bool
+) -> tuple[Ints, Floats, int]:
+    """Return the times [n] in ns, the numbers [n, columns], and the number of messages without a header stamp.
+
+    The arrays are allocated only once, so that the memory above their size does not grow with the length of the bag.
+    """
+    connections = [one for one in bag.connections if one.topic == name and one.msgtype == kind]
+    rows = sum(one.rows for one in bag.topics if one.name == name and one.message_type == kind)
+    t_ns, numbers = np.empty(rows, np.int64), np.empty((rows, len(COLUMNS_OF_TYPES[kind])))
+    end = unstamped = 0
+    for log_times, block in iter_message_blocks(bag.messages(connections)):
+        start, end = end, end + len(block)
+        limit.check_row_count(end)
+        report_read_share(end, rows)
+        if end > len(t_ns):  # the index states too few messages
+            t_ns, numbers = np.resize(t_ns, 2 * end), np.resize(numbers, (2 * end, numbers.shape[1]))
+        stamps_ns, numbers[start:end] = decode_messages(block, kind, bag.cdr)
+        log_ns = np.array(log_times, np.int64)
+        missing = (stamps_ns == 0) & (log_ns >= MIN_LOG_NS)
+        unstamped += int(np.count_nonzero(missing))
+        t_ns[start:end] = log_ns if use_log_times else np.where(missing, table.NO_TIME_NS, stamps_ns)
+    return (t_ns, numbers, unstamped) if end == len(t_ns) else (t_ns[:end], numbers[:end], unstamped)

@@ -56,6 +56,12 @@ BOSCH_SIGNALS = {
     "gy": "Mm7Frame3.PitchRate",
     "az": "Mm7Frame3.AccelerationZ",
 }
+TPDO_SIGNALS = {f"g{c}": f"Tpdo2.Rate{c.upper()}" for c in "xyz"} | {
+    f"a{c}": f"Tpdo1.Acceleration{c.upper()}" for c in "xyz"
+}
+OXTS_SIGNALS = {f"g{c}": f"RateVehicle.AngRate{c.upper()}" for c in "xyz"} | {
+    f"a{c}": f"AccelVehicle.Accel{c.upper()}" for c in "xyz"
+}
 RATE_ID, ACCEL_ID = 0x0CF02AE2 | EXTENDED_ID, 0x0CF02DE2 | EXTENDED_ID
 
 
@@ -140,6 +146,57 @@ def test_bosch_frames_are_decoded() -> None:
     assert forces == pytest.approx([-2.7e-5, 1.0000635, -2.7e-5], abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("file", "signals", "frames", "gyro_deg_s", "accel_m_s2", "temperature_c"),
+    [
+        # 1000 counts of 7/800 deg/s, 1 g = 4096 counts
+        (
+            "sick_tmm61",
+            {**TPDO_SIGNALS, "temperature": "Tpdo1.Temperature"},
+            {0x181: "0000 00F0 0010 E7", 0x281: "E803 18FC 0000"},
+            [8.75, -8.75, 0.0],
+            [0.0, -G0, G0],
+            -25.0,
+        ),
+        (
+            "dis_qg65d",
+            {**TPDO_SIGNALS, "temperature": "Tpdo1.Temperature"},
+            {0x181: "0000 18FC E803 FB00", 0x281: "6400 9CFF 0100"},
+            [1.0, -1.0, 0.01],
+            [0.0, -G0, G0],
+            25.1,
+        ),
+        (
+            "oxts_rt",
+            OXTS_SIGNALS,
+            {0x605: "6400 0000 2BFC", 0x608: "6400 9CFF 0100"},
+            [1, -1, 0.01],
+            [1, 0, -9.81],
+            None,
+        ),
+    ],
+)
+def test_documented_layouts_are_decoded_as_by_cantools(
+    file: str,
+    signals: dict[str, str],
+    frames: dict[int, str],
+    gyro_deg_s: list[float],
+    accel_m_s2: list[float],
+    temperature_c: float | None,
+) -> None:
+    got = concatenate_blocks(build(file, signals).feed([make_chunk(a, data) for a, data in frames.items()]))
+    assert got.values[0, :3] / DEGREE == pytest.approx(gyro_deg_s)
+    assert got.values[0, 3:] == pytest.approx(accel_m_s2)
+    assert got.temperature_c[0] == pytest.approx(np.nan if temperature_c is None else temperature_c, nan_ok=True)
+    database = cantools.database.load_file(SHIPPED / f"{file}.dbc")
+    decoded = {
+        f"{database.get_message_by_frame_id(a).name}.{name}": value
+        for a, data in frames.items()
+        for name, value in database.decode_message(a, bytes.fromhex(data)).items()
+    }
+    assert [decoded[signals[axis]] for axis in AXES[:3]] == pytest.approx(gyro_deg_s)
+
+
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.dbc")), ids=lambda p: p.stem)
 def test_shipped_databases_pass_the_strict_check(path: Path) -> None:
     """No signals overlap, and each signal lies inside its message."""
@@ -217,6 +274,9 @@ CASES: list[tuple[str, dict[str, str], dict[str, Any], list[float]]] = [
     ("xsens_mti", XSENS_SIGNALS, {"counter": "SampleTime.SampleTimeFine", "tick": 1e-4}, [2**-9] * 3 + [2**-8] * 3),
     ("xsens_mti", XSENS_SIGNALS, {"counter": "GroupCounter.Counter", "join": "counter"}, [2**-9] * 3 + [2**-8] * 3),
     ("bosch_mm7", BOSCH_SIGNALS, {}, [0.005 * DEGREE] * 3 + [0.000127465 * G0] * 3),
+    ("sick_tmm61", TPDO_SIGNALS, {}, [7 / 800 * DEGREE] * 3 + [G0 / 4096] * 3),
+    ("dis_qg65d", TPDO_SIGNALS, {}, [0.01 * DEGREE] * 3 + [1e-3 * G0] * 3),
+    ("oxts_rt", OXTS_SIGNALS, {}, [0.01 * DEGREE] * 3 + [0.01] * 3),
 ]
 
 

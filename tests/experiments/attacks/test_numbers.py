@@ -220,6 +220,7 @@ def iter_config_tables() -> Iterator[tuple[str, type[SettingsModel], str]]:
             "can",
             'link = "can"\ndecoder = "dbc"\ndecoder_options = {{ {CAN} }}\n{{}}',
         ),
+        ("iio", 'link = "iio"\ndevice = "0"\nenable = true\n{}'),
         ("replay", 'link = "replay"\npath = "r.npz"\n{}'),
         ("udp", 'link = "udp"\nport = 9\ndecoder = "mavlink"\n{}'),
         ("zenoh", 'link = "zenoh"\nkey = "a/b"\n{}'),

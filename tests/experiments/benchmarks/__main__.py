@@ -10,6 +10,7 @@ RUNS: Final = (
     ("bench_paper", "--budget", "0.05", "--rounds", "1", "--windows", "10000"),
     ("bench_memory", "--rate", "200", "--window", "600"),
     ("bench_simulate", "--rounds", "3", "--memory", "2e6"),
+    ("bench_bag", "--hours", "0.2"),
     ("bench_reconcile", "--rows", "100000"),
     ("bench_decoders",),
     ("bench_imports", "--rounds", "3"),

@@ -129,7 +129,10 @@ WRONG_FILES = {
     ),
     "protocol by number": (DEVICE + 'driver = { link = "virtual", decoder = 3 }\n', "driver.decoder: 3; possible are"),
     "unknown link": (DEVICE + 'driver = { link = "seral" }\n', 'driver.link: "seral"; possible are serial, '),
-    "no link": (DEVICE + "driver = {}\n", "driver.link: missing; possible are can, replay, serial, virtual, zenoh"),
+    "no link": (
+        DEVICE + "driver = {}\n",
+        "driver.link: missing; possible are can, iio, replay, serial, virtual, zenoh",
+    ),
     "no protocol": (
         DEVICE + 'driver = { link = "serial", port = "/dev/x" }\n',
         "driver.decoder: missing; possible are",
@@ -452,7 +455,7 @@ WRONG_ARGUMENTS = {
     "nothing to write": (("simulate", "consumer-mems", "--seconds", "1"), "Missing option '--out'"),
     "unknown suffix": (
         build_simulate_arguments("consumer-mems", "--out", "x.xlsx"),
-        "x.xlsx: the suffix is not that of a recording",
+        "x.xlsx: the suffix is unknown; recordings are written as .csv",
     ),
     "recording in a missing folder": (
         build_simulate_arguments("consumer-mems", "--out", "nowhere/x.csv"),
@@ -1468,7 +1471,7 @@ def test_history_accepts_a_time_range_and_a_step(run_program: RunProgram, histor
         (("{kept}", "--from", "2025-11-22", "--to", "2025-11-21"), 2, "is not after --from"),
         (("{kept}", "--axis", "g"), 2, "possible are gx, gy"),
         (("{kept}", "--plot", "h.pdf"), 2, "ending in .png"),
-        (("{kept}", "--out", "h.xls"), 2, "known are .csv"),
+        (("{kept}", "--out", "h.xls"), 2, "tables are written as .csv"),
         (("{kept}", "--connect", "tcp/127.0.0.1:1"), 2, "not both"),
         ((".",), 2, "history.sqlite: no such file"),
         (("absent.toml",), 2, "no such file"),

@@ -9,18 +9,21 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from scipy.io import savemat
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import WRITABLE, load_samples, save_samples
-from drivers.recordings.file_formats.mcap_writer import split_times
 from drivers.recordings.reading_options import ReadingOptions
 from monitor.commands.convert import BLOCK_ROWS, ConversionRequest, run_conversion
+from monitor.commands.wire_format_decoding import DecoderChoice
 from tests.support import dataflash, ros_bags, ulog
 from tests.support.program import exit_status
 
 N = 1500
 T0_NS = 1_763_700_000_123_456_789
+T_NS = T0_NS + np.arange(N) * 5_000_003
+T_US = 5_000_000 + np.arange(N) * 4001
 
 
 def make_samples(n: int = N, start_s: float = T0_NS * 1e-9) -> tuple[Floats, Floats, Floats]:
@@ -42,18 +45,39 @@ def write_table(folder: Path, suffix: str) -> Path:
 
 def write_ros_bag(folder: Path, kind: str) -> Path:
     _, values, _ = make_samples()
-    t_ns = T0_NS + np.arange(N) * 5_000_003
-    return ros_bags.write_bag(folder, kind, {"/imu": ros_bags.imu_topic(t_ns, values)}, "in")
+    return ros_bags.write_bag(folder, kind, {"/imu": ros_bags.imu_topic(T_NS, values)}, "in")
 
 
 def write_px4_log(folder: Path, _kind: str) -> Path:
     _, values, _ = make_samples()
-    return ulog.write_ulog(folder / "in.ulg", ulog.sensor_combined(5_000_000 + np.arange(N) * 4001, values))
+    return ulog.write_ulog(folder / "in.ulg", ulog.sensor_combined(T_US, values))
 
 
 def write_ardupilot_log(folder: Path, _kind: str) -> Path:
     _, values, _ = make_samples()
-    return dataflash.write_dataflash(folder / "in.bin", dataflash.imu(5_000_000 + np.arange(N) * 4001, values))
+    return dataflash.write_dataflash(folder / "in.bin", dataflash.imu(T_US, values))
+
+
+def write_table_in_ns(folder: Path, kind: str) -> Path:
+    _, values, temperature_c = make_samples()
+    path = folder / f"in{kind.split(maxsplit=1)[0]}"
+    save_samples(path, T_NS, values, temperature_c)
+    return path
+
+
+def write_euroc_csv(folder: Path, _kind: str) -> Path:
+    _, values, _ = make_samples()
+    header = "#timestamp [ns]," + ",".join(f"{kind}_RS_S_{axis}" for kind in "wa" for axis in "xyz")
+    rows = (f"{t},{','.join(map(repr, row))}" for t, row in zip(T_NS.tolist(), values.tolist(), strict=True))
+    path = folder / "in.csv"
+    path.write_text("\n".join((header, *rows, "")))
+    return path
+
+
+def write_matlab_file(folder: Path, _kind: str) -> Path:
+    _, values, _ = make_samples()
+    savemat(folder / "in.mat", {"t_ns": T_NS, "gyro": values[:, :3], "acc": values[:, 3:]})
+    return folder / "in.mat"
 
 
 SOURCES: dict[str, Callable[[Path, str], Path]] = {
@@ -61,19 +85,23 @@ SOURCES: dict[str, Callable[[Path, str], Path]] = {
     **dict.fromkeys(ros_bags.KINDS, write_ros_bag),
     ".ulg": write_px4_log,
     ".bin": write_ardupilot_log,
+    **{f"{suffix} in ns": write_table_in_ns for suffix in WRITABLE},
+    "EuRoC": write_euroc_csv,
+    ".mat": write_matlab_file,
 }
+IN_SECONDS = set(WRITABLE) - {".mcap"}
+"""Sources that contain times in s."""
 
 
 def assert_equal_recordings(found: Any, expected: Any, mcap: bool) -> None:
     assert found.axes == expected.axes
     np.testing.assert_array_equal(found.values, expected.values)
     if not mcap:
-        assert found.t_s.tobytes() == expected.t_s.tobytes()
+        assert found.times.dtype == expected.times.dtype
+        assert found.times.tobytes() == expected.times.tobytes()
         np.testing.assert_array_equal(found.temperature_c, expected.temperature_c)
-    elif expected.t_s[0] > 1e9:  # the resolution of Unix times in float64 is coarser than 1 ns
-        assert found.t_s.tobytes() == expected.t_s.tobytes()
     else:
-        assert np.abs(found.t_s - expected.t_s).max() <= 0.5e-9 + np.spacing(expected.t_s.max())
+        assert found.times.tolist() == expected.t_ns.tolist()
 
 
 @pytest.mark.parametrize("target", WRITABLE)
@@ -83,6 +111,9 @@ def test_every_format_is_converted_without_loss(tmp_path: Path, source: str, tar
     expected = run_conversion(ConversionRequest(path, out))
     assert_equal_recordings(load_samples(out), expected, target == ".mcap")
     assert len(expected) == N
+    if source not in IN_SECONDS:
+        stamps = 1000 * T_US if source in (".ulg", ".bin") else expected.t_ns if source == ".mcap" else T_NS
+        assert load_samples(out).times.tolist() == stamps.tolist()
     assert {one.name for one in tmp_path.iterdir()} == {path.name, out.name}  # no temporary files remain
 
 
@@ -128,7 +159,7 @@ def test_temperature_of_mcap_is_joined_by_topic(tmp_path: Path) -> None:
     both = ReadingOptions(topic="/imu/data+/imu/temperature")
     found = run_conversion(ConversionRequest(tmp_path / "a.mcap", tmp_path / "b.csv", reading=both))
     np.testing.assert_array_equal(found.temperature_c, expected.temperature_c)
-    assert_equal_recordings(load_samples(tmp_path / "b.csv"), expected, mcap=False)
+    assert_equal_recordings(load_samples(tmp_path / "b.csv"), found, mcap=False)
 
 
 def test_axes_and_temperature_without_values_are_left_out(tmp_path: Path) -> None:
@@ -138,6 +169,25 @@ def test_axes_and_temperature_without_values_are_left_out(tmp_path: Path) -> Non
     for suffix in WRITABLE:
         run_conversion(ConversionRequest(tmp_path / "in.csv", tmp_path / f"out{suffix}"))
         assert load_samples(tmp_path / f"out{suffix}").axes == ("gz",)
+
+
+def test_a_stamp_survives_every_format_in_turn(tmp_path: Path) -> None:
+    t_ns = np.array([1_700_000_000_123_456_789, 1_700_000_000_123_456_790, 1_700_000_000_128_456_788])
+    path = write_table_in_ns(tmp_path, ".csv")
+    save_samples(path, t_ns, np.ones((3, 6)))
+    for i, suffix in enumerate((*WRITABLE, *reversed(WRITABLE))):
+        run_conversion(ConversionRequest(path, tmp_path / f"{i}{suffix}"))
+        path = tmp_path / f"{i}{suffix}"
+        assert load_samples(path).times.tolist() == t_ns.tolist()
+
+
+def test_decoded_samples_keep_their_nanoseconds(tmp_path: Path) -> None:
+    (tmp_path / "in.txt").write_text("".join(f"{i},{i},{i}\n" for i in range(7)))
+    choice = DecoderChoice("text", {"columns": ["gx", "gy", "gz"]})
+    run_conversion(ConversionRequest(tmp_path / "in.txt", tmp_path / "out.csv", rate_hz=3.0, decoder=choice))
+    times = load_samples(tmp_path / "out.csv").times
+    assert times is not None
+    assert times.tolist() == [round(i * 1e9 / 3.0) for i in range(6)]  # the first line may be incomplete
 
 
 def test_rate_replaces_missing_times(tmp_path: Path) -> None:
@@ -166,10 +216,6 @@ def test_times_beyond_the_range_of_ros_are_refused(tmp_path: Path, t_s: float) -
     assert os.listdir(tmp_path) == ["in.csv"]
 
 
-def test_nanoseconds_carry_into_the_next_second() -> None:
-    assert split_times(Path(), np.array([np.nextafter(7.0, 0.0), 7.25])).tolist() == [[7, 0], [7, 250_000_000]]
-
-
 def test_recording_is_not_overwritten_by_itself(tmp_path: Path) -> None:
     save_samples(tmp_path / "in.csv", *make_samples())
     before = (tmp_path / "in.csv").read_bytes()
@@ -189,6 +235,10 @@ def test_command_prints_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ]
     assert exit_status("convert", tmp_path / "in.csv", tmp_path / "out.ulg") == 2
     assert capsys.readouterr().err == (
-        f"imu-monitor: {tmp_path / 'out.ulg'}: this format is only read; recordings are written as "
+        f"imu-monitor: {tmp_path / 'out.ulg'}: this format is not written; recordings are written as "
         f"{' '.join(WRITABLE)}\n"
+    )
+    assert exit_status("convert", tmp_path / "in.csv", tmp_path / "out.xls") == 2
+    assert capsys.readouterr().err == (
+        f"imu-monitor: {tmp_path / 'out.xls'}: the suffix is unknown; recordings are written as {' '.join(WRITABLE)}\n"
     )

@@ -36,6 +36,7 @@ from monitor.daemon.storage.recorder import segment_metadata
 from monitor.noise.model_loading import read_model
 from monitor.settings import loading
 from monitor.settings.loading import Storage
+from tests.support.fake_iio_device import FakeIioDevice
 from tests.support.waiting import PATIENCE_S
 
 QUIET = '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
@@ -209,6 +210,28 @@ def test_missing_package_of_a_can_interface_is_named(monkeypatch: pytest.MonkeyP
     found = doctor.check_can_interface("device a", "udp_multicast", "239.74.163.2")
     assert (found.mark, found.text) == ("wrong", "CAN interface udp_multicast needs the package msgpack")
     assert found.do == install_command("imu-monitor[multicast]")
+
+
+def test_iio_device_and_its_permissions_are_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = FakeIioDevice(tmp_path, "bmi160", {"in_timestamp": "le:s64/64>>0"})
+    user = pwd.getpwuid(os.geteuid()).pw_name
+
+    def check(name: str, enable: bool) -> tuple[str, str]:
+        found = doctor.check_iio_device("device a", name, enable, tmp_path)
+        return found.mark, found.text
+
+    good = f"{device.node}: exists, and {user} has the necessary permissions"
+    assert check("bmi160", True) == ("well", good)
+    assert check("bmi160", False) == ("doubt", f"{device.node}: its buffer is not enabled")
+    (device.folder / "buffer/enable").write_text("1\n")
+    assert check("bmi160", False) == ("well", good)
+    assert check("bmi270", False)[0] == "wrong"
+    enabled = device.folder / "buffer/enable"
+    monkeypatch.setattr(os, "access", lambda path, mode: path != enabled)  # root may write every file
+    assert check("bmi160", True) == ("wrong", f"{enabled}: {user} cannot write it, as enable = true needs")
+    monkeypatch.setattr(os, "access", lambda path, mode: path != device.node)
+    assert check("bmi160", True) == ("wrong", f"{device.node}: does not exist, or {user} cannot read it")
+    device.unplug()
 
 
 # --- outputs

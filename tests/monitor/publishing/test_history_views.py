@@ -150,7 +150,7 @@ def read_file(path: Path, suffix: str) -> dict[str, np.ndarray]:
 
 
 def test_unknown_suffix_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"known are \.csv"):
+    with pytest.raises(ConfigError, match=r"tables are written as \.csv"):
         history_file.save_history(make_history(), tmp_path / "h.doc")
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, make_block
-from drivers.decoders.base import MAX_FRAMES_WITHOUT_SAMPLE
-from drivers.decoders.binary_frames.microstrain_mip import Settings, build, encode_packet, fletcher_checksum
+from drivers.decoders.base import MAX_FRAMES_WITHOUT_SAMPLE, fletcher_checksum
+from drivers.decoders.binary_frames.microstrain_mip import Settings, build, encode_packet
 from drivers.units import G0
 
 MANUAL = bytes.fromhex("75 65 80 0E 0E 04 3E 7A 63 A0 BB 8E 3B 29 7F E5 BF 7F 84 EE")

@@ -23,6 +23,7 @@ from drivers.decoders.base import Decoder
 from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
+from drivers.decoders.messages.iio import AXIS_CHANNELS
 from drivers.decoders.text_lines.text import Settings as TextSettings
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
@@ -369,6 +370,42 @@ def _ros2_seeds() -> Iterator[bytes]:
         yield b"\1" + b"".join(b"\0" + bytes([202]) + chunk.data.ljust(328, b"\0") + b"\0" for chunk in chunks)
 
 
+def check_iio(data: bytes) -> None:
+    """Check scans with valid and invalid layouts."""
+    reader = InputReader(data)
+    rate = reader.choose(RATES_HZ)
+    chunks = []
+    while reader and len(chunks) < 20:
+        kinds = (
+            "le:s16/16>>0",
+            "be:s32/32>>0",
+            "le:u12/16>>4",
+            "be:s8/8X3>>0",
+            "le:s16/16>>1",
+            reader.read_piece()[:9],
+        )
+        elements = [
+            {
+                "channel": reader.choose((*AXIS_CHANNELS, "in_temp", "in_other")),
+                "type": str(reader.choose(kinds)),
+                "scale": reader.choose((1, -1e-3, 1e15, 1e300)),
+                "offset": reader.choose((0, 1e15, -5)),
+            }
+            for _ in range(reader.read_byte() % 9)
+        ]
+        elements += [{"channel": "in_timestamp", "type": "le:s64/64>>0"}] * (reader.read_byte() % 2)
+        layout = {"clock": "realtime", "elements": elements}
+        attachment = msgspec.json.encode(layout) if reader.read_byte() % 4 else reader.read_piece()
+        chunks.append(Chunk(reader.read_piece().ljust(8 * (reader.read_byte() % 9), b"\1"), 5, attachment=attachment))
+    _check_independence_of_chunks(lambda: _build_decoder("iio"), chunks, rate)
+
+
+def _iio_seeds() -> Iterator[bytes]:
+    rng = np.random.default_rng(5)
+    for n in (100, 400, 1000):
+        yield rng.bytes(n)
+
+
 def check_samples(data: bytes) -> None:
     """Check messages of other monitors, as raw bytes or built from fields."""
     reader = InputReader(data)
@@ -459,11 +496,12 @@ def wire_text_pattern(data: bytes) -> None:
 
 target("wire-text-pattern", (b"\n1 g=0.5 a=-9.8 T20\r\n2,,nan\n3 1 2\nx\n",), 250, WORDS["text"])(wire_text_pattern)
 target("wire-dbc", lambda: [bytes([i, *range(100)]) for i in range(len(CAN))], 100)(wire_dbc)
-for _name in ("ros2_imu", "samples"):
+for _name in ("iio", "ros2_imu", "samples"):
     target(f"wire-{_name}", partial(_message_seeds, _name), 512)(make_message_check(_name))
 
 NON_STREAM_TARGETS: Final = {
     "dbc": (check_dbc, _can_seeds),
+    "iio": (check_iio, _iio_seeds),
     "ros2_imu": (check_ros2, _ros2_seeds),
     "samples": (check_samples, _samples_seeds),
 }
