@@ -7,6 +7,7 @@ does not contain the axis. The samples of a decoder must be a subsequence of the
 """
 
 import math
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -342,6 +343,10 @@ def _text_wrap(data: bytes, settings: Settings) -> bytes:
     return b"$%b*%02X\r\n" % (body, compute_xor(body))
 
 
+def _split_text(body: bytes) -> list[bytes]:
+    return [word.strip() for word in body.replace(b";", b",").replace(b"\t", b",").split(b",")]
+
+
 def _text_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
     """Return the readings of sentences with a checksum, in SI units."""
     axes = ("gx", "gy", "gz", "ax", "ay", "az")
@@ -351,7 +356,13 @@ def _text_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
         body = body.rpartition(b"$")[2]
         try:
             is_valid = star and len(stated) == 2 and int(stated, 16) == compute_xor(body)
-            words = [word.strip() for word in body.replace(b";", b",").replace(b"\t", b",").split(b",")]
+            words = _split_text(body)
+            if len(words) != len(columns):
+                words = _split_text(re.sub(rb"[ \t]*:[ \t]*", b":", body))
+            labelled = [word.rpartition(b":") for word in words]
+            if any(colon and not re.search(rb"[A-Za-z]", label) for label, colon, _ in labelled):
+                continue
+            words = [word.strip() for _, _, word in labelled]
             numbers = dict(zip(columns, [float(word) if word else math.nan for word in words], strict=True))
         except ValueError:
             continue
