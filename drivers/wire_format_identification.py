@@ -16,6 +16,7 @@ import numpy as np
 from drivers import decoders, module_lookup
 from drivers.data_types import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from drivers.decoders.base import Decoder
+from drivers.decoders.text_lines.text.settings import COLUMNS as TEXT_COLUMNS
 from drivers.errors import ConfigError
 from drivers.settings_model import SettingsModel
 
@@ -127,21 +128,26 @@ def _identify_text_lines(data: bytes) -> IdentifiedFormat | None:
     lines = [line.strip() for line in data.split(b"\n")[1:-1]]
     texts = [line.decode("ascii") for line in lines if line and line.isascii()]
     for delimiter in DELIMITERS:
-        counts = Counter(_count_numbers(text, delimiter) for text in texts)
-        columns, matching = counts.most_common(1)[0] if counts else (0, 0)
-        if columns >= MIN_TEXT_COLUMNS and matching >= max(MIN_SAMPLES, MIN_MATCHING_LINES * len(lines)):
-            example = next(text for text in texts if _count_numbers(text, delimiter) == columns)
+        layouts = Counter(_read_labels(text, delimiter) for text in texts)
+        labels, matching = layouts.most_common(1)[0] if layouts else ((), 0)
+        if len(labels) >= MIN_TEXT_COLUMNS and matching >= max(MIN_SAMPLES, MIN_MATCHING_LINES * len(lines)):
+            example = next(text for text in texts if _read_labels(text, delimiter) == labels)
+            columns = [label if label in TEXT_COLUMNS else UNKNOWN for label in labels]
             nmea = {"nmea": True} if NMEA_SENTENCE.fullmatch(example) else {}
-            return IdentifiedFormat(TEXT_DECODER, {"columns": [UNKNOWN] * columns, **nmea}, matching, text_line=example)
+            return IdentifiedFormat(TEXT_DECODER, {"columns": columns, **nmea}, matching, text_line=example)
     return None
 
 
-def _count_numbers(text: str, delimiter: str) -> int:
-    """Return the number of fields of a line, or 0 if a field is not a number."""
+def _read_labels(text: str, delimiter: str) -> tuple[str, ...]:
+    """Return the label of each number in a line, "" for a number without a label, or () if a field is not a number."""
     sentence = NMEA_SENTENCE.fullmatch(text)
     fields = (sentence[1] if sentence else text).split(None if delimiter == " " else delimiter)
-    try:
-        list(map(float, fields))
-    except ValueError:
-        return 0
-    return len(fields)
+    labels = []
+    for one in fields:
+        label, _, number = one.rpartition(":")
+        try:
+            float(number)
+        except ValueError:
+            return ()
+        labels.append(label.strip())
+    return tuple(labels)

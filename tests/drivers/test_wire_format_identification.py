@@ -92,6 +92,12 @@ def test_lines_of_numbers_are_identified_as_text(line: str, columns: int) -> Non
     assert (found.decoder, found.options, found.text_line) == (TEXT_DECODER, {"columns": ["?"] * columns}, line)
 
 
+def test_labels_of_text_lines_name_the_columns() -> None:
+    found = identify_wire_format(b"gx:0.01,gy:-0.02,az:9.81,light:3\r\n" * 20)
+    assert found is not None
+    assert (found.decoder, found.options) == (TEXT_DECODER, {"columns": ["gx", "gy", "az", "?"]})
+
+
 @pytest.mark.parametrize("text", ["starting\nready\n" * 20, "1,2\n" * 20, "1,2,3\n" * MIN_SAMPLES])
 def test_other_text_is_not_identified(text: str) -> None:
     assert identify_wire_format(text.encode()) is None
