@@ -155,8 +155,9 @@ def to_svg_element(figure: "Figure", description: str) -> str:
 
     text = io.StringIO()
     figure.set_dpi(RASTER_DPI)
+    canvas: Any = FigureCanvasSVG(figure)
     # savefig would draw the figure twice
-    FigureCanvasSVG(figure).print_svg(text, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    canvas.print_svg(text, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     element = text.getvalue()[text.getvalue().index("<svg") :]
     element = re.sub(r' (?:width|height)="[\d.]+pt"', "", element, count=2)
     element = element.replace("<svg", f'<svg role="img" aria-label="{html.escape(description)}"', 1)

@@ -133,9 +133,24 @@ def transform_blocks(z: Complexes, rate_hz: float, length: int) -> BlockSpectra:
     return BlockSpectra(length, rate_hz, offsets_hz, transforms, np.abs(transforms))
 
 
-def block_log_likelihood(blocks: BlockSpectra, parameters: WanderingLineParameters) -> float:
-    """Return the log-likelihood of a wandering line whose frequency is constant in each block."""
-    return _filter_blocks(blocks, parameters).log_likelihood
+class BlockEmission(NamedTuple):
+    """Likelihood of each block of a series, as a function of the frequency of the line in this block."""
+
+    blocks: BlockSpectra
+    relative: Floats  # [b, k] likelihood relative to the most likely frequency
+    log_scale: float  # sum of the log-likelihoods of the most likely frequencies
+
+
+def compute_block_emission(blocks: BlockSpectra, power: float) -> BlockEmission:
+    """Compute the likelihood of each block for a line of the given power.
+
+    The average over the unknown phase is I₀(2A|Z|) exp(−A² length) with the amplitude A and the Fourier transform Z.
+    """
+    argument = 2.0 * sqrt(power) * blocks.magnitudes
+    largest = argument.max(axis=1, keepdims=True)
+    scaled = i0e(largest)
+    relative = np.exp(argument - largest) * _interpolate_scaled_bessel(argument, SCALED_BESSEL) / scaled
+    return BlockEmission(blocks, relative, float((np.log(scaled) + largest - blocks.length * power).sum()))
 
 
 def possible_block_lengths(size: int) -> list[int]:
@@ -162,10 +177,11 @@ def phase_log_likelihood(
     return _smooth_phase(z, phase, _phase_model(rate_hz, parameters), np.zeros((z.size, 2)), PHASE_ITERATIONS)
 
 
-def track_phase(blocks: BlockSpectra, size: int, parameters: WanderingLineParameters) -> Floats:
+def track_phase(filtered: "FilteredBlocks", size: int) -> Floats:
     """Return the phase of a wandering line, shape (size,), from the most likely frequency and phase of each block."""
+    blocks = filtered.emission.blocks
     rate_hz, length = blocks.rate_hz, blocks.length
-    at = _smoothed_states(*_filter_blocks(blocks, parameters)[1:])
+    at = _smoothed_states(filtered.forward, filtered.transition, filtered.emission.relative)
     k = np.arange(at.size)
     offset_hz = blocks.offsets_hz[at]
     centre_s = (k * length + 0.5 * (length - 1)) / rate_hz
@@ -203,50 +219,61 @@ def draw_line(z: Complexes, rate_hz: float, parameters: WanderingLineParameters,
     lengths = possible_block_lengths(z.size)
     if not lengths or not parameters.power > 0.0:
         return np.zeros_like(z)
-    blocks = max(
-        (transform_blocks(z, rate_hz, length) for length in lengths),
-        key=lambda one: block_log_likelihood(one, parameters),
+    filtered = max(
+        (_transform_and_filter_blocks(z, rate_hz, length, parameters) for length in lengths),
+        key=lambda one: one.log_likelihood,
     )
-    tracked, phase = phase_log_likelihood(z, rate_hz, track_phase(blocks, z.size, parameters), parameters)
-    if tracked > block_log_likelihood(blocks, parameters):
+    tracked, phase = phase_log_likelihood(z, rate_hz, track_phase(filtered, z.size), parameters)
+    if tracked > filtered.log_likelihood:
         draws = rng.standard_normal((z.size, 2))
         _, phase = _smooth_phase(z, phase, _phase_model(rate_hz, parameters), draws, 1)
         return np.asarray(sqrt(parameters.power) * np.exp(1j * phase))
-    padded = np.concatenate([z, np.zeros(-z.size % blocks.length)])
-    blocks = transform_blocks(padded, rate_hz, blocks.length)
-    filtered = _filter_blocks(blocks, parameters)
+    length = filtered.emission.blocks.length
+    padded = np.concatenate([z, np.zeros(-z.size % length)])
+    filtered = _transform_and_filter_blocks(padded, rate_hz, length, parameters)
+    blocks = filtered.emission.blocks
     at = _draw_states(filtered.forward, filtered.transition, np.asarray(rng.random(filtered.forward.shape[0])))
     found = blocks.transforms[np.arange(at.size), at]
     theta = rng.vonmises(np.angle(found), 2.0 * sqrt(parameters.power) * np.abs(found))
-    turns = blocks.offsets_hz[at][:, None] * np.arange(blocks.length) / rate_hz
+    turns = blocks.offsets_hz[at][:, None] * np.arange(length) / rate_hz
     line = sqrt(parameters.power) * np.exp(1j * (theta[:, None] + 2.0 * pi * turns))
     return np.asarray(line.ravel()[: z.size])
 
 
-class _FilteredBlocks(NamedTuple):
+class FilteredBlocks(NamedTuple):
     """Hidden Markov model of the frequency in blocks of z."""
 
     log_likelihood: float
-    forward: Floats  # [b, k] probability of the frequency given this block and all earlier blocks
+    emission: BlockEmission
     transition: Floats  # [k, k] probability of each change of the frequency
-    emission: Floats  # [b, k] likelihood of each block, relative to the most likely frequency
+    forward: Floats  # [b, k] probability of the frequency given this block and all earlier blocks
 
 
-def _filter_blocks(blocks: BlockSpectra, parameters: WanderingLineParameters) -> _FilteredBlocks:
-    """Run the forward algorithm. The likelihood of a block is averaged over the phase, which gives I₀(2A|Z|)."""
-    argument, offsets_hz = 2.0 * sqrt(parameters.power) * blocks.magnitudes, blocks.offsets_hz
-    largest = argument.max(axis=1, keepdims=True)
-    scaled = i0e(largest)
-    emission = np.exp(argument - largest) * _interpolate_scaled_bessel(argument, SCALED_BESSEL) / scaled
-    log_emission = np.log(scaled) + largest - blocks.length * parameters.power
+def _transform_and_filter_blocks(
+    z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters
+) -> FilteredBlocks:
+    return filter_blocks(compute_block_emission(transform_blocks(z, rate_hz, length), parameters.power), parameters)
+
+
+def filter_blocks(emission: BlockEmission, parameters: WanderingLineParameters) -> FilteredBlocks:
+    """Run the forward algorithm for a wandering line whose frequency is constant in each block.
+
+    Parameters
+    ----------
+    emission : BlockEmission
+        Likelihood of each block for the power of the line.
+    parameters : WanderingLineParameters
+        Parameters of the line.
+    """
+    blocks, offsets_hz = emission.blocks, emission.blocks.offsets_hz
     decay = float(np.exp(-blocks.length / blocks.rate_hz / parameters.time_s))
     from_centre = offsets_hz - parameters.centre_hz
     rounding = (offsets_hz[1] - offsets_hz[0]) ** 2 / 6.0  # of two frequencies to the grid
     variance = parameters.deviation_hz**2
     transition = _normalised(from_centre - decay * from_centre[:, None], variance * (1.0 - decay**2) + rounding)
     first = _normalised(from_centre[None, :], variance + rounding)[0]
-    value, forward = _forward(emission, transition, first)
-    return _FilteredBlocks(value + float(log_emission.sum()), forward, transition, emission)
+    value, forward = _forward(emission.relative, transition, first)
+    return FilteredBlocks(value + emission.log_scale, emission, transition, forward)
 
 
 @compiled
