@@ -147,18 +147,14 @@ def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Flo
 
     A small ridge term allows collinear regressors.
     """
-    q, m = cross.shape
+    q = cross.shape[0]
+    weight = 1.0 / variance
     normal = np.zeros((q, q))
     right = np.zeros(q)
     for i in range(q):
-        for b in range(m):
-            right[i] += cross[i, b] / variance[b]
+        right[i] = np.dot(cross[i], weight)
         for j in range(i + 1):
-            total = 0.0
-            for b in range(m):
-                total += gram[i, j, b] / variance[b]
-            normal[i, j] = total
-            normal[j, i] = total
+            normal[i, j] = normal[j, i] = np.dot(gram[i, j], weight)
     scaled = np.zeros((q, q))
     scale = np.zeros(q)
     for i in range(q):
@@ -174,14 +170,13 @@ def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Flo
 def _residual(power: Floats, cross: Floats, gram: Floats, beta: Floats) -> Floats:
     q, m = cross.shape
     left = power.copy()
-    for b in range(m):
-        for i in range(q):
+    for i in range(q):
+        for b in range(m):
             left[b] -= 2.0 * beta[i] * cross[i, b]
-            for j in range(q):
+        for j in range(q):
+            for b in range(m):
                 left[b] += beta[i] * beta[j] * gram[i, j, b]
-        if left[b] < 0.0:
-            left[b] = 0.0  # negative only by rounding
-    return left
+    return np.maximum(left, 0.0)  # negative only by rounding
 
 
 @compiled
