@@ -43,6 +43,7 @@ MIN_DETAIL_SHARE: Final = 0.01  # smallest extension of a detail plot, as a shar
 MIN_DETAIL_POINTS: Final = 8
 ROW_INCHES: Final = 0.21  # height of one row of a gap chart or an interval chart
 ROWS_WIDTH_INCHES: Final = 5.6
+NAME_CHARACTER_INCHES: Final = 0.08  # width of a character in the name of a row
 ALLAN_INCHES: Final = (5.6, 3.5)  # size of an Allan deviation before and after the search
 MARK_SHARE: Final = 0.1  # height of the labels above the curves, as a share of the height of the curves
 MAX_NAME_LENGTH: Final = 32
@@ -414,9 +415,13 @@ def interval_chart_svg(
 
 
 def _create_row_panel(names: Sequence[str], x_label: str) -> "tuple[Figure, Axes]":
-    figure = style.create_figure(ROWS_WIDTH_INCHES, 0.75 + ROW_INCHES * len(names))
-    panel = figure.subplots()
+    height = 0.75 + ROW_INCHES * len(names)
     short = [name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…" for name in names]
+    left = NAME_CHARACTER_INCHES * max(map(len, short), default=0) + MARGINS_INCHES[1]
+    _, right, top, bottom = MARGINS_INCHES
+    figure = style.create_figure(ROWS_WIDTH_INCHES, height, layout=None)
+    size = (1.0 - (left + right) / ROWS_WIDTH_INCHES, 1.0 - (top + bottom) / height)
+    panel = figure.add_axes((left / ROWS_WIDTH_INCHES, bottom / height, *size))
     panel.set_yticks(range(len(names)), short)
     panel.set_ylim(len(names) - 0.4, -0.6)
     panel.set_xlabel(x_label)

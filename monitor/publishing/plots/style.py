@@ -152,8 +152,13 @@ def to_svg_element(figure: "Figure", description: str) -> str:
     description
                 Text alternative for people who cannot see the figure.
     """
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     text = io.StringIO()
-    figure.savefig(text, format="svg", dpi=RASTER_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    figure.set_dpi(RASTER_DPI)
+    canvas: Any = FigureCanvasSVG(figure)
+    # savefig would draw the figure twice
+    canvas.print_svg(text, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     element = text.getvalue()[text.getvalue().index("<svg") :]
     element = re.sub(r' (?:width|height)="[\d.]+pt"', "", element, count=2)
     element = element.replace("<svg", f'<svg role="img" aria-label="{html.escape(description)}"', 1)

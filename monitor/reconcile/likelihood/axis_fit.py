@@ -54,8 +54,8 @@ MIN_STOP_BAND_FRACTION: Final = 0.02
 """Lowest frequency of a stop band, as a fraction of the sample rate.
 """
 MAX_CACHE_BYTES: Final = 1 << 26
-MIN_CACHED_SERIES: Final = 8
-"""Smallest number of cached series that are not smooth."""
+MIN_CACHED_EFFECTS: Final = 8
+"""Smallest number of cached effects that are not smooth. An effect has one or two series of 8 bytes per sample."""
 MAX_CACHED_SMOOTH_SERIES: Final = 128
 SMOOTH_EFFECTS: Final = (RateRamp, BiasCurve, TemperatureBias, TemperatureLag, TurnOnTransient)
 """Deterministic effects that change slowly unless they have a short time constant."""
@@ -106,7 +106,7 @@ class RegressorCache:
         self._min_time_constant_s = MIN_BLOCKS_PER_TIME_CONSTANT * size / MAX_SMOOTH_COEFFICIENTS / rate_hz
         self.step_power = 0.25 / size / np.sin(0.5 * np.pi * np.arange(1, size) / size) ** 2
         """Mean square of each coefficient of a unit step over all step times, shape (n − 1,)."""
-        self._transform = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * size)))(compute_transforms)
+        self._transform = lru_cache(max(MIN_CACHED_EFFECTS, MAX_CACHE_BYTES // (16 * size)))(compute_transforms)
         self._transform_smooth = lru_cache(MAX_CACHED_SMOOTH_SERIES)(compute_smooth_transforms)
 
     def restrict_to_part(self, part: slice) -> "RegressorCache":

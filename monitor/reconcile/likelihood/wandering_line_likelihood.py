@@ -34,6 +34,11 @@ INITIAL_PHASE_VARIANCE: Final = 100.0
 MIN_CURVATURE: Final = 1e-12
 """Smallest curvature of the log-likelihood of one sample with respect to the phase, to avoid a division by zero."""
 MIN_PROBABILITY: Final = 1e-300
+BESSEL_GRID: Final = np.linspace(0.0, 1.0, 4097)[:-1]
+SCALED_BESSEL: Final = np.append(
+    i0e(BESSEL_GRID / (1.0 - BESSEL_GRID)) / np.sqrt(1.0 - BESSEL_GRID), 1.0 / sqrt(2.0 * pi)
+)
+"""Table of I₀(x) exp(−x) √(1 + x) at equally spaced values of x/(1 + x) from 0 to 1."""
 MIN_TANH_ARGUMENT: Final = 0.01
 """Smallest ratio x of sample interval and correlation time for which 2x − 4 tanh(x/2) is computed without a series."""
 
@@ -101,9 +106,51 @@ def expand_band(band: FrequencyBand, z: Complexes, n: int) -> Floats:
     return np.asarray(np.fft.irfft(transform, n))
 
 
-def block_log_likelihood(z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters) -> float:
-    """Return the log-likelihood of a wandering line whose frequency is constant in blocks of ``length`` samples."""
-    return _filter_blocks(z, rate_hz, length, parameters).log_likelihood
+class BlockSpectra(NamedTuple):
+    """Fourier transforms of the blocks of a series in a band."""
+
+    length: int  # samples in a block
+    rate_hz: float  # sample rate of the series
+    offsets_hz: Floats  # [k] frequencies
+    transforms: Complexes  # [b, k] Fourier transform of each block
+    magnitudes: Floats  # [b, k] magnitude of the Fourier transform
+
+
+def transform_blocks(z: Complexes, rate_hz: float, length: int) -> BlockSpectra:
+    """Divide a series into blocks and transform each block.
+
+    Parameters
+    ----------
+    z : ndarray of complex128, shape (m,)
+        Series in a band. Samples after the last complete block are not used.
+    rate_hz : float
+        Sample rate of z, Hz.
+    length : int
+        Length of a block in samples.
+    """
+    transforms = np.fft.fft(z[: z.size // length * length].reshape(-1, length), 2 * length, axis=1)
+    offsets_hz = np.asarray(np.fft.fftfreq(2 * length, 1.0 / rate_hz), np.float64)
+    return BlockSpectra(length, rate_hz, offsets_hz, transforms, np.abs(transforms))
+
+
+class BlockEmission(NamedTuple):
+    """Likelihood of each block of a series, as a function of the frequency of the line in this block."""
+
+    blocks: BlockSpectra
+    relative: Floats  # [b, k] likelihood relative to the most likely frequency
+    log_scale: float  # sum of the log-likelihoods of the most likely frequencies
+
+
+def compute_block_emission(blocks: BlockSpectra, power: float) -> BlockEmission:
+    """Compute the likelihood of each block for a line of the given power.
+
+    The average over the unknown phase is I₀(2A|Z|) exp(−A² length) with the amplitude A and the Fourier transform Z.
+    """
+    argument = 2.0 * sqrt(power) * blocks.magnitudes
+    largest = argument.max(axis=1, keepdims=True)
+    scaled = i0e(largest)
+    relative = np.exp(argument - largest) * _interpolate_scaled_bessel(argument, SCALED_BESSEL) / scaled
+    return BlockEmission(blocks, relative, float((np.log(scaled) + largest - blocks.length * power).sum()))
 
 
 def possible_block_lengths(size: int) -> list[int]:
@@ -130,10 +177,11 @@ def phase_log_likelihood(
     return _smooth_phase(z, phase, _phase_model(rate_hz, parameters), np.zeros((z.size, 2)), PHASE_ITERATIONS)
 
 
-def track_phase(z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters) -> Floats:
-    """Return the phase of a wandering line, shape (m,), from the most likely frequency and phase of each block."""
-    blocks = _filter_blocks(z, rate_hz, length, parameters)
-    at = _smoothed_states(blocks.forward, blocks.transition, blocks.emission)
+def track_phase(filtered: "FilteredBlocks", size: int) -> Floats:
+    """Return the phase of a wandering line, shape (size,), from the most likely frequency and phase of each block."""
+    blocks = filtered.emission.blocks
+    rate_hz, length = blocks.rate_hz, blocks.length
+    at = _smoothed_states(filtered.forward, filtered.transition, filtered.emission.relative)
     k = np.arange(at.size)
     offset_hz = blocks.offsets_hz[at]
     centre_s = (k * length + 0.5 * (length - 1)) / rate_hz
@@ -141,7 +189,7 @@ def track_phase(z: Complexes, rate_hz: float, length: int, parameters: Wandering
     advance = pi * (offset_hz[1:] + offset_hz[:-1]) * np.diff(centre_s)
     steps = advance + (np.diff(theta) - advance + pi) % (2.0 * pi) - pi
     unwrapped = theta[0] + np.concatenate([[0.0], np.cumsum(steps)])
-    t_s = np.arange(z.size) / rate_hz
+    t_s = np.arange(size) / rate_hz
     inside = np.interp(t_s, centre_s, unwrapped)
     before, after = np.minimum(t_s - centre_s[0], 0.0), np.maximum(t_s - centre_s[-1], 0.0)
     return np.asarray(inside + 2.0 * pi * (offset_hz[0] * before + offset_hz[-1] * after))
@@ -171,16 +219,20 @@ def draw_line(z: Complexes, rate_hz: float, parameters: WanderingLineParameters,
     lengths = possible_block_lengths(z.size)
     if not lengths or not parameters.power > 0.0:
         return np.zeros_like(z)
-    length = max(lengths, key=lambda one: block_log_likelihood(z, rate_hz, one, parameters))
-    tracked, phase = phase_log_likelihood(z, rate_hz, track_phase(z, rate_hz, length, parameters), parameters)
-    if tracked > block_log_likelihood(z, rate_hz, length, parameters):
+    filtered = max(
+        (_transform_and_filter_blocks(z, rate_hz, length, parameters) for length in lengths),
+        key=lambda one: one.log_likelihood,
+    )
+    tracked, phase = phase_log_likelihood(z, rate_hz, track_phase(filtered, z.size), parameters)
+    if tracked > filtered.log_likelihood:
         draws = rng.standard_normal((z.size, 2))
         _, phase = _smooth_phase(z, phase, _phase_model(rate_hz, parameters), draws, 1)
         return np.asarray(sqrt(parameters.power) * np.exp(1j * phase))
+    length = filtered.emission.blocks.length
     padded = np.concatenate([z, np.zeros(-z.size % length)])
-    blocks = _filter_blocks(padded, rate_hz, length, parameters)
-    chances = np.asarray(rng.random(blocks.forward.shape[0]))
-    at = _draw_states(blocks.forward, blocks.transition, chances)
+    filtered = _transform_and_filter_blocks(padded, rate_hz, length, parameters)
+    blocks = filtered.emission.blocks
+    at = _draw_states(filtered.forward, filtered.transition, np.asarray(rng.random(filtered.forward.shape[0])))
     found = blocks.transforms[np.arange(at.size), at]
     theta = rng.vonmises(np.angle(found), 2.0 * sqrt(parameters.power) * np.abs(found))
     turns = blocks.offsets_hz[at][:, None] * np.arange(length) / rate_hz
@@ -188,34 +240,56 @@ def draw_line(z: Complexes, rate_hz: float, parameters: WanderingLineParameters,
     return np.asarray(line.ravel()[: z.size])
 
 
-class _FilteredBlocks(NamedTuple):
+class FilteredBlocks(NamedTuple):
     """Hidden Markov model of the frequency in blocks of z."""
 
     log_likelihood: float
-    offsets_hz: Floats  # [k] frequencies
-    transforms: Complexes  # [b, k] Fourier transform of each block
+    emission: BlockEmission
     transition: Floats  # [k, k] probability of each change of the frequency
-    emission: Floats  # [b, k] likelihood of each block, relative to the most likely frequency
     forward: Floats  # [b, k] probability of the frequency given this block and all earlier blocks
 
 
-def _filter_blocks(z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters) -> _FilteredBlocks:
-    """Run the forward algorithm. The likelihood of a block is averaged over the phase."""
-    blocks = z[: z.size // length * length].reshape(-1, length)
-    transforms = np.fft.fft(blocks, 2 * length, axis=1)
-    offsets_hz = np.asarray(np.fft.fftfreq(2 * length, 1.0 / rate_hz), np.float64)
-    argument = 2.0 * sqrt(parameters.power) * np.abs(transforms)
-    log_emission = np.log(i0e(argument)) + argument - length * parameters.power
-    largest = log_emission.max(axis=1)
-    emission = np.exp(log_emission - largest[:, None])
-    decay = float(np.exp(-length / rate_hz / parameters.time_s))
+def _transform_and_filter_blocks(
+    z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters
+) -> FilteredBlocks:
+    return filter_blocks(compute_block_emission(transform_blocks(z, rate_hz, length), parameters.power), parameters)
+
+
+def filter_blocks(emission: BlockEmission, parameters: WanderingLineParameters) -> FilteredBlocks:
+    """Run the forward algorithm for a wandering line whose frequency is constant in each block.
+
+    Parameters
+    ----------
+    emission : BlockEmission
+        Likelihood of each block for the power of the line.
+    parameters : WanderingLineParameters
+        Parameters of the line.
+    """
+    blocks, offsets_hz = emission.blocks, emission.blocks.offsets_hz
+    decay = float(np.exp(-blocks.length / blocks.rate_hz / parameters.time_s))
     from_centre = offsets_hz - parameters.centre_hz
     rounding = (offsets_hz[1] - offsets_hz[0]) ** 2 / 6.0  # of two frequencies to the grid
     variance = parameters.deviation_hz**2
     transition = _normalised(from_centre - decay * from_centre[:, None], variance * (1.0 - decay**2) + rounding)
     first = _normalised(from_centre[None, :], variance + rounding)[0]
-    value, forward = _forward(emission, transition, first)
-    return _FilteredBlocks(value + float(largest.sum()), offsets_hz, transforms, transition, emission, forward)
+    value, forward = _forward(emission.relative, transition, first)
+    return FilteredBlocks(value + emission.log_scale, emission, transition, forward)
+
+
+@compiled
+def _interpolate_scaled_bessel(x: Floats, table: Floats) -> Floats:
+    """Return I₀(x) exp(−x), shape (b, k), by cubic interpolation in ``SCALED_BESSEL`` with an error below 10⁻¹²."""
+    found = np.empty_like(x)
+    for b in range(x.shape[0]):
+        for k in range(x.shape[1]):
+            place = x[b, k] / (1.0 + x[b, k]) * (table.size - 1)
+            at = min(max(int(place), 1), table.size - 3)
+            t = place - at
+            low, high = t * (t - 1.0) / 6.0, (t + 1.0) * (t - 2.0) / 2.0
+            value = low * ((t + 1.0) * table[at + 2] - (t - 2.0) * table[at - 1])
+            value += high * ((t - 1.0) * table[at] - t * table[at + 1])
+            found[b, k] = value / np.sqrt(1.0 + x[b, k])
+    return found
 
 
 def _normalised(distance_hz: Floats, variance: float) -> Floats:

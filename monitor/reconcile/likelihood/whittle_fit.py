@@ -70,7 +70,13 @@ def maximise_whittle_likelihood(
     """
     floor = MIN_VARIANCE_RATIO * float((sums.power / np.maximum(count, 1.0)).max(initial=0.0)) or MIN_VARIANCE_RATIO
     theta, beta, variance, residual, likelihood, information, normal = _maximise(
-        count, sums.power, sums.cross, sums.gram, variance_bases, fixed_variance + floor, np.maximum(start_theta, 0.0)
+        count,
+        sums.power,
+        np.ascontiguousarray(sums.cross),
+        np.ascontiguousarray(sums.gram),
+        np.ascontiguousarray(variance_bases),
+        fixed_variance + floor,
+        np.maximum(start_theta, 0.0),
     )
     covariance = np.linalg.pinv(normal) if beta.size else np.zeros((0, 0))
     return WhittleFit(theta, beta, variance, residual, float(likelihood), information, covariance)
@@ -125,19 +131,14 @@ def _profile(
 def _score_and_information(
     count: Floats, bases: Floats, variance: Floats, residual: Floats, information: Floats
 ) -> Floats:
-    p, m = bases.shape
+    p = bases.shape[0]
     gradient = np.zeros(p)
+    slope, weight = 0.5 * (residual / variance - count) / variance, 0.5 * count / variance**2
     for j in range(p):
-        total = 0.0
-        for b in range(m):
-            total += 0.5 * bases[j, b] * (residual[b] / variance[b] - count[b]) / variance[b]
-        gradient[j] = total
+        gradient[j] = np.dot(bases[j], slope)
+        weighted = bases[j] * weight
         for i in range(j + 1):
-            total = 0.0
-            for b in range(m):
-                total += 0.5 * count[b] * bases[j, b] * bases[i, b] / variance[b] ** 2
-            information[j, i] = total
-            information[i, j] = total
+            information[j, i] = information[i, j] = np.dot(weighted, bases[i])
     return gradient
 
 
@@ -147,18 +148,14 @@ def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Flo
 
     A small ridge term allows collinear regressors.
     """
-    q, m = cross.shape
+    q = cross.shape[0]
+    weight = 1.0 / variance
     normal = np.zeros((q, q))
     right = np.zeros(q)
     for i in range(q):
-        for b in range(m):
-            right[i] += cross[i, b] / variance[b]
+        right[i] = np.dot(cross[i], weight)
         for j in range(i + 1):
-            total = 0.0
-            for b in range(m):
-                total += gram[i, j, b] / variance[b]
-            normal[i, j] = total
-            normal[j, i] = total
+            normal[i, j] = normal[j, i] = np.dot(gram[i, j], weight)
     scaled = np.zeros((q, q))
     scale = np.zeros(q)
     for i in range(q):
@@ -174,14 +171,13 @@ def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Flo
 def _residual(power: Floats, cross: Floats, gram: Floats, beta: Floats) -> Floats:
     q, m = cross.shape
     left = power.copy()
-    for b in range(m):
-        for i in range(q):
+    for i in range(q):
+        for b in range(m):
             left[b] -= 2.0 * beta[i] * cross[i, b]
-            for j in range(q):
+        for j in range(q):
+            for b in range(m):
                 left[b] += beta[i] * beta[j] * gram[i, j, b]
-        if left[b] < 0.0:
-            left[b] = 0.0  # negative only by rounding
-    return left
+    return np.maximum(left, 0.0)  # negative only by rounding
 
 
 @compiled

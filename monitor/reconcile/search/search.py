@@ -254,7 +254,7 @@ def _select_trial(
                 tried[:2] = line, trial
                 after, added = _add_effect(current.hypothesis, line, rng), lines.line
                 whitened = whiten_axis(after.fit)
-                if difference_remains_near_line(lines.line, findings, run_diagnostics(whitened), null):
+                if difference_remains_near_line(lines.line, findings, whitened, null):
                     continue
         if _is_gaussian_and_stationary(whitened, null):
             after, tried = replace_by_likelier_alternative(after, tried)

@@ -32,7 +32,9 @@ from monitor.noise.effects import (
     WanderingLine,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 from monitor.reconcile.likelihood.axis_fit import Effects
+from monitor.reconcile.likelihood.whitening import WhitenedAxis
 
 MIN_COMB_LINES: Final = 4
 MAX_HARMONIC: Final = 60
@@ -111,21 +113,23 @@ def keep_uncontradicted_effects(
     return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)
 
 
-def difference_remains_near_line(line: WanderingLine, before: Findings, after: Findings, null: AxisNull) -> bool:
+def difference_remains_near_line(line: WanderingLine, before: Findings, whitened: WhitenedAxis, null: AxisNull) -> bool:
     """Return True if a significant difference remains in the frequency range of a wandering line.
 
     Parameters
     ----------
     line : WanderingLine
         Line that was subtracted from the axis.
-    before, after : Findings
-        Findings before and after the subtraction.
+    before : Findings
+        Findings before the subtraction.
+    whitened : WhitenedAxis
+        Axis after the subtraction.
     null : AxisNull
         Null distribution of each diagnostic.
     """
     largest = max(before[diagnostic].gain for diagnostic in FREQUENCY_DIAGNOSTICS)
     for diagnostic in FREQUENCY_DIAGNOSTICS:
-        one = after[diagnostic]
+        one = DIAGNOSTICS[diagnostic](whitened)
         if one.gain > max(null[diagnostic].threshold, MAX_REMAINING_SHARE * largest) and one.where.frequency:
             lo, hi = _frequency_range(line)
             if lo < one.where.frequency[1] and one.where.frequency[0] < hi:
