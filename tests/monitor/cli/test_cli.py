@@ -131,7 +131,7 @@ WRONG_FILES = {
     "unknown link": (DEVICE + 'driver = { link = "seral" }\n', 'driver.link: "seral"; possible are serial, '),
     "no link": (
         DEVICE + "driver = {}\n",
-        "driver.link: missing; possible are can, iio, replay, serial, virtual, zenoh",
+        "driver.link: missing; possible are can, iio, replay, serial, udp, virtual, zenoh",
     ),
     "no protocol": (
         DEVICE + 'driver = { link = "serial", port = "/dev/x" }\n',

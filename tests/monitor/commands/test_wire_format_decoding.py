@@ -226,7 +226,7 @@ class TestRefusals:
         assert refusal(tmp_path / "drive.blf") == "contains CAN frames; name the decoder with --decoder: dbc"
         (tmp_path / "x.raw").write_bytes(b"abc")
         assert refusal(tmp_path / "x.raw").startswith(
-            "contains captured bytes; name the decoder with --decoder: stim300, "
+            "contains captured bytes; name the decoder with --decoder: aceinna_dmu, "
         )
 
     def test_wrong_decoder_and_options(self, tmp_path: Path) -> None:
