@@ -38,16 +38,16 @@ from tests.support.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
-ARCHITECTURE = ROOT / "docs" / "architecture.md"
+ARCHITECTURE = ROOT / "docs" / "explanation" / "architecture.md"
 MODULES_NOT_IN_DIAGRAM = {"extras", "file_access", "module_lookup", "number_ranges", "settings_model"}
 """Small modules that the diagram of the layers does not show."""
-SIMULATOR = ROOT / "docs" / "simulator.md"
-EXPORT = ROOT / "docs" / "export.md"
-COMMANDS_PAGE = ROOT / "docs" / "commands.md"
-MESSAGES = ROOT / "docs" / "messages.md"
-DECODERS = ROOT / "docs" / "decoders.md"
-CONNECTING_SENSORS = ROOT / "docs" / "connecting-sensors.md"
-VIEWER = ROOT / "docs" / "viewer.md"
+SIMULATOR = ROOT / "docs" / "how-to" / "simulator.md"
+EXPORT = ROOT / "docs" / "reference" / "export.md"
+COMMANDS_PAGE = ROOT / "docs" / "reference" / "commands.md"
+MESSAGES = ROOT / "docs" / "reference" / "messages.md"
+DECODERS = ROOT / "docs" / "reference" / "decoders.md"
+CONNECTING_SENSORS = ROOT / "docs" / "how-to" / "connecting-sensors.md"
+VIEWER = ROOT / "docs" / "how-to" / "viewer.md"
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 PAGES = sorted(
     [
@@ -288,7 +288,7 @@ def read_first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]"
 
 @pytest.mark.parametrize(
     ("page", "word"),
-    [(MESSAGES, "estimated"), (ROOT / "docs" / "samples-format.md", "9.81")],
+    [(MESSAGES, "estimated"), (ROOT / "docs" / "reference" / "samples-format.md", "9.81")],
     ids=["coefficients", "samples"],
 )
 def test_subscriber_example_prints_the_published_results(page: Path, word: str) -> None:
