@@ -23,6 +23,7 @@ nb_execution_mode = "off"  # the tests run the notebooks
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the signature shows the types
 napoleon_numpy_docstring = True
+smartquotes = False  # the pages quote values of keys
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "imu-monitor"

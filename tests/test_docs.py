@@ -163,7 +163,9 @@ def test_generated_parts_are_current(page: Path) -> None:
 
 
 def test_every_generated_part_has_a_page() -> None:
-    names = [part[2] for page in reference_pages.PAGES for part in reference_pages.PART.finditer(page.read_text("utf-8"))]
+    names = [
+        part[2] for page in reference_pages.PAGES for part in reference_pages.PART.finditer(page.read_text("utf-8"))
+    ]
     assert sorted(names) == sorted(reference_pages.PARTS)
 
 

@@ -17,6 +17,7 @@ import msgspec
 import typer
 
 import drivers.decoders
+import imu_monitor
 from drivers import module_lookup
 from drivers.settings_model import SettingsModel
 from monitor.cli import app
@@ -168,10 +169,22 @@ def _attribute_docstrings(one: type) -> dict[str, str]:
     return found
 
 
+def format_python() -> str:
+    """List the public names of the Python interface, whose docstrings Sphinx inserts."""
+    parts = []
+    for name in imu_monitor.__all__:
+        value = getattr(imu_monitor, name)
+        kind = "module" if inspect.ismodule(value) else "class" if isinstance(value, type) else "function"
+        parts.append(f".. auto{kind}:: imu_monitor.{name}")
+        parts += [] if kind == "function" else ["   :members:"]
+    return "\n".join(["```{eval-rst}", *parts, "```"])
+
+
 PARTS: Final[dict[str, Callable[[], str]]] = {
     "commands": format_commands,
     "configuration": format_configuration,
     "messages": format_messages,
+    "python": format_python,
 }
 
 
