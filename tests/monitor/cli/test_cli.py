@@ -1558,7 +1558,7 @@ def test_unexpected_error_is_reported_in_one_line(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("monitor.commands.analyze.run_analysis", fail)
+    monkeypatch.setattr("monitor.commands.recording_loading.load_recording", fail)
     run = run_program("analyze", "a.csv")
     assert line in run.require_one_error_line()
     assert len(run.err) < 1000
