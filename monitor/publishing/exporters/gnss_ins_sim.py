@@ -13,8 +13,7 @@ simulation.
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from drivers.errors import ConfigError
-from drivers.number_ranges import DURATION_S, HOUR_S
+from drivers.number_ranges import HOUR_S
 from monitor.common.unit_formatting import DEGREE, ROOT_HOUR, Kind, axes_of
 from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
@@ -47,17 +46,7 @@ def export_gnss_ins_sim(
         Factor that multiplies N and B.
     correlation_time_s
         Correlation time of the bias [s]. By default, the time is computed from N and K.
-
-    Raises
-    ------
-    ConfigError
-        If the correlation time is outside the supported range.
     """
-    if correlation_time_s is not None:
-        try:
-            DURATION_S.check(correlation_time_s)
-        except ConfigError as error:
-            raise ConfigError(f"correlation time: {error}") from None
     lines = [
         "# imu_err for imu_model.IMU(accuracy=imu_err) of gnss-ins-sim",
         *header_comments(noise, inflation, "#"),
