@@ -122,7 +122,7 @@ def _from_file(source: Path | None, name: str | None) -> Get:
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
-    from monitor.publishing.zenoh.history_client import query_histories
+    from monitor.publishing.zenoh.clients import query_histories
 
     def query_daemon(query: "HistoryQuery") -> "HistoryTable":
         found = {

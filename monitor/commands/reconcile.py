@@ -178,11 +178,11 @@ def compare_recordings(
 
 
 def _write_comparison(result: RecordingsComparison, folder: Path) -> None:
-    from monitor.publishing.reports.comparison_page import render_page
+    from monitor.publishing.reports.reconcile_page import render_comparison_page
 
     _write(folder / REPORT, comparison_json.encode_comparison(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
-    _write(folder / "report.html", render_page(result).encode())
+    _write(folder / "report.html", render_comparison_page(result).encode())
 
 
 def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:

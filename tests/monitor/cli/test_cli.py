@@ -921,7 +921,7 @@ def test_present_result_of_a_daemon_is_exported(run_program: RunProgram, monkeyp
         only, named = run_program(*arguments), run_program(*arguments, "--device", "bench-1")
         publisher.put(topics.COEFFICIENTS, "bench-2", message)
         several = run_program(*arguments)
-        monkeypatch.setattr("monitor.publishing.zenoh.coefficients_client.PATIENCE_S", 1.0)
+        monkeypatch.setattr("monitor.publishing.zenoh.clients.PATIENCE_S", 1.0)
         absent = run_program(*arguments, "--device", "bench-3")
     finally:
         publisher.close()
