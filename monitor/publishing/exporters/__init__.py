@@ -22,10 +22,9 @@ from monitor.publishing.exporters.export_input import (
     from_model,
     missing_coefficient_error,
 )
-from monitor.publishing.exporters.gnss_ins_sim import export_gnss_ins_sim
-from monitor.publishing.exporters.gyroparams import export_gyroparams
 from monitor.publishing.exporters.imu_utils import export_imu_utils
 from monitor.publishing.exporters.kalman import export_kalman_process_noise
+from monitor.publishing.exporters.simulator_parameters import export_gnss_ins_sim, export_gyroparams
 
 __all__ = ["FORMATS", "AxisCoefficientOrBound", "NoiseCoefficients", "export", "from_analysis_json", "from_model"]
 
