@@ -22,13 +22,14 @@ def doctor(
     """Check this machine and a configuration for unattended operation. No device is opened."""
     import msgspec
 
-    from monitor.commands import doctor as checks
+    from monitor.commands.doctor import examine_machine
+    from monitor.commands.doctor.finding import worst_mark
 
-    findings = checks.examine_machine(config)
+    findings = examine_machine(config)
     output.write_json(json, lambda: msgspec.json.encode({"schema": SCHEMA, "findings": findings}))
     if json != Path("-"):
         _print(findings)
-    if checks.worst_mark(findings) == "wrong":
+    if worst_mark(findings) == "wrong":
         raise typer.Exit(FAILED)
 
 
