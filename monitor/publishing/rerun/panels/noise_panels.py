@@ -21,7 +21,7 @@ from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.style import omit_wide_intervals
 from monitor.publishing.rerun import allan_drawing, dynamic_heat_map
-from monitor.publishing.rerun.bounded_allan_history import AllanHistory
+from monitor.publishing.rerun.dynamic_heat_map import AllanHistory
 from monitor.publishing.rerun.panels import history_points
 from monitor.publishing.rerun.panels.panel import Panel
 from monitor.publishing.rerun.panels.panel_text import noise_text
