@@ -81,7 +81,7 @@ def additional_deviations(
 
     Parameters
     ----------
-        total
+    total
         Total variance, or None to draw no total deviation.
     hadamard
         Hadamard variance, or None to draw no Hadamard deviation.

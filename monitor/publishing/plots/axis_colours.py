@@ -30,7 +30,7 @@ def blend_colours(colour: Colour, colour_share: float, background: Colour = BACK
     Parameters
     ----------
     colour
-                Colour of the area as red, green and blue, 0 to 255.
+        Colour of the area as red, green and blue, 0 to 255.
     colour_share
         Opacity of the area, 0 to 1.
     background

@@ -36,7 +36,7 @@ class ChartDecadeRange:
         tau
             Averaging times [s], shape [n].
         sigma
-                        Allan deviations in the unit of the plot, shape [n].
+            Allan deviations in the unit of the plot, shape [n].
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             log_tau, log_sigma = np.log10(tau), np.log10(np.where(sigma > 0, sigma, np.nan))
@@ -58,7 +58,7 @@ def decade_range(values: Iterable[Floats], min_decades: int = int(MIN_DECADES)) 
     values
         Arrays of numbers.
     min_decades
-                Smallest number of decades of the range.
+        Smallest number of decades of the range.
     """
     good = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
     if good.size == 0:

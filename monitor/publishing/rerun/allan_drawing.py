@@ -56,7 +56,7 @@ class AllanPlotPair:
         Parameters
         ----------
         estimate
-                        Estimate with the measured and fitted Allan deviations.
+            Estimate with the measured and fitted Allan deviations.
         gap
             Comparison with the noise model, which is drawn as dashed lines. None if the device has no model.
         """
@@ -188,7 +188,7 @@ def log_lines(
     line_colours
         One colour for each line, or one for all lines.
     radius
-                Half of the line width, in points of the screen.
+        Half of the line width, in points of the screen.
     order
         Drawing order. Lines with higher values are in front.
     """

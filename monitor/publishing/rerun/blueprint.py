@@ -51,7 +51,7 @@ def blueprint(devices: Sequence[ViewerDeviceDescription], fleet: bool = False) -
     devices
         Devices to show.
     fleet
-                True if the overview is a table that also lists devices that are not shown in detail.
+        True if the overview is a table that also lists devices that are not shown in detail.
     """
     pages, names = [_device(one) for one in devices], [one.name for one in devices]
     if fleet:

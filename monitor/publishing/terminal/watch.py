@@ -56,7 +56,7 @@ def watch(
     Parameters
     ----------
     keyexpr
-                Pattern of zenoh keys (key expression) that selects the devices.
+        Pattern of zenoh keys (key expression) that selects the devices.
     connect
         Endpoints of daemons or routers.
     stop
