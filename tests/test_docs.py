@@ -30,7 +30,7 @@ from monitor.publishing.rerun.sinks import server_url
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings import loading
 from monitor.settings.loading import ZenohTable
-from tests.experiments import reference_pages
+from tests.experiments import picture_sources, reference_pages
 from tests.monitor.publishing.example_results import make_estimate
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
@@ -167,6 +167,19 @@ def test_every_generated_part_has_a_page() -> None:
         part[2] for page in reference_pages.PAGES for part in reference_pages.PART.finditer(page.read_text("utf-8"))
     ]
     assert sorted(names) == sorted(reference_pages.PARTS)
+
+
+@pytest.mark.parametrize("picture", picture_sources.SOURCES)
+def test_picture_shows_the_present_layout(picture: str) -> None:
+    pytest.importorskip("rerun")
+    pytest.importorskip("matplotlib")
+    stored = picture_sources.read_checksums()[picture]
+    assert stored == picture_sources.checksum(picture), "run: python -m tests.experiments.pictures"
+
+
+def test_every_picture_is_shown_by_a_page() -> None:
+    shown = {Path(name).name for page in PAGES for name in re.findall(r"pictures/[\w.-]+", page.read_text("utf-8"))}
+    assert {path.name for path in picture_sources.PICTURES.glob("*.png")} <= shown
 
 
 def test_viewer_address_has_the_default_ports() -> None:

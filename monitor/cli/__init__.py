@@ -72,29 +72,31 @@ def _options_of_all_commands(
     """Live noise monitor for MEMS IMUs: windowed Allan variance and Q, N, B, K, R while the sensor runs."""
 
 
-for _command in (
-    demo.demo,
-    run.run,
-    check.check,
-    doctor.doctor,
-    identify.identify,
-    warm_up.warm_up,
-    watch.watch,
-    view.view,
-    analyze.analyze,
-    simulate.simulate,
-    reconcile.reconcile,
-    compensate.compensate,
-    convert.convert,
-    history.history,
-    export.export,
+for _command, _example in (
+    (demo.demo, "demo --effect gz.sinusoidal:amplitude=4e-3,frequency=17"),
+    (run.run, "run bench.toml"),
+    (check.check, "check bench.toml"),
+    (doctor.doctor, "doctor bench.toml"),
+    (identify.identify, "identify /dev/ttyUSB0"),
+    (warm_up.warm_up, "warm-up"),
+    (watch.watch, "watch --connect tcp/127.0.0.1:7450"),
+    (view.view, "view --detail bench-1"),
+    (analyze.analyze, "analyze run.csv --rest --plot allan.png"),
+    (simulate.simulate, "simulate mpu-6050 --seconds 1h --out hour.npz"),
+    (reconcile.reconcile, "reconcile run.csv --model mpu-6050 --out report"),
+    (compensate.compensate, "compensate run.csv --out compensated.csv"),
+    (convert.convert, "convert flight.ulg flight.mcap"),
+    (history.history, "history bench.toml --from -7d --plot week.png"),
+    (export.export, "export result.json --format kalibr --out imu.yaml"),
 ):
-    app.command()(_command)
+    app.command(epilog=f"Example: imu-monitor {_example}")(_command)
 _thermal = typer.Typer(
     help="Bias against temperature: fit a model to a recording, and predict another recording.", rich_markup_mode=None
 )
-_thermal.command("fit")(thermal.thermal_fit)
-_thermal.command("predict")(thermal.thermal_predict)
+_thermal.command("fit", epilog="Example: imu-monitor thermal fit run.csv --out thermal.json")(thermal.thermal_fit)
+_thermal.command("predict", epilog="Example: imu-monitor thermal predict new.csv --model thermal.json")(
+    thermal.thermal_predict
+)
 app.add_typer(_thermal, name="thermal")
 
 

@@ -28,7 +28,7 @@ def export(
     source: Annotated[
         str | None,
         typer.Argument(
-            metavar="[MODEL.toml|NAME|RESULT.json]",
+            metavar="MODEL.toml|NAME|RESULT.json",
             help="Model, name of a shipped model, or JSON of analyze; - = standard input.",
         ),
     ] = None,

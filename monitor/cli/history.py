@@ -24,7 +24,7 @@ Get = Callable[["HistoryQuery"], "HistoryTable"]
 
 def history(
     source: Annotated[
-        Path | None, typer.Argument(metavar="[CONFIG.toml|FOLDER]", help="Configuration file, or folder of [storage].")
+        Path | None, typer.Argument(metavar="CONFIG.toml|FOLDER", help="Configuration file, or folder of [storage].")
     ] = None,
     connect: Annotated[
         str | None, typer.Option(metavar="ENDPOINT", help="Query a running daemon instead, e.g. tcp/127.0.0.1:7450.")

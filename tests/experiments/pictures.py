@@ -54,6 +54,7 @@ from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
 from monitor.simulator import AMBIENT_C, WARM_UP_C, WARM_UP_S
 from monitor.simulator.demo_config import build_demo_config
+from tests.experiments.picture_sources import store_checksum
 from tests.monitor.publishing.example_results import make_estimate, make_true_coefficients
 
 SIZE = (1600, 1000)
@@ -152,6 +153,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in arguments.only:
             path = PICTURES[name](arguments.out.resolve(), Path(folder))
+            store_checksum(path)
             print(f"{path} ({path.stat().st_size / 1e3:.0f} kB)")
 
 

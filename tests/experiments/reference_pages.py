@@ -45,7 +45,7 @@ def format_commands() -> str:
         own = [_option_row(one) for one in _options(command)]
         rows += [row for row in own if row not in shared]
         common = [f"`{row.split('`')[1].split()[0]}`" for row in own if row in shared]
-        parts += [f"### `{name}`", f"```sh\n{usage}\n```", " ".join((command.help or "").split())]
+        parts += [f"### `{name}`", f"```sh\n{usage}\n{_example(command)}```", " ".join((command.help or "").split())]
         parts += [_table(("argument or option", "meaning"), rows)] if rows else []
         parts += [f"[Shared options](#shared-options): {', '.join(common)}."] if common else []
     parts += ["### Shared options", _table(("option", "meaning"), shared)]
@@ -58,6 +58,10 @@ def _commands(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
             yield from _commands(command, f"{prefix}{name} ")
         else:
             yield f"{prefix}{name}", command
+
+
+def _example(command: Any) -> str:
+    return f"{command.epilog.removeprefix('Example: ')}    # example\n" if command.epilog else ""
 
 
 def _options(command: Any) -> list[Any]:

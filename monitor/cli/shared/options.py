@@ -65,7 +65,7 @@ JsonFile = Annotated[
 Viewer = Annotated[
     str | None, typer.Option(metavar="auto|native|web|none|FILE.rrd", help="Where to show the live view.")
 ]
-KeyExpr = Annotated[str, typer.Argument(metavar="[KEYEXPR]", help="Keys to show.")]
+KeyExpr = Annotated[str, typer.Argument(metavar="KEYEXPR", help="Keys to show.")]
 Connect = Annotated[
     list[str] | None, typer.Option(metavar="ENDPOINT", help="Daemon or router, e.g. tcp/127.0.0.1:7450; repeatable.")
 ]

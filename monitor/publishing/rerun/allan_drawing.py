@@ -112,7 +112,7 @@ class AllanPlotPair:
         log_lines(self._log, f"{path}/band", [sign + at[2]], [axis_colours.blend_colours(grey, 0.4)], 5.0, 10.0)
         log_lines(self._log, f"{path}/model", dash_line(sign + at[3]), [axis_colours.TEXT], 0.75, 10.0)
         log_lines(self._log, f"{path}/ring", [ring_outline(at[4, 0] + 0.4, y)], [grey], 0.9, 10.0)
-        self._log(path, rr.Points2D([(0.4, y)], colors=[grey], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
+        self._log(path, rr.Points2D([(0.0, y)], colors=[grey], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
         self._log(
             f"{path}/text", label_points([(x + KEY_TEXT, y - 0.4, text) for (x, _), text in zip(at, KEY, strict=True)])
         )
