@@ -153,8 +153,6 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None, option
     notes: list[str] = []
     free = memory_check.available_bytes()
     rows = size_bytes = 0
-    if last_s is None:
-        _check_folder(path, segments, free, options)
     for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz, options)
@@ -175,18 +173,6 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None, option
 def _number_order(path: Path) -> list[str | int]:
     """Return a key that sorts ``run_10.bag`` after ``run_2.bag``."""
     return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", path.name))]
-
-
-def _check_folder(path: Path, segments: Sequence[Path], free: int | None, options: ReadingOptions) -> None:
-    """Raise an error if the readable segments together contain too many rows."""
-    rows = size_bytes = 0
-    for segment in segments:
-        try:
-            rows += 0 if _is_empty(segment) else _format_with_packages(segment).count_rows(segment, options)
-        except (RecordingError, OSError):
-            continue  # the note about the segment is added when the segment is read
-        size_bytes += segment.stat().st_size
-        memory_check.RecordingSizeLimits(path, size_bytes, free).check_row_count(rows)
 
 
 def _duration_s(parts: Sequence[Recording]) -> float:

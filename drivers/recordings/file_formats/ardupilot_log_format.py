@@ -90,13 +90,6 @@ def read_ardupilot_log(path: Path, topic: str | None) -> table.Table:
     return table.Table(join_topics(path, tables), None, notes)
 
 
-def count_ardupilot_rows(path: Path, topic: str | None) -> int:
-    """Return the number of messages of the topic in an ArduPilot log."""
-    with _pymavlink_errors(path), _open_log(path, memory_check.measure_read_limit(path)) as log:
-        messages = _list_messages(log)
-        return messages[_select(path, messages, topic, [])[0]].offsets.size
-
-
 @contextmanager
 def _open_log(path: Path, limit: memory_check.RecordingSizeLimits) -> Iterator[Any]:
     """Open a log and find its messages."""

@@ -103,18 +103,13 @@ def read_csv(path: Path, options: ReadingOptions) -> table.Table:
     return read_csv_source(_file_source(path), options)
 
 
-def count_csv_rows(path: Path) -> int:
-    """Return the number of complete lines in a CSV file. Raise an error if the file exceeds a size limit."""
-    return count_csv_source_rows(_file_source(path))
-
-
 def _file_source(path: Path) -> CsvSource:
     return CsvSource(path, str(path), path.name.partition(".")[0], lambda: open_regular_file(path))
 
 
 def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
     """Read the columns of a CSV file on disk or in an archive. See ``read_csv``."""
-    lines = count_csv_source_rows(source)
+    lines = _count_rows(source)
     try:
         return _read_columns(source, options, "i8", lines)
     except _FractionalTimeError:
@@ -154,8 +149,8 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
     return table.Table({name: rows[name] for name in layout.columns}, None, notes, layout.units)
 
 
-def count_csv_source_rows(source: CsvSource) -> int:
-    """Return the number of complete lines in a CSV file on disk or in an archive. See ``count_csv_rows``."""
+def _count_rows(source: CsvSource) -> int:
+    """Return the number of complete lines in a CSV file. Raise an error if the file exceeds a size limit."""
     limit = memory_check.measure_read_limit(source.path)
     lines = unpacked = 0
     with source.open_stream() as file:

@@ -22,7 +22,6 @@ from drivers.file_access import open_regular_file
 from drivers.recordings import table
 from drivers.recordings.file_formats.csv_format import (
     CsvSource,
-    count_csv_source_rows,
     read_csv_column_names,
     read_csv_source,
 )
@@ -66,12 +65,6 @@ def read_sensor_files(path: Path, options: ReadingOptions) -> table.Table:
             stated |= found.units
             notes += [f"{name}: {note}" for note in found.notes]
     return table.Table(join_topics(path, tables), None, notes, stated)
-
-
-def count_sensor_rows(path: Path, options: ReadingOptions) -> int:
-    """Return the number of lines in the first selected CSV file of a folder or a zip archive."""
-    with _open_sources(path) as sources:
-        return count_csv_source_rows(sources[_select(path, sources, options, [])[0]])
 
 
 def _select(path: Path, sources: Mapping[str, CsvSource], options: ReadingOptions, notes: list[str]) -> list[str]:

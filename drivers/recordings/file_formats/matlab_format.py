@@ -63,13 +63,6 @@ def read_matlab(path: Path, options: ReadingOptions) -> table.Table:
     return table.Table(found, fs, notes, layout.units)
 
 
-def count_matlab_rows(path: Path, options: ReadingOptions) -> int:
-    """Return the number of samples of a MATLAB file."""
-    columns, _ = _load_columns(path, [])
-    names = list(columns)
-    return max(columns[names[i]].size for i in find_layout(path, names, options, []).columns.values())
-
-
 def _load_columns(path: Path, notes: list[str]) -> tuple[dict[str, Floats], float | None]:
     """Return all numeric columns of a MATLAB file by name, and the sample rate in Hz or None."""
     columns: dict[str, Floats] = {}

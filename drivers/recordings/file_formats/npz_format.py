@@ -71,16 +71,6 @@ class _Header:
         return math.prod(self.shape)
 
 
-def count_npz_rows(path: Path, options: ReadingOptions) -> int:
-    """Return the number of rows of a .npz file according to the array headers, or 0 if the file is truncated."""
-    with IndexSizeLimitedFile(path) as file:
-        if not _has_index(path, file):
-            return 0  # the reader checks the number of rows of a truncated archive
-        with _open_archive(path, file) as archive:
-            names = _array_names(archive)
-            return _check_columns(path, archive, names, find_layout(path, names, options, []))
-
-
 def read_npz(path: Path, options: ReadingOptions) -> table.Table:
     """Read the known arrays of a .npz file. If the file is truncated, only the complete values are read.
 
@@ -142,9 +132,8 @@ def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
     return names[key] if key in names else names[f"{key}.npy"]
 
 
-def _check_columns(path: Path, archive: zipfile.ZipFile, names: Sequence[str], layout: TableLayout) -> int:
-    """Check the array headers of all columns, and return the length of the longest column."""
-    rows = 0
+def _check_columns(path: Path, archive: zipfile.ZipFile, names: Sequence[str], layout: TableLayout) -> None:
+    """Check the array headers of all columns."""
     limit = memory_check.measure_read_limit(path)
     for key in (names[i] for i in layout.columns.values()):
         header = _read_header(path, archive, key)
@@ -152,10 +141,8 @@ def _check_columns(path: Path, archive: zipfile.ZipFile, names: Sequence[str], l
             raise RecordingError(f"{path}: {key} contains {_describe_dtype(header.dtype)}, expected numbers")
         if len(header.shape) != 1:
             raise RecordingError(f"{path}: {key} has shape {header.shape}, expected one dimension")
-        rows = max(rows, header.values)
-        limit.check_row_count(rows)
+        limit.check_row_count(header.values)
         _check_size(path, limit, _find_member(archive, key), key, header)
-    return rows
 
 
 def _check_size(

@@ -87,12 +87,6 @@ def read_ulog(path: Path, topic: str | None) -> table.Table:
     return table.Table(join_topics(path, {name: _read_columns(data[name]) for name in names}), None, notes)
 
 
-def count_ulog_rows(path: Path, topic: str | None) -> int:
-    """Return the number of messages of the topic in a PX4 log."""
-    data = _data_by_topic(_load(path, memory_check.measure_read_limit(path)))
-    return int(data[_select(path, data, topic, [])[0]].data[TIMES[-1]].size)
-
-
 def _load(path: Path, limit: memory_check.RecordingSizeLimits) -> Any:
     """Return the log with the messages of the topics in FIELDS."""
     from pyulog import core

@@ -78,13 +78,6 @@ def read_ros_bag(path: Path, topic: str | None) -> table.Table:
     return table.Table(join_topics(path, tables), None, notes)
 
 
-def count_ros_bag_rows(path: Path, topic: str | None) -> int:
-    """Return the number of messages of the topic according to the index of a bag."""
-    with _bag_errors(path), _open_bag(path) as (bag, _):
-        first = bag.select(path, topic, [])[0]
-        return next(one.rows for one in bag.topics if one.name == first)
-
-
 @dataclass(frozen=True, slots=True)
 class _Bag:
     """An open bag."""
