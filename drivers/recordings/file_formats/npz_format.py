@@ -6,7 +6,6 @@ The reader rejects arrays of Python objects, because unpickling can execute code
 so the reader finds each array by its local header.
 """
 
-import io
 import math
 import re
 import shutil
@@ -45,7 +44,6 @@ MAX_DEFLATE_RATIO: Final = 1032
 """Highest compression ratio of deflate, https://zlib.net/zlib_tech.html."""
 NUMERIC_KINDS: Final = "fiu"
 """Values of ``numpy.dtype.kind`` that a column may have: float, signed integer and unsigned integer."""
-NPY_MAGIC: Final = b"\x93NUMPY"
 NPY_HEADER: Final = re.compile(
     rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?:False|True), "
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
@@ -167,24 +165,12 @@ def _read_header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
             f"{path}: {key} is packed by method {method} of zip, expected stored or deflated as written by NumPy"
         )
     with _member_errors(path, key), archive.open(_find_member(archive, key)) as member:
-        start = member.read(len(NPY_MAGIC) + 4)
-        version, size_bytes = start[len(NPY_MAGIC) : len(NPY_MAGIC) + 2], 2
-        if not start.startswith(NPY_MAGIC):
-            raise ValueError("it is not an array in the format .npy")
-        if version == b"\2\0":
-            start += member.read(2)
-            size_bytes = 4
-        elif version != b"\1\0":
-            raise ValueError(f"version {'.'.join(map(str, version))} of .npy is no version for numbers")
-        size = int.from_bytes(start[-size_bytes:], "little")
-        if size > MAX_HEADER_BYTES:
-            raise ValueError(f"its header has {size} bytes, expected at most {MAX_HEADER_BYTES}")
-        text = io.BytesIO(start[-size_bytes:] + member.read(size))
-        versioned = np.lib.format.read_array_header_1_0 if size_bytes == 2 else np.lib.format.read_array_header_2_0
-        shape, _, dtype = versioned(text)
+        if np.lib.format.read_magic(member) != (1, 0):  # other versions are written only for structured arrays
+            raise ValueError("it is not an array in version 1.0 of the format .npy")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
         if min(shape, default=0) < 0:
             raise ValueError(f"its shape is {shape}")
-        return _Header(shape, dtype, len(start) + size)
+        return _Header(shape, dtype, member.tell())
 
 
 def _describe_dtype(dtype: np.dtype[Any]) -> str:
