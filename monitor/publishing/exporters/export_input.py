@@ -37,7 +37,7 @@ def ascii_unit(letter: str, kind: Kind) -> str:
 
     Parameters
     ----------
-        letter
+    letter
         Symbol of the coefficient: Q, N, B, K or R.
     kind
         Kind of sensor: gyro or accel.
@@ -99,7 +99,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
 
     Parameters
     ----------
-        model
+    model
         Noise model with the effects of each axis.
     source
         Source of the coefficients, for the header of the file.
@@ -159,7 +159,7 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
 
     Parameters
     ----------
-        json_text
+    json_text
         Output of ``imu-monitor analyze --json``, or message ``imu/<device>/coefficients``.
     source
         Source of the coefficients, for the header of the file.

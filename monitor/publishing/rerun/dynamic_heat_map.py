@@ -121,7 +121,7 @@ def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
     Parameters
     ----------
     log
-                Function that logs a Rerun entity.
+        Function that logs a Rerun entity.
     path
         Path of the entities with the heat maps.
     allan_history

@@ -1,8 +1,8 @@
 """Command ``imu-monitor watch``, which shows a live table of devices, or prints the messages of daemons as JSON.
 
 With ``--json``, each line is an object with the keys ``key`` (zenoh key), ``topic`` and ``message``. ``message`` is the
-payload as ``docs/messages.md`` describes it. Messages with samples are msgpack on the wire. Each column becomes an
-array.
+payload as ``docs/reference/messages.md`` describes it. Messages with samples are msgpack on the wire. Each column
+becomes an array.
 """
 
 import contextlib
@@ -56,7 +56,7 @@ def watch(
     Parameters
     ----------
     keyexpr
-                Pattern of zenoh keys (key expression) that selects the devices.
+        Pattern of zenoh keys (key expression) that selects the devices.
     connect
         Endpoints of daemons or routers.
     stop

@@ -115,13 +115,13 @@ class CoefficientsPanel(Panel):
         Parameters
         ----------
         symbol
-                        Symbol of the coefficient: Q, N, B, K or R.
+            Symbol of the coefficient: Q, N, B, K or R.
         axis
             Name of the axis.
         unix_s
             Unix times [s], shape [n].
         values
-                        Values, shape [n], or values with the ends of their intervals, shape [n, 3], in SI units.
+            Values, shape [n], or values with the ends of their intervals, shape [n, 3], in SI units.
         name
             Suffix of the path of the entity.
         """

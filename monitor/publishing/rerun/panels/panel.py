@@ -25,7 +25,7 @@ class Panel:
     Parameters
     ----------
     scene
-                Scene that contains the panel.
+        Scene that contains the panel.
     device
         Name of the device.
     """

@@ -56,7 +56,7 @@ def average_buckets(wall_s: Floats, values: Floats, per_s: float) -> tuple[Float
     wall_s
         Unix times [s], shape [n].
     values
-                Values, shape [n]; NaN if missing.
+        Values, shape [n]; NaN if missing.
     per_s
         Number of time intervals per second.
     """
