@@ -15,9 +15,9 @@ import pytest
 import typer
 
 import drivers.decoders
-from drivers import module_lookup
 from drivers.data_types import EVENT_KINDS, make_block
 from drivers.recordings import FORMATS
+from drivers.settings import module_lookup
 from drivers.zenoh.sample_message import encode_samples
 from monitor.cli import app
 from monitor.common import topics

@@ -19,9 +19,8 @@ from pathlib import Path
 
 from drivers.data_types import times_to_seconds
 from drivers.errors import ConfigError, RecordingError, describe_error
-from drivers.extras import require_extra
-from drivers.file_access import check_regular_file
-from drivers.number_ranges import DURATION_S, RATE_HZ
+from drivers.host.extras import require_extra
+from drivers.host.file_access import check_regular_file
 from drivers.recordings import memory_check
 from drivers.recordings.formats import FORMATS, WRITABLE, Format, find_format, is_recording, is_recording_folder
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
@@ -35,6 +34,7 @@ from drivers.recordings.recording import (
 )
 from drivers.recordings.table import EXAMPLE_HEADER
 from drivers.recordings.writing import open_recording_writer, save_samples
+from drivers.settings.number_ranges import DURATION_S, RATE_HZ
 
 __all__ = [
     "FORMATS",

@@ -21,11 +21,11 @@ from drivers.data_types import (
     times_to_seconds,
 )
 from drivers.errors import ConfigError, RecordingError, make_printable_and_shorten
-from drivers.number_ranges import RATE_HZ
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.table import BATCH_ROWS, T_LIMIT_S, TIME_NS, Columns, Table, column_dtype
 from drivers.recordings.table_layout import find_unit
 from drivers.recordings.unit_check import describe_likely_unit_errors
+from drivers.settings.number_ranges import RATE_HZ
 from drivers.units import time_factor
 
 MAX_VALUE: Final = 1e100

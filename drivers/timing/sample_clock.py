@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import NO_TICK, CounterTimedFormat, Event, Ints, SampleBlock, SenderTimedFormat, Timing
-from drivers.number_ranges import RATE_HZ
+from drivers.settings.number_ranges import RATE_HZ
 from drivers.timing.arrival_regression import MIN_SAMPLES, MIN_SPAN_S, snap_to_standard_rate
 from drivers.timing.arrival_timeline import MAX_RATE_HZ, ArrivalTimeline
 from drivers.timing.counter_gaps import CounterGaps

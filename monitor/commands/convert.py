@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.file_access import real_path
+from drivers.host.file_access import real_path
 from drivers.recordings import Recording, save_samples
 from drivers.recordings.file_formats.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
 from drivers.recordings.formats import find_writer

@@ -14,7 +14,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from drivers.data_types import AXES
-from drivers.number_ranges import DAY_S, HOUR_S
+from drivers.settings.number_ranges import DAY_S, HOUR_S
 from drivers.units import G0
 
 Kind = Literal["gyro", "accel"]

@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.data_types import AXES, NS_PER_S, Floats, Ints, SampleBlock, SenderTimedFormat
 from drivers.errors import ConfigError, NotReady, RecordingError
-from drivers.number_ranges import RATE_HZ
+from drivers.settings.number_ranges import RATE_HZ
 from drivers.timing.arrival_regression import snap_to_standard_rate
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock

@@ -24,8 +24,8 @@ from typing import Any, Final
 import msgspec
 
 from drivers.errors import RecordingError
-from drivers.file_access import check_folder_or_absent, check_regular_file
-from drivers.number_ranges import DAY_S
+from drivers.host.file_access import check_folder_or_absent, check_regular_file
+from drivers.settings.number_ranges import DAY_S
 from monitor.history.history_row import (
     MAX_COLUMNS,
     STATES,

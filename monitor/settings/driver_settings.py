@@ -17,13 +17,12 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 import drivers.decoders
 import drivers.links
-from drivers import module_lookup, number_ranges
 from drivers.data_types import make_block
 from drivers.decoders.base import AddressFilteringDecoder, Decoder
 from drivers.errors import ConfigError
 from drivers.links.base import AddressFilteringLink, Link, LinkSettings
-from drivers.number_ranges import format_value
-from drivers.settings_model import (
+from drivers.settings import module_lookup, number_ranges
+from drivers.settings.model import (
     Conflict,
     ListOf,
     Problem,
@@ -33,6 +32,7 @@ from drivers.settings_model import (
     check_table,
     fields_by_key,
 )
+from drivers.settings.number_ranges import format_value
 from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.settings.field_types import Duration
 

@@ -33,7 +33,7 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
+from drivers.settings.model import SettingsModel
 from drivers.units import DEGREE, G0
 
 SYNC: Final = b"\x55\x55"

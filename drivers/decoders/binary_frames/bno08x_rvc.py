@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.data_types import Chunk, CounterTimedFormat, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
+from drivers.settings.model import SettingsModel
 from drivers.units import G0
 
 HEADER: Final = b"\xaa\xaa"

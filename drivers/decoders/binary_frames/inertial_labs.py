@@ -24,7 +24,7 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, CounterTimedFormat, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
+from drivers.settings.model import SettingsModel
 from drivers.units import DEGREE, G0
 
 SYNC: Final = b"\xaa\x55\x01"

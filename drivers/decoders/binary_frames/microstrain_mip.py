@@ -37,7 +37,7 @@ from drivers.data_types import (
     Timing,
 )
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
+from drivers.settings.model import SettingsModel
 from drivers.units import G0
 
 SYNC: Final = b"\x75\x65"

@@ -29,8 +29,8 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.number_ranges import SCALE, NumberRange
-from drivers.settings_model import Conflict, SettingsModel
+from drivers.settings.model import Conflict, SettingsModel
+from drivers.settings.number_ranges import SCALE, NumberRange
 from drivers.units import DEGREE, G0
 
 SYNC: Final = b"\xaa\x44"

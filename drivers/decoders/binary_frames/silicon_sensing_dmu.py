@@ -24,7 +24,7 @@ from pydantic import Field
 
 from drivers.data_types import Chunk, CounterTimedFormat, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
+from drivers.settings.model import SettingsModel
 from drivers.units import DEGREE, G0
 
 HEADER: Final = b"\x55\xaa"

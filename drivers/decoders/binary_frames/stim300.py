@@ -30,8 +30,8 @@ from pydantic import Field
 from drivers.data_types import Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.errors import ConfigError
-from drivers.number_ranges import RATE_HZ
-from drivers.settings_model import Conflict, KeywordOrType, SettingsModel, checked_by
+from drivers.settings.model import Conflict, KeywordOrType, SettingsModel, checked_by
+from drivers.settings.number_ranges import RATE_HZ
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8

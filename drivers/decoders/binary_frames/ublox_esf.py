@@ -34,8 +34,8 @@ from pydantic import Field
 
 from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.number_ranges import DELAY_S, TICK_S
-from drivers.settings_model import SettingsModel
+from drivers.settings.model import SettingsModel
+from drivers.settings.number_ranges import DELAY_S, TICK_S
 from drivers.units import DEGREE
 
 SYNC: Final = b"\xb5\x62"

@@ -21,8 +21,8 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.number_ranges import FULL_SCALE
-from drivers.settings_model import SettingsModel
+from drivers.settings.model import SettingsModel
+from drivers.settings.number_ranges import FULL_SCALE
 from drivers.units import DEGREE, G0
 
 ACCEL, RATE = 0x51, 0x52

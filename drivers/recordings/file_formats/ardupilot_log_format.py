@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.file_access import open_regular_file
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import report_read_share
 from drivers.recordings.topics import BLOCK_ROWS, JOIN, Topic, join_topics, select_topics

@@ -18,7 +18,7 @@ from typing import IO, Final
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, RecordingError
-from drivers.file_access import open_regular_file
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import table
 from drivers.recordings.file_formats.csv_format import (
     CsvSource,

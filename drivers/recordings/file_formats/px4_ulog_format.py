@@ -21,7 +21,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.file_access import open_regular_file
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import open_file_and_report_position
 from drivers.recordings.topics import JOIN, Topic, join_topics, select_topics

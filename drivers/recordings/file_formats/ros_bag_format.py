@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.file_access import check_regular_file, open_regular_file
+from drivers.host.file_access import check_regular_file, open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.file_formats.ros_message_arrays import (
     IMU_TYPE,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr, xlogy
 
 from drivers.data_types import Floats
-from drivers.number_ranges import HOUR_S
+from drivers.settings.number_ranges import HOUR_S
 from drivers.units import DEGREE, G0
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95

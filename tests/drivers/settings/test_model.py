@@ -10,8 +10,7 @@ import pytest
 from pydantic import Field
 
 from drivers.errors import ConfigError
-from drivers.number_ranges import FRACTION, RATE_HZ
-from drivers.settings_model import (
+from drivers.settings.model import (
     Conflict,
     FileOrName,
     FilePath,
@@ -21,6 +20,7 @@ from drivers.settings_model import (
     check_table,
     one_of,
 )
+from drivers.settings.number_ranges import FRACTION, RATE_HZ
 from tests.support.settings import read_settings
 
 

@@ -1,0 +1,1 @@
+"""Models of settings, ranges of numbers, and look-up of modules by name."""
