@@ -18,8 +18,8 @@ from drivers.data_types import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, 
 from drivers.decoders.base import Decoder
 from drivers.decoders.text_lines.text.settings import COLUMNS as TEXT_COLUMNS
 from drivers.errors import ConfigError
-from drivers.settings import module_lookup
-from drivers.settings.model import SettingsModel
+from drivers.validation import module_lookup
+from drivers.validation.settings_model import SettingsModel
 
 MIN_SAMPLES: Final = 5
 """Minimum number of samples or text lines that identify a format.

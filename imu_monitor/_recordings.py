@@ -14,8 +14,8 @@ from drivers.data_types import AXES, Floats, Times, times_to_seconds
 from drivers.errors import ConfigError
 from drivers.recordings.reading_options import create_reading_options
 from drivers.recordings.table import ALIASES, COLUMNS, TIME_NS, integers_to_ns
-from drivers.settings.module_lookup import format_suggestion
-from drivers.settings.number_ranges import RATE_HZ, NumberRange
+from drivers.validation.module_lookup import format_suggestion
+from drivers.validation.number_ranges import RATE_HZ, NumberRange
 from imu_monitor._display import build_dataframe, render_html
 from imu_monitor._messages import errors_name_arguments, name_arguments
 from monitor.commands.analyze import check_averaging_times

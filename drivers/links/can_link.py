@@ -29,9 +29,9 @@ from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_erro
 from drivers.host.extras import install_command, require_extra
 from drivers.links.arrival_times import monotonic_arrival_ns
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.settings.model import checked_by
-from drivers.settings.module_lookup import format_choices_by_similarity
-from drivers.settings.number_ranges import BIT_RATE, format_value
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.number_ranges import BIT_RATE, format_value
+from drivers.validation.settings_model import checked_by
 
 if TYPE_CHECKING:
     import can

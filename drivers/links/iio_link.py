@@ -27,8 +27,8 @@ from drivers.data_types import Chunk
 from drivers.errors import ConfigError, DecodeError, LinkLost, LinkUnavailable, describe_error
 from drivers.host.iio_scan_layout import ScanElement, ScanLayout, locate_numbers
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.settings.model import Conflict, checked_by
-from drivers.settings.number_ranges import RATE_HZ
+from drivers.validation.number_ranges import RATE_HZ
+from drivers.validation.settings_model import Conflict, checked_by
 
 DEFAULT_DECODER: Final = "iio"
 ROOT: Final = Path("/")

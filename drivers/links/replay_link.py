@@ -41,9 +41,9 @@ from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, re
 from drivers.recordings.file_formats.ardupilot_log_format import is_ardupilot_log
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.reading_progress import open_file_and_report_position
-from drivers.settings.model import FilePath, KeywordOrType
-from drivers.settings.module_lookup import format_choices_by_similarity
-from drivers.settings.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
+from drivers.validation.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
 DEFAULT_DECODER: Final = "samples"

@@ -34,7 +34,7 @@ from drivers.recordings.recording import (
 )
 from drivers.recordings.table import EXAMPLE_HEADER
 from drivers.recordings.writing import open_recording_writer, save_samples
-from drivers.settings.number_ranges import DURATION_S, RATE_HZ
+from drivers.validation.number_ranges import DURATION_S, RATE_HZ
 
 __all__ = [
     "FORMATS",

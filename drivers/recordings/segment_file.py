@@ -36,7 +36,7 @@ from drivers.recordings.file_formats.parquet_and_arrow_format import (
 )
 from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
-from drivers.settings.number_ranges import COUNTER_STEP, RATE_HZ
+from drivers.validation.number_ranges import COUNTER_STEP, RATE_HZ
 
 SUFFIX: Final = ".arrows"
 NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")

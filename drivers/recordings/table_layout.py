@@ -38,7 +38,7 @@ from drivers.recordings.table import (
     format_name_list,
     integers_to_ns,
 )
-from drivers.settings.module_lookup import format_suggestion
+from drivers.validation.module_lookup import format_suggestion
 
 
 @dataclass(frozen=True, slots=True)

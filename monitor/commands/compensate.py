@@ -16,7 +16,7 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks
 from drivers.recordings.writing import save_samples
-from drivers.settings.module_lookup import format_suggestion
+from drivers.validation.module_lookup import format_suggestion
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma

@@ -15,7 +15,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.host import file_access
 from drivers.recordings import iter_blocks
-from drivers.settings.number_ranges import DURATION_S, FIT_NUMBER
+from drivers.validation.number_ranges import DURATION_S, FIT_NUMBER
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means

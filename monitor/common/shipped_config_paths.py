@@ -6,7 +6,7 @@ from typing import Final
 
 from drivers.errors import ConfigError
 from drivers.host import file_access
-from drivers.settings import module_lookup
+from drivers.validation import module_lookup
 
 CONFIG_FOLDER: Final = Path(__file__).resolve().parents[2] / "config"
 MODELS_FOLDER: Final = CONFIG_FOLDER / "models"

@@ -25,7 +25,7 @@ import msgspec
 
 from drivers.errors import RecordingError
 from drivers.host.file_access import check_folder_or_absent, check_regular_file
-from drivers.settings.number_ranges import DAY_S
+from drivers.validation.number_ranges import DAY_S
 from monitor.history.history_row import (
     MAX_COLUMNS,
     STATES,

@@ -21,8 +21,9 @@ from drivers.data_types import make_block
 from drivers.decoders.base import AddressFilteringDecoder, Decoder
 from drivers.errors import ConfigError
 from drivers.links.base import AddressFilteringLink, Link, LinkSettings
-from drivers.settings import module_lookup, number_ranges
-from drivers.settings.model import (
+from drivers.validation import module_lookup, number_ranges
+from drivers.validation.number_ranges import format_value
+from drivers.validation.settings_model import (
     Conflict,
     ListOf,
     Problem,
@@ -32,7 +33,6 @@ from drivers.settings.model import (
     check_table,
     fields_by_key,
 )
-from drivers.settings.number_ranges import format_value
 from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.settings.field_types import Duration
 

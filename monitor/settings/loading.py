@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from drivers.errors import ConfigError, make_printable_and_shorten
 from drivers.host import file_access
-from drivers.settings.model import Problem, TableCheckResult, check_table
+from drivers.validation.settings_model import Problem, TableCheckResult, check_table
 from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_parser
 from monitor.settings.driver_settings import BuiltLinkAndDecoder, FaultsTable, VirtualTable

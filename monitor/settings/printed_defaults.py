@@ -14,9 +14,9 @@ from pydantic.fields import FieldInfo
 import drivers.decoders
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.settings import module_lookup
-from drivers.settings.model import SettingsModel, fields_by_key, find_settings_model
-from drivers.settings.number_ranges import NumberRange
+from drivers.validation import module_lookup
+from drivers.validation.number_ranges import NumberRange
+from drivers.validation.settings_model import SettingsModel, fields_by_key, find_settings_model
 from monitor.settings import driver_settings
 from monitor.settings.schema import ConfigFile, Device, Hook, Limit
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from drivers import decoders
 from drivers.decoders.base import Decoder
-from drivers.settings import module_lookup
+from drivers.validation import module_lookup
 from tests.support.settings import read_settings
 
 DEGREE = math.pi / 180.0

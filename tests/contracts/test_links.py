@@ -24,7 +24,7 @@ from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import iio_link
 from drivers.links.base import Link, LinkSettings
-from drivers.settings import module_lookup
+from drivers.validation import module_lookup
 from tests.support.fake_iio_device import FakeIioDevice
 from tests.support.loopback_link import LoopbackLink
 from tests.support.ports import free_endpoint

@@ -18,7 +18,7 @@ from drivers.decoders.dbc.signal_bits import SignalCodec
 from drivers.errors import ConfigError
 from drivers.host import file_access
 from drivers.host.extras import require_extra
-from drivers.settings.module_lookup import format_suggestion
+from drivers.validation.module_lookup import format_suggestion
 
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
 SHIPPED_PREFIX: Final = "shipped:"

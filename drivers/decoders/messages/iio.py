@@ -31,7 +31,7 @@ from drivers.decoders.base import Bytes, Decoder, RejectingDecoder, quantize
 from drivers.errors import DecodeError
 from drivers.host.iio_scan_layout import TIMESTAMP, ScanElement, ScanLayout, StoredNumber, decode_layout, locate_numbers
 from drivers.recordings.table import T_LIMIT_S
-from drivers.settings.model import SettingsModel
+from drivers.validation.settings_model import SettingsModel
 
 AXIS_CHANNELS: Final = tuple(f"in_{'anglvel' if axis[0] == 'g' else 'accel'}_{axis[1]}" for axis in AXES)
 TEMPERATURE_CHANNELS: Final = ("in_temp", "in_temp0")

@@ -22,9 +22,9 @@ import drivers.links
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError
 from drivers.recordings import load_samples
-from drivers.settings import module_lookup, number_ranges
-from drivers.settings.model import KeywordOrType, SettingsModel, fields_by_key
-from drivers.settings.number_ranges import NumberRange
+from drivers.validation import module_lookup, number_ranges
+from drivers.validation.number_ranges import NumberRange
+from drivers.validation.settings_model import KeywordOrType, SettingsModel, fields_by_key
 from monitor import cli
 from monitor.commands.analyze import analyze_recording
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording

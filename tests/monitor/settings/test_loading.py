@@ -10,7 +10,7 @@ import drivers.links
 from drivers.decoders.text_lines.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from drivers.settings import module_lookup
+from drivers.validation import module_lookup
 from monitor.common.shipped_config_paths import CONFIG_FOLDER, resolve_model_path
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings.loading import (

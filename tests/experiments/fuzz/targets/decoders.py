@@ -25,7 +25,7 @@ from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.decoders.messages.iio import AXIS_CHANNELS
 from drivers.decoders.text_lines.text import Settings as TextSettings
-from drivers.settings import module_lookup
+from drivers.validation import module_lookup
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
 from tests.experiments.fuzz.binary_formats import BINARY_FORMATS

@@ -29,8 +29,8 @@ from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from drivers.errors import ConfigError
 from drivers.host import file_access
-from drivers.settings.module_lookup import format_choices_by_similarity, format_suggestion
-from drivers.settings.number_ranges import format_value
+from drivers.validation.module_lookup import format_choices_by_similarity, format_suggestion
+from drivers.validation.number_ranges import format_value
 
 MAX_PASSES: Final = 4
 """Maximum number of times that a table is validated. Invalid values are replaced after each validation."""

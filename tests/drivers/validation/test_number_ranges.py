@@ -7,9 +7,9 @@ import pytest
 from pydantic import Field
 
 from drivers.errors import ConfigError
-from drivers.settings import number_ranges
-from drivers.settings.model import ListOf, SettingsModel
-from drivers.settings.number_ranges import RATE_HZ, SCALE, SEED, SILENCE_S, NumberRange
+from drivers.validation import number_ranges
+from drivers.validation.number_ranges import RATE_HZ, SCALE, SEED, SILENCE_S, NumberRange
+from drivers.validation.settings_model import ListOf, SettingsModel
 from tests.support.settings import read_settings
 
 RANGES = {name: value for name, value in vars(number_ranges).items() if isinstance(value, NumberRange)}

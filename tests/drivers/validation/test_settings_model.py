@@ -10,7 +10,8 @@ import pytest
 from pydantic import Field
 
 from drivers.errors import ConfigError
-from drivers.settings.model import (
+from drivers.validation.number_ranges import FRACTION, RATE_HZ
+from drivers.validation.settings_model import (
     Conflict,
     FileOrName,
     FilePath,
@@ -20,7 +21,6 @@ from drivers.settings.model import (
     check_table,
     one_of,
 )
-from drivers.settings.number_ranges import FRACTION, RATE_HZ
 from tests.support.settings import read_settings
 
 

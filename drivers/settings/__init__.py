@@ -1,1 +1,0 @@
-"""Models of settings, ranges of numbers, and look-up of modules by name."""
