@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from typing import Final, TypeVar
 
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices_by_similarity
-from drivers.number_ranges import HOUR_S, SCALE
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.number_ranges import HOUR_S, SCALE
 
 G0: Final = 9.80665
 """Standard acceleration of free fall in m/s², exact by definition (CGPM 1901)."""

@@ -13,12 +13,13 @@ from typing import Any, Final, Literal, get_args, get_origin
 
 import numpy as np
 
-from drivers import decoders, module_lookup
+from drivers import decoders
 from drivers.data_types import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from drivers.decoders.base import Decoder
 from drivers.decoders.text_lines.text.settings import COLUMNS as TEXT_COLUMNS
 from drivers.errors import ConfigError
-from drivers.settings_model import SettingsModel
+from drivers.validation import module_lookup
+from drivers.validation.settings_model import SettingsModel
 
 MIN_SAMPLES: Final = 5
 """Minimum number of samples or text lines that identify a format.

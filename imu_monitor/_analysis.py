@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from drivers.data_types import AXES
-from drivers.number_ranges import DURATION_S
+from drivers.validation.number_ranges import DURATION_S
 from imu_monitor._estimates import AllanEstimate
 from imu_monitor._messages import errors_name_arguments, name_arguments
 from imu_monitor._recordings import Samples, check_range, to_recording, to_tau_grid

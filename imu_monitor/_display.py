@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.number_ranges import DURATION_S, RATE_HZ, SEED
 from drivers.recordings import memory_check
+from drivers.validation.number_ranges import DURATION_S, RATE_HZ, SEED
 from imu_monitor._estimates import AllanEstimate
 from imu_monitor._messages import errors_name_arguments
 from imu_monitor._recordings import Recording, check_range

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 
 from drivers.errors import ConfigError
-from drivers.extras import require_extra
-from drivers.number_ranges import SEED
+from drivers.host.extras import require_extra
+from drivers.validation.number_ranges import SEED
 from imu_monitor._display import build_dataframe, render_html, render_text
 from imu_monitor._messages import errors_name_arguments, name_arguments
 from imu_monitor._models import ModelSource, to_model

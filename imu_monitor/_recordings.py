@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from drivers import recordings
 from drivers.data_types import AXES, Floats, Times, times_to_seconds
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_suggestion
-from drivers.number_ranges import RATE_HZ, NumberRange
 from drivers.recordings.reading_options import create_reading_options
 from drivers.recordings.table import ALIASES, COLUMNS, TIME_NS, integers_to_ns
+from drivers.validation.module_lookup import format_suggestion
+from drivers.validation.number_ranges import RATE_HZ, NumberRange
 from imu_monitor._display import build_dataframe, render_html
 from imu_monitor._messages import errors_name_arguments, name_arguments
 from monitor.commands.analyze import check_averaging_times

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.extras import EXTRAS, install_command
+from drivers.host.extras import EXTRAS, install_command
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for

@@ -17,8 +17,8 @@ from pydantic import Field
 
 from drivers.data_types import Chunk
 from drivers.errors import LinkLost
-from drivers.number_ranges import SILENCE_S
-from drivers.settings_model import SettingsModel
+from drivers.validation.number_ranges import SILENCE_S
+from drivers.validation.settings_model import SettingsModel
 
 Carrier = Literal["bytes", "frames", "messages"]
 """Content of a chunk: part of a byte stream ("bytes"), one CAN frame ("frames") or one message ("messages")."""

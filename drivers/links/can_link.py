@@ -26,12 +26,12 @@ from pydantic import Field, SkipValidation
 
 from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
-from drivers.extras import install_command, require_extra
+from drivers.host.extras import install_command, require_extra
 from drivers.links.arrival_times import monotonic_arrival_ns
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices_by_similarity
-from drivers.number_ranges import BIT_RATE, format_value
-from drivers.settings_model import checked_by
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.number_ranges import BIT_RATE, format_value
+from drivers.validation.settings_model import checked_by
 
 if TYPE_CHECKING:
     import can

@@ -1,8 +1,8 @@
 """Link to an inertial sensor whose driver is part of the Linux kernel (Industrial I/O).
 
 The kernel writes one scan per sample to a buffer, which the link reads from ``/dev/iio:deviceN``. Each chunk contains
-one or more complete scans. ``Chunk.attachment`` contains their layout (``drivers.iio_scan_layout``), which the link
-reads from sysfs when it is opened.
+one or more complete scans. ``Chunk.attachment`` contains their layout (``drivers.host.iio_scan_layout``), which the
+link reads from sysfs when it is opened.
 
 By default, the link writes nothing, and another program has to enable the buffer. With ``enable = true``, the link
 enables the channels of angular rate, acceleration, temperature and time, sets the trigger and the sampling frequency
@@ -25,10 +25,10 @@ from pydantic import Field
 
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, DecodeError, LinkLost, LinkUnavailable, describe_error
-from drivers.iio_scan_layout import ScanElement, ScanLayout, locate_numbers
+from drivers.host.iio_scan_layout import ScanElement, ScanLayout, locate_numbers
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.number_ranges import RATE_HZ
-from drivers.settings_model import Conflict, checked_by
+from drivers.validation.number_ranges import RATE_HZ
+from drivers.validation.settings_model import Conflict, checked_by
 
 DEFAULT_DECODER: Final = "iio"
 ROOT: Final = Path("/")

@@ -32,18 +32,18 @@ from typing import IO, Annotated, Any, Final, Literal, cast
 
 from pydantic import Field
 
-from drivers import file_access
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
-from drivers.extras import require_extra
+from drivers.host import file_access
+from drivers.host.extras import require_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices_by_similarity
-from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, require_packages_of_format, segment_file
 from drivers.recordings.file_formats.ardupilot_log_format import is_ardupilot_log
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.reading_progress import open_file_and_report_position
-from drivers.settings_model import FilePath, KeywordOrType
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
+from drivers.validation.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
 DEFAULT_DECODER: Final = "samples"

@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import Field
 
-from drivers.credential_masking import mask_secrets
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices_by_similarity
-from drivers.number_ranges import BIT_RATE, READ_TIMEOUT_S
-from drivers.settings_model import checked_by
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.number_ranges import BIT_RATE, READ_TIMEOUT_S
+from drivers.validation.settings_model import checked_by
+from drivers.zenoh.credential_masking import mask_secrets
 
 if TYPE_CHECKING:
     import serial

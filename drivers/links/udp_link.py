@@ -24,7 +24,7 @@ from drivers.data_types import Chunk
 from drivers.errors import LinkLost, LinkUnavailable, describe_error
 from drivers.links.arrival_times import monotonic_arrival_ns
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.number_ranges import PORT
+from drivers.validation.number_ranges import PORT
 
 DEFAULT_DECODER: Final = ""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20

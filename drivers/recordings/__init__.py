@@ -19,9 +19,8 @@ from pathlib import Path
 
 from drivers.data_types import times_to_seconds
 from drivers.errors import ConfigError, RecordingError, describe_error
-from drivers.extras import require_extra
-from drivers.file_access import check_regular_file
-from drivers.number_ranges import DURATION_S, RATE_HZ
+from drivers.host.extras import require_extra
+from drivers.host.file_access import check_regular_file
 from drivers.recordings import memory_check
 from drivers.recordings.formats import FORMATS, WRITABLE, Format, find_format, is_recording, is_recording_folder
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
@@ -35,6 +34,7 @@ from drivers.recordings.recording import (
 )
 from drivers.recordings.table import EXAMPLE_HEADER
 from drivers.recordings.writing import open_recording_writer, save_samples
+from drivers.validation.number_ranges import DURATION_S, RATE_HZ
 
 __all__ = [
     "FORMATS",
@@ -153,8 +153,6 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None, option
     notes: list[str] = []
     free = memory_check.available_bytes()
     rows = size_bytes = 0
-    if last_s is None:
-        _check_folder(path, segments, free, options)
     for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz, options)
@@ -175,18 +173,6 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None, option
 def _number_order(path: Path) -> list[str | int]:
     """Return a key that sorts ``run_10.bag`` after ``run_2.bag``."""
     return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", path.name))]
-
-
-def _check_folder(path: Path, segments: Sequence[Path], free: int | None, options: ReadingOptions) -> None:
-    """Raise an error if the readable segments together contain too many rows."""
-    rows = size_bytes = 0
-    for segment in segments:
-        try:
-            rows += 0 if _is_empty(segment) else _format_with_packages(segment).count_rows(segment, options)
-        except (RecordingError, OSError):
-            continue  # the note about the segment is added when the segment is read
-        size_bytes += segment.stat().st_size
-        memory_check.RecordingSizeLimits(path, size_bytes, free).check_row_count(rows)
 
 
 def _duration_s(parts: Sequence[Recording]) -> float:

@@ -29,8 +29,6 @@ class Format:
 
     read: Callable[[Path, ReadingOptions], Table]
     """Function that reads a file."""
-    count_rows: Callable[[Path, ReadingOptions], int]
-    """Function that returns the number of rows without keeping the samples."""
     open_writer: OpenWriter | None = None
     """Function that writes a file, or None if the program does not write the format."""
     any_columns: bool = False
@@ -39,79 +37,48 @@ class Format:
     """Extra with the packages for the format, or "" if none is needed or if the functions check for it."""
 
 
-def _table_format(
-    read: Callable[[Path, ReadingOptions], Table],
-    open_writer: OpenWriter | None,
-    count_rows: Callable[[Path, ReadingOptions], int],
-) -> Format:
+def _table_format(read: Callable[[Path, ReadingOptions], Table], open_writer: OpenWriter | None) -> Format:
     """Return the format of a file that contains a single table and no topics."""
 
-    def refuse_topic(path: Path, options: ReadingOptions) -> None:
+    def read_table(path: Path, options: ReadingOptions) -> Table:
         if options.topic is not None:
             raise ConfigError(f"{path}: contains a single table and no topics; leave out the topic {options.topic}")
-
-    def read_table(path: Path, options: ReadingOptions) -> Table:
-        refuse_topic(path, options)
         return convert_to_si(path, read(path, options), options)
 
-    def count_table_rows(path: Path, options: ReadingOptions) -> int:
-        refuse_topic(path, options)
-        return count_rows(path, options)
-
-    return Format(read_table, count_table_rows, open_writer, any_columns=True)
+    return Format(read_table, open_writer, any_columns=True)
 
 
-def _log_format(
-    read: Callable[[Path, str | None], Table], count_rows: Callable[[Path, str | None], int], extra: str
-) -> Format:
+def _log_format(read: Callable[[Path, str | None], Table], extra: str) -> Format:
     """Return the format of a log that contains topics. The messages of the log determine the columns."""
 
-    def check_topic(path: Path, options: ReadingOptions) -> str | None:
+    def read_log(path: Path, options: ReadingOptions) -> Table:
         for option, given in (("--columns", options.columns), ("--time-unit", options.time_unit)):
             if given:
                 raise ConfigError(f"{path}: the messages of this log determine columns and times; leave out {option}")
-        return options.topic
+        return convert_to_si(path, read(path, options.topic), options)
 
-    return Format(
-        lambda path, options: convert_to_si(path, read(path, check_topic(path, options)), options),
-        lambda path, options: count_rows(path, check_topic(path, options)),
-        extra=extra,
-    )
+    return Format(read_log, extra=extra)
 
 
-_SENSOR_FILES: Final = Format(csv_per_sensor_format.read_sensor_files, csv_per_sensor_format.count_sensor_rows)
-_ROS_BAG: Final = _log_format(ros_bag_format.read_ros_bag, ros_bag_format.count_ros_bag_rows, "ros")
-
-
-def _count_csv_rows(path: Path, _: ReadingOptions) -> int:
-    return csv_format.count_csv_rows(path)
-
-
-def _count_ipc_rows(path: Path, _: ReadingOptions) -> int:
-    return arrow_format.count_ipc_rows(path)
+_SENSOR_FILES: Final = Format(csv_per_sensor_format.read_sensor_files)
+_ROS_BAG: Final = _log_format(ros_bag_format.read_ros_bag, "ros")
 
 
 FORMATS: Final[Mapping[str, Format]] = {
-    ".csv": _table_format(csv_format.read_csv, csv_format.open_csv_writer, _count_csv_rows),
-    ".csv.gz": _table_format(csv_format.read_csv, partial(csv_format.open_csv_writer, use_gzip=True), _count_csv_rows),
-    ".npz": _table_format(npz_format.read_npz, npz_format.open_npz_writer, npz_format.count_npz_rows),
-    ".parquet": _table_format(
-        arrow_format.read_parquet, arrow_format.open_parquet_writer, arrow_format.count_parquet_rows
-    ),
-    ".arrow": _table_format(arrow_format.read_ipc, arrow_format.open_ipc_writer, _count_ipc_rows),
-    ".feather": _table_format(arrow_format.read_ipc, arrow_format.open_ipc_writer, _count_ipc_rows),
-    ".arrows": _table_format(
-        arrow_format.read_ipc, partial(arrow_format.open_ipc_writer, stream=True), _count_ipc_rows
-    ),
-    ".mat": _table_format(matlab_format.read_matlab, None, matlab_format.count_matlab_rows),
+    ".csv": _table_format(csv_format.read_csv, csv_format.open_csv_writer),
+    ".csv.gz": _table_format(csv_format.read_csv, partial(csv_format.open_csv_writer, use_gzip=True)),
+    ".npz": _table_format(npz_format.read_npz, npz_format.open_npz_writer),
+    ".parquet": _table_format(arrow_format.read_parquet, arrow_format.open_parquet_writer),
+    ".arrow": _table_format(arrow_format.read_ipc, arrow_format.open_ipc_writer),
+    ".feather": _table_format(arrow_format.read_ipc, arrow_format.open_ipc_writer),
+    ".arrows": _table_format(arrow_format.read_ipc, partial(arrow_format.open_ipc_writer, stream=True)),
+    ".mat": _table_format(matlab_format.read_matlab, None),
     ".zip": _SENSOR_FILES,
     ".bag": _ROS_BAG,
     ".db3": _ROS_BAG,
     ".mcap": replace(_ROS_BAG, open_writer=mcap_writer.open_mcap_writer),
-    ".ulg": _log_format(px4_ulog_format.read_ulog, px4_ulog_format.count_ulog_rows, "px4"),
-    ".bin": _log_format(
-        ardupilot_log_format.read_ardupilot_log, ardupilot_log_format.count_ardupilot_rows, "ardupilot"
-    ),
+    ".ulg": _log_format(px4_ulog_format.read_ulog, "px4"),
+    ".bin": _log_format(ardupilot_log_format.read_ardupilot_log, "ardupilot"),
 }
 """Recording format for each file suffix."""
 

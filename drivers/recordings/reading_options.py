@@ -10,9 +10,9 @@ from pydantic import BeforeValidator, Field
 
 from drivers import units
 from drivers.errors import ConfigError
-from drivers.number_ranges import format_value
 from drivers.recordings.table import COLUMNS
-from drivers.settings_model import SettingsModel, check_table, checked_by, one_of
+from drivers.validation.number_ranges import format_value
+from drivers.validation.settings_model import SettingsModel, check_table, checked_by, one_of
 
 NOT_READ: Final = "-"
 """Column reference that leaves a quantity out."""

@@ -21,12 +21,12 @@ from drivers.data_types import (
     times_to_seconds,
 )
 from drivers.errors import ConfigError, RecordingError, make_printable_and_shorten
-from drivers.number_ranges import RATE_HZ
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.table import BATCH_ROWS, T_LIMIT_S, TIME_NS, Columns, Table, column_dtype
 from drivers.recordings.table_layout import find_unit
 from drivers.recordings.unit_check import describe_likely_unit_errors
 from drivers.units import time_factor
+from drivers.validation.number_ranges import RATE_HZ
 
 MAX_VALUE: Final = 1e100
 """Largest absolute value. The sum of the squares of larger values could overflow float64."""

@@ -26,8 +26,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, ns_to_seconds, seconds_to_ns
 from drivers.errors import ImuError, RecordingError
-from drivers.file_access import open_regular_file
-from drivers.number_ranges import COUNTER_STEP, RATE_HZ
+from drivers.host.file_access import open_regular_file
 from drivers.recordings.file_formats.arrow_message_sizes import iter_batch_sizes
 from drivers.recordings.file_formats.parquet_and_arrow_format import (
     METADATA_KEY,
@@ -37,6 +36,7 @@ from drivers.recordings.file_formats.parquet_and_arrow_format import (
 )
 from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
+from drivers.validation.number_ranges import COUNTER_STEP, RATE_HZ
 
 SUFFIX: Final = ".arrows"
 NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")

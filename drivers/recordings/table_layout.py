@@ -27,7 +27,6 @@ import numpy as np
 from drivers import units
 from drivers.data_types import AXES, NS_PER_S, Floats, Times
 from drivers.errors import ConfigError, RecordingError
-from drivers.module_lookup import format_suggestion
 from drivers.recordings.reading_options import NOT_READ, ReadingOptions
 from drivers.recordings.table import (
     COLUMNS,
@@ -39,6 +38,7 @@ from drivers.recordings.table import (
     format_name_list,
     integers_to_ns,
 )
+from drivers.validation.module_lookup import format_suggestion
 
 
 @dataclass(frozen=True, slots=True)

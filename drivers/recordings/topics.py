@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Times
 from drivers.errors import ConfigError, RecordingError
-from drivers.module_lookup import format_choices_by_similarity
 from drivers.recordings.table import TIME_NS, Columns, column_seconds, format_name_list
+from drivers.validation.module_lookup import format_choices_by_similarity
 
 JOIN: Final = "+"
 """Separator of two topics that are read as one IMU."""

@@ -5,7 +5,7 @@ existing recording remains unchanged.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
@@ -15,7 +15,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats, Times, times_to_seconds
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings.formats import find_writer
-from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, TIME_NS, column_dtype, format_name_list
+from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S, TIME_NS, column_dtype, format_name_list
 
 
 class AppendSamples(Protocol):
@@ -84,6 +84,7 @@ def save_samples(
     values: Floats,
     temperature_c: Floats | None = None,
     axes: Sequence[str] | None = None,
+    report_share: Callable[[float], None] = lambda _share: None,
 ) -> None:
     """Save samples as a recording without loss of precision. The file suffix determines the format.
 
@@ -99,6 +100,8 @@ def save_samples(
         [n] float64 in °C. None if no temperature was measured.
     axes
         Axes to write. By default, all axes with at least one value are written.
+    report_share
+        Function that receives the share of the rows that have been written, from 0 to 1.
 
     Raises
     ------
@@ -112,7 +115,11 @@ def save_samples(
         axes = [axis for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()]
     temperature = temperature_c is not None and not np.isnan(temperature_c).all()
     with open_recording_writer(path, axes, temperature, times_in_ns=times.dtype == np.int64) as append_samples:
-        append_samples(times, values, temperature_c)
+        for start in range(0, len(times), BATCH_ROWS):
+            report_share(start / len(times))
+            rows = slice(start, start + BATCH_ROWS)
+            append_samples(times[rows], values[rows], None if temperature_c is None else temperature_c[rows])
+        report_share(1.0)
 
 
 @contextmanager

@@ -16,7 +16,6 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import NO_TICK, CounterTimedFormat, Event, Ints, SampleBlock, SenderTimedFormat, Timing
-from drivers.number_ranges import RATE_HZ
 from drivers.timing.arrival_regression import MIN_SAMPLES, MIN_SPAN_S, snap_to_standard_rate
 from drivers.timing.arrival_timeline import MAX_RATE_HZ, ArrivalTimeline
 from drivers.timing.counter_gaps import CounterGaps
@@ -24,6 +23,7 @@ from drivers.timing.duplicate_rows import RowFilter
 from drivers.timing.event_rate_limiter import EventRateLimiter
 from drivers.timing.rate_check import RateCheck
 from drivers.timing.sender_time_gaps import SenderTimeGapDetector
+from drivers.validation.number_ranges import RATE_HZ
 
 MAX_RESUME_DELAY_S: Final = 10.0
 """Assumed maximum delay in s of the last sample before a restart."""

@@ -13,8 +13,8 @@ import ssl
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.credential_masking import mask_secrets
 from drivers.errors import describe_error
+from drivers.zenoh.credential_masking import mask_secrets
 
 if TYPE_CHECKING:
     import zenoh

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.credential_masking import mask_secrets
-from drivers.file_access import check_regular_file
+from drivers.host.file_access import check_regular_file
+from drivers.zenoh.credential_masking import mask_secrets
 
 if TYPE_CHECKING:
     import zenoh

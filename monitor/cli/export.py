@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
+from drivers.zenoh.credential_masking import mask_secrets
 from monitor.cli.shared import options, output
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import NotReady
-from drivers.extras import require_extra
+from drivers.host.extras import require_extra
 from monitor.cli.shared import options, output, service_in_terminal
 
 

@@ -5,6 +5,7 @@ estimated drift noise. All methods are evaluated on the same samples, which were
 first third of the samples at rest is excluded from the evaluation, because some methods use it for learning.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, NotReady
-from drivers.module_lookup import format_suggestion
 from drivers.recordings import iter_blocks
-from drivers.recordings.writing import open_recording_writer
+from drivers.recordings.writing import save_samples
+from drivers.validation.module_lookup import format_suggestion
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
@@ -30,7 +31,6 @@ METHODS: Final = ("adaptive", "fixed", *REFERENCE_METHODS)
 GYROS: Final = AXES[:3]
 LEARNING_SHARE: Final = 1.0 / 3.0
 """Fraction of the samples at rest that is used for learning and excluded from the evaluation."""
-BLOCK_ROWS: Final = 1 << 16
 
 
 def run_compensation(
@@ -97,7 +97,9 @@ def run_compensation(
     }
     start_s = 0.0 if (stored_s := found.t_s) is None else float(stored_s[0])
     t_s = start_s + np.arange(len(values)) / rate_hz
-    _write(out, found.axes, t_s, compensated, temperature_c, report_progress)
+    there = np.flatnonzero(np.isfinite(compensated).any(axis=1))
+    report = partial(report_progress, "writing")
+    save_samples(out, t_s[there], compensated[there], temperature_c[there], found.axes, report)
     return DriftCompensationResult(
         recording=recording.name,
         out=out,
@@ -175,15 +177,3 @@ def _evaluate_axis(
         rejected_intervals=int((became == REJECTED).sum()),
         steps=int((became == STEPPED).sum()),
     )
-
-
-def _write(
-    path: Path, axes: tuple[str, ...], t_s: Floats, out: Floats, temperature_c: Floats, tell: ProgressCallback
-) -> None:
-    there = np.flatnonzero(np.isfinite(out).any(axis=1))
-    warm = bool(np.isfinite(temperature_c).any())
-    with open_recording_writer(path, axes, warm) as append:
-        for start in range(0, there.size, BLOCK_ROWS):
-            rows = there[start : start + BLOCK_ROWS]
-            append(t_s[rows], out[rows], temperature_c[rows])
-            tell("writing", start / there.size)

@@ -1,22 +1,20 @@
 """Command ``convert``: reads a recording in any format and writes the samples in another format."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.file_access import real_path
-from drivers.recordings import Recording, open_recording_writer
+from drivers.host.file_access import real_path
+from drivers.recordings import Recording, save_samples
 from drivers.recordings.file_formats.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
 from drivers.recordings.formats import find_writer
 from drivers.recordings.topics import JOIN
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
-
-BLOCK_ROWS: Final = 1 << 16
 
 
 def run_conversion(
@@ -49,18 +47,11 @@ def run_conversion(
         raise ConfigError(f"{out}: is the recording itself; choose another name")
     found = load_recording(path, loading, report_progress)
     axes = [axis for axis in found.axes if not np.isnan(found.values[:, AXES.index(axis)]).all()] or found.axes
-    in_ns = found.times is not None and found.times.dtype == np.int64
-    with open_recording_writer(out, axes, has_temperature(found), times_in_ns=in_ns) as append_samples:
-        for start in range(0, len(found), BLOCK_ROWS):
-            report_progress("writing", start / len(found))
-            part = slice(start, min(start + BLOCK_ROWS, len(found)))
-            if found.times is not None:
-                times = found.times[part]
-            else:
-                assert found.rate_hz is not None
-                times = np.arange(part.start, part.stop) / found.rate_hz
-            append_samples(times, found.values[part], found.temperature_c[part])
-        report_progress("finishing the file", None)  # some formats are compressed only at the end
+    times = found.times
+    if times is None:
+        assert found.rate_hz is not None
+        times = np.arange(len(found)) / found.rate_hz
+    save_samples(out, times, found.values, found.temperature_c, axes, partial(report_progress, "writing"))
     if has_temperature(found) and out.suffix.lower() == ".mcap":
         topic = JOIN.join((IMU_TOPIC, TEMPERATURE_TOPIC))
         note = f"The temperature has a topic of its own; read both with --topic {topic}."

@@ -8,8 +8,8 @@ from typing import Final
 
 import msgspec
 
-from drivers import file_access
 from drivers.errors import LinkLost, LinkUnavailable, NotReady
+from drivers.host import file_access
 from drivers.links import serial_link
 from drivers.wire_format_identification import TEXT_DECODER, UNKNOWN, IdentifiedFormat, identify_wire_format
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady, RecordingError
-from drivers.file_access import real_path
+from drivers.host.file_access import real_path
 from drivers.recordings import FORMATS, iter_blocks
 from drivers.recordings import Recording as Samples
 from drivers.recordings.writing import atomic_write_path

@@ -15,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 
 import drivers.decoders
-from drivers import module_lookup
 from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Times, Timing, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
@@ -24,8 +23,9 @@ from drivers.recordings import Recording, create_recording, load_samples, memory
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.reading_progress import listen_to_reading_progress
 from drivers.recordings.table import TIME_NS
-from drivers.settings_model import TableError
 from drivers.timing.sample_clock import SampleClock
+from drivers.validation import module_lookup
+from drivers.validation.settings_model import TableError
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.common.unit_formatting import format_count
 from monitor.settings.driver_settings import build_link_and_decoder, list_decoders

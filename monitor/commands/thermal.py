@@ -11,11 +11,11 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from drivers import file_access
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
-from drivers.number_ranges import DURATION_S, FIT_NUMBER
+from drivers.host import file_access
 from drivers.recordings import iter_blocks
+from drivers.validation.number_ranges import DURATION_S, FIT_NUMBER
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means

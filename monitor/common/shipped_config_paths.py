@@ -4,8 +4,9 @@ import os
 from pathlib import Path
 from typing import Final
 
-from drivers import file_access, module_lookup
 from drivers.errors import ConfigError
+from drivers.host import file_access
+from drivers.validation import module_lookup
 
 CONFIG_FOLDER: Final = Path(__file__).resolve().parents[2] / "config"
 MODELS_FOLDER: Final = CONFIG_FOLDER / "models"

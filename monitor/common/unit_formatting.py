@@ -14,8 +14,8 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from drivers.data_types import AXES
-from drivers.number_ranges import DAY_S, HOUR_S
 from drivers.units import G0
+from drivers.validation.number_ranges import DAY_S, HOUR_S
 
 Kind = Literal["gyro", "accel"]
 KINDS: Final[tuple[Kind, Kind]] = ("gyro", "accel")

@@ -15,11 +15,11 @@ import numpy as np
 
 from drivers.data_types import AXES, NS_PER_S, Floats, Ints, SampleBlock, SenderTimedFormat
 from drivers.errors import ConfigError, NotReady, RecordingError
-from drivers.number_ranges import RATE_HZ
 from drivers.timing.arrival_regression import snap_to_standard_rate
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
 from drivers.timing.sender_time_gaps import FORWARD_JUMP_S
+from drivers.validation.number_ranges import RATE_HZ
 from monitor.common.unit_formatting import format_axis_value, format_two_significant_digits
 from monitor.estimation.detection.coarse_quantization import QuantizationStepAndNoise, find_coarsely_quantized_axes
 from monitor.estimation.detection.repeated_share import estimate_stale_sample_share

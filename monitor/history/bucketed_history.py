@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from drivers.errors import NotReady
-from drivers.number_ranges import DAY_S
+from drivers.validation.number_ranges import DAY_S
 from monitor.common.unit_formatting import format_utc
 from monitor.history.history_row import HistoryRow, Singles, merge_rows, select_columns
 from monitor.history.sqlite_store import HistoryReader

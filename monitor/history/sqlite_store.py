@@ -24,8 +24,8 @@ from typing import Any, Final
 import msgspec
 
 from drivers.errors import RecordingError
-from drivers.file_access import check_folder_or_absent, check_regular_file
-from drivers.number_ranges import DAY_S
+from drivers.host.file_access import check_folder_or_absent, check_regular_file
+from drivers.validation.number_ranges import DAY_S
 from monitor.history.history_row import (
     MAX_COLUMNS,
     STATES,
@@ -112,8 +112,6 @@ class HistoryFileWriter:
         before = os.stat(path)
         self._files = _file_states(path)
         self._db = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
-        self._devices: dict[str, int] = {}
-        self._layouts = _LayoutCache(self._db)
         self._version = -1
         try:
             with _damage_as_unusable(path):
@@ -159,9 +157,9 @@ class HistoryFileWriter:
         """
         with _damage_as_unusable(self.path), self._transaction():
             for device, row in rows:
-                self._put(self._device_id(device), row)
+                self._put(_identifier(self._db, "device", "name", device), row)
             for device, event in events:
-                insert_event(self._db, self._device_id(device), event)
+                insert_event(self._db, _identifier(self._db, "device", "name", device), event)
         self._files = _file_states(self.path)
 
     def merge_old_rows(self, now_s: float, max_buckets: int = 100) -> int:
@@ -244,13 +242,19 @@ class HistoryFileWriter:
         found = self._db.execute(
             f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
         ).fetchone()
-        return None if found is None else self._layouts.parse_row(found)
+        return None if found is None else _parse_row(self._db, found, {})
 
     def _write(self, device: int, row: HistoryRow) -> None:
         self._db.execute(
             f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
-                *(device, row.start_s, row.width_s, row.newest_s, self._layouts.layout_id(row.names)),
+                *(
+                    device,
+                    row.start_s,
+                    row.width_s,
+                    row.newest_s,
+                    _identifier(self._db, "layout", "names", " ".join(row.names)),
+                ),
                 *(*row.counts, row.state, pack_count_min_max_last(row)),
             ),
         )
@@ -275,7 +279,8 @@ class HistoryFileWriter:
         where = "device = ? AND width = ? AND start >= ? AND start < ?"
         with self._transaction():
             found = self._db.execute(f"SELECT {_FIELDS} FROM row WHERE {where} ORDER BY start", bucket).fetchall()
-            rows = [self._layouts.parse_row(one) for one in found]
+            names: dict[int, tuple[str, ...]] = {}
+            rows = [_parse_row(self._db, one, names) for one in found]
             held = self._stored_row(device, wider_s, start_s)
             self._write(device, merge_rows([*([held] if held else []), *rows], start_s, wider_s))
             self._db.execute(f"DELETE FROM row WHERE {where}", bucket)
@@ -291,19 +296,6 @@ class HistoryFileWriter:
 
     # --- internal
 
-    def _device_id(self, name: str) -> int:
-        if name not in self._devices:
-            self._devices[name] = _identifier(self._db, "device", "name", name)
-        return self._devices[name]
-
-    def _refresh_identifiers(self) -> None:
-        """Clear the cached identifiers of devices and column layouts if another connection has changed the file."""
-        version = self._data_version()
-        if version != self._version:
-            self._version = version
-            self._devices.clear()
-            self._layouts.forget_column_layouts()
-
     def _committed_by_others(self) -> bool:
         try:
             return self._data_version() != self._version
@@ -318,12 +310,10 @@ class HistoryFileWriter:
     def _transaction(self) -> Iterator[None]:
         self._db.execute("BEGIN IMMEDIATE")
         try:
-            self._refresh_identifiers()
+            self._version = self._data_version()
             yield
             self._db.execute("COMMIT")
         except BaseException:
-            self._devices.clear()  # Identifiers that were created in this transaction may no longer exist.
-            self._layouts.forget_column_layouts()
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
             raise
@@ -335,7 +325,7 @@ class HistoryReader:
     def __init__(self, db: sqlite3.Connection, path: Path) -> None:
         self._db = db
         self.path = path
-        self._layouts = _LayoutCache(db)
+        self._names: dict[int, tuple[str, ...]] = {}  # names of the columns by the identifier of the layout
 
     def list_devices(self) -> tuple[str, ...]:
         """Return the sorted names of all devices in the history file."""
@@ -374,7 +364,7 @@ class HistoryReader:
                 ),
             )
             for one in found:
-                row = self._layouts.parse_row(one)
+                row = _parse_row(self._db, one, self._names)
                 if span.overlaps(row.start_s, row.end_s):
                     yield row
 
@@ -453,47 +443,28 @@ def _is_history(db: sqlite3.Connection, path: Path) -> bool:
     return True
 
 
-class _LayoutCache:
-    """Cache of column layouts.
-
-    A layout is a tuple of column names, which the file stores only once, with an identifier.
-    """
-
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
-        self._ids: dict[tuple[str, ...], int] = {}
-        self._names: dict[int, tuple[str, ...]] = {}
-
-    def forget_column_layouts(self) -> None:
-        """Remove all column layouts from the cache."""
-        self._ids.clear()
-        self._names.clear()
-
-    def layout_id(self, names: tuple[str, ...]) -> int:
-        """Return the identifier of a column layout, which is inserted into the database if necessary."""
-        if names not in self._ids:
-            self._ids[names] = _identifier(self._db, "layout", "names", " ".join(names))
-        return self._ids[names]
-
-    def parse_row(self, record: Sequence[Any]) -> HistoryRow:
-        """Convert a database record to a history row."""
-        start, width, newest, layout, received, lost, bad, overflowed, state, data = record
-        whole = (start, width, layout, received, lost, bad, overflowed, state)
-        if not (all(isinstance(one, int) for one in whole) and isinstance(newest, float) and isinstance(data, bytes)):
-            raise RecordingError("a row has fields of another kind")
-        if width <= 0 or not 0 <= state < len(STATES):
-            raise RecordingError(f"a row of {width} s in state {state}")
-        if layout not in self._names:
-            text = self._db.execute("SELECT names FROM layout WHERE id = ?", (layout,)).fetchone()
-            if text is None or len(text[0]) > 64 * MAX_COLUMNS:
-                raise RecordingError(f"a row names numbers ({layout}) that are not known")
-            self._names[layout] = tuple(text[0].split())
-        names = self._names[layout]
-        counts = (received, lost, bad, overflowed)
-        return HistoryRow(start, width, newest, names, *unpack_count_min_max_last(data, len(names)), counts, state)
+def _parse_row(
+    db: sqlite3.Connection, record: Sequence[Any], names_by_layout: dict[int, tuple[str, ...]]
+) -> HistoryRow:
+    """Convert a database record to a history row, and add the column names of its layout to ``names_by_layout``."""
+    start, width, newest, layout, received, lost, bad, overflowed, state, data = record
+    whole = (start, width, layout, received, lost, bad, overflowed, state)
+    if not (all(isinstance(one, int) for one in whole) and isinstance(newest, float) and isinstance(data, bytes)):
+        raise RecordingError("a row has fields of another kind")
+    if width <= 0 or not 0 <= state < len(STATES):
+        raise RecordingError(f"a row of {width} s in state {state}")
+    if layout not in names_by_layout:
+        text = db.execute("SELECT names FROM layout WHERE id = ?", (layout,)).fetchone()
+        if text is None or len(text[0]) > 64 * MAX_COLUMNS:
+            raise RecordingError(f"a row names numbers ({layout}) that are not known")
+        names_by_layout[layout] = tuple(text[0].split())
+    names = names_by_layout[layout]
+    counts = (received, lost, bad, overflowed)
+    return HistoryRow(start, width, newest, names, *unpack_count_min_max_last(data, len(names)), counts, state)
 
 
 def _identifier(db: sqlite3.Connection, table: str, column: str, text: str) -> int:
+    """Return the identifier of a device or of a column layout, which is inserted if it is not stored yet."""
     db.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
     return int(db.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()[0])
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import msgspec
 
-from drivers.number_ranges import DAY_S
+from drivers.validation.number_ranges import DAY_S
 from monitor.history.time_ranges import TimeRange
 
 MAX_EVENTS: Final = 20_000

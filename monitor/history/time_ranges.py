@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.number_ranges import DAY_S, HOUR_S
+from drivers.validation.number_ranges import DAY_S, HOUR_S
 
 UNITS_S: Final = {
     "": 1.0,

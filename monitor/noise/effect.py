@@ -22,8 +22,8 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_suggestion
-from drivers.number_ranges import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, NumberRange
+from drivers.validation.module_lookup import format_suggestion
+from drivers.validation.number_ranges import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, NumberRange
 from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 QUANTITIES: Final = {"s": DELAY_S, "Hz": EFFECT_FREQUENCY_HZ, "1/s": EFFECT_FREQUENCY_HZ}

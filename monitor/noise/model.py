@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_suggestion
+from drivers.validation.module_lookup import format_suggestion
 from monitor.noise.effect import AxisLeak, Effect, Source, Transform
 from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.coupling.axis_permutation import AxisPermutation

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from drivers import file_access
 from drivers.errors import ConfigError
+from drivers.host import file_access
 from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.noise.model import NoiseModel
 

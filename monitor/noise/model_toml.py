@@ -12,8 +12,8 @@ from typing import Any, Final, TypeVar
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_suggestion
-from drivers.number_ranges import RATE_HZ
+from drivers.validation.module_lookup import format_suggestion
+from drivers.validation.number_ranges import RATE_HZ
 from monitor.noise.effect import GYROS, Effect, ParameterTable, gyro_and_accel_units, required_parameters
 from monitor.noise.effects import EFFECTS
 from monitor.noise.temperature import Temperature

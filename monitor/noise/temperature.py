@@ -11,7 +11,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import ConfigError
-from drivers.number_ranges import DURATION_S, TEMPERATURE_C
+from drivers.validation.number_ranges import DURATION_S, TEMPERATURE_C
 from monitor.noise.effect import NoiseSeries, ParameterTable, SampleBlockContext, StatelessSeries, parameter_field
 from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated
 from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal

@@ -17,13 +17,13 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 import drivers.decoders
 import drivers.links
-from drivers import module_lookup, number_ranges
 from drivers.data_types import make_block
 from drivers.decoders.base import AddressFilteringDecoder, Decoder
 from drivers.errors import ConfigError
 from drivers.links.base import AddressFilteringLink, Link, LinkSettings
-from drivers.number_ranges import format_value
-from drivers.settings_model import (
+from drivers.validation import module_lookup, number_ranges
+from drivers.validation.number_ranges import format_value
+from drivers.validation.settings_model import (
     Conflict,
     ListOf,
     Problem,

@@ -7,11 +7,11 @@ from urllib.parse import parse_qs, urlsplit
 
 from pydantic import BeforeValidator
 
-from drivers import file_access
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices_by_similarity
-from drivers.number_ranges import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
-from drivers.settings_model import ConvertedFrom, checked_by
+from drivers.host import file_access
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.number_ranges import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
+from drivers.validation.settings_model import ConvertedFrom, checked_by
 from monitor.common.topics import ENDPOINT
 
 UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}

@@ -9,8 +9,8 @@ import stat
 from pathlib import Path
 from typing import Final
 
-from drivers.credential_masking import has_secret
-from drivers.file_access import open_regular_file, real_path
+from drivers.host.file_access import open_regular_file, real_path
+from drivers.zenoh.credential_masking import has_secret
 
 MAX_SECRET_FILE_BYTES: Final = 1_000_000
 """Number of bytes at the start of a file that are searched for a secret."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from drivers import file_access
 from drivers.errors import ConfigError, make_printable_and_shorten
-from drivers.settings_model import Problem, TableCheckResult, check_table
+from drivers.host import file_access
+from drivers.validation.settings_model import Problem, TableCheckResult, check_table
 from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_parser
 from monitor.settings.driver_settings import BuiltLinkAndDecoder, FaultsTable, VirtualTable
@@ -105,7 +105,7 @@ def load_config(path: Path, *, allow_pipe: bool = False) -> Config:
     path
         Configuration file.
     allow_pipe
-        True to accept a pipe instead of a regular file (``drivers.file_access.read_small_file``).
+        True to accept a pipe instead of a regular file (``drivers.host.file_access.read_small_file``).
 
     Raises
     ------

@@ -12,11 +12,11 @@ from typing import Any, Final, Literal, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 import drivers.decoders
-from drivers import module_lookup
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.number_ranges import NumberRange
-from drivers.settings_model import SettingsModel, fields_by_key, find_settings_model
+from drivers.validation import module_lookup
+from drivers.validation.number_ranges import NumberRange
+from drivers.validation.settings_model import SettingsModel, fields_by_key, find_settings_model
 from monitor.settings import driver_settings
 from monitor.settings.schema import ConfigFile, Device, Hook, Limit
 

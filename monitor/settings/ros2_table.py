@@ -5,9 +5,9 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
-from drivers import number_ranges
 from drivers.errors import ConfigError
-from drivers.settings_model import ConvertedFrom, ListOf, SettingsModel, checked_by
+from drivers.validation import number_ranges
+from drivers.validation.settings_model import ConvertedFrom, ListOf, SettingsModel, checked_by
 from monitor.settings.field_types import Endpoint
 
 ROUTER: Final = "tcp/127.0.0.1:7447"

@@ -12,14 +12,23 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, Strict, ValidationInfo, model_validator
 
-from drivers import file_access, module_lookup, number_ranges
 from drivers.data_types import AXES, EVENT_KINDS
 from drivers.decoders.base import Decoder
 from drivers.driver import AxisMap, parse_axis_map
 from drivers.errors import ConfigError
+from drivers.host import file_access
 from drivers.links.base import Link
-from drivers.number_ranges import DAY_S, NumberRange
-from drivers.settings_model import Conflict, ConvertedFrom, KeywordOrType, ListOf, SettingsModel, checked_by, one_of
+from drivers.validation import module_lookup, number_ranges
+from drivers.validation.number_ranges import DAY_S, NumberRange
+from drivers.validation.settings_model import (
+    Conflict,
+    ConvertedFrom,
+    KeywordOrType,
+    ListOf,
+    SettingsModel,
+    checked_by,
+    one_of,
+)
 from drivers.zenoh.ros2_imu_message import FRAME_ID
 from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.common.topics import ENDPOINT

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from drivers import decoders, module_lookup
+from drivers import decoders
 from drivers.decoders.base import Decoder
+from drivers.validation import module_lookup
 from tests.support.settings import read_settings
 
 DEGREE = math.pi / 180.0

@@ -19,11 +19,12 @@ from typing import Any
 
 import pytest
 
-from drivers import links, module_lookup
+from drivers import links
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import iio_link
 from drivers.links.base import Link, LinkSettings
+from drivers.validation import module_lookup
 from tests.support.fake_iio_device import FakeIioDevice
 from tests.support.loopback_link import LoopbackLink
 from tests.support.ports import free_endpoint

@@ -227,7 +227,7 @@ class TestReplay:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         write_dataflash(tmp_path / "log.bin", imu(times_us(30), noise(30)))
-        monkeypatch.setattr("drivers.extras.find_missing_packages", lambda _: ("pymavlink",))
+        monkeypatch.setattr("drivers.host.extras.find_missing_packages", lambda _: ("pymavlink",))
         with pytest.raises(
             ConfigError, match=r'log\.bin: this recording needs pymavlink: .*pip install "imu-monitor\[ardu'
         ):

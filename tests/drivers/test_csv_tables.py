@@ -16,8 +16,8 @@ from drivers.links import replay_link
 from drivers.recordings import Recording, load_samples, save_samples
 from drivers.recordings.reading_options import create_reading_options, parse_column_mapping
 from drivers.recordings.table_layout import parse_column_name
-from drivers.settings_model import check_table
 from drivers.units import DEGREE, G0
+from drivers.validation.settings_model import check_table
 from monitor.commands.analyze import analyze_recording
 from tests.support.recordings import recordings
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers import file_access
 from drivers.errors import ConfigError, ImuError, RecordingError
+from drivers.host import file_access
 from drivers.links import replay_link
 from drivers.recordings import FORMATS, load_samples, segment_file
 from drivers.recordings.writing import atomic_write_path

@@ -18,8 +18,8 @@ import typer
 
 import drivers.decoders
 import imu_monitor
-from drivers import module_lookup
-from drivers.settings_model import SettingsModel
+from drivers.validation import module_lookup
+from drivers.validation.settings_model import SettingsModel
 from monitor.cli import app
 from monitor.publishing.messages import results
 from monitor.publishing.messages.message import Message

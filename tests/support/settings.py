@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from drivers.errors import ConfigError
-from drivers.settings_model import SettingsModel, check_table
+from drivers.validation.settings_model import SettingsModel, check_table
 
 Model = TypeVar("Model", bound=SettingsModel)
 

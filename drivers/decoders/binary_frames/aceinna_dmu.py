@@ -33,8 +33,8 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
 from drivers.units import DEGREE, G0
+from drivers.validation.settings_model import SettingsModel
 
 SYNC: Final = b"\x55\x55"
 CRC_START: Final = 0x1D0F

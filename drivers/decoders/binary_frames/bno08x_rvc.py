@@ -14,8 +14,8 @@ import numpy as np
 
 from drivers.data_types import Chunk, CounterTimedFormat, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
 from drivers.units import G0
+from drivers.validation.settings_model import SettingsModel
 
 HEADER: Final = b"\xaa\xaa"
 LENGTH: Final = 19

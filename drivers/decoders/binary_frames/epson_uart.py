@@ -31,9 +31,9 @@ from pydantic import Field
 from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices_by_similarity
-from drivers.settings_model import Conflict, ListOf, SettingsModel, checked_by
 from drivers.units import DEGREE, G0
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.settings_model import Conflict, ListOf, SettingsModel, checked_by
 
 HEADER: Final = b"\x80"
 DELIMITER: Final = 0x0D

@@ -24,8 +24,8 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, CounterTimedFormat, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
 from drivers.units import DEGREE, G0
+from drivers.validation.settings_model import SettingsModel
 
 SYNC: Final = b"\xaa\x55\x01"
 OVERHEAD: Final = 8

@@ -32,8 +32,8 @@ from pydantic import Field
 from drivers import units
 from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.number_ranges import MAVLINK_ID
-from drivers.settings_model import Conflict, SettingsModel, checked_by
+from drivers.validation.number_ranges import MAVLINK_ID
+from drivers.validation.settings_model import Conflict, SettingsModel, checked_by
 
 VERSION_1, VERSION_2 = 0xFE, 0xFD
 HEADER_BYTES: Final = {VERSION_1: 6, VERSION_2: 10}

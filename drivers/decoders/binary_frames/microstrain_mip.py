@@ -37,8 +37,8 @@ from drivers.data_types import (
     Timing,
 )
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
 from drivers.units import G0
+from drivers.validation.settings_model import SettingsModel
 
 SYNC: Final = b"\x75\x65"
 LONGEST: Final = 4 + 255 + 2

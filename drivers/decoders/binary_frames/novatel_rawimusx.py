@@ -29,9 +29,9 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.number_ranges import SCALE, NumberRange
-from drivers.settings_model import Conflict, SettingsModel
 from drivers.units import DEGREE, G0
+from drivers.validation.number_ranges import SCALE, NumberRange
+from drivers.validation.settings_model import Conflict, SettingsModel
 
 SYNC: Final = b"\xaa\x44"
 LONG_HEADER, SHORT_HEADER = 0x12, 0x13

@@ -29,7 +29,7 @@ from pydantic import Field
 
 from drivers.data_types import Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
+from drivers.validation.settings_model import SettingsModel
 
 SYNC: Final = b"\xff\x5a"
 END: Final = 0x33

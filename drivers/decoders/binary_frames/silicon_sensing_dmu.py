@@ -24,8 +24,8 @@ from pydantic import Field
 
 from drivers.data_types import Chunk, CounterTimedFormat, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
 from drivers.units import DEGREE, G0
+from drivers.validation.settings_model import SettingsModel
 
 HEADER: Final = b"\x55\xaa"
 

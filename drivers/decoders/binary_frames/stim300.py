@@ -30,9 +30,9 @@ from pydantic import Field
 from drivers.data_types import Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.errors import ConfigError
-from drivers.number_ranges import RATE_HZ
-from drivers.settings_model import Conflict, KeywordOrType, SettingsModel, checked_by
 from drivers.units import DEGREE, G0
+from drivers.validation.number_ranges import RATE_HZ
+from drivers.validation.settings_model import Conflict, KeywordOrType, SettingsModel, checked_by
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
 # The index of an identifier in its list is the bit mask of the parts. The datagrams F0 to F7 contain PPS (pulse per

@@ -34,9 +34,9 @@ from pydantic import Field
 
 from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.number_ranges import DELAY_S, TICK_S
-from drivers.settings_model import SettingsModel
 from drivers.units import DEGREE
+from drivers.validation.number_ranges import DELAY_S, TICK_S
+from drivers.validation.settings_model import SettingsModel
 
 SYNC: Final = b"\xb5\x62"
 MESSAGES: Final = {"esf-raw": b"\x10\x03", "esf-meas": b"\x10\x02"}

@@ -25,7 +25,7 @@ from pydantic import Field
 
 from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
+from drivers.validation.settings_model import SettingsModel
 
 FIELD_SIZES: Final = {
     1: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),

@@ -21,9 +21,9 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.number_ranges import FULL_SCALE
-from drivers.settings_model import SettingsModel
 from drivers.units import DEGREE, G0
+from drivers.validation.number_ranges import FULL_SCALE
+from drivers.validation.settings_model import SettingsModel
 
 ACCEL, RATE = 0x51, 0x52
 TYPES: Final = range(0x50, 0x60)

@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import drivers
-from drivers import file_access, units
+from drivers import units
 from drivers.data_types import ArrivalTimedFormat, CounterTimedFormat, Timing
 from drivers.decoders.dbc.sample_assembly import CanMessage, MeasuredSignal
 from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, SignalSettings
 from drivers.decoders.dbc.signal_bits import SignalCodec
 from drivers.errors import ConfigError
-from drivers.extras import require_extra
-from drivers.module_lookup import format_suggestion
+from drivers.host import file_access
+from drivers.host.extras import require_extra
+from drivers.validation.module_lookup import format_suggestion
 
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
 SHIPPED_PREFIX: Final = "shipped:"

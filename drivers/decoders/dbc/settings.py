@@ -7,8 +7,8 @@ from pydantic import BeforeValidator, Field
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.number_ranges import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S, format_value
-from drivers.settings_model import Conflict, FileOrName, SettingsModel, one_of
+from drivers.validation.number_ranges import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S, format_value
+from drivers.validation.settings_model import Conflict, FileOrName, SettingsModel, one_of
 
 TEMPERATURE: Final = "temperature"
 COLUMNS: Final = (*AXES, TEMPERATURE)

@@ -1,8 +1,8 @@
 """Decoder of the scans that the link ``iio`` reads from a Linux IIO device.
 
 Each message contains one or more complete scans, and its attachment contains their layout
-(``drivers.iio_scan_layout``). The kernel reports angular rates in rad/s, accelerations in m/s² and temperatures in m°C.
-Other channels are ignored, and an axis without a channel is not measured.
+(``drivers.host.iio_scan_layout``). The kernel reports angular rates in rad/s, accelerations in m/s² and temperatures in
+m°C. Other channels are ignored, and an axis without a channel is not measured.
 
 The time of a sample is the time stamp of the kernel. The time stamps must be on the clock ``realtime``, which is the
 default of the kernel. With ``clock = "arrival"``, sample times are computed from the arrival times, and the buffer
@@ -29,9 +29,9 @@ from drivers.data_types import (
 )
 from drivers.decoders.base import Bytes, Decoder, RejectingDecoder, quantize
 from drivers.errors import DecodeError
-from drivers.iio_scan_layout import TIMESTAMP, ScanElement, ScanLayout, StoredNumber, decode_layout, locate_numbers
+from drivers.host.iio_scan_layout import TIMESTAMP, ScanElement, ScanLayout, StoredNumber, decode_layout, locate_numbers
 from drivers.recordings.table import T_LIMIT_S
-from drivers.settings_model import SettingsModel
+from drivers.validation.settings_model import SettingsModel
 
 AXIS_CHANNELS: Final = tuple(f"in_{'anglvel' if axis[0] == 'g' else 'accel'}_{axis[1]}" for axis in AXES)
 TEMPERATURE_CHANNELS: Final = ("in_temp", "in_temp0")

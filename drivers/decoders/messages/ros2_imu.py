@@ -15,7 +15,7 @@ import numpy as np
 from drivers.data_types import NO_TICK, Chunk, Floats, SampleBlock, SenderTimedFormat, Timing
 from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
-from drivers.settings_model import SettingsModel
+from drivers.validation.settings_model import SettingsModel
 from drivers.zenoh.rmw_attachment import GID_BYTES, SEQUENCE_OFFSETS, encode_attachment
 from drivers.zenoh.ros2_imu_message import (
     ACCEL,

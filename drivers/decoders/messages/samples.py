@@ -13,7 +13,7 @@ from typing import ClassVar, Final
 from drivers.data_types import Chunk, SampleBlock, SenderTimedFormat, Timing
 from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
-from drivers.settings_model import SettingsModel
+from drivers.validation.settings_model import SettingsModel
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 
 MAX_GAP_SAMPLES: Final = 1_000_000_000

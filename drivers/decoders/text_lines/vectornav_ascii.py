@@ -21,7 +21,7 @@ from pydantic import Field
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, Floats, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.settings_model import SettingsModel
+from drivers.validation.settings_model import SettingsModel
 
 LONGEST: Final = 256
 """Maximum length of a sentence in bytes. The longest sentence in the manual has fewer than 200 bytes."""

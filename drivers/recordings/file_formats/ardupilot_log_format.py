@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.file_access import open_regular_file
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import report_read_share
 from drivers.recordings.topics import BLOCK_ROWS, JOIN, Topic, join_topics, select_topics
@@ -88,13 +88,6 @@ def read_ardupilot_log(path: Path, topic: str | None) -> table.Table:
         if (end := _end_of_messages(log)) < log.data_len - MAX_TRAILING_BYTES:
             notes.append(f"The log is damaged at byte {end} of {log.data_len} and was read up to there.")
     return table.Table(join_topics(path, tables), None, notes)
-
-
-def count_ardupilot_rows(path: Path, topic: str | None) -> int:
-    """Return the number of messages of the topic in an ArduPilot log."""
-    with _pymavlink_errors(path), _open_log(path, memory_check.measure_read_limit(path)) as log:
-        messages = _list_messages(log)
-        return messages[_select(path, messages, topic, [])[0]].offsets.size
 
 
 @contextmanager

@@ -18,11 +18,10 @@ from typing import IO, Final
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, RecordingError
-from drivers.file_access import open_regular_file
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import table
 from drivers.recordings.file_formats.csv_format import (
     CsvSource,
-    count_csv_source_rows,
     read_csv_column_names,
     read_csv_source,
 )
@@ -68,12 +67,6 @@ def read_sensor_files(path: Path, options: ReadingOptions) -> table.Table:
     return table.Table(join_topics(path, tables), None, notes, stated)
 
 
-def count_sensor_rows(path: Path, options: ReadingOptions) -> int:
-    """Return the number of lines in the first selected CSV file of a folder or a zip archive."""
-    with _open_sources(path) as sources:
-        return count_csv_source_rows(sources[_select(path, sources, options, [])[0]])
-
-
 def _select(path: Path, sources: Mapping[str, CsvSource], options: ReadingOptions, notes: list[str]) -> list[str]:
     """Return the names of the sensors to read."""
     topics = [_describe(source, name, options) for name, source in sources.items()]
@@ -107,7 +100,10 @@ def _open_sources(path: Path) -> Iterator[dict[str, CsvSource]]:
     """Yield the CSV files of a folder or a zip archive by name, without the suffix."""
     if path.is_dir():
         files = sorted(one for one in path.iterdir() if one.suffix.lower() == ".csv")[:MAX_FILES]
-        yield {one.stem: CsvSource(one, str(one), one.stem, partial(open_regular_file, one)) for one in files}
+        yield {
+            one.stem: CsvSource(one, one.stat().st_size, str(one), one.stem, partial(open_regular_file, one))
+            for one in files
+        }
         return
     with IndexSizeLimitedFile(path) as file:
         try:
@@ -120,7 +116,7 @@ def _open_sources(path: Path) -> Iterator[dict[str, CsvSource]]:
             members = [one for one in archive.infolist() if one.filename.lower().endswith(".csv")][:MAX_FILES]
             yield {
                 (stem := Path(one.filename).stem): CsvSource(
-                    path, f"{path}: {one.filename}", stem, partial(_open_member, path, archive, one)
+                    path, one.file_size, f"{path}: {one.filename}", stem, partial(_open_member, path, archive, one)
                 )
                 for one in members
                 if one.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) and "meta/" not in one.filename

@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import RecordingError
-from drivers.file_access import open_regular_file
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import find_layout
@@ -61,13 +61,6 @@ def read_matlab(path: Path, options: ReadingOptions) -> table.Table:
     layout = find_layout(path, names, options, notes)
     found = {quantity: table.to_column(quantity, columns[names[i]]) for quantity, i in layout.columns.items()}
     return table.Table(found, fs, notes, layout.units)
-
-
-def count_matlab_rows(path: Path, options: ReadingOptions) -> int:
-    """Return the number of samples of a MATLAB file."""
-    columns, _ = _load_columns(path, [])
-    names = list(columns)
-    return max(columns[names[i]].size for i in find_layout(path, names, options, []).columns.values())
 
 
 def _load_columns(path: Path, notes: list[str]) -> tuple[dict[str, Floats], float | None]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Ints, times_to_ns
 from drivers.errors import RecordingError
-from drivers.extras import require_extra
+from drivers.host.extras import require_extra
 from drivers.recordings import table
 from drivers.recordings.file_formats.ros_message_arrays import IMU_TYPE, NOT_PROVIDED, SECOND_NS, TEMPERATURE_TYPE
 

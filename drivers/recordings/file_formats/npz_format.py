@@ -6,7 +6,6 @@ The reader rejects arrays of Python objects, because unpickling can execute code
 so the reader finds each array by its local header.
 """
 
-import io
 import math
 import re
 import shutil
@@ -27,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import RecordingError
-from drivers.file_access import open_regular_file
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.file_formats.zip_index import IndexSizeLimitedFile
 from drivers.recordings.reading_options import ReadingOptions
@@ -45,7 +44,6 @@ MAX_DEFLATE_RATIO: Final = 1032
 """Highest compression ratio of deflate, https://zlib.net/zlib_tech.html."""
 NUMERIC_KINDS: Final = "fiu"
 """Values of ``numpy.dtype.kind`` that a column may have: float, signed integer and unsigned integer."""
-NPY_MAGIC: Final = b"\x93NUMPY"
 NPY_HEADER: Final = re.compile(
     rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?:False|True), "
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
@@ -69,16 +67,6 @@ class _Header:
     def values(self) -> int:
         """Number of values in the array."""
         return math.prod(self.shape)
-
-
-def count_npz_rows(path: Path, options: ReadingOptions) -> int:
-    """Return the number of rows of a .npz file according to the array headers, or 0 if the file is truncated."""
-    with IndexSizeLimitedFile(path) as file:
-        if not _has_index(path, file):
-            return 0  # the reader checks the number of rows of a truncated archive
-        with _open_archive(path, file) as archive:
-            names = _array_names(archive)
-            return _check_columns(path, archive, names, find_layout(path, names, options, []))
 
 
 def read_npz(path: Path, options: ReadingOptions) -> table.Table:
@@ -142,9 +130,8 @@ def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
     return names[key] if key in names else names[f"{key}.npy"]
 
 
-def _check_columns(path: Path, archive: zipfile.ZipFile, names: Sequence[str], layout: TableLayout) -> int:
-    """Check the array headers of all columns, and return the length of the longest column."""
-    rows = 0
+def _check_columns(path: Path, archive: zipfile.ZipFile, names: Sequence[str], layout: TableLayout) -> None:
+    """Check the array headers of all columns."""
     limit = memory_check.measure_read_limit(path)
     for key in (names[i] for i in layout.columns.values()):
         header = _read_header(path, archive, key)
@@ -152,10 +139,8 @@ def _check_columns(path: Path, archive: zipfile.ZipFile, names: Sequence[str], l
             raise RecordingError(f"{path}: {key} contains {_describe_dtype(header.dtype)}, expected numbers")
         if len(header.shape) != 1:
             raise RecordingError(f"{path}: {key} has shape {header.shape}, expected one dimension")
-        rows = max(rows, header.values)
-        limit.check_row_count(rows)
+        limit.check_row_count(header.values)
         _check_size(path, limit, _find_member(archive, key), key, header)
-    return rows
 
 
 def _check_size(
@@ -180,24 +165,12 @@ def _read_header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
             f"{path}: {key} is packed by method {method} of zip, expected stored or deflated as written by NumPy"
         )
     with _member_errors(path, key), archive.open(_find_member(archive, key)) as member:
-        start = member.read(len(NPY_MAGIC) + 4)
-        version, size_bytes = start[len(NPY_MAGIC) : len(NPY_MAGIC) + 2], 2
-        if not start.startswith(NPY_MAGIC):
-            raise ValueError("it is not an array in the format .npy")
-        if version == b"\2\0":
-            start += member.read(2)
-            size_bytes = 4
-        elif version != b"\1\0":
-            raise ValueError(f"version {'.'.join(map(str, version))} of .npy is no version for numbers")
-        size = int.from_bytes(start[-size_bytes:], "little")
-        if size > MAX_HEADER_BYTES:
-            raise ValueError(f"its header has {size} bytes, expected at most {MAX_HEADER_BYTES}")
-        text = io.BytesIO(start[-size_bytes:] + member.read(size))
-        versioned = np.lib.format.read_array_header_1_0 if size_bytes == 2 else np.lib.format.read_array_header_2_0
-        shape, _, dtype = versioned(text)
+        if np.lib.format.read_magic(member) != (1, 0):  # other versions are written only for structured arrays
+            raise ValueError("it is not an array in version 1.0 of the format .npy")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
         if min(shape, default=0) < 0:
             raise ValueError(f"its shape is {shape}")
-        return _Header(shape, dtype, len(start) + size)
+        return _Header(shape, dtype, member.tell())
 
 
 def _describe_dtype(dtype: np.dtype[Any]) -> str:

@@ -14,8 +14,8 @@ import numpy as np
 
 from drivers.data_types import Times
 from drivers.errors import ConfigError, RecordingError
-from drivers.extras import install_command
-from drivers.file_access import open_regular_file
+from drivers.host.extras import install_command
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.file_formats.arrow_message_sizes import (
     check_batch_buffer_sizes,
@@ -70,28 +70,21 @@ def read_parquet(path: Path, options: ReadingOptions) -> table.Table:
     """
     notes: list[str] = []
     with _open_parquet(path) as file:
-        chosen, units, _ = _check_parquet(path, file, options, notes)
+        chosen, units = _check_parquet(path, file, options, notes)
         return _build_table(path, file.read(columns=list(chosen.values())), chosen, units, notes)
-
-
-def count_parquet_rows(path: Path, options: ReadingOptions) -> int:
-    """Return the number of rows according to the index of a Parquet file."""
-    with _open_parquet(path) as file:
-        return _check_parquet(path, file, options, [])[2]
 
 
 def _check_parquet(
     path: Path, file: Any, options: ReadingOptions, notes: list[str]
-) -> tuple[dict[str, str], dict[str, str], int]:
-    """Return the column name and the unit of each quantity, and the number of rows."""
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Check the index of a Parquet file, and return the column name and the unit of each quantity."""
     metadata = file.metadata
     table.check_column_count(path, metadata.num_columns)
     chosen, units = _select_columns(path, file.schema_arrow.names, options, notes)
     _check_types(path, file.schema_arrow, chosen)
-    rows = int(metadata.num_rows)
     stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
-    memory_check.measure_read_limit(path).check_row_count(max(rows, stated))
-    return chosen, units, rows
+    memory_check.measure_read_limit(path).check_row_count(max(int(metadata.num_rows), stated))
+    return chosen, units
 
 
 def _select_columns(
@@ -148,7 +141,7 @@ def read_ipc(path: Path, options: ReadingOptions) -> table.Table:
         own = METADATA_KEY in (schema.metadata or {})
         names = [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)]
         chosen, units = _select_columns(path, names, options, notes)
-        count, _ = _check_ipc(path, start, schema, chosen)
+        count = _check_ipc(path, start, schema, chosen)
         if not _has_end_mark(path, start > 0):
             notes.append("The file has no end mark; it is cut off and was read up to the cut.")
         file.seek(start)
@@ -166,12 +159,6 @@ def read_ipc(path: Path, options: ReadingOptions) -> table.Table:
             notes.append(f"Only {len(batches)} complete batches could be read: {first_message_line(error)}.")
     schema = batches[0].schema if batches else schema
     return _build_table(path, pa.Table.from_batches(batches, schema), chosen, units, notes)
-
-
-def count_ipc_rows(path: Path) -> int:
-    """Return the number of rows in the complete batches of an Arrow file or stream."""
-    with open_regular_file(path) as file:
-        return _check_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
 def _ipc_start(path: Path) -> int:
@@ -204,7 +191,8 @@ def _ipc_schema(path: Path, file: Any) -> Any:
     return schema
 
 
-def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> tuple[int, int]:
+def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> int:
+    """Check the sizes of the batches of an Arrow file or stream, and return the number of complete batches."""
     pa = import_pyarrow(path)
     _check_types(path, schema, chosen)
     counts = [
@@ -228,7 +216,7 @@ def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -
             limit.check_row_count(rows)
             if wrong := check_batch_buffer_sizes(size, counts, SLACK_BYTES):
                 raise RecordingError(f"{path}: batch {batches} is damaged: {wrong}")
-    return batches, rows
+    return batches
 
 
 def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.file_access import open_regular_file
+from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import open_file_and_report_position
 from drivers.recordings.topics import JOIN, Topic, join_topics, select_topics
@@ -85,12 +85,6 @@ def read_ulog(path: Path, topic: str | None) -> table.Table:
         lost_ms = sum(one.duration for one in log.dropouts)
         notes.append(f"The logger lost messages {len(log.dropouts)} times, for {lost_ms / 1e3:g} s in total.")
     return table.Table(join_topics(path, {name: _read_columns(data[name]) for name in names}), None, notes)
-
-
-def count_ulog_rows(path: Path, topic: str | None) -> int:
-    """Return the number of messages of the topic in a PX4 log."""
-    data = _data_by_topic(_load(path, memory_check.measure_read_limit(path)))
-    return int(data[_select(path, data, topic, [])[0]].data[TIMES[-1]].size)
 
 
 def _load(path: Path, limit: memory_check.RecordingSizeLimits) -> Any:

@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.file_access import check_regular_file, open_regular_file
+from drivers.host.file_access import check_regular_file, open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.file_formats.ros_message_arrays import (
     IMU_TYPE,
@@ -76,13 +76,6 @@ def read_ros_bag(path: Path, topic: str | None) -> table.Table:
         limit.check_row_count(sum(one.rows for one in bag.topics if one.name in names))
         tables: dict[str, table.Columns] = {name: _read_topic(bag, name, limit, notes) for name in names}
     return table.Table(join_topics(path, tables), None, notes)
-
-
-def count_ros_bag_rows(path: Path, topic: str | None) -> int:
-    """Return the number of messages of the topic according to the index of a bag."""
-    with _bag_errors(path), _open_bag(path) as (bag, _):
-        first = bag.select(path, topic, [])[0]
-        return next(one.rows for one in bag.topics if one.name == first)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, overload
 import typer
 
 from drivers.errors import ConfigError, make_printable_and_shorten
-from drivers.number_ranges import (
+from drivers.validation.number_ranges import (
     DURATION_S,
     INFLATION,
     RATE_HZ,
@@ -359,7 +359,7 @@ def read_noise_coefficients(source: str) -> "NoiseCoefficients":
     ConfigError
         If the file cannot be read, or if its content is invalid.
     """
-    from drivers import file_access
+    from drivers.host import file_access
     from monitor.common.shipped_config_paths import resolve_model_path
     from monitor.noise.model import NoiseModel
     from monitor.publishing.exporters import from_analysis_json, from_model
@@ -398,7 +398,7 @@ def select_device(name: str | None, there: list[str], where: str, what: str) -> 
         If no device has this name, or if there are several devices and no name is given.
     """
     from drivers.errors import NotReady
-    from drivers.module_lookup import format_suggestion
+    from drivers.validation.module_lookup import format_suggestion
 
     if not there:
         raise NotReady(f"{where}: there is no {what} yet")

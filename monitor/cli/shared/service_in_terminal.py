@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
 
-from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
+from drivers.zenoh.credential_masking import mask_secrets
 from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import Final
 
 from packaging.requirements import Requirement
 
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 from monitor.commands.doctor.finding import Finding, doubt, well, wrong
 
 TIME_ERROR: Final = 5

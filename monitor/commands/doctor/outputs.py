@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from urllib.parse import urlsplit
 
-from drivers.extras import find_missing_packages, install_command
+from drivers.host.extras import find_missing_packages, install_command
 from monitor.commands.doctor.finding import Finding, check_permissions, doubt, well, wrong
 from monitor.commands.doctor.network import LOOPBACK, TCP_ENDPOINT, check_port_free, check_reachable
 from monitor.settings.loading import Config

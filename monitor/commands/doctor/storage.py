@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import Final
 
-from drivers import file_access
-from drivers.extras import install_command
+from drivers.host import file_access
+from drivers.host.extras import install_command
 from drivers.links.replay_link import ReplayLink
-from drivers.number_ranges import DAY_S
+from drivers.validation.number_ranges import DAY_S
 from monitor.commands.doctor.finding import Finding, doubt, user_name, well, wrong
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, describe_lock_holder
 from monitor.settings.loading import Config, Storage

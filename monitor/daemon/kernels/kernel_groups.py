@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import SampleBlock, make_block
-from drivers.extras import find_missing_packages
+from drivers.host.extras import find_missing_packages
 
 
 @dataclass(frozen=True, slots=True)

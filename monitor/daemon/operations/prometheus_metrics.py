@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 from monitor.daemon.outputs.newest_metrics import NewestMetrics
 from monitor.settings.loading import MetricsAddress
 

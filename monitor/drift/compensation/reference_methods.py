@@ -11,7 +11,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import ConfigError, NotReady
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 from monitor.common.compiled import compiled
 from monitor.common.distributions import NORMAL_QUARTILE
 

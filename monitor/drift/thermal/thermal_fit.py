@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import NotReady
-from drivers.number_ranges import HOUR_S
+from drivers.validation.number_ranges import HOUR_S
 from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, temperature_noise_c
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import (

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.number_ranges import DAY_S
+from drivers.validation.number_ranges import DAY_S
 from monitor.common.unit_formatting import format_axis_value
 from monitor.estimation.detection.change_kernel import (
     AFTER,

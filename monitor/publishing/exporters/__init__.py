@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 from drivers.errors import ConfigError
-from drivers.number_ranges import COEFFICIENT, DURATION_S, INFLATION
+from drivers.validation.number_ranges import COEFFICIENT, DURATION_S, INFLATION
 from monitor.publishing.exporters.estimator_parameters import PARAMETER_FILES
 from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,

@@ -13,7 +13,7 @@ import msgspec
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError, NotReady
-from drivers.number_ranges import DURATION_S, RATE_HZ
+from drivers.validation.number_ranges import DURATION_S, RATE_HZ
 from monitor.common.unit_formatting import KINDS, Kind, axes_of
 from monitor.noise.effect import Source, gyro_and_accel_units
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk

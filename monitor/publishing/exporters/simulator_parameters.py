@@ -19,7 +19,7 @@ simulation.
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from drivers.number_ranges import HOUR_S
+from drivers.validation.number_ranges import HOUR_S
 from monitor.common.unit_formatting import DEGREE, ROOT_HOUR, Kind, axes_of
 from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from drivers.credential_masking import mask_secrets
 from drivers.data_types import AXES, Event, Floats
+from drivers.zenoh.credential_masking import mask_secrets
 from monitor.common import topics
 from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult

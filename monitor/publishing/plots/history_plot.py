@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
-from drivers.number_ranges import DAY_S
+from drivers.validation.number_ranges import DAY_S
 from monitor.common.unit_formatting import (
     COEFFICIENT_NAMES,
     DEFAULT_UNITS,

@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -3,7 +3,7 @@
 from typing import Any, Final
 
 from drivers.errors import ConfigError
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 
 MISSING_MESSAGE: Final = f"Jinja2 is not installed: {install_command('imu-monitor[plot]')}"
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.bounded_queue import BoundedQueue
 from monitor.publishing.rerun.viewer_settings_and_errors import (

@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError, LinkUnavailable, NotReady
 from drivers.zenoh.connection_diagnosis import explain_refusals
+from drivers.zenoh.credential_masking import mask_secrets
 from drivers.zenoh.session_config import format_zenoh_error
 from monitor.common import topics
 from monitor.history.bucketed_history import HistoryTable

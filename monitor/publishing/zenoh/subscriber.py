@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from drivers.zenoh.connection_diagnosis import explain_refusal
+from drivers.zenoh.credential_masking import mask_secrets
 from drivers.zenoh.session_config import (
     DEFAULT_CONFIGURATION,
     build_session_config,

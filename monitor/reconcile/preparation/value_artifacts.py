@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr, xlogy
 
 from drivers.data_types import Floats
-from drivers.number_ranges import HOUR_S
 from drivers.units import DEGREE, G0
+from drivers.validation.number_ranges import HOUR_S
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
 from monitor.estimation.detection.coarse_quantization import GRID_TOLERANCE, SIGMA_PER_MEAN_DISTANCE

@@ -22,7 +22,7 @@ import pytest
 from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_blocks
 from drivers.decoders import dbc
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 from drivers.links import arrival_times, can_link
 from drivers.links.can_link import CanLink
 from tests.support.settings import read_settings

@@ -19,12 +19,12 @@ import pytest
 
 import drivers.decoders
 import drivers.links
-from drivers import module_lookup, number_ranges
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError
-from drivers.number_ranges import NumberRange
 from drivers.recordings import load_samples
-from drivers.settings_model import KeywordOrType, SettingsModel, fields_by_key
+from drivers.validation import module_lookup, number_ranges
+from drivers.validation.number_ranges import NumberRange
+from drivers.validation.settings_model import KeywordOrType, SettingsModel, fields_by_key
 from monitor import cli
 from monitor.commands.analyze import analyze_recording
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording

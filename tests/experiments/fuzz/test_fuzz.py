@@ -7,10 +7,10 @@ import psutil
 import pytest
 
 import drivers.decoders
-from drivers import module_lookup
 from drivers.data_types import Chunk
 from drivers.decoders.base import FrameBuffer, RawFrames
 from drivers.recordings import FORMATS
+from drivers.validation import module_lookup
 from tests.experiments.fuzz import limits
 from tests.experiments.fuzz.limits import enforce_limits, try_input
 from tests.experiments.fuzz.mutations import generate_inputs

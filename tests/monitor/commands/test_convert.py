@@ -15,7 +15,8 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import WRITABLE, load_samples, save_samples
 from drivers.recordings.reading_options import ReadingOptions
-from monitor.commands.convert import BLOCK_ROWS, run_conversion
+from drivers.recordings.table import BATCH_ROWS
+from monitor.commands.convert import run_conversion
 from monitor.commands.recording_loading import DecoderChoice, LoadingOptions
 from tests.support import dataflash, ros_bags, ulog
 from tests.support.program import exit_status
@@ -120,12 +121,12 @@ def test_every_format_is_converted_without_loss(tmp_path: Path, source: str, tar
 @pytest.mark.parametrize("start_s", [0.0, 1.763e9], ids=["since the start", "Unix times"])
 def test_mcap_returns_every_row(tmp_path: Path, start_s: float) -> None:
     """The first time is 0, times repeat and step back, and the rows fill several chunks and blocks."""
-    n = BLOCK_ROWS + 10
+    n = BATCH_ROWS + 10
     t_s, values, temperature_c = make_samples(n)
     t_s = start_s + np.arange(n) / 400.0
     t_s[100:110] = t_s[100]
     t_s[20_000:] -= 30.0
-    t_s[BLOCK_ROWS - 1] = t_s[BLOCK_ROWS]
+    t_s[BATCH_ROWS - 1] = t_s[BATCH_ROWS]
     save_samples(tmp_path / "in.npz", t_s, values, temperature_c)
     run_conversion(tmp_path / "in.npz", tmp_path / "out.mcap")
     found = load_samples(tmp_path / "out.mcap")
@@ -198,13 +199,13 @@ def test_rate_replaces_missing_times(tmp_path: Path) -> None:
 
 
 def test_progress_of_writing_and_last_part(tmp_path: Path) -> None:
-    n = 3 * BLOCK_ROWS
+    n = 3 * BATCH_ROWS
     t_s, values, temperature_c = make_samples(n)
     save_samples(tmp_path / "in.npz", t_s, values, temperature_c)
     steps: list[tuple[str, float | None]] = []
     run_conversion(tmp_path / "in.npz", tmp_path / "out.arrow", report_progress=lambda *step: steps.append(step))
     shares = [("writing", share) for share in (0.0, 1 / 3, 2 / 3)]
-    assert steps == [("reading", None), *shares, ("finishing the file", None)]
+    assert steps == [("reading", None), *shares, ("writing", 1.0)]
     assert len(run_conversion(tmp_path / "in.npz", tmp_path / "out.arrow", loading=LoadingOptions(last_s=1.0))) < 210
 
 

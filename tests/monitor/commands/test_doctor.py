@@ -16,7 +16,7 @@ import pytest
 
 from drivers.data_types import make_block
 from drivers.driver import AxisMap
-from drivers.extras import install_command
+from drivers.host.extras import install_command
 from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter
 from monitor.commands.doctor import devices, examine_machine, machine, network

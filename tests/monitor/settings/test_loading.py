@@ -7,10 +7,10 @@ import pytest
 
 import drivers.decoders
 import drivers.links
-from drivers import module_lookup
 from drivers.decoders.text_lines.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
+from drivers.validation import module_lookup
 from monitor.common.shipped_config_paths import CONFIG_FOLDER, resolve_model_path
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings.loading import (

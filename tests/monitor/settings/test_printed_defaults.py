@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 import drivers.decoders
-from drivers import module_lookup
 from drivers.decoders.dbc.settings import SignalSettings
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from drivers.settings_model import SettingsModel, fields_by_key, find_settings_model
+from drivers.validation import module_lookup
+from drivers.validation.settings_model import SettingsModel, fields_by_key, find_settings_model
 from monitor.commands.check_configuration import check_configuration
 from monitor.settings import printed_defaults
 from monitor.settings.driver_settings import FaultsTable, link_settings_class, list_link_names

@@ -9,10 +9,10 @@ from pydantic import AfterValidator, Field
 from drivers import units
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.extras import require_extra
-from drivers.module_lookup import format_choices_by_similarity
-from drivers.number_ranges import COUNTER_MODULUS, HEADER_LINES, OFFSET, SCALE
-from drivers.settings_model import Conflict, ListOf, SettingsModel, checked_by, fields_by_key, one_of
+from drivers.host.extras import require_extra
+from drivers.validation.module_lookup import format_choices_by_similarity
+from drivers.validation.number_ranges import COUNTER_MODULUS, HEADER_LINES, OFFSET, SCALE
+from drivers.validation.settings_model import Conflict, ListOf, SettingsModel, checked_by, fields_by_key, one_of
 
 SKIP: Final = "-"
 COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)

@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from drivers.number_ranges import NumberRange
+from drivers.validation.number_ranges import NumberRange
 from monitor.noise.effect import Effect, RunningEffect, parameter_field
 
 DEGREES_OF_FREEDOM: Final = NumberRange("", 2.1, 1000.0)

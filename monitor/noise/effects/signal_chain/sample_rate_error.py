@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.number_ranges import RATE_RATIO
+from drivers.validation.number_ranges import RATE_RATIO
 from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 

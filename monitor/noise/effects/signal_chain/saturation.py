@@ -5,7 +5,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.number_ranges import HOUR_S
+from drivers.validation.number_ranges import HOUR_S
 from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum, nan_spectrum
 

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.data_types import ArrivalTimedFormat, Chunk, SampleBlock, SenderTimedFormat, concatenate_blocks
 from drivers.decoders.messages import iio
-from drivers.iio_scan_layout import ScanElement, ScanLayout
+from drivers.host.iio_scan_layout import ScanElement, ScanLayout
 
 TIME_NS = 1_763_900_000_123_456_789
 STAMP = ScanElement("in_timestamp", "le:s64/64>>0")

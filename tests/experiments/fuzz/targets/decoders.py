@@ -17,7 +17,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from drivers import decoders, module_lookup
+from drivers import decoders
 from drivers.data_types import AXES, EXTENDED_ID, NO_TICK, Chunk, CounterTimedFormat, SampleBlock, make_block
 from drivers.decoders.base import Decoder
 from drivers.decoders.dbc import DbcDecoder
@@ -25,6 +25,7 @@ from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.decoders.messages.iio import AXIS_CHANNELS
 from drivers.decoders.text_lines.text import Settings as TextSettings
+from drivers.validation import module_lookup
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, DECODER_NAMES, EXAMPLES, Example
 from tests.experiments.fuzz.binary_formats import BINARY_FORMATS

@@ -16,7 +16,7 @@ from typing import Any, Final
 from drivers.data_types import Chunk
 from drivers.decoders import dbc
 from drivers.errors import ConfigError
-from drivers.settings_model import SettingsModel
+from drivers.validation.settings_model import SettingsModel
 from monitor.common import shipped_config_paths
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model

@@ -27,10 +27,10 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
-from drivers import file_access
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices_by_similarity, format_suggestion
-from drivers.number_ranges import format_value
+from drivers.host import file_access
+from drivers.validation.module_lookup import format_choices_by_similarity, format_suggestion
+from drivers.validation.number_ranges import format_value
 
 MAX_PASSES: Final = 4
 """Maximum number of times that a table is validated. Invalid values are replaced after each validation."""

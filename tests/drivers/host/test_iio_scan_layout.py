@@ -3,7 +3,7 @@
 import pytest
 
 from drivers.errors import DecodeError
-from drivers.iio_scan_layout import ScanElement, ScanLayout, StoredNumber, decode_layout, locate_numbers
+from drivers.host.iio_scan_layout import ScanElement, ScanLayout, StoredNumber, decode_layout, locate_numbers
 
 
 def test_elements_are_aligned_to_their_own_size() -> None:

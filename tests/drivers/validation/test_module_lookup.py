@@ -7,7 +7,7 @@ import pytest
 
 from drivers import decoders, links
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_suggestion, import_module, list_modules
+from drivers.validation.module_lookup import format_suggestion, import_module, list_modules
 
 
 @pytest.fixture

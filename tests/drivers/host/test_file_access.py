@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers import file_access
 from drivers.errors import ConfigError
+from drivers.host import file_access
 from monitor.commands import thermal
 from monitor.noise.model_loading import read_model
 from monitor.settings import loading

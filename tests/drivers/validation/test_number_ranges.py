@@ -6,10 +6,10 @@ from typing import Annotated
 import pytest
 from pydantic import Field
 
-from drivers import number_ranges
 from drivers.errors import ConfigError
-from drivers.number_ranges import RATE_HZ, SCALE, SEED, SILENCE_S, NumberRange
-from drivers.settings_model import ListOf, SettingsModel
+from drivers.validation import number_ranges
+from drivers.validation.number_ranges import RATE_HZ, SCALE, SEED, SILENCE_S, NumberRange
+from drivers.validation.settings_model import ListOf, SettingsModel
 from tests.support.settings import read_settings
 
 RANGES = {name: value for name, value in vars(number_ranges).items() if isinstance(value, NumberRange)}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.credential_masking import has_secret, mask_secrets
+from drivers.zenoh.credential_masking import has_secret, mask_secrets
 
 SECRET = "hunter2"
 

@@ -10,8 +10,8 @@ import pytest
 from pydantic import Field
 
 from drivers.errors import ConfigError
-from drivers.number_ranges import FRACTION, RATE_HZ
-from drivers.settings_model import (
+from drivers.validation.number_ranges import FRACTION, RATE_HZ
+from drivers.validation.settings_model import (
     Conflict,
     FileOrName,
     FilePath,

@@ -1,0 +1,1 @@
+"""Validation of settings: models of settings, ranges of numbers, and look-up of modules by name."""
