@@ -29,6 +29,7 @@ from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
 from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
+from tests.support.noise_series import draw_next_samples
 
 SHARES: Final = (0.125, 0.25, 0.5, 0.75, 1.0)
 NOISES: Final[dict[str, tuple[float, float, float, float]]] = {  # Q N B K, τ0 = 1
@@ -48,7 +49,7 @@ def simulate_records(coefficients: tuple[float, ...], n: int, count: int, rng: n
     values = np.zeros((n, count))
     for kind, letter, size in zip(kinds, "QNBK", coefficients, strict=True):
         for column in range(count if size else 0):
-            values[:, column] += kind(**{letter: size}).start_series(1.0, rng).draw_next_samples(n)
+            values[:, column] += draw_next_samples(kind(**{letter: size}).start_series(1.0, rng), n)
     return values
 
 

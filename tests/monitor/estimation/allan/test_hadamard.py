@@ -12,6 +12,7 @@ from monitor.estimation.allan.squared_difference_moments import phase_autocovari
 from monitor.estimation.allan.total import total_estimator_moments
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
 from tests.support.allan_references import columns, nist_1000
+from tests.support.noise_series import draw_next_samples
 
 
 def test_nist_sp_1065_values_are_reproduced():
@@ -103,7 +104,7 @@ def test_intervals_have_the_stated_coverage():
     theta = np.array([0.0, 1.0, 0.02, 1e-3, 0.0])
     sources = AngleRandomWalk(N=1.0), BiasInstability(B=0.02**0.5), RateRandomWalk(K=1e-3**0.5)
     values = sum(
-        np.stack([s.start_series(rate_hz, rng).draw_next_samples(n) for _ in range(runs)], axis=1) for s in sources
+        np.stack([draw_next_samples(s.start_series(rate_hz, rng), n) for _ in range(runs)], axis=1) for s in sources
     )
     factors = np.array([4, 16, 64, 128, 170])
     curve = compute_hadamard_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)

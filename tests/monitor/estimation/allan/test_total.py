@@ -13,6 +13,7 @@ from monitor.estimation.allan.batch import octave_cluster_sizes, overlapping_ava
 from monitor.estimation.allan.total import MIN_SHARE, compute_total_curve, total_estimator_moments, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from tests.support.allan_references import nist_1000
+from tests.support.noise_series import draw_next_samples
 
 
 def compute_reflected_differences(rate, m):
@@ -154,7 +155,7 @@ def test_intervals_have_the_stated_coverage_up_to_half_the_recording(rate_hz):
         RateRandomWalk(K=1e-3**0.5),
     )
     values = sum(
-        np.stack([s.start_series(rate_hz, rng).draw_next_samples(n) for _ in range(runs)], axis=1) for s in sources
+        np.stack([draw_next_samples(s.start_series(rate_hz, rng), n) for _ in range(runs)], axis=1) for s in sources
     )
     factors = np.array([64, 128, 256, 384])
     curve = compute_total_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
