@@ -33,6 +33,7 @@ from monitor.reconcile.diagnostics.null_distribution import (
     estimate_null_distributions,
     run_diagnostics,
 )
+from monitor.reconcile.effect_table import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.effect_roles import is_stationary_gaussian, with_effect_size
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
@@ -53,7 +54,6 @@ from monitor.reconcile.result import (
     combine_decisions,
 )
 from monitor.reconcile.search.backward_elimination import MapFunction, eliminate_unneeded_effects
-from monitor.reconcile.search.candidate_effects import PENALTY_NATS
 from monitor.reconcile.search.common_vibration_search import name_common_vibrations
 from monitor.reconcile.search.sample_rate_from_spectrum import (
     SAMPLE_RATE_PENALTY_NATS,

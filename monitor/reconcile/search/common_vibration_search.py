@@ -25,6 +25,7 @@ from monitor.noise.effect import AxisLeak
 from monitor.noise.effects import CommonVibration, ExponentiallyCorrelated, Narrowband
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, run_diagnostics
 from monitor.reconcile.diagnostics.plot_data import build_plot_data
+from monitor.reconcile.effect_table import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.hypothesis_fit import (
     RESIZE_PENALTY_NATS,
@@ -35,7 +36,6 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.cosine_bins import FrequencyBins, build_frequency_bins, cosine_transform
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.search.candidate_effects import PENALTY_NATS
 from monitor.reconcile.search.cross_validation import accept_without_validation
 from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
 from monitor.reconcile.search.trials import Trial

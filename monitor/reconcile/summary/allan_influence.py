@@ -14,8 +14,8 @@ from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 from monitor.noise.effect import Effect, Source
 from monitor.noise.spectrum import allan_variance_of_density
+from monitor.reconcile.effect_table import SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Effects
-from monitor.reconcile.likelihood.effect_roles import SIZE_PARAMETERS
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import AllanInfluence
@@ -68,7 +68,7 @@ def _noise_avar(hypothesis: Hypothesis, effects: Effects, factors: Ints) -> Floa
     tau0_s = 1.0 / axis.rate_hz
     variance = axis.fit(effects, noise_effect_indices(effects)).whittle.variance
     x, y = np.log(axis.bins.f_hz), np.log(variance * tau0_s)
-    others = [one for one in effects if isinstance(one, Source) and type(one) not in SIZE_PARAMETERS]
+    others = [one for one in effects if isinstance(one, Source) and one.name not in SIZE_PARAMETERS]
 
     def density(f_hz: Floats) -> Floats:
         added = sum(np.nan_to_num(one.two_sided_psd(f_hz, tau0_s)) for one in others)
