@@ -44,7 +44,6 @@ def reconcile(
     from monitor.noise.model_loading import load_model
     from monitor.publishing.terminal import reconcile_text as text
     from monitor.reconcile import json_report
-    from monitor.reconcile.several_recordings import comparison_json
 
     last_s = options.parse_duration("--last", last)
     choice = options.parse_decoder(decoder, option)
@@ -60,7 +59,7 @@ def reconcile(
                     tuple(recordings), tested, out, seed, rate, last_s, reading, choice
                 )
                 runs = reconciling.compare_recordings(every, tell)
-                data, show = comparison_json.encode_comparison(runs), partial(text.print_comparison, runs)
+                data, show = json_report.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
                 one = reconciling.reconcile_and_write_report(
                     reconciling.ReconciliationRequest(

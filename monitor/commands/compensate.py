@@ -21,8 +21,7 @@ from drivers.recordings.writing import open_recording_writer
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
-from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
-from monitor.drift.compensation.compensation_score import score_at_rest
+from monitor.drift.compensation.compensation_score import AxisCompensation, DriftCompensationResult, score_at_rest
 from monitor.drift.compensation.compensator import Compensator, MeasuredAndPredictedDrift
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.compensation.sage_husa import MIN_CONFIRMED_INTERVALS, REJECTED, STEPPED, USED

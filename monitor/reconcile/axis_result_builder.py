@@ -25,8 +25,11 @@ from monitor.reconcile.result import (
 from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
 from monitor.reconcile.search.trials import RETUNE, Trial
-from monitor.reconcile.summary.allan_influence import compute_allan_influences_of_changes
-from monitor.reconcile.summary.gap_decomposition import decompose_explained_gain, measure_remaining_gaps
+from monitor.reconcile.summary.effect_contributions import (
+    compute_allan_influences_of_changes,
+    decompose_explained_gain,
+    measure_remaining_gaps,
+)
 
 MAX_RUNNERS_UP: Final = 3
 MAX_FREQUENCY_DIFFERENCE: Final = 0.05

@@ -7,7 +7,7 @@ one finding. The gap of a finding is the sum over its axes. If the model was fit
 do not count as findings.
 
 The whole gap is the sum of the explained and the remaining gaps of all axes. Each share lies between 0 and 1, and the
-sum of all shares is 1. The measure is described in ``gap_decomposition``.
+sum of all shares is 1. The measure is described in ``effect_contributions``.
 """
 
 from collections.abc import Mapping, Sequence
