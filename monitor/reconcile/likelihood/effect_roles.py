@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import AxisLeak, Effect, SampleBlockContext, Source
+from monitor.noise.effect import Effect, SampleBlockContext, Source
 from monitor.noise.effects import (
     BandwidthLimit,
     CommonVibration,
@@ -95,7 +95,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     Parameters
     ----------
     effect : Effect
-        Deterministic effect.
+        Deterministic effect that is not a leak from another axis.
     n : int
         Number of samples.
     rate_hz : float
@@ -107,14 +107,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     -------
     list of ndarray of float64, shape (n,)
         Series of each of the ``regressor_count(effect)`` regressors.
-
-    Raises
-    ------
-    TypeError
-        If the effect is a leak from another axis.
     """
-    if isinstance(effect, AxisLeak):
-        raise TypeError("the series of a leak is another axis")
     variants: list[Any]
     if isinstance(effect, Sinusoidal):
         variants = [replace(effect, amplitude=1.0, phase=phase) for phase in (0.0, 0.5 * pi)]

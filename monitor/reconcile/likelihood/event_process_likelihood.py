@@ -23,7 +23,6 @@ MAX_BLOCKS: Final = 1 << 15
 """Largest number of blocks. The end of a longer recording is not used."""
 TARGET_BLOCKS: Final = 200.0
 """Smallest number of blocks in a recording with enough samples."""
-MIN_BLOCKS: Final = 16
 INITIAL_VARIANCE_RATIO: Final = 100.0
 """Prior variance of the first level, relative to the variance of the data."""
 FLICKER_TIME_RATIO: Final = 10.0
@@ -112,11 +111,6 @@ def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Float
     block_s : float
         Exact length of a block in seconds.
 
-    Raises
-    ------
-    ValueError
-        If the series has too few blocks.
-
     Examples
     --------
     >>> means, block_s = compute_block_means(np.arange(48.0), 0.5, 1.4)
@@ -125,8 +119,6 @@ def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Float
     """
     size = max(1, round(block_s / tau0_s))
     count = min(y.size // size, MAX_BLOCKS)
-    if count < MIN_BLOCKS:
-        raise ValueError(f"the series has {count} blocks of {size * tau0_s:g} s; at least {MIN_BLOCKS} are needed")
     means = y[: count * size].reshape(count, size).mean(1)
     return means - means.mean(), size * tau0_s
 
@@ -142,14 +134,7 @@ def build_state_space_noise(background: BackgroundNoise, block_s: float, duratio
         Length of a block in seconds.
     duration_s : float
         Length of the recording in seconds.
-
-    Raises
-    ------
-    ValueError
-        If the background contains no white noise.
     """
-    if not background.white > 0.0:
-        raise ValueError(f"the white noise is {background.white:g}; it must be above zero")
     walk = background.walk * block_s
     rows, white = [(1.0, 1.0, walk, 0.5 * walk)], background.white / block_s + walk / 3.0
     for sigma, time_s in (*background.correlated, *_flicker_processes(background, block_s, duration_s)):

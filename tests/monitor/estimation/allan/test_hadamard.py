@@ -109,7 +109,7 @@ def test_intervals_have_the_stated_coverage():
     factors = np.array([4, 16, 64, 128, 170])
     curve = compute_hadamard_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
     white = 1.0 / curve.tau_s  # white noise makes all but a ten-thousandth of the variance
-    np.testing.assert_allclose(curve.hvar.mean(axis=1), white, rtol=0.1)
+    np.testing.assert_allclose(curve.variance.mean(axis=1), white, rtol=0.1)
     covered = (curve.lo**2 <= white[:, None]) & (white[:, None] <= curve.hi**2)
     assert (covered.mean(axis=1) > 0.94).all()
     assert (covered.mean(axis=1) < 0.982).all()
@@ -119,7 +119,7 @@ def test_gaps_reduce_degrees_of_freedom_and_unknown_noise_gives_no_intervals():
     values = np.random.default_rng(3).standard_normal((400, 2))
     whole = compute_hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, np.nan])
     assert whole.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128]
-    assert np.isfinite(whole.hvar).all()
+    assert np.isfinite(whole.variance).all()
     assert np.isfinite(whole.hi[:, 0]).all()
     assert np.isnan(whole.hi[:, 1]).all()
     values[100, 0] = np.nan

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monitor.noise.effect import AxisLeak, SampleBlockContext, Source
-from monitor.noise.effects import EFFECTS, CrossAxis, Sinusoidal, TemperatureBias
+from monitor.noise.effects import EFFECTS, Sinusoidal, TemperatureBias
 from monitor.reconcile.effect_table import NOISE_SIZE_PARAMETERS, SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.effect_roles import (
     build_unit_regressors,
@@ -94,8 +94,3 @@ def test_size_keeps_its_sign_where_it_has_one():
     assert effect_size(with_effect_size(make_effect("bias_step"), -2.0)) == -2.0
     assert effect_size(with_effect_size(make_effect("sinusoidal"), -2.0)) == 2.0
     assert effect_size(with_effect_size(make_effect("rate_ramp"), -2.0)) == 2.0
-
-
-def test_a_leak_has_no_series_of_its_own():
-    with pytest.raises(TypeError, match="another axis"):
-        build_unit_regressors(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)

@@ -95,7 +95,3 @@ def test_block_means():
     assert block_s == pytest.approx(0.1)
     assert means + y[:1000].mean() == pytest.approx([y[10 * k : 10 * k + 10].mean() for k in range(100)])
     assert prior_level_variance(means) == pytest.approx(100.0 * means.var())
-    with pytest.raises(ValueError, match="at least 16"):
-        compute_block_means(y, 0.01, 1.0)
-    with pytest.raises(ValueError, match="above zero"):
-        build_state_space_noise(BackgroundNoise(0.0, walk=1.0), 1.0, 100.0)
