@@ -137,7 +137,6 @@ def _describe_step(
     confidence, others = _confidence_and_runners_up(effect.name if kind == "added" or moved else RETUNE, trials)
     if kind != "added" and trial.name != RETUNE and not moved:  # an effect was added in the same round
         confidence, others = _resize_confidence(search.hypothesis, index), ()
-    held_out_before, held_out_after = _held_out_gaps(done, gap, later)
     return AddedOrResizedEffect(
         kind=kind,
         effect=effect.name,
@@ -146,23 +145,10 @@ def _describe_step(
         runners_up=others,
         before=gap,
         after=later,
-        held_out_before=held_out_before,
-        held_out_after=held_out_after,
+        held_out=None if done.validation.reason else (done.validation.before, done.validation.after),
         held_out_reason=done.validation.reason,
         because=_justification(effect, kind, gap, later, others, trial),
         snapshot_after=after,
-    )
-
-
-def _held_out_gaps(
-    done: SearchRound, gap: DiagnosticGap, later: DiagnosticGap
-) -> tuple[DiagnosticGap | None, DiagnosticGap | None]:
-    validation = done.validation
-    if validation.reason:
-        return None, None
-    return (
-        DiagnosticGap(gap.diagnostic, gap.where, validation.before, gap.null95, gap.threshold),
-        DiagnosticGap(gap.diagnostic, gap.where, validation.after, later.null95, later.threshold),
     )
 
 

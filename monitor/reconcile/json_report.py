@@ -108,7 +108,6 @@ def _axis_entry(result: AxisResult) -> dict[str, Any]:
 
 
 def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
-    held_out = _gap_entry(step.held_out_before, step.held_out_after)
     return {
         "found": _gap_and_location_entry(step.before),
         "kind": step.kind,
@@ -117,18 +116,16 @@ def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
         "confidence": step.confidence,
         "gain_nats": step.gain_nats,
         "runners_up": step.runners_up,
-        "gap": _gap_entry(step.before, step.after),
-        "held_out_gap": held_out,
-        **({} if held_out else {"held_out_reason": step.held_out_reason}),
+        "gap": _gap_entry(step.before.gap, step.after.gap, step.after),
+        "held_out_gap": None if step.held_out is None else _gap_entry(*step.held_out, step.after),
+        **({} if step.held_out else {"held_out_reason": step.held_out_reason}),
         "because": step.because,
         "scores": [_gap_and_location_entry(gap) for gap in step.snapshot_after.gaps],
     }
 
 
-def _gap_entry(before: DiagnosticGap | None, after: DiagnosticGap | None) -> dict[str, float | None] | None:
-    if before is None or after is None:
-        return None
-    return {"before": before.gap, "after": after.gap, "null95": after.null95, "threshold": after.threshold}
+def _gap_entry(before: float, after: float, limits: DiagnosticGap) -> dict[str, float]:
+    return {"before": before, "after": after, "null95": limits.null95, "threshold": limits.threshold}
 
 
 def _gap_and_location_entry(gap: DiagnosticGap) -> dict[str, Any]:

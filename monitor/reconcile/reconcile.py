@@ -351,8 +351,7 @@ def _add_sample_rate_step(
         runners_up=(),
         before=before,
         after=next(score for score in result.start.gaps if score.diagnostic == "lines"),
-        held_out_before=None,
-        held_out_after=None,
+        held_out=None,
         held_out_reason="the sample rate is common to the whole recording",
         because=(
             f"The feature of the model at {stated:.6g} Hz appears at {observed:.6g} Hz in the recording, and one ratio "

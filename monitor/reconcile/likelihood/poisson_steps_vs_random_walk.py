@@ -214,14 +214,9 @@ def _weigh_branches(
     log_scale : float
         Logarithm of the factor by which the weights were multiplied.
     """
-    table, probability, mean, covariance = noise.table, state.probability, state.mean, state.covariance
-    weight, inverse_variance, state_covariance, next_mean = (
-        update.weight,
-        update.inverse_variance,
-        update.state_covariance,
-        update.mean,
-    )
-    d = table.shape[0]
+    table, d = noise.table, noise.table.shape[0]
+    probability, mean, covariance = state
+    weight, inverse_variance, state_covariance, next_mean = update
     least = np.inf
     for age in range(JUMP_AGES):
         if probability[age] < MIN_HYPOTHESIS_PROBABILITY:
@@ -274,12 +269,7 @@ def _merge(
     The mean and the lower triangle of the covariance are written in place. The jumps are independent of the earlier
     state, and the caller adds their variance.
     """
-    weight, inverse_variance, state_covariance, mean = (
-        update.weight,
-        update.inverse_variance,
-        update.state_covariance,
-        update.mean,
-    )
+    weight, inverse_variance, state_covariance, mean = update
     share = 0.0
     for age in range(first, end):
         share += weight[jump, age]
@@ -297,11 +287,8 @@ def _merge(
             continue
         part, known = weight[jump, age] / share, inverse_variance[jump, age]
         for i in range(d):
-            decay, pull, apart = (
-                table[i, 0],
-                state_covariance[jump, age, i] * known,
-                mean[jump, age, i] - merged_mean[i],
-            )
+            decay, pull = table[i, 0], state_covariance[jump, age, i] * known
+            apart = mean[jump, age, i] - merged_mean[i]
             for j in range(i + 1):
                 own = decay * table[j, 0] * covariance[age, i, j] - pull * state_covariance[jump, age, j]
                 merged_covariance[i, j] += part * (own + apart * (mean[jump, age, j] - merged_mean[j]))
@@ -313,9 +300,8 @@ def _merge(
 @compiled
 def _increase_ages(table: Floats, state: _JumpFilterState, update: _JumpFilterUpdate) -> None:
     """Update the hypotheses with ages from 1 to ``JUMP_AGES`` − 2, which have no jump in the block."""
-    probability, mean, covariance = state.probability, state.mean, state.covariance
-    weight, next_mean = update.weight, update.mean
-    inverse_variance, state_covariance = update.inverse_variance, update.state_covariance
+    probability, mean, covariance = state
+    weight, inverse_variance, state_covariance, next_mean = update
     for age in range(JUMP_AGES - 2, 0, -1):
         old = age - 1
         probability[age] = weight[0, old]

@@ -78,10 +78,8 @@ def compare_telegraph_with_correlated_noise(
     means, block_s = compute_block_means(
         y, tau0_s, _choose_block_length_s(y.size * tau0_s, tau0_s, correlation_time, background.white / sigma**2)
     )
-    noise, level_variance = (
-        build_state_space_noise(background, block_s, means.size * block_s),
-        prior_level_variance(means),
-    )
+    noise = build_state_space_noise(background, block_s, means.size * block_s)
+    level_variance = prior_level_variance(means)
 
     def correlated_noise_log_likelihood(sigma: float, time_s: float) -> float:
         row, own = correlated_noise_of_block_means(sigma, time_s, block_s)
@@ -246,15 +244,9 @@ def _merge_into_level(
 ) -> None:
     """Merge all cases that end at ``level`` into one Gaussian, and write its mean and covariance in place."""
     d, other = table.shape[0], 1 - level
-    state_covariance, pull, known, at, covariance = (
-        update.state_covariance,
-        update.scaled_innovation,
-        update.inverse_variance,
-        state.mean,
-        state.covariance,
-    )
-    step = update.mean_difference
-    stays, comes = update.weight[level, 0], update.weight[other, 2]
+    _, at, covariance = state
+    weight, pull, known, state_covariance, step = update
+    stays, comes = weight[level, 0], weight[other, 2]
     state.probability[level] = (stays + comes) / density
     came = comes / (stays + comes)
     for i in range(d):

@@ -149,7 +149,6 @@ def test_numbers_of_numpy_are_numbers() -> None:
         score,
         score,
         None,
-        None,
         "once",
         "it jumps",
         look,

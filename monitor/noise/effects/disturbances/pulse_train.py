@@ -104,10 +104,8 @@ def _allan_variance(covariance: Floats, tau0_s: float) -> Curve:
 
     def allan_variance(tau_s: Floats) -> Floats:
         m = np.maximum(np.rint(np.asarray(tau_s) / tau0_s), 1.0).astype(np.int64)
-        (inner, inner_first), (outer, outer_first) = (
-            sum_autocovariance_below_lag(m + 1),
-            sum_autocovariance_below_lag(2 * m),
-        )
+        inner, inner_first = sum_autocovariance_below_lag(m + 1)
+        outer, outer_first = sum_autocovariance_below_lag(2 * m)
         total = 2.0 * m * inner - 3.0 * inner_first + (outer_first - inner_first) - 2.0 * m * (outer - inner)
         return np.asarray(np.maximum(total - m * covariance[0], 0.0) / m.astype(np.float64) ** 2)
 
