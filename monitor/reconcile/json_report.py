@@ -11,6 +11,9 @@ step. ``gap`` compares the same diagnostic before and after the step. ``scores``
 ``gap_nats``.
 
 ``recording_findings`` lists the faults of the recording with their evidence, the most serious fault first.
+
+In a comparison, the parameters of an effect are averaged over the recordings. ``p`` is the probability of an equal or
+larger scatter if the true value is the same in all recordings. ``each`` contains the values of each recording.
 """
 
 from collections.abc import Mapping

@@ -143,7 +143,12 @@ def _misfit_event(axis: str, mean_square: float, t_ns: int, since_ns: int) -> Ev
 
 
 class InnovationTest:
-    """Test of the innovations of a drift model for one axis."""
+    """Test of the innovations of a drift model for one axis.
+
+    If the drift model fits, the mean of the squared normalised innovations ε²/S over n intervals has the distribution
+    χ²_n/n. When the mean exceeds LIMIT, a misfit is reported. The next misfit is reported only after the mean has
+    fallen below RESET_LIMIT.
+    """
 
     def __init__(self) -> None:
         self._squares: deque[float] = deque(maxlen=INTERVALS)

@@ -298,7 +298,15 @@ class _Axis:
 
 
 class ModelAgreementMonitor:
-    """Monitor of the agreement between the axes of one device and the noise model."""
+    """Monitor that decides whether each axis of a device agrees with the noise model, and reports changes as events.
+
+    The sliding window is compared with the noise model ten times per second, so successive comparisons are strongly
+    correlated. An axis disagrees with the model if the largest difference stays above ``AxisModelComparison.alarm``
+    until 1/8 of the window has been replaced. If the difference exceeds twice ``AxisModelComparison.threshold``,
+    ``MIN_SAMPLES`` new samples are sufficient. An axis agrees again if the largest difference stays below ``null95``
+    until 1/8 of the window has been replaced. In a simulation of 1600 windows of six axes with 128 comparisons each, a
+    true model was rejected three times.
+    """
 
     def __init__(self) -> None:
         self._axes = {axis: _Axis() for axis in AXES}

@@ -65,11 +65,6 @@ def compare_poisson_with_random_walk(
     -------
     EventProcessComparison
         Log-likelihood gain, fitted rate and height, and number of Poisson steps.
-
-    Raises
-    ------
-    ValueError
-        If the series is too short or the background contains no white noise.
     """
     means, block_s = compute_block_means(y, tau0_s, choose_block_length_s(y.size * tau0_s, background, K))
     level_variance, duration_s = prior_level_variance(means), means.size * block_s

@@ -58,11 +58,6 @@ def compare_poisson_with_single_steps(
     -------
     EventProcessComparison
         Log-likelihood gain, fitted rate and height of Poisson steps, and the numbers of jumps and single steps.
-
-    Raises
-    ------
-    ValueError
-        If the series is too short or the background contains no white noise.
     """
     means, block_s = compute_block_means(
         y, tau0_s, poisson_steps_vs_random_walk.choose_block_length_s(y.size * tau0_s, background, K)

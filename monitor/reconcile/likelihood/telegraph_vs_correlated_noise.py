@@ -69,11 +69,6 @@ def compare_telegraph_with_correlated_noise(
     -------
     EventProcessComparison
         Log-likelihood gain, fitted amplitude and dwell time, and number of switches of the telegraph.
-
-    Raises
-    ------
-    ValueError
-        If the series is too short or the background contains no white noise.
     """
     means, block_s = compute_block_means(
         y, tau0_s, _choose_block_length_s(y.size * tau0_s, tau0_s, correlation_time, background.white / sigma**2)

@@ -200,6 +200,10 @@ def _sensor_name(triad: Sequence[str]) -> str:
 def compute_robust_spectrum(y: Floats, rate_hz: float) -> RobustBandSpectrum | None:
     """Compute the robust spectrum of one axis, or return None if there is no noise or too few complete blocks.
 
+    The spectrum is the median over blocks of the power in frequency bands. A knock, a spike or a gap changes only a few
+    blocks and therefore has little effect on the median. The median of the power is smaller than the mean. The ratio of
+    median and mean is the same for a recording and a simulation, so the ratio cancels in the comparison.
+
     Parameters
     ----------
     y : ndarray of float64, shape (n,)

@@ -68,6 +68,10 @@ def check_repeated_rows(
 ) -> list[RecordingFinding]:
     """Report rows that repeat on all axes more often than by chance.
 
+    Such rows occur throughout a recording that was resampled to a higher rate. Quantized values also repeat by chance,
+    but independently on each axis. The share of rows that repeat on all axes is therefore compared with the product of
+    the shares of single axes. The rows are kept, because the search for noise effects describes the repeats.
+
     Parameters
     ----------
     values : mapping of str to ndarray, shape (n,)
@@ -117,6 +121,10 @@ def check_stuck_values(
     values: Mapping[str, Floats], rate_hz: float, simulated: Mapping[str, Floats] | None
 ) -> tuple[dict[str, Floats], list[RecordingFinding]]:
     """Mark stuck samples as missing, and return the values with a finding for each group of stuck axes.
+
+    Quantized values also repeat by chance. The length of a run is therefore compared with the repeats in the rest of
+    the recording and with the longest run in a simulation of the model. A run at the largest or smallest value of the
+    axis may be clipping, which the search for noise effects handles.
 
     Parameters
     ----------

@@ -30,8 +30,7 @@ from monitor.noise.effects import (
     ScaleFactor,
     Sinusoidal,
 )
-from monitor.reconcile.diagnostics.null_distribution import AxisNull, run_diagnostics
-from monitor.reconcile.diagnostics.plot_data import build_plot_data
+from monitor.reconcile.diagnostics.null_distribution import AxisNull
 from monitor.reconcile.effect_table import EFFECT_TABLE, PENALTY_NATS, SIZE_PARAMETERS
 from monitor.reconcile.likelihood.effect_roles import effect_size, with_effect_size
 from monitor.reconcile.likelihood.hypothesis_fit import (
@@ -42,10 +41,9 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     fit_shape_parameter,
     noise_effect_indices,
 )
-from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.recording_checks.checks import TRIADS
 from monitor.reconcile.search.cross_validation import accept_without_validation
-from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
+from monitor.reconcile.search.search import AxisSearchResult, SearchRound, diagnose_hypothesis
 from monitor.reconcile.search.trials import SCALE_FACTOR_MARGIN_NATS, SCALE_SEARCH_ITERATIONS, Trial
 
 PEAKS: Final = (Sinusoidal, Narrowband)
@@ -111,13 +109,9 @@ def _accept_if_diagnostics_agree(
     """
     if simpler is search.hypothesis:
         return search
-    whitened = whiten_axis(simpler.fit)
-    findings = run_diagnostics(whitened)
-    for diagnostic, one in findings.items():
-        if (
-            one.gain > null[diagnostic].threshold
-            and not search.final.findings[diagnostic].gain > null[diagnostic].threshold
-        ):
+    final = diagnose_hypothesis(simpler)
+    for diagnostic, one in final.findings.items():
+        if one.gain > null[diagnostic].threshold >= search.final.findings[diagnostic].gain:
             return search
     rounds = search.rounds
     if replacement_reason:
@@ -126,12 +120,7 @@ def _accept_if_diagnostics_agree(
         trial = Trial(effect.name, effect, score)
         reason = accept_without_validation(replacement_reason)
         rounds = (*rounds, SearchRound(search.final, (trial,), simpler, reason, replaces_effects=True))
-    return replace(
-        search,
-        rounds=rounds,
-        hypothesis=simpler,
-        final=HypothesisDiagnostics(findings, build_plot_data(whitened)),
-    )
+    return replace(search, rounds=rounds, hypothesis=simpler, final=final)
 
 
 def _without_unneeded_effects(hypothesis: Hypothesis, others: Sequence[Effect]) -> Hypothesis:

@@ -76,6 +76,11 @@ class HypothesisDiagnostics:
     plots: tuple[DiagnosticPlotData, ...]
 
 
+def diagnose_hypothesis(hypothesis: Hypothesis) -> HypothesisDiagnostics:
+    """Run the diagnostics on the residuals of a hypothesis, and build the plots."""
+    return _diagnose(hypothesis).findings_and_plots()
+
+
 @dataclass(frozen=True, slots=True)
 class SearchRound:
     """Search round that added an effect or changed sizes of the noise model."""

@@ -1,4 +1,21 @@
-"""Contribution of each change of the model to the gap and to the Allan deviation of an axis."""
+"""Contribution of each change of the model to the gap and to the Allan deviation of an axis.
+
+The **explained gap** is the gain in log-likelihood of the final hypothesis over the model under test. The gain is
+distributed among the changes of the model: in each step, the change whose removal costs least is removed, the remaining
+sizes are fitted again, and the loss is the gain of this change. The gains are never negative, and their sum is the
+explained gap.
+
+Outliers, heavy tails, changes of the variance, random jumps and wandering lines are not fully visible in the likelihood
+of the spectrum. The gain of the test that found them is added. For random jumps, only the gain over Gaussian noise with
+the same spectrum is added. The gain of a moved line is the score of its trial. The likelihood of quantized, clipped or
+repeated values is unbounded, because a continuous distribution never yields equal values. The gain of these effects is
+the gain of their influence on the noise (``value_artifact_gain``). If the model was fitted to the same recording, only
+added effects have a gain, because the sizes of the model cannot serve as a reference.
+
+The **remaining gap** is the sum over the groups of diagnostics in ``GROUPS``. The diagnostics of a group detect the
+same difference, so the gain of a group is that of its strongest significant diagnostic. For the spectrum, the gain from
+fitting the power in each of ``SATURATED_BANDS`` frequency bands is used if it is larger.
+"""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from math import exp, log
@@ -187,6 +204,9 @@ def _saturated_spectrum_gain(fit: AxisFit) -> float:
 
 def compute_allan_influences_of_changes(hypothesis: Hypothesis, changed: Iterable[int]) -> dict[int, AllanInfluence]:
     """Compute the influence of each changed effect on the Allan deviation.
+
+    The Allan deviation of the extended model is compared with the Allan deviation of the model without the change. All
+    other sizes stay the same. Cross products of deterministic effects are neglected.
 
     Parameters
     ----------
