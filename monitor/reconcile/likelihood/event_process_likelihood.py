@@ -67,6 +67,7 @@ class StateSpaceNoise(NamedTuple):
 
     table: Floats  # [d, 4] a, c, variance of w and covariance of v and w, for each process
     white: float  # variance of the white noise in a block mean, plus the variances of all v
+    level_variance: float  # prior variance of the mean level in the first block
 
 
 class EventProcessFit(NamedTuple):
@@ -123,25 +124,25 @@ def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Float
     return means - means.mean(), size * tau0_s
 
 
-def build_state_space_noise(background: BackgroundNoise, block_s: float, duration_s: float) -> StateSpaceNoise:
+def build_state_space_noise(background: BackgroundNoise, means: Floats, block_s: float) -> StateSpaceNoise:
     """Build the state-space model of the background noise in block means.
 
     Parameters
     ----------
     background : BackgroundNoise
         Noise of the axis.
+    means : ndarray of float64, shape (m,)
+        Block means, of which the variance sets the prior variance of the mean level.
     block_s : float
         Length of a block in seconds.
-    duration_s : float
-        Length of the recording in seconds.
     """
     walk = background.walk * block_s
     rows, white = [(1.0, 1.0, walk, 0.5 * walk)], background.white / block_s + walk / 3.0
-    for sigma, time_s in (*background.correlated, *_flicker_processes(background, block_s, duration_s)):
+    for sigma, time_s in (*background.correlated, *_flicker_processes(background, block_s, means.size * block_s)):
         row, own = correlated_noise_of_block_means(sigma, time_s, block_s)
         rows.append(row)
         white += own
-    return StateSpaceNoise(np.array(rows), white)
+    return StateSpaceNoise(np.array(rows), white, INITIAL_VARIANCE_RATIO * float(means.var()))
 
 
 def correlated_noise_of_block_means(
@@ -305,18 +306,13 @@ def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -
     return curvature / CURVATURE_STEP**2
 
 
-def prior_level_variance(means: Floats) -> float:
-    """Return the prior variance of the mean level in the first block."""
-    return INITIAL_VARIANCE_RATIO * float(means.var())
-
-
 @compiled
-def initial_state_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
+def initial_state_covariance(noise: StateSpaceNoise) -> Floats:
     """Return the state covariance, shape (d, d), before the first block."""
     table = noise.table
     d = table.shape[0]
     covariance = np.zeros((d, d))
-    covariance[0, 0] = level_variance
+    covariance[0, 0] = noise.level_variance
     for i in range(1, d):
         covariance[i, i] = table[i, 2] / (1.0 - table[i, 0] ** 2)
     return covariance
@@ -350,9 +346,7 @@ def difference_from_predicted_block_mean(block_mean: float, noise: StateSpaceNoi
 
 
 @compiled
-def innovation_variances(
-    extra_level_variance: Floats, noise: StateSpaceNoise, level_variance: float
-) -> tuple[Floats, Floats]:
+def innovation_variances(extra_level_variance: Floats, noise: StateSpaceNoise) -> tuple[Floats, Floats]:
     """Return the innovation variances, shape (m,), and the covariances with the next state, shape (m, d).
 
     The variance of the mean level increases by ``extra_level_variance``, shape (m,), at the start of each block.
@@ -360,7 +354,7 @@ def innovation_variances(
     table = noise.table
     d, m = table.shape[0], extra_level_variance.size
     variances, state_covariances = np.empty(m), np.empty((m, d))
-    covariance = initial_state_covariance(noise, level_variance)
+    covariance = initial_state_covariance(noise)
     for k in range(m):
         covariance[0, 0] += extra_level_variance[k]
         variances[k] = predict_block_mean_variance(noise, covariance, state_covariances[k])
@@ -388,12 +382,12 @@ def innovations_of_series(
 
 
 @compiled
-def kalman_log_likelihood(means: Floats, noise: StateSpaceNoise, level_variance: float) -> float:
+def kalman_log_likelihood(means: Floats, noise: StateSpaceNoise) -> float:
     """Return the log-likelihood of block means under Gaussian noise.
 
     The Kalman filter follows Anderson & Moore, "Optimal Filtering", 1979, sections 5.5 and 10.4.
     """
-    variances, state_covariances = innovation_variances(np.zeros(means.size), noise, level_variance)
+    variances, state_covariances = innovation_variances(np.zeros(means.size), noise)
     innovations = innovations_of_series(means, noise, variances, state_covariances)
     total = 0.0
     for k in range(means.size):

@@ -29,7 +29,6 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
     initial_state_covariance,
     kalman_log_likelihood,
     maximise_over_log_parameters,
-    prior_level_variance,
 )
 
 BLOCKS_PER_CROSSING_TIME: Final = 3.0
@@ -67,11 +66,10 @@ def compare_poisson_with_random_walk(
         Log-likelihood gain, fitted rate and height, and number of Poisson steps.
     """
     means, block_s = compute_block_means(y, tau0_s, choose_block_length_s(y.size * tau0_s, background, K))
-    level_variance, duration_s = prior_level_variance(means), means.size * block_s
 
     def random_walk_log_likelihood(K: float) -> float:
-        noise = build_state_space_noise(replace(background, walk=background.walk + K * K), block_s, duration_s)
-        return float(kalman_log_likelihood(means, noise, level_variance))
+        noise = build_state_space_noise(replace(background, walk=background.walk + K * K), means, block_s)
+        return float(kalman_log_likelihood(means, noise))
 
     return fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
         maximise_over_log_parameters(random_walk_log_likelihood, (K,))[0]
@@ -108,11 +106,11 @@ def fit_poisson_jumps(means: Floats, block_s: float, background: BackgroundNoise
     K : float
         Random walk coefficient in unit/√s.
     """
-    duration_s, level_variance = means.size * block_s, prior_level_variance(means)
-    noise = build_state_space_noise(background, block_s, duration_s)
+    duration_s = means.size * block_s
+    noise = build_state_space_noise(background, means, block_s)
 
     def poisson_log_likelihood(rate: float, height: float, odds: float = 1.0) -> float:
-        return _log_likelihood(means, noise, level_variance, rate * block_s, height, odds)
+        return _log_likelihood(means, noise, rate * block_s, height, odds)
 
     rates = np.geomspace(
         2.0 / duration_s, max(MAX_START_JUMPS * K / background.white**0.5, 4.0 / duration_s), START_RATES
@@ -121,15 +119,11 @@ def fit_poisson_jumps(means: Floats, block_s: float, background: BackgroundNoise
     return fit_event_process(poisson_log_likelihood, {"rate": rate, "height": K / rate**0.5})
 
 
-def _log_likelihood(
-    means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: float, height: float, odds: float = 1.0
-) -> float:
+def _log_likelihood(means: Floats, noise: StateSpaceNoise, jumps: float, height: float, odds: float = 1.0) -> float:
     """Return the log-likelihood of Poisson steps, with the jump probability multiplied by ``odds``."""
     some = -expm1(-jumps)
     variance = jumps / some * height**2  # variance of the sum of all jumps in a block with at least one jump
-    return float(
-        _jump_log_likelihood(means, noise, level_variance, _JumpProbabilities(exp(-jumps), odds * some, variance))
-    )
+    return float(_jump_log_likelihood(means, noise, _JumpProbabilities(exp(-jumps), odds * some, variance)))
 
 
 class _JumpProbabilities(NamedTuple):
@@ -156,13 +150,11 @@ class _JumpFilterUpdate(NamedTuple):
 
 
 @compiled
-def _jump_log_likelihood(
-    means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: _JumpProbabilities
-) -> float:
+def _jump_log_likelihood(means: Floats, noise: StateSpaceNoise, jumps: _JumpProbabilities) -> float:
     d, last = noise.table.shape[0], JUMP_AGES - 1
     state = _JumpFilterState(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
     state.probability[last] = 1.0
-    state.covariance[last] = initial_state_covariance(noise, level_variance)
+    state.covariance[last] = initial_state_covariance(noise)
     update = _JumpFilterUpdate(
         np.zeros((2, JUMP_AGES)), np.zeros((2, JUMP_AGES)), np.zeros((2, JUMP_AGES, d)), np.zeros((2, JUMP_AGES, d))
     )
