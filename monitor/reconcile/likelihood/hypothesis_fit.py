@@ -188,10 +188,13 @@ def fit_shape_parameter(
         return with_shape(effect, parameter_name, exp(log_value))
 
     middle, width = log(getattr(effect, parameter_name)), log(search_factor)
+    highest = middle + width
+    if parameter_name == "frequency":
+        highest = min(highest, log(0.5 * axis.rate_hz))  # frequencies above half the sample rate are aliases
     best = find_maximum_by_golden_section(
         lambda x: axis.fit((*other_effects, with_shape_parameter(x))).log_likelihood,
         middle - width,
-        middle + width,
+        highest,
         SHAPE_ITERATIONS,
     )
     return with_shape_parameter(best)
