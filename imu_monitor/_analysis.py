@@ -12,8 +12,7 @@ from imu_monitor._messages import errors_name_arguments, name_arguments
 from imu_monitor._recordings import Samples, check_range, to_recording, to_tau_grid
 from monitor.commands.analyze import AnalysisResults, analyze_recording, save_plot_or_report
 from monitor.common.unit_formatting import UnitSystem
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalVarianceCurve
+from monitor.estimation.allan.curve import VarianceCurve
 from monitor.publishing.messages.analysis_json import AnalysisMessage
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ class Analysis(AllanEstimate):
     def _message(self) -> AnalysisMessage:
         return self._results.to_message()
 
-    def _total_and_hadamard(self) -> tuple[TotalVarianceCurve | None, HadamardCurve | None]:
+    def _total_and_hadamard(self) -> tuple[VarianceCurve | None, VarianceCurve | None]:
         return self._results.total, self._results.hadamard
 
     def _axes_of_temperature(self) -> tuple[str, ...]:

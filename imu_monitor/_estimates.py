@@ -22,9 +22,7 @@ from monitor.common.unit_formatting import (
     format_number,
     sensor_kind,
 )
-from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalVarianceCurve
+from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing.messages.analysis_json import AnalysisMessage, AxisAnalysis, AxisDeviations
@@ -258,7 +256,7 @@ class AllanEstimate(Mapping[str, AxisEstimate]):
             changes=[],
         )
 
-    def _total_and_hadamard(self) -> tuple[TotalVarianceCurve | None, HadamardCurve | None]:
+    def _total_and_hadamard(self) -> tuple[VarianceCurve | None, VarianceCurve | None]:
         return None, None
 
     def _axes_of_temperature(self) -> tuple[str, ...]:
@@ -333,5 +331,5 @@ def plot_allan(
     return estimate._draw(UNIT_SYSTEMS[units], title)  # noqa: SLF001 - the subclasses draw different panels
 
 
-def _deviations(curve: AllanCurve | TotalVarianceCurve | HadamardCurve, axis: int) -> Deviations:
+def _deviations(curve: AllanCurve | VarianceCurve, axis: int) -> Deviations:
     return Deviations(curve.tau_s, *deviations_with_interval_ends(curve, axis))

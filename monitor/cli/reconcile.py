@@ -40,7 +40,6 @@ def reconcile(
     from monitor.noise.model_loading import load_model
     from monitor.publishing.terminal import reconcile_text as text
     from monitor.reconcile import json_report
-    from monitor.reconcile.several_recordings import comparison_json
 
     tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
@@ -50,7 +49,7 @@ def reconcile(
             output.compile_analysis_kernels(tell)
             if several:
                 runs = reconciling.compare_recordings(recordings, tested, out, seed, loading, tell)
-                data, show = comparison_json.encode_comparison(runs), partial(text.print_comparison, runs)
+                data, show = json_report.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
                 one = reconciling.reconcile_and_write_report(
                     recordings[0], tested, out, seed, loading, report_progress=tell

@@ -26,9 +26,10 @@ from monitor.drift.thermal.temperature_removal import (
     temperature_varied,
 )
 from monitor.estimation.allan.batch import TauGrid
+from monitor.estimation.allan.curve import VarianceCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
-from monitor.estimation.allan.hadamard import HadamardCurve, compute_hadamard_curve
-from monitor.estimation.allan.total import TotalVarianceCurve, compute_total_curve
+from monitor.estimation.allan.hadamard import compute_hadamard_curve
+from monitor.estimation.allan.total import compute_total_curve
 from monitor.estimation.analysis import RecordingAnalysis, analyze, detect_disturbances
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.publishing.messages.analysis_json import AnalysisMessage
@@ -61,8 +62,8 @@ class AnalysisResults:
     """Results of an analysis."""
 
     analysis: RecordingAnalysis
-    total: TotalVarianceCurve | None = None
-    hadamard: HadamardCurve | None = None
+    total: VarianceCurve | None = None
+    hadamard: VarianceCurve | None = None
     dynamic: DynamicAllan | None = None
     lacking: str = ""  # reason why the dynamic Allan deviations are missing
     without_temperature: TemperatureRemovalComparison | None = (
@@ -215,7 +216,7 @@ def _dynamic_curves(
     return shown, ""
 
 
-def _total_and_hadamard(result: RecordingAnalysis, tau: TauGrid) -> tuple[TotalVarianceCurve, HadamardCurve | None]:
+def _total_and_hadamard(result: RecordingAnalysis, tau: TauGrid) -> tuple[VarianceCurve, VarianceCurve | None]:
     """Return the total and Hadamard deviations at octave-spaced or requested averaging times."""
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors

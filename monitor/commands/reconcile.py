@@ -25,11 +25,10 @@ from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.json_report import SCHEMA, encode_report
+from monitor.reconcile.json_report import COMPARISON_SCHEMA, SCHEMA, encode_comparison, encode_report
 from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.result import Reconciliation
-from monitor.reconcile.several_recordings import comparison_json
 from monitor.reconcile.several_recordings.comparison import NamedResult, RecordingsComparison, compare_results
 
 REPORT: Final = "report.json"
@@ -169,7 +168,7 @@ def compare_recordings(
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
         why = f"at least two recordings are needed for a comparison, but only {len(runs)} can be evaluated: {why}"
-        _write(out / REPORT, _encode_failure(why, 0, comparison_json.SCHEMA))
+        _write(out / REPORT, _encode_failure(why, 0, COMPARISON_SCHEMA))
         raise NotReady(why)
     report_progress("writing", None)
     comparison = compare_results(runs, fitted_to, silent)
@@ -180,7 +179,7 @@ def compare_recordings(
 def _write_comparison(result: RecordingsComparison, folder: Path) -> None:
     from monitor.publishing.reports.reconcile_page import render_comparison_page
 
-    _write(folder / REPORT, comparison_json.encode_comparison(result))
+    _write(folder / REPORT, encode_comparison(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
     _write(folder / "report.html", render_comparison_page(result).encode())
 

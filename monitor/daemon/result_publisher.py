@@ -19,8 +19,7 @@ from monitor.daemon.operations.coefficient_limits import LimitMonitor
 from monitor.daemon.outputs.output import Output
 from monitor.daemon.schedule import Schedule
 from monitor.drift.compensation.live_compensation import LiveDriftCompensation
-from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
-from monitor.estimation.detection.model_agreement_monitor import ModelAgreementMonitor
+from monitor.estimation.detection.comparison_with_noise_model import ModelAgreementMonitor, ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings.loading import Device

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from drivers.data_types import Floats, Ints, SampleBlock
 from drivers.errors import NotReady
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
-from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.hadamard import HadamardCurve
+from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.allan.live_total_and_hadamard import LiveTotalAndHadamard
-from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.allan.uncertainty import (
     CovarianceTable,
     CovarianceTablesByAxis,
@@ -245,12 +243,12 @@ class Estimator:
             self.get_estimate()
         return self.get_estimate()
 
-    def step_slow_statistics(self) -> tuple[TotalVarianceCurve, HadamardCurve] | None:
+    def step_slow_statistics(self) -> tuple[VarianceCurve, VarianceCurve] | None:
         """Run one step of the slow computations: total deviation, Hadamard deviation and search for a low-pass filter.
 
         Returns
         -------
-        tuple of TotalVarianceCurve and HadamardCurve, or None
+        tuple of VarianceCurve and VarianceCurve, or None
             Total and Hadamard deviations if this step completes them, otherwise None.
         """
         rounds = self._total_hadamard.rounds

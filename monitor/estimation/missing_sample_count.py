@@ -101,10 +101,8 @@ def _count_missing(late: Floats, rows: Ints, claimed: Ints, ends: Ints, at: Ints
     for k in range(holes):
         reach[k] = rows[k] + ROWS_BESIDE_GAP + min(2 * claimed[k], MAX_CATCH_UP_ROWS)
         end = ends[at[k] + 1]
-        near, far = (
-            np.median(late[rows[k] : min(rows[k] + ROWS_BESIDE_GAP, end)]),
-            np.median(late[rows[k] : min(reach[k], end)]),
-        )
+        near = np.median(late[rows[k] : min(rows[k] + ROWS_BESIDE_GAP, end)])
+        far = np.median(late[rows[k] : min(reach[k], end)])
         after[k] = far if near - far > MAX_RATE_VARIATION * (reach[k] - rows[k]) else near
     missing = np.zeros(holes, np.int64)
     level = 0.0

@@ -42,89 +42,34 @@ class SampleBlockContext:
     scratch: Floats  # [n] work array with arbitrary content
 
 
-class RunningEffect:
-    """Effect on one axis during a simulation."""
-
-    def drawn_random_values(self) -> dict[str, Any]:
-        """Return the random values that have been drawn so far, such as phases and event times."""
-        return {}
-
-
-class NoiseSeries(RunningEffect, ABC):
+@dataclass(slots=True)
+class NoiseSeries:
     """Time series of a source during a simulation."""
 
-    @abstractmethod
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        """Add the next samples of the time series to ``values``, in the unit of the axis.
-
-        Parameters
-        ----------
-        values : ndarray of float64, shape (n,)
-            Sum of all sources of the axis, updated in place. The array must not be empty.
-        block : SampleBlockContext
-            Sample index, temperature and work array of the block.
-        """
-
-    def draw_next_samples(self, n: int, first_index: int = 0) -> Floats:
-        """Return the next samples of the time series.
-
-        Parameters
-        ----------
-        n : int
-            Number of samples.
-        first_index : int
-            Index of the first sample, counted from the start of the simulation.
-        """
-        values = np.zeros(n)
-        if n:
-            self.add_next_samples(values, SampleBlockContext(first_index, np.full(n, np.nan), np.empty(n)))
-        return values
+    add_next_samples: Callable[[Floats, SampleBlockContext], object]
+    """Function that adds the next samples of the series to an array [n] with n > 0, in the unit of the axis."""
+    drawn_random_values: Callable[[], dict[str, Any]] = dict
+    """Function that returns the random values that have been drawn so far, such as phases and event times."""
 
 
-class StatelessSeries(NoiseSeries):
-    """Time series without memory, whose samples a function computes for each block."""
+@dataclass(slots=True)
+class RunningTransform:
+    """Transform of one axis during a simulation. A function with a memory must be a method, because it is copied."""
 
-    def __init__(self, function: Callable[[Floats, SampleBlockContext], object]) -> None:
-        self._function = function
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        """Add the samples that the function computes for the block."""
-        self._function(values, block)
-
-
-class RunningTransform(RunningEffect, ABC):
-    """Transform of one axis during a simulation."""
-
-    @abstractmethod
-    def transform_in_place(self, values: Floats) -> None:
-        """Transform the next samples [n] in place."""
+    transform_in_place: Callable[[Floats], object]
+    """Function that transforms the next samples [n] in place."""
+    drawn_random_values: Callable[[], dict[str, Any]] = dict
+    """Function that returns the random values that have been drawn so far."""
 
 
-class MemorylessTransform(RunningTransform):
-    """Transform without memory, whose output depends only on the current sample."""
-
-    def __init__(self, function: Callable[[Floats], object]) -> None:
-        self._function = function
-
-    def transform_in_place(self, values: Floats) -> None:
-        """Apply the function to the next samples [n] in place."""
-        self._function(values)
-
-
-class RunningGain(RunningEffect, ABC):
+@dataclass(slots=True)
+class RunningGain:
     """Simulated gain of the white noise of one axis."""
 
-    @abstractmethod
-    def compute_gain(self, first: int, n: int) -> Floats:
-        """Return the gain of ``n`` samples, shape (n,).
-
-        Parameters
-        ----------
-        first : int
-            Index of the first sample, counted from the start of the stream.
-        n : int
-            Number of samples.
-        """
+    compute_gain: Callable[[int, int], Floats]
+    """Function that returns the gain [n] for the index of the first sample in the stream and the number n."""
+    drawn_random_values: Callable[[], dict[str, Any]] = dict
+    """Function that returns the random values that have been drawn so far."""
 
 
 class ParameterTable:
@@ -262,7 +207,7 @@ class WhiteNoiseGain(Effect):
     __slots__ = ()
 
     @abstractmethod
-    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> "RunningGain":
+    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> RunningGain:
         """Start a simulated gain.
 
         Parameters

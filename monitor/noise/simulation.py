@@ -11,7 +11,7 @@ of preceding effects of that name. Common vibrations with the same source number
 
 import copy
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 from zlib import crc32
@@ -25,7 +25,6 @@ from monitor.noise.effect import (
     AxisLeak,
     Effect,
     NoiseSeries,
-    RunningEffect,
     RunningGain,
     RunningTransform,
     SampleBlockContext,
@@ -36,7 +35,7 @@ from monitor.noise.effect import (
 from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.coupling.axis_permutation import AxisPermutation
 from monitor.noise.effects.disturbances.common_vibration import CommonVibration
-from monitor.noise.effects.disturbances.heavy_tails import HeavyTails, WhiteNoiseFactors
+from monitor.noise.effects.disturbances.heavy_tails import HeavyTails
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
 from monitor.noise.model_toml import prefix_config_errors
@@ -132,7 +131,7 @@ class ModelStream:
         self._seed = seed
         self._count = 0  # number of samples that have been simulated so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
-        self._truths: list[tuple[str, Effect, RunningEffect]] = []
+        self._truths: list[tuple[str, Effect, Callable[[], dict[str, Any]]]] = []
         self._temperature: NoiseSeries | None = None
         if temperature_c is not None:
             self._temperature = recorded_temperature(temperature_c)
@@ -192,8 +191,8 @@ class ModelStream:
         All values can be converted to JSON. Effects without random values are omitted.
         """
         truths: dict[str, dict[str, list[dict[str, Any]]]] = {}
-        for axis, effect, running in self._truths:
-            if truth := running.drawn_random_values():
+        for axis, effect, drawn_random_values in self._truths:
+            if truth := drawn_random_values():
                 truths.setdefault(axis, {}).setdefault(effect.name, []).append(truth)
         return truths
 
@@ -207,11 +206,11 @@ class ModelStream:
                 key = "", int(effect.source_number)
             series = effect.start_series(self._true_hz, self._rng(key[0], effect.name, key[1]))
             (line.white if isinstance(effect, AngleRandomWalk) else line.others).append(series)
-            self._truths.append((axis, effect, series))
+            self._truths.append((axis, effect, series.drawn_random_values))
         elif isinstance(effect, WhiteNoiseGain):
             gain = effect.start_gain(self._true_hz, self._rng(axis, effect.name, occurrence))
             line.gains.append(gain)
-            self._truths.append((axis, effect, gain))
+            self._truths.append((axis, effect, gain.drawn_random_values))
         elif isinstance(effect, AxisPermutation):
             self._columns[AXES.index(axis)] = AXES.index(effect.source)
         elif isinstance(effect, HeavyTails):
@@ -223,7 +222,7 @@ class ModelStream:
             with prefix_config_errors(f"{axis}.{effect.name}"):
                 running = effect.start_transform(self._true_hz, self._rng(axis, effect.name, occurrence))
             line.insert_transform(TRANSFORM_ORDER.index(type(effect)), running)
-            self._truths.append((axis, effect, running))
+            self._truths.append((axis, effect, running.drawn_random_values))
         else:
             raise TypeError(f"{effect.name} is not a source, leak, transform, permutation or change of the white noise")
 
@@ -258,7 +257,7 @@ class _AxisSimulator:
         self.white: list[NoiseSeries] = []
         self.others: list[NoiseSeries] = []
         self.gains: list[RunningGain] = []  # gains of the white noise
-        self.factors: list[WhiteNoiseFactors] = []
+        self.factors: list[Callable[[Floats], None]] = []  # functions that multiply the white noise
         self.leaks: list[AxisLeak] = []
         self.leaks_out = False
         # These are the transforms and their positions in TRANSFORM_ORDER, sorted by position.
@@ -298,8 +297,8 @@ class _AxisSimulator:
             series.add_next_samples(values, block)
         for gain in self.gains:
             values *= gain.compute_gain(block.first, n)
-        for factors in self.factors:
-            factors.multiply_in_place(values)
+        for multiply_in_place in self.factors:
+            multiply_in_place(values)
         for series in self.others:
             series.add_next_samples(values, block)
         return values

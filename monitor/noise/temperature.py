@@ -12,7 +12,7 @@ import numpy as np
 from drivers.data_types import Floats
 from drivers.errors import ConfigError
 from drivers.validation.number_ranges import DURATION_S, TEMPERATURE_C
-from monitor.noise.effect import NoiseSeries, ParameterTable, SampleBlockContext, StatelessSeries, parameter_field
+from monitor.noise.effect import NoiseSeries, ParameterTable, SampleBlockContext, parameter_field
 from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated
 from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal
 
@@ -77,7 +77,7 @@ class Temperature(ParameterTable):
             for part in parts:
                 part.add_next_samples(values, block)
 
-        return StatelessSeries(add_temperature_samples)
+        return NoiseSeries(add_temperature_samples)
 
 
 def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
@@ -106,4 +106,4 @@ def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
         index = np.arange(block.first, block.first + values.size)
         values += filled[np.minimum(index, filled.size - 1)]
 
-    return StatelessSeries(add_recorded_temperature)
+    return NoiseSeries(add_recorded_temperature)

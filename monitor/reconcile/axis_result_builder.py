@@ -6,32 +6,11 @@ from typing import Final
 
 from monitor.common.distributions import Z95
 from monitor.noise.effect import AxisLeak, Effect
-from monitor.noise.effects import (
-    EFFECTS,
-    BandwidthLimit,
-    BiasCurve,
-    BiasStep,
-    ExponentiallyCorrelated,
-    Narrowband,
-    Outliers,
-    PowerLaw,
-    PulseTrain,
-    ScaleFactor,
-    Sinusoidal,
-    TemperatureBias,
-    TemperatureHysteresis,
-    TemperatureLag,
-    TurnOnTransient,
-)
+from monitor.noise.effects import EFFECTS, BandwidthLimit, Outliers, PulseTrain, Sinusoidal, TemperatureBias
 from monitor.noise.effects.signal_chain.bandwidth_limit import FILTER_KINDS
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, compute_diagnostic_gaps
-from monitor.reconcile.likelihood.effect_roles import (
-    COEFFICIENTS,
-    MOST_DIRECT_DIAGNOSTIC,
-    SIZE_PARAMETERS,
-    effect_size,
-    linear_coefficient_names,
-)
+from monitor.reconcile.effect_table import EFFECT_TABLE, MOST_DIRECT_DIAGNOSTIC, SERIES_SIZE_PARAMETERS, SIZE_PARAMETERS
+from monitor.reconcile.likelihood.effect_roles import effect_size, linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, compute_shape_interval, compute_size_interval
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
@@ -46,23 +25,12 @@ from monitor.reconcile.result import (
 from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
 from monitor.reconcile.search.trials import RETUNE, Trial
-from monitor.reconcile.summary.allan_influence import compute_allan_influences_of_changes
-from monitor.reconcile.summary.gap_decomposition import decompose_explained_gain, measure_remaining_gaps
+from monitor.reconcile.summary.effect_contributions import (
+    compute_allan_influences_of_changes,
+    decompose_explained_gain,
+    measure_remaining_gaps,
+)
 
-SHAPE_PARAMETERS: Final[dict[type[Effect], tuple[str, ...]]] = {
-    ExponentiallyCorrelated: ("correlation_time",),
-    Narrowband: ("frequency", "bandwidth"),
-    Sinusoidal: ("frequency",),
-    TemperatureLag: ("time_constant",),
-    TemperatureHysteresis: ("reversal",),
-    BiasCurve: ("time_constant",),
-    TurnOnTransient: ("time_constant",),
-    BiasStep: ("time",),
-    BandwidthLimit: ("cutoff",),
-    PowerLaw: ("exponent",),
-    ScaleFactor: ("factor",),
-}
-"""For each effect, the shape parameters that are reported with an interval."""
 MAX_RUNNERS_UP: Final = 3
 MAX_FREQUENCY_DIFFERENCE: Final = 0.05
 """Largest relative difference of the frequencies of two candidates for the same oscillation."""
@@ -169,7 +137,6 @@ def _describe_step(
     confidence, others = _confidence_and_runners_up(effect.name if kind == "added" or moved else RETUNE, trials)
     if kind != "added" and trial.name != RETUNE and not moved:  # an effect was added in the same round
         confidence, others = _resize_confidence(search.hypothesis, index), ()
-    held_out_before, held_out_after = _held_out_gaps(done, gap, later)
     return AddedOrResizedEffect(
         kind=kind,
         effect=effect.name,
@@ -178,23 +145,10 @@ def _describe_step(
         runners_up=others,
         before=gap,
         after=later,
-        held_out_before=held_out_before,
-        held_out_after=held_out_after,
+        held_out=None if done.validation.reason else (done.validation.before, done.validation.after),
         held_out_reason=done.validation.reason,
         because=_justification(effect, kind, gap, later, others, trial),
         snapshot_after=after,
-    )
-
-
-def _held_out_gaps(
-    done: SearchRound, gap: DiagnosticGap, later: DiagnosticGap
-) -> tuple[DiagnosticGap | None, DiagnosticGap | None]:
-    validation = done.validation
-    if validation.reason:
-        return None, None
-    return (
-        DiagnosticGap(gap.diagnostic, gap.where, validation.before, gap.null95, gap.threshold),
-        DiagnosticGap(gap.diagnostic, gap.where, validation.after, later.null95, later.threshold),
     )
 
 
@@ -269,14 +223,14 @@ def _parameters_with_bounds(
     found: dict[str, ParameterInterval] = {}
     if isinstance(effect, AxisLeak):
         found["source"] = ParameterInterval(effect.source)
-    size_name = SIZE_PARAMETERS.get(type(effect))
+    size_name = SIZE_PARAMETERS.get(effect.name)
     if size_name is not None and getattr(effect, size_name) is not None:
         found[size_name] = compute_size_interval(hypothesis.fit, index)
-    for name in linear_coefficient_names(effect)[1:] if type(effect) in COEFFICIENTS else ():
+    for name in linear_coefficient_names(effect)[1:] if effect.name in SERIES_SIZE_PARAMETERS else ():
         found[name] = _coefficient_bounds(hypothesis, index, name)
     if isinstance(effect, TemperatureBias):
         found["reference"] = ParameterInterval(effect.reference)
-    for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
+    for shape in EFFECT_TABLE[effect.name].shapes if kind == "added" else ():
         if getattr(effect, shape) is not None:
             found[shape] = compute_shape_interval(hypothesis.fit, index, shape)
     if isinstance(effect, PulseTrain):

@@ -33,6 +33,7 @@ from monitor.reconcile.diagnostics.null_distribution import (
     estimate_null_distributions,
     run_diagnostics,
 )
+from monitor.reconcile.effect_table import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.effect_roles import is_stationary_gaussian, with_effect_size
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
@@ -53,7 +54,6 @@ from monitor.reconcile.result import (
     combine_decisions,
 )
 from monitor.reconcile.search.backward_elimination import MapFunction, eliminate_unneeded_effects
-from monitor.reconcile.search.candidate_effects import PENALTY_NATS
 from monitor.reconcile.search.common_vibration_search import name_common_vibrations
 from monitor.reconcile.search.sample_rate_from_spectrum import (
     SAMPLE_RATE_PENALTY_NATS,
@@ -351,8 +351,7 @@ def _add_sample_rate_step(
         runners_up=(),
         before=before,
         after=next(score for score in result.start.gaps if score.diagnostic == "lines"),
-        held_out_before=None,
-        held_out_after=None,
+        held_out=None,
         held_out_reason="the sample rate is common to the whole recording",
         because=(
             f"The feature of the model at {stated:.6g} Hz appears at {observed:.6g} Hz in the recording, and one ratio "

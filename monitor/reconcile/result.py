@@ -132,8 +132,7 @@ class AddedOrResizedEffect:
     runners_up: tuple[AlternativeEffect, ...]
     before: DiagnosticGap  # difference that led to the change of the model
     after: DiagnosticGap  # the same diagnostic after the change
-    held_out_before: DiagnosticGap | None
-    held_out_after: DiagnosticGap | None
+    held_out: tuple[float, float] | None  # gap before and after the change in cross-validation, standard deviations
     held_out_reason: str  # reason for the missing held-out gap, or empty
     because: str  # justification in sentences
     snapshot_after: AxisModelDiagnostics

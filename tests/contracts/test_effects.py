@@ -38,6 +38,7 @@ from tests.contracts.effect_examples import (
     make_model,
     make_model_without_effect,
 )
+from tests.support.noise_series import draw_next_samples
 
 N = 1 << 16
 RUNS = 16
@@ -168,8 +169,8 @@ def test_series_does_not_depend_on_the_division_into_blocks(name, cuts):
 )
 def test_source_gives_the_same_series_for_any_division(name):
     started = make_effect(name).start_series(RATE_HZ, np.random.default_rng(5))
-    pieces = [started.draw_next_samples(size, first) for size, first in ((1, 0), (0, 1), (900, 1), (99, 901))]
-    expected = make_effect(name).start_series(RATE_HZ, np.random.default_rng(5)).draw_next_samples(1000)
+    pieces = [draw_next_samples(started, size, first) for size, first in ((1, 0), (0, 1), (900, 1), (99, 901))]
+    expected = draw_next_samples(make_effect(name).start_series(RATE_HZ, np.random.default_rng(5)), 1000)
     np.testing.assert_array_equal(np.concatenate(pieces), expected)
 
 

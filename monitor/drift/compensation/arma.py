@@ -56,11 +56,7 @@ START_VARIANCE_SHARES: Final = (1e-3, 0.03, 0.5)
 
 @dataclass(frozen=True, slots=True)
 class ArmaModel:
-    """Identified ARMA model.
-
-    >>> ArmaModel((0.5, 0.3), -0.2, 1.0).green_function_values
-    (1.0, 0.3)
-    """
+    """Identified ARMA model."""
 
     phi: tuple[float, float]  # φ1 and φ2; 0 for coefficients that are not part of the model
     theta: float
@@ -74,11 +70,6 @@ class ArmaModel:
     log_likelihood: float = np.nan  # logarithm of the maximum likelihood
     bic: float = np.nan
     count: int = 0  # number of interval means from which the model was identified
-
-    @property
-    def green_function_values(self) -> tuple[float, float]:
-        """Return the first two values G0 and G1 of Green's function of the ARMA model."""
-        return 1.0, self.phi[0] + self.theta
 
     @property
     def name(self) -> str:

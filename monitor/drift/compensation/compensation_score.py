@@ -4,12 +4,16 @@ Samples from which the drift model was learned are not evaluated. Their mean is 
 so that removing a constant bias does not count as an improvement.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from drivers.data_types import Floats, Ints
+from monitor.drift.compensation.arma import ArmaModel
+from monitor.drift.compensation.compensator import MeasuredAndPredictedDrift
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 
 MINUTE_S: Final = 60.0
@@ -67,3 +71,31 @@ def _span_means(x: Floats, samples: int) -> Floats:
 def _rms(x: Floats) -> float:
     known = x[np.isfinite(x)]
     return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
+
+
+@dataclass(frozen=True, slots=True)
+class AxisCompensation:
+    """Quality of the drift compensation of one gyro axis, measured at rest."""
+
+    model: ArmaModel | None  # last identified drift model; None if the sensor was not at rest for long enough
+    uncompensated: RateQualityAtRest  # score without compensation, after subtraction of the mean of the first third
+    compensated: RateQualityAtRest  # score with compensation
+    rejected_intervals: int  # number of intervals that were rejected as outliers
+    steps: int  # number of bias steps
+
+
+@dataclass(frozen=True, slots=True)
+class DriftCompensationResult:
+    """Result of the drift compensation of a recording."""
+
+    recording: str
+    out: Path  # path of the compensated recording
+    method: str
+    rate_hz: float
+    samples: int
+    interval_s: float
+    learning_rest_s: float  # time at rest in the first third of the recording, s
+    evaluated_rest_s: float  # time at rest in the rest of the recording, s
+    intervals: tuple[MeasuredAndPredictedDrift, ...]
+    axes: Mapping[str, AxisCompensation]
+    notes: tuple[str, ...]

@@ -448,12 +448,8 @@ def _finish_interval(s: CompensatorArrays, outcomes: Floats) -> None:
         count, mean, scatter = _interval_mean(s.means[a])
         if count >= MIN_REST_BLOCKS:
             variance, became = sage_husa.update_with_interval(s.drift[a], mean, scatter, _min_variance(s.rest.open, a))
-            outcome[MEAN], outcome[INNOVATION_STD], outcome[OUTCOME], outcome[SCATTER] = (
-                mean,
-                np.sqrt(variance),
-                became,
-                scatter,
-            )
+            outcome[MEAN], outcome[INNOVATION_STD] = mean, np.sqrt(variance)
+            outcome[OUTCOME], outcome[SCATTER] = became, scatter
             if known and became == sage_husa.USED:
                 s.learned[a] += 1
                 update_rest_noise(s.bank[a], s.followed[a], s.samples[a], s.learned[a])

@@ -4,6 +4,7 @@ Identifying a drift model takes about 50 ms, so the caller should do it in anoth
 that no longer fit are reported as events.
 """
 
+from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,11 +14,18 @@ from drivers.data_types import AXES, Event, Floats, SampleBlock, make_block
 from monitor.common.unit_formatting import format_axis_value
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensator import GYROS, Compensator, MeasuredAndPredictedDrift
-from monitor.drift.compensation.innovation_test import INTERVALS, InnovationTest
 from monitor.drift.compensation.sage_husa import STEPPED, USED
 from monitor.estimation.detection.motion_and_change_monitor import MAX_RATE_CHANGE
 
 EVENT_KIND: Final = "drift_unexplained"
+INTERVALS: Final = 64
+"""Number of intervals over which the squared normalised innovations are averaged."""
+FALSE_ALARM_PROBABILITY: Final = 1e-8
+"""Probability that a correct model exceeds LIMIT in a single test."""
+LIMIT: Final = 2.327393746165351
+"""Quantile of χ²/n with n = INTERVALS degrees of freedom, for the probability 1 − FALSE_ALARM_PROBABILITY."""
+RESET_LIMIT: Final = 1.3
+"""Mean squared normalised innovation below which a drift model counts as fitting again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,3 +140,40 @@ def _misfit_event(axis: str, mean_square: float, t_ns: int, since_ns: int) -> Ev
         f"expected"
     )
     return Event(EVENT_KIND, t_ns, text, axis, {"innovation": {"mean_square": mean_square}}, since_ns, mean_square**0.5)
+
+
+class InnovationTest:
+    """Test of the innovations of a drift model for one axis.
+
+    If the drift model fits, the mean of the squared normalised innovations ε²/S over n intervals has the distribution
+    χ²_n/n. When the mean exceeds LIMIT, a misfit is reported. The next misfit is reported only after the mean has
+    fallen below RESET_LIMIT.
+    """
+
+    def __init__(self) -> None:
+        self._squares: deque[float] = deque(maxlen=INTERVALS)
+        self._exceeded = False
+
+    @property
+    def mean_square_innovation(self) -> float:
+        """Return the mean of ε²/S over the last INTERVALS intervals, or NaN if there are fewer intervals."""
+        return sum(self._squares) / INTERVALS if len(self._squares) == INTERVALS else float("nan")
+
+    def detect_new_misfit(self, innovation: float) -> bool:
+        """Add a normalised innovation ε/√S, and return True if the drift model has ceased to fit.
+
+        The function returns True only once for each misfit.
+        """
+        self._squares.append(innovation**2)
+        now = self.mean_square_innovation
+        if self._exceeded and now < RESET_LIMIT:
+            self._exceeded = False
+        if self._exceeded or not now > LIMIT:
+            return False
+        self._exceeded = True
+        return True
+
+    def forget_innovations(self) -> None:
+        """Discard all innovations, for example after a change of the drift model or a bias step."""
+        self._squares.clear()
+        self._exceeded = False

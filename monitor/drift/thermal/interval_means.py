@@ -5,11 +5,13 @@ from typing import Final
 
 import numpy as np
 
-from drivers.data_types import Floats, Ints
+from drivers.data_types import AXES, Floats, Ints
 
 PARTS_PER_INTERVAL: Final = 8
 """Number of parts into which an interval is divided to estimate the standard error of the mean."""
 MIN_KNOWN_SHARE: Final = 0.5
+BUFFER_ROWS: Final = 1024
+TEMPERATURE_COLUMN: Final = len(AXES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,3 +95,134 @@ def standard_error_from_parts(part_sums: Floats, part_counts: Ints) -> Floats:
         known = np.isfinite(differences)
         square = np.where(known, differences, 0.0) ** 2
         return np.asarray(np.sqrt(0.5 * square.sum(axis=0) / known.sum(axis=0) / PARTS_PER_INTERVAL))
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalMean:
+    """Means of the biases and of the temperature in one interval."""
+
+    bias: Floats  # [6] mean biases, rad/s and m/s²; NaN if too few samples are known
+    error: Floats  # [6] standard error of each mean bias
+    temperature_c: float  # mean temperature, °C; NaN if too few samples are known
+    end: int  # index of the first sample after the interval, counting missing samples
+
+
+class RunningIntervalMeans:
+    """Computes interval means from a stream of samples, which equal the results of ``compute_interval_means``.
+
+    The results do not depend on how the stream is divided into blocks.
+
+    Parameters
+    ----------
+    length : int
+        Number of samples in an interval, at least PARTS_PER_INTERVAL.
+    longest : int
+        Maximum number of empty intervals that are returned for a gap in the samples.
+
+    Examples
+    --------
+    >>> means = RunningIntervalMeans(50)
+    >>> ramp = np.repeat(np.arange(100.0)[:, None], 6, axis=1)
+    >>> [(one.bias[0].item(), one.temperature_c) for one in means.add_samples(ramp, np.full(100, 25.0), 0)]
+    [(24.5, 25.0), (74.5, 25.0)]
+    """
+
+    def __init__(self, length: int, longest: int = 1000) -> None:
+        size = length // PARTS_PER_INTERVAL
+        self._length = length
+        self._max_empty = longest
+        # Samples after the last of the equal parts contribute to the mean, but not to the standard error.
+        self._edges = [*(size * k for k in range(1, PARTS_PER_INTERVAL)), size * PARTS_PER_INTERVAL, length]
+        self._rows = np.empty((BUFFER_ROWS, TEMPERATURE_COLUMN + 1))
+        self._buffered = 0
+        # Subtracting the origin reduces rounding errors, for example with noise of 1e-4 m/s² on gravity of 9.81 m/s².
+        self._origin = np.full(TEMPERATURE_COLUMN + 1, np.nan)
+        self._end = 0  # end of the last complete interval, in samples
+        self._begin()
+
+    def add_samples(self, values: Floats, temperature_c: Floats, lost: int) -> list[IntervalMean]:
+        """Add samples, and return the means of the intervals that have ended.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, 6)
+            Samples in rad/s and m/s²; NaN means missing.
+        temperature_c : ndarray, shape (n,)
+            Temperature in °C; NaN means missing.
+        lost : int
+            Number of samples that are missing before ``values``.
+        """
+        finished = self._skip_missing(lost) if lost else []
+        at = 0
+        while at < len(values):
+            count = min(len(values) - at, BUFFER_ROWS - self._buffered, self._edges[self._part] - self._position)
+            rows = slice(self._buffered, self._buffered + count)
+            self._rows[rows, :TEMPERATURE_COLUMN] = values[at : at + count]
+            self._rows[rows, TEMPERATURE_COLUMN] = temperature_c[at : at + count]
+            self._buffered += count
+            at += count
+            finished += self._advance(count)
+        return finished
+
+    def forget_interval_samples_except_temperature(self) -> None:
+        """Discard the samples of the current interval, but keep the temperatures."""
+        self._rows[: self._buffered, :TEMPERATURE_COLUMN] = np.nan
+        self._sum[:, :TEMPERATURE_COLUMN], self._count[:, :TEMPERATURE_COLUMN] = 0.0, 0
+
+    def _begin(self) -> None:
+        self._position = self._part = 0
+        self._sum = np.zeros((PARTS_PER_INTERVAL + 1, TEMPERATURE_COLUMN + 1))
+        self._count = np.zeros((PARTS_PER_INTERVAL + 1, TEMPERATURE_COLUMN + 1), np.int64)
+
+    def _advance(self, count: int) -> list[IntervalMean]:
+        """Advance by ``count`` samples, and return the means if the interval has ended."""
+        self._position += count
+        if self._buffered == BUFFER_ROWS or self._position == self._edges[self._part]:
+            self._sum_buffer()
+        while self._part < PARTS_PER_INTERVAL and self._position == self._edges[self._part]:
+            self._part += 1
+        if self._position < self._length:
+            return []
+        self._end += self._length
+        closed = self._interval()
+        self._begin()
+        return [closed]
+
+    def _sum_buffer(self) -> None:
+        rows, self._buffered = self._rows[: self._buffered], 0
+        there = np.isfinite(rows)
+        new = there.any(axis=0) & np.isnan(self._origin)
+        if new.any():
+            self._origin[new] = rows[there.argmax(axis=0), np.arange(TEMPERATURE_COLUMN + 1)][new]
+        self._sum[self._part] += np.where(there, rows - self._origin, 0.0).sum(axis=0)
+        self._count[self._part] += there.sum(axis=0)
+
+    def _skip_missing(self, lost: int) -> list[IntervalMean]:
+        """Advance over missing samples, and return the means of the intervals that have ended."""
+        finished: list[IntervalMean] = []
+        while lost and self._position:
+            count = min(lost, self._edges[self._part] - self._position)
+            lost -= count
+            if self._buffered:
+                self._sum_buffer()
+            finished += self._advance(count)
+        if not lost:
+            return finished
+        whole, self._position = divmod(lost, self._length)
+        nothing = np.full(TEMPERATURE_COLUMN, np.nan)
+        for left in range(min(whole, self._max_empty) - 1, -1, -1):
+            finished.append(IntervalMean(nothing, nothing, np.nan, self._end + (whole - left) * self._length))
+        self._end += whole * self._length
+        while self._part < PARTS_PER_INTERVAL and self._position >= self._edges[self._part]:
+            self._part += 1
+        return finished
+
+    def _interval(self) -> IntervalMean:
+        count = self._count.sum(axis=0)
+        too_few = count < max(MIN_KNOWN_SHARE * self._length, 1.0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = self._origin + self._sum.sum(axis=0) / count
+        parts = np.s_[:PARTS_PER_INTERVAL, :TEMPERATURE_COLUMN]
+        error = standard_error_from_parts(self._sum[parts], self._count[parts])
+        mean[too_few], error[too_few[:TEMPERATURE_COLUMN]] = np.nan, np.nan
+        return IntervalMean(mean[:TEMPERATURE_COLUMN], error, float(mean[TEMPERATURE_COLUMN]), self._end)

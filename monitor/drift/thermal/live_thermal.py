@@ -12,10 +12,9 @@ import numpy as np
 
 from drivers.data_types import AXES, Event, SampleBlock
 from monitor.common.unit_formatting import format_axis_value
-from monitor.drift.thermal.interval_means import PARTS_PER_INTERVAL
+from monitor.drift.thermal.interval_means import PARTS_PER_INTERVAL, IntervalMean, RunningIntervalMeans
 from monitor.drift.thermal.online_thermal_model import MAX_INTERVALS, MeasuredAndPredictedMean, OnlineThermalModel
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
-from monitor.drift.thermal.running_interval_means import IntervalMean, RunningIntervalMeans
 from monitor.estimation.detection.motion_and_change_monitor import MAX_RATE_CHANGE
 
 KIND: Final = "temperature_unexplained"

@@ -11,7 +11,7 @@ that contain a missing sample are left out.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.batch import octave_cluster_sizes
+from monitor.estimation.allan.curve import VarianceCurve
 from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
     EstimatorMoments,
@@ -26,7 +27,6 @@ from monitor.estimation.allan.squared_difference_moments import (
     correct_bias_and_compute_intervals,
     phase_autocovariance,
     summation_nodes,
-    theta_in_sample_units,
     variance_from_squared_differences,
 )
 
@@ -38,19 +38,6 @@ MAX_LAG_CLUSTERS: Final = 16
 
 At a lag of 16 clusters, the squared correlation coefficient of third differences of flicker noise is 1e-9.
 """
-
-
-@dataclass(frozen=True, slots=True)
-class HadamardCurve:
-    """Overlapping Hadamard variance of k axes at m averaging times."""
-
-    tau_s: Floats  # [m]
-    factors: Ints  # [m] cluster sizes in samples
-    hvar: Floats  # [m, k] Hadamard variance in squared units of the axis; NaN if too many samples are missing
-    terms: Ints  # [m, k] number of averaged third differences
-    edf: Floats  # [m, k] equivalent degrees of freedom; NaN if the noise is unknown
-    lo: Floats  # [m, k] lower end of the 95 % confidence interval of the Hadamard deviation
-    hi: Floats  # [m, k] upper end of the 95 % confidence interval of the Hadamard deviation
 
 
 def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
@@ -65,7 +52,7 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, add_hadamard_squares)
 
 
-def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
+def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> VarianceCurve:
     """Compute the Hadamard variance of a recording with confidence intervals.
 
     The parameters are those of ``total.compute_total_curve``, but cluster sizes must not exceed n/3.
@@ -80,16 +67,13 @@ def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factor
 
 def hadamard_curve_from_variance(
     moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
-) -> HadamardCurve:
+) -> VarianceCurve:
     """Compute the degrees of freedom and confidence intervals of given Hadamard variances.
 
     The parameters are those of ``total.correct_total_variance``.
     """
-    _, edf, lo, hi = correct_bias_and_compute_intervals(
-        moments, theta_in_sample_units(theta, rate_hz), raw_variance, terms
-    )
-    factors = np.array([one.factor for one in moments])
-    return HadamardCurve(factors / rate_hz, factors, raw_variance, terms, edf, lo, hi)
+    curve = correct_bias_and_compute_intervals(moments, rate_hz, theta, raw_variance, terms)
+    return replace(curve, variance=raw_variance)  # the variance has no bias, even if the noise is unknown
 
 
 def hadamard_estimator_moments(n: int, factor: int) -> EstimatorMoments:

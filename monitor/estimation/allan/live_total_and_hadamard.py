@@ -21,16 +21,14 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats, Ints
-from drivers.errors import ConfigError
 from monitor.estimation.allan import hadamard, total
 from monitor.estimation.allan.batch import octave_cluster_sizes
-from monitor.estimation.allan.hadamard import HadamardCurve
+from monitor.estimation.allan.curve import VarianceCurve
 from monitor.estimation.allan.squared_difference_moments import (
     EstimatorMoments,
     PhaseRing,
     compute_variance_from_squared_differences,
 )
-from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
 from monitor.estimation.allan.window_kernel import AXES
 
@@ -60,28 +58,14 @@ class LiveTotalAndHadamard:
     ----------
     window : AllanWindow
         Sliding window, which is not changed.
-    totals : ndarray of int64 or None
-        Cluster sizes of the total variance in samples, below the window length. None means powers of two.
-    hadamards : ndarray of int64 or None
-        Cluster sizes of the Hadamard variance in samples, up to a third of the window length. None means powers of two.
-
-    Raises
-    ------
-    ConfigError
-        If a cluster size is out of range.
     """
 
-    def __init__(self, window: AllanWindow, totals: Ints | None = None, hadamards: Ints | None = None) -> None:
+    def __init__(self, window: AllanWindow) -> None:
         self._window = window
         unit = window.view_phase_ring()[3]
         longest = int((2.0**63 * unit / (0.5 * np.array(FULL_SCALE[:AXES]))).min())
         limits = (min(window.length - 1, longest), min(window.length // 3, longest // 2))
-        given = [octave_cluster_sizes(limits[0]) if totals is None else totals]
-        given.append(octave_cluster_sizes(limits[1]) if hadamards is None else hadamards)
-        for factors, limit in zip(given, limits, strict=True):
-            if factors.size == 0 or factors.min() < 1 or factors.max() > limit:
-                raise ConfigError(f"cluster sizes {factors.tolist()} must lie within 1 and {limit}")
-        self._factors = [[int(m) for m in factors] for factors in given]
+        self._factors = [octave_cluster_sizes(limit).tolist() for limit in limits]
         self._moments: list[dict[int, EstimatorMoments]] = [{}, {}]
         self.rounds = 0  # number of complete rounds over all averaging times
         self._window_resets = window.resets
@@ -99,7 +83,7 @@ class LiveTotalAndHadamard:
         self._window_resets = self._window.resets
         next(self._round)
 
-    def curves_of_last_round(self, rate_hz: float, theta: Floats) -> tuple[TotalVarianceCurve, HadamardCurve] | None:
+    def curves_of_last_round(self, rate_hz: float, theta: Floats) -> tuple[VarianceCurve, VarianceCurve] | None:
         """Return the total and Hadamard variance of the last complete round, or None if there is none yet.
 
         Parameters

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
+from monitor.estimation.allan.curve import VarianceCurve
 from monitor.estimation.allan.uncertainty import deviation_intervals
 from monitor.estimation.fit.coefficient_fit import TO_SI
 
@@ -127,43 +128,35 @@ def theta_in_sample_units(theta: Floats, rate_hz: float) -> Floats:
 
 
 def correct_bias_and_compute_intervals(
-    moments: Sequence[EstimatorMoments], theta: Floats, variance: Floats, terms: Ints
-) -> tuple[Floats, Floats, Floats, Floats]:
+    moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
+) -> VarianceCurve:
     """Correct measured variances for bias, and compute degrees of freedom and confidence intervals.
-
-    An estimate with the expectation E and the variance V has 2 E²/V degrees of freedom. Missing samples reduce the
-    degrees of freedom in proportion to the number of omitted differences.
 
     Parameters
     ----------
     moments : sequence of EstimatorMoments
-        Moments of the estimates at m cluster sizes.
+        Moments of the variance estimates at m cluster sizes.
+    rate_hz : float
+        Sample rate in Hz.
     theta : ndarray of float64, shape (5, k)
-        Squared coefficients Q², N², B², K², R² in units of one sample interval; NaN means unknown.
-    variance : ndarray of float64, shape (m, k)
-        Measured variances.
+        Fitted Q², N², B², K², R² in SI units; NaN means unknown.
+    raw_variance : ndarray of float64, shape (m, k)
+        Measured variances that are not corrected for bias.
     terms : ndarray of int64, shape (m, k)
-        Number of averaged differences.
-
-    Returns
-    -------
-    corrected : ndarray of float64, shape (m, k)
-        Unbiased estimates of the Allan variance.
-    edf : ndarray of float64, shape (m, k)
-        Degrees of freedom; NaN if θ is unknown or the variance is zero.
-    lo, hi : ndarray of float64, shape (m, k)
-        Lower and upper end of the 95 % confidence interval of the deviation.
+        Number of averaged squared differences.
     """
+    theta = theta_in_sample_units(theta, rate_hz)
     mean = np.stack([one.mean for one in moments]) @ theta
     allan = np.stack([one.allan for one in moments]) @ theta
     square = np.einsum("ak,mab,bk->mk", theta, np.stack([one.covariance for one in moments]), theta)
     whole = np.array([one.terms for one in moments])[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        edf = np.where(variance > 0.0, 2.0 * mean * mean / square * (terms / whole), np.nan)
-        corrected = variance * (allan / mean)
+        edf = np.where(raw_variance > 0.0, 2.0 * mean * mean / square * (terms / whole), np.nan)
+        corrected = raw_variance * (allan / mean)
     edf[~np.isfinite(edf)] = np.nan
     lo, hi = deviation_intervals(corrected, edf)
-    return corrected, edf, lo, hi
+    factors = np.array([one.factor for one in moments])
+    return VarianceCurve(factors / rate_hz, factors, corrected, terms, edf, lo, hi)
 
 
 def phase_autocovariance(t: Floats) -> Floats:

@@ -20,7 +20,6 @@ out.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -28,6 +27,7 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.batch import octave_cluster_sizes
+from monitor.estimation.allan.curve import VarianceCurve
 from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
     EstimatorMoments,
@@ -35,7 +35,6 @@ from monitor.estimation.allan.squared_difference_moments import (
     correct_bias_and_compute_intervals,
     phase_autocovariance,
     summation_nodes,
-    theta_in_sample_units,
     variance_from_squared_differences,
 )
 
@@ -56,19 +55,6 @@ SQUARED_WEIGHTS: Final = 2.0
 """Divisor in the definition of the Allan variance, which is the mean of d² / (2 m²) for second differences d."""
 _RAMP: Final = NUM_COEFFICIENTS - 1
 """Index of the linear drift R in θ."""
-
-
-@dataclass(frozen=True, slots=True)
-class TotalVarianceCurve:
-    """Total variance of k axes at m averaging times, corrected for bias."""
-
-    tau_s: Floats  # [m]
-    factors: Ints  # [m] cluster sizes in samples
-    tvar: Floats  # [m, k] total variance in squared units of the axis; NaN if the bias cannot be corrected
-    terms: Ints  # [m, k] number of averaged second differences
-    edf: Floats  # [m, k] equivalent degrees of freedom; NaN where ``tvar`` is NaN
-    lo: Floats  # [m, k] lower end of the 95 % confidence interval of the deviation; NaN for τ > T/2
-    hi: Floats  # [m, k] upper end of the 95 % confidence interval of the deviation; NaN for τ > T/2
 
 
 def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
@@ -94,9 +80,7 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, _add_all_terms)
 
 
-def compute_total_curve(
-    values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None
-) -> TotalVarianceCurve:
+def compute_total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> VarianceCurve:
     """Compute the bias-corrected total variance of a recording with confidence intervals.
 
     Parameters
@@ -120,7 +104,7 @@ def compute_total_curve(
 
 def correct_total_variance(
     moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
-) -> TotalVarianceCurve:
+) -> VarianceCurve:
     """Correct given total variances for bias, and compute their degrees of freedom and confidence intervals.
 
     Parameters
@@ -137,13 +121,10 @@ def correct_total_variance(
         Number of averaged second differences.
     """
     enough = terms >= MIN_SHARE * np.array([one.terms for one in moments])[:, None]
-    tvar, edf, lo, hi = correct_bias_and_compute_intervals(
-        moments, theta_in_sample_units(theta, rate_hz), np.where(enough, raw_variance, np.nan), terms
-    )
-    factors = np.array([one.factor for one in moments])
-    unsure = 2 * factors > np.array([one.n for one in moments])
-    lo[unsure] = hi[unsure] = np.nan
-    return TotalVarianceCurve(factors / rate_hz, factors, tvar, terms, edf, lo, hi)
+    curve = correct_bias_and_compute_intervals(moments, rate_hz, theta, np.where(enough, raw_variance, np.nan), terms)
+    unsure = 2 * curve.factors > np.array([one.n for one in moments])
+    curve.lo[unsure] = curve.hi[unsure] = np.nan
+    return curve
 
 
 def total_estimator_moments(n: int, factor: int) -> EstimatorMoments:

@@ -27,7 +27,6 @@ from statistics import NormalDist
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
@@ -42,7 +41,6 @@ from monitor.estimation.detection.change_kernel import (
     FOUND,
     KIND,
     LIMIT,
-    MIN_REFERENCE_TERMS,
     NEVER,
     NEXT_DUE,
     SEED,
@@ -176,14 +174,6 @@ class NoiseAndBiasChangeDetector:
     def samples_since_start(self) -> int:
         """Number of samples since the start, including missing samples."""
         return int(self._state.clock[TOTAL])
-
-    @property
-    def octaves_ready_for_alarm(self) -> NDArray[np.bool_]:
-        """Boolean array [octaves, 6] that is True where the reference is long enough to raise an alarm."""
-        band = self._state.band
-        known = (band[:, :, N] >= MIN_REFERENCE_TERMS * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
-        old_enough = self.samples_since_start - self._state.born >= LEARN_S * self.rate_hz
-        return np.asarray((known & old_enough[:, None]).T)
 
     def process_samples(self, values: Floats) -> None:
         """Search samples for noise changes, bias steps and bursts of outliers.

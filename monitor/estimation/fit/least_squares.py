@@ -80,13 +80,8 @@ def compute_weights(problem: LeastSquares, tau_indices: Ints, theta: Floats, ful
 def _whiten(problem: LeastSquares, tau_indices: Ints, theta: Floats) -> bool:
     """Compute V⁻¹ X by Cholesky decomposition, and return False if the correlation matrix is singular."""
     # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
-    m, variance, stretch, ignored_direction = (
-        tau_indices.size,
-        problem.variance,
-        problem.stretch,
-        problem.ignored_direction,
-    )
-    covariance, columns, weighted = problem.covariance, problem.columns, problem.weighted
+    _, stretch, columns, covariance, ignored_direction, variance, weighted, _, _ = problem
+    m = tau_indices.size
     factor, column = np.empty((m, m)), np.empty(m)
     for k in range(m):
         for j in range(k + 1):
@@ -120,8 +115,7 @@ def compute_normal_equations(problem: LeastSquares, tau_indices: Ints) -> None:
     tau_indices : ndarray of int64
         Indices of the τ to use.
     """
-    normal, right, weighted = problem.normal, problem.right, problem.weighted
-    level, columns = problem.level, problem.columns
+    level, _, columns, _, _, _, weighted, normal, right = problem
     for a in range(5):
         right[a] = 0.0
         for b in range(a + 1):

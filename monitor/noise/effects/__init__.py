@@ -53,36 +53,9 @@ TRANSFORM_ORDER: Final[tuple[type[Transform], ...]] = (
 Transforms of the same kind are applied in the order of the model.
 """
 
-_ALL: Final[tuple[type[Effect], ...]] = (
-    ConstantBias,
-    QuantizationNoise,
-    AngleRandomWalk,
-    BiasInstability,
-    RateRandomWalk,
-    RateRamp,
-    ExponentiallyCorrelated,
-    Sinusoidal,
-    Narrowband,
-    WanderingLine,
-    CommonVibration,
-    TemperatureBias,
-    TemperatureLag,
-    TemperatureHysteresis,
-    TurnOnTransient,
-    BiasStep,
-    BiasCurve,
-    RandomTelegraph,
-    PoissonSteps,
-    Outliers,
-    PulseTrain,
-    NoiseStep,
-    VarianceModulation,
-    GSensitivity,
-    CrossAxis,
-    PowerLaw,
-    AxisPermutation,
-    HeavyTails,
-    *TRANSFORM_ORDER,
-)
-EFFECTS: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in _ALL}
+EFFECTS: Final[dict[str, type[Effect]]] = {
+    kind.name: kind
+    for kind in tuple(vars().values())
+    if isinstance(kind, type) and issubclass(kind, Effect) and kind not in (Effect, Transform)
+}
 """Class of each effect, by its name in model files."""

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
 from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemovalComparison
-from monitor.estimation.allan.curve import AllanCurve
+from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
@@ -36,7 +34,7 @@ class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
     hi: Floats
 
     @classmethod
-    def from_curve(cls, curve: AllanCurve | TotalVarianceCurve | HadamardCurve, axis: int) -> Self:
+    def from_curve(cls, curve: AllanCurve | VarianceCurve, axis: int) -> Self:
         """Build the deviations of one axis from the variances of all axes."""
         return cls(curve.tau_s, *deviations_with_interval_ends(curve, axis))
 
@@ -167,8 +165,8 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
     def from_analysis(
         cls,
         result: RecordingAnalysis,
-        total: TotalVarianceCurve | None = None,
-        hadamard: HadamardCurve | None = None,
+        total: VarianceCurve | None = None,
+        hadamard: VarianceCurve | None = None,
         dynamic: DynamicAllan | None = None,
         temperature: TemperatureRemovalComparison | None = None,
     ) -> Self:

@@ -14,9 +14,7 @@ from monitor.common import topics
 from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
-from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalVarianceCurve
+from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
@@ -40,8 +38,8 @@ STATUSES: Final = {status.name.lower(): status for status in Status}
 class TotalAndHadamardCurves(NamedTuple):
     """Total and Hadamard variances of the samples in the sliding window."""
 
-    total: TotalVarianceCurve
-    hadamard: HadamardCurve
+    total: VarianceCurve
+    hadamard: VarianceCurve
 
 
 class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
@@ -293,7 +291,7 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
     axes: dict[str, DeviationCurve]
 
     @classmethod
-    def from_curve(cls, curve: TotalVarianceCurve | HadamardCurve) -> Self:
+    def from_curve(cls, curve: VarianceCurve) -> Self:
         """Build the table from the variances of all axes, and omit axes without values."""
         curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
@@ -537,9 +535,7 @@ def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficie
     return total
 
 
-def deviations_with_interval_ends(
-    curve: AllanCurve | TotalVarianceCurve | HadamardCurve, axis: int
-) -> tuple[Floats, Floats, Floats]:
+def deviations_with_interval_ends(curve: AllanCurve | VarianceCurve, axis: int) -> tuple[Floats, Floats, Floats]:
     """Return the deviations of one axis and the ends of the 95 % intervals, each of shape [m].
 
     Parameters
@@ -549,13 +545,7 @@ def deviations_with_interval_ends(
     axis
         Column of the axis.
     """
-    match curve:
-        case AllanCurve():
-            variance = curve.avar
-        case TotalVarianceCurve():
-            variance = curve.tvar
-        case HadamardCurve():
-            variance = curve.hvar
+    variance = curve.avar if isinstance(curve, AllanCurve) else curve.variance
     return np.sqrt(variance[:, axis]), curve.lo[:, axis], curve.hi[:, axis]
 
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats
 from monitor.common.unit_formatting import DEFAULT_UNITS, KIND_NAMES, Kind, UnitSystem, axes_of
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalVarianceCurve
+from monitor.estimation.allan.curve import VarianceCurve
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.standard_terms import UNIT_SOURCES
@@ -73,7 +72,7 @@ class AdditionalDeviation:
 
 
 def additional_deviations(
-    total: TotalVarianceCurve | None = None, hadamard: HadamardCurve | None = None
+    total: VarianceCurve | None = None, hadamard: VarianceCurve | None = None
 ) -> list[AdditionalDeviation]:
     """Return the total and Hadamard deviations that are drawn in addition to the Allan deviation.
 
@@ -89,10 +88,12 @@ def additional_deviations(
     found = []
     if total is not None:
         found.append(
-            AdditionalDeviation("total", total.tau_s, np.sqrt(total.tvar), total.lo, total.hi, only_beyond=True)
+            AdditionalDeviation("total", total.tau_s, np.sqrt(total.variance), total.lo, total.hi, only_beyond=True)
         )
     if hadamard is not None:
-        found.append(AdditionalDeviation("Hadamard", hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi))
+        found.append(
+            AdditionalDeviation("Hadamard", hadamard.tau_s, np.sqrt(hadamard.variance), hadamard.lo, hadamard.hi)
+        )
     return found
 
 

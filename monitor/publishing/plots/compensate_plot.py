@@ -11,7 +11,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from monitor.common.distributions import Z95
 from monitor.common.unit_formatting import DEVIATION_UNITS, format_duration
-from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
+from monitor.drift.compensation.compensation_score import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.sage_husa import USED
 from monitor.publishing.plots import style
 

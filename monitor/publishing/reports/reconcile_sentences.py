@@ -271,10 +271,10 @@ def describe_alternatives(step: AddedOrResizedEffect) -> str:
 
 def describe_held_out_gap_change(step: AddedOrResizedEffect) -> str:
     """Describe the gap before and after a step on data that were not used to choose the effect."""
-    before, after = step.held_out_before, step.held_out_after
-    if before is None or after is None:
+    if step.held_out is None:
         return f"None: {step.held_out_reason}."
-    return f"{format_gap(before.gap)} → {format_gap(after.gap)}, threshold {format_gap(after.threshold)}"
+    before, after = step.held_out
+    return f"{format_gap(before)} → {format_gap(after)}, threshold {format_gap(step.after.threshold)}"
 
 
 def parameter_unit(effect: str, name: str, axis: str, value_si: float) -> Unit:

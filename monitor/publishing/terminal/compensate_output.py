@@ -8,8 +8,12 @@ from rich.padding import Padding
 
 from monitor.common.unit_formatting import DEVIATION_UNITS, format_count, format_duration, format_number
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
-from monitor.drift.compensation.compensation_score import SPANS_S, RateQualityAtRest
+from monitor.drift.compensation.compensation_score import (
+    SPANS_S,
+    AxisCompensation,
+    DriftCompensationResult,
+    RateQualityAtRest,
+)
 from monitor.publishing.messages.message import encode_json
 from monitor.publishing.terminal.tables import plain_table, print_notes
 

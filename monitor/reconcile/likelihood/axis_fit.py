@@ -28,8 +28,8 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.noise.spectrum import Spectrum, white_noise_spectrum
+from monitor.reconcile.effect_table import SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.effect_roles import (
-    DETERMINISTIC_SIZE_PARAMETERS,
     MAX_REGRESSORS,
     build_unit_regressors,
     effect_size,
@@ -285,7 +285,7 @@ class Axis:
         slices: list[tuple[int, slice]] = []
         columns: list[Regressor] = []
         for at, effect in enumerate(effects):
-            if type(effect) in DETERMINISTIC_SIZE_PARAMETERS:
+            if effect.name in SERIES_SIZE_PARAMETERS:
                 count = regressor_count(effect)
                 slices.append((at, slice(len(columns), len(columns) + count)))
                 columns += [(effect, i) for i in range(count)]

@@ -13,77 +13,20 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import AxisLeak, Effect, SampleBlockContext, Source
+from monitor.noise.effect import Effect, SampleBlockContext, Source
 from monitor.noise.effects import (
-    AngleRandomWalk,
     BandwidthLimit,
-    BiasCurve,
-    BiasInstability,
-    BiasStep,
     CommonVibration,
     ConstantBias,
-    CrossAxis,
-    ExponentiallyCorrelated,
-    GSensitivity,
-    Narrowband,
     PoissonSteps,
-    PowerLaw,
-    PulseTrain,
-    QuantizationNoise,
     RandomTelegraph,
     RateRamp,
-    RateRandomWalk,
     Resolution,
     SampleRateError,
     ScaleFactor,
     Sinusoidal,
-    TemperatureBias,
-    TemperatureHysteresis,
-    TemperatureLag,
-    TurnOnTransient,
 )
-
-NOISE_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
-    QuantizationNoise: "Q",
-    AngleRandomWalk: "N",
-    BiasInstability: "B",
-    RateRandomWalk: "K",
-    ExponentiallyCorrelated: "sigma",
-    Narrowband: "sigma",
-    CommonVibration: "gain",
-    RandomTelegraph: "amplitude",
-    PoissonSteps: "height",
-    BandwidthLimit: "floor",
-    PowerLaw: "density",
-}
-"""For each noise effect, the name of the size parameter.
-
-A low-pass filter is a noise effect if the parameter ``floor`` is present, even if the floor is 0.
-"""
-
-DETERMINISTIC_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
-    RateRamp: "R",
-    Sinusoidal: "amplitude",
-    TemperatureBias: "coefficient",
-    TemperatureLag: "coefficient",
-    TemperatureHysteresis: "height",
-    PulseTrain: "height",
-    BiasCurve: "slope",
-    TurnOnTransient: "amplitude",
-    BiasStep: "height",
-    GSensitivity: "coefficient",
-    CrossAxis: "coefficient",
-}
-"""For each deterministic effect, the name of the size parameter."""
-
-COEFFICIENTS: Final[dict[type[Effect], tuple[str, ...]]] = {
-    TemperatureBias: ("coefficient", "quadratic", "cubic"),
-    BiasCurve: ("slope", "curvature", "logarithmic"),
-}
-"""For each effect with several linear coefficients, the names of the coefficients. A coefficient may be absent."""
-
-SIZE_PARAMETERS: Final = NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS
-"""For each effect with a size, the name of the size parameter."""
+from monitor.reconcile.effect_table import EFFECT_TABLE, NOISE_SIZE_PARAMETERS, SIZE_PARAMETERS
 
 MAX_REGRESSORS: Final = 3
 """Largest number of regressors of an effect."""
@@ -92,62 +35,39 @@ NON_GAUSSIAN_NOISES: Final = (PoissonSteps, RandomTelegraph)
 GAUSSIAN_TRANSFORMS: Final = (BandwidthLimit, ConstantBias, Resolution, SampleRateError, ScaleFactor)
 """Effects without a size that keep Gaussian noise Gaussian and stationary. Quantization does so with small steps."""
 
-ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient", "bias_curve"})
-"""Names of the effects that happen at most once in a recording."""
-
-_EFFECTS_BY_DIAGNOSTIC: Final = {
-    "psd": (
-        *("quantization_noise", "angle_random_walk", "bias_instability", "rate_random_walk"),
-        *("exponentially_correlated", "scale_factor", "narrowband", "bandwidth_limit", "power_law"),
-        "wandering_line",
-    ),
-    "lines": ("sinusoidal", "pulse_train"),
-    "temperature": ("temperature_bias", "temperature_lag", "temperature_hysteresis"),
-    "other_axes": ("g_sensitivity", "cross_axis", "common_vibration"),
-    "level": ("bias_step", "rate_ramp", "turn_on_transient", "bias_curve"),
-    "tails": ("outliers", "heavy_tails"),
-    "variance": ("noise_step", "variance_modulation"),
-    "values": ("resolution", "saturation", "sample_hold"),
-}
-MOST_DIRECT_DIAGNOSTIC: Final = {
-    effect: diagnostic for diagnostic, effects in _EFFECTS_BY_DIAGNOSTIC.items() for effect in effects
-}
-"""Diagnostic that is most sensitive to each effect."""
-
 
 def linear_coefficient_names(effect: Effect) -> tuple[str, ...]:
     """Return the names of the linear coefficients of a deterministic effect, beginning with the size."""
-    names = COEFFICIENTS.get(type(effect), (SIZE_PARAMETERS[type(effect)],))
-    return tuple(name for name in names if getattr(effect, name) is not None)
+    return tuple(name for name in EFFECT_TABLE[effect.name].sizes if getattr(effect, name) is not None)
 
 
 def regressor_count(effect: Effect) -> int:
     """Return the number of regressors of a deterministic effect.
 
-    A sinusoid has a regressor for each of two phases. An effect in ``COEFFICIENTS`` has a regressor for each
-    coefficient. Other effects have one regressor.
+    A sinusoid has a regressor for each of two phases. A polynomial has a regressor for each coefficient.
+    Other effects have one regressor.
     """
     return 2 if isinstance(effect, Sinusoidal) else len(linear_coefficient_names(effect))
 
 
 def is_noise_effect(effect: Effect) -> bool:
     """Return True if an effect adds noise, whose size is a parameter of the effect."""
-    return getattr(effect, NOISE_SIZE_PARAMETERS.get(type(effect), ""), None) is not None
+    return getattr(effect, NOISE_SIZE_PARAMETERS.get(effect.name, ""), None) is not None
 
 
 def is_stationary_gaussian(effects: Sequence[Effect]) -> bool:
     """Return True if the sum of all effects is stationary Gaussian noise with a known mean."""
     return not any(
         isinstance(effect, NON_GAUSSIAN_NOISES)
-        or not (type(effect) in SIZE_PARAMETERS or isinstance(effect, GAUSSIAN_TRANSFORMS))
+        or not (effect.name in SIZE_PARAMETERS or isinstance(effect, GAUSSIAN_TRANSFORMS))
         for effect in effects
     )
 
 
 def effect_size(effect: Effect) -> float:
     """Return the size parameter of a noise effect or a deterministic effect. A noise effect has no sign."""
-    size = float(getattr(effect, SIZE_PARAMETERS[type(effect)]))
-    return abs(size) if type(effect) in NOISE_SIZE_PARAMETERS else size
+    size = float(getattr(effect, SIZE_PARAMETERS[effect.name]))
+    return abs(size) if effect.name in NOISE_SIZE_PARAMETERS else size
 
 
 def with_effect_size(effect: Effect, size: float) -> Effect:
@@ -162,10 +82,10 @@ def with_effect_size(effect: Effect, size: float) -> Effect:
     size : float
         New size, in the unit of the size parameter.
     """
-    name = SIZE_PARAMETERS[type(effect)]
+    name = SIZE_PARAMETERS[effect.name]
     if isinstance(effect, CommonVibration):
         return replace(effect, gain=copysign(size, effect.gain))
-    unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or type(effect) in NOISE_SIZE_PARAMETERS
+    unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or effect.name in NOISE_SIZE_PARAMETERS
     return replace(effect, **{name: abs(size) if unsigned else size})  # type: ignore[type-var]
 
 
@@ -175,7 +95,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     Parameters
     ----------
     effect : Effect
-        Deterministic effect.
+        Deterministic effect that is not a leak from another axis.
     n : int
         Number of samples.
     rate_hz : float
@@ -187,14 +107,7 @@ def build_unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c:
     -------
     list of ndarray of float64, shape (n,)
         Series of each of the ``regressor_count(effect)`` regressors.
-
-    Raises
-    ------
-    TypeError
-        If the effect is a leak from another axis.
     """
-    if isinstance(effect, AxisLeak):
-        raise TypeError("the series of a leak is another axis")
     variants: list[Any]
     if isinstance(effect, Sinusoidal):
         variants = [replace(effect, amplitude=1.0, phase=phase) for phase in (0.0, 0.5 * pi)]
@@ -217,7 +130,7 @@ def with_regression_coefficients(effect: Effect, coefficients: Floats) -> Effect
         return replace(
             effect, amplitude=hypot(*coefficients[:2]), phase=atan2(coefficients[1], coefficients[0]) % (2.0 * pi)
         )
-    if type(effect) in COEFFICIENTS:
+    if len(EFFECT_TABLE[effect.name].sizes) > 1:
         changed: dict[str, Any] = dict(zip(linear_coefficient_names(effect), map(float, coefficients), strict=False))
         return replace(effect, **changed)  # type: ignore[type-var]
     return with_effect_size(effect, float(coefficients[0]))

@@ -23,7 +23,6 @@ MAX_BLOCKS: Final = 1 << 15
 """Largest number of blocks. The end of a longer recording is not used."""
 TARGET_BLOCKS: Final = 200.0
 """Smallest number of blocks in a recording with enough samples."""
-MIN_BLOCKS: Final = 16
 INITIAL_VARIANCE_RATIO: Final = 100.0
 """Prior variance of the first level, relative to the variance of the data."""
 FLICKER_TIME_RATIO: Final = 10.0
@@ -68,6 +67,7 @@ class StateSpaceNoise(NamedTuple):
 
     table: Floats  # [d, 4] a, c, variance of w and covariance of v and w, for each process
     white: float  # variance of the white noise in a block mean, plus the variances of all v
+    level_variance: float  # prior variance of the mean level in the first block
 
 
 class EventProcessFit(NamedTuple):
@@ -112,11 +112,6 @@ def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Float
     block_s : float
         Exact length of a block in seconds.
 
-    Raises
-    ------
-    ValueError
-        If the series has too few blocks.
-
     Examples
     --------
     >>> means, block_s = compute_block_means(np.arange(48.0), 0.5, 1.4)
@@ -125,38 +120,29 @@ def compute_block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Float
     """
     size = max(1, round(block_s / tau0_s))
     count = min(y.size // size, MAX_BLOCKS)
-    if count < MIN_BLOCKS:
-        raise ValueError(f"the series has {count} blocks of {size * tau0_s:g} s; at least {MIN_BLOCKS} are needed")
     means = y[: count * size].reshape(count, size).mean(1)
     return means - means.mean(), size * tau0_s
 
 
-def build_state_space_noise(background: BackgroundNoise, block_s: float, duration_s: float) -> StateSpaceNoise:
+def build_state_space_noise(background: BackgroundNoise, means: Floats, block_s: float) -> StateSpaceNoise:
     """Build the state-space model of the background noise in block means.
 
     Parameters
     ----------
     background : BackgroundNoise
         Noise of the axis.
+    means : ndarray of float64, shape (m,)
+        Block means, of which the variance sets the prior variance of the mean level.
     block_s : float
         Length of a block in seconds.
-    duration_s : float
-        Length of the recording in seconds.
-
-    Raises
-    ------
-    ValueError
-        If the background contains no white noise.
     """
-    if not background.white > 0.0:
-        raise ValueError(f"the white noise is {background.white:g}; it must be above zero")
     walk = background.walk * block_s
     rows, white = [(1.0, 1.0, walk, 0.5 * walk)], background.white / block_s + walk / 3.0
-    for sigma, time_s in (*background.correlated, *_flicker_processes(background, block_s, duration_s)):
+    for sigma, time_s in (*background.correlated, *_flicker_processes(background, block_s, means.size * block_s)):
         row, own = correlated_noise_of_block_means(sigma, time_s, block_s)
         rows.append(row)
         white += own
-    return StateSpaceNoise(np.array(rows), white)
+    return StateSpaceNoise(np.array(rows), white, INITIAL_VARIANCE_RATIO * float(means.var()))
 
 
 def correlated_noise_of_block_means(
@@ -320,18 +306,13 @@ def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -
     return curvature / CURVATURE_STEP**2
 
 
-def prior_level_variance(means: Floats) -> float:
-    """Return the prior variance of the mean level in the first block."""
-    return INITIAL_VARIANCE_RATIO * float(means.var())
-
-
 @compiled
-def initial_state_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
+def initial_state_covariance(noise: StateSpaceNoise) -> Floats:
     """Return the state covariance, shape (d, d), before the first block."""
     table = noise.table
     d = table.shape[0]
     covariance = np.zeros((d, d))
-    covariance[0, 0] = level_variance
+    covariance[0, 0] = noise.level_variance
     for i in range(1, d):
         covariance[i, i] = table[i, 2] / (1.0 - table[i, 0] ** 2)
     return covariance
@@ -365,9 +346,7 @@ def difference_from_predicted_block_mean(block_mean: float, noise: StateSpaceNoi
 
 
 @compiled
-def innovation_variances(
-    extra_level_variance: Floats, noise: StateSpaceNoise, level_variance: float
-) -> tuple[Floats, Floats]:
+def innovation_variances(extra_level_variance: Floats, noise: StateSpaceNoise) -> tuple[Floats, Floats]:
     """Return the innovation variances, shape (m,), and the covariances with the next state, shape (m, d).
 
     The variance of the mean level increases by ``extra_level_variance``, shape (m,), at the start of each block.
@@ -375,7 +354,7 @@ def innovation_variances(
     table = noise.table
     d, m = table.shape[0], extra_level_variance.size
     variances, state_covariances = np.empty(m), np.empty((m, d))
-    covariance = initial_state_covariance(noise, level_variance)
+    covariance = initial_state_covariance(noise)
     for k in range(m):
         covariance[0, 0] += extra_level_variance[k]
         variances[k] = predict_block_mean_variance(noise, covariance, state_covariances[k])
@@ -403,12 +382,12 @@ def innovations_of_series(
 
 
 @compiled
-def kalman_log_likelihood(means: Floats, noise: StateSpaceNoise, level_variance: float) -> float:
+def kalman_log_likelihood(means: Floats, noise: StateSpaceNoise) -> float:
     """Return the log-likelihood of block means under Gaussian noise.
 
     The Kalman filter follows Anderson & Moore, "Optimal Filtering", 1979, sections 5.5 and 10.4.
     """
-    variances, state_covariances = innovation_variances(np.zeros(means.size), noise, level_variance)
+    variances, state_covariances = innovation_variances(np.zeros(means.size), noise)
     innovations = innovations_of_series(means, noise, variances, state_covariances)
     total = 0.0
     for k in range(means.size):

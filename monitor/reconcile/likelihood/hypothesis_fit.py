@@ -14,8 +14,9 @@ import numpy as np
 from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
 from monitor.noise.effects import CommonVibration, ExponentiallyCorrelated, PulseTrain, VarianceModulation
+from monitor.reconcile.effect_table import SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
-from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, effect_size, is_noise_effect
+from monitor.reconcile.likelihood.effect_roles import effect_size, is_noise_effect
 from monitor.reconcile.likelihood.periodic_pulse_search import find_pulse_delay
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.result import ParameterInterval
@@ -187,10 +188,13 @@ def fit_shape_parameter(
         return with_shape(effect, parameter_name, exp(log_value))
 
     middle, width = log(getattr(effect, parameter_name)), log(search_factor)
+    highest = middle + width
+    if parameter_name == "frequency":
+        highest = min(highest, log(0.5 * axis.rate_hz))  # frequencies above half the sample rate are aliases
     best = find_maximum_by_golden_section(
         lambda x: axis.fit((*other_effects, with_shape_parameter(x))).log_likelihood,
         middle - width,
-        middle + width,
+        highest,
         SHAPE_ITERATIONS,
     )
     return with_shape_parameter(best)
@@ -258,7 +262,7 @@ def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
         Index of the effect.
     """
     value, error = effect_size(fit.effects[effect_index]), fit.size_standard_error(effect_index)
-    if type(fit.effects[effect_index]) in DETERMINISTIC_SIZE_PARAMETERS:
+    if fit.effects[effect_index].name in SERIES_SIZE_PARAMETERS:
         return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
         return ParameterInterval(value)

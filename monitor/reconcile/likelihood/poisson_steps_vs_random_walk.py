@@ -29,7 +29,6 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
     initial_state_covariance,
     kalman_log_likelihood,
     maximise_over_log_parameters,
-    prior_level_variance,
 )
 
 BLOCKS_PER_CROSSING_TIME: Final = 3.0
@@ -65,18 +64,12 @@ def compare_poisson_with_random_walk(
     -------
     EventProcessComparison
         Log-likelihood gain, fitted rate and height, and number of Poisson steps.
-
-    Raises
-    ------
-    ValueError
-        If the series is too short or the background contains no white noise.
     """
     means, block_s = compute_block_means(y, tau0_s, choose_block_length_s(y.size * tau0_s, background, K))
-    level_variance, duration_s = prior_level_variance(means), means.size * block_s
 
     def random_walk_log_likelihood(K: float) -> float:
-        noise = build_state_space_noise(replace(background, walk=background.walk + K * K), block_s, duration_s)
-        return float(kalman_log_likelihood(means, noise, level_variance))
+        noise = build_state_space_noise(replace(background, walk=background.walk + K * K), means, block_s)
+        return float(kalman_log_likelihood(means, noise))
 
     return fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
         maximise_over_log_parameters(random_walk_log_likelihood, (K,))[0]
@@ -113,11 +106,11 @@ def fit_poisson_jumps(means: Floats, block_s: float, background: BackgroundNoise
     K : float
         Random walk coefficient in unit/√s.
     """
-    duration_s, level_variance = means.size * block_s, prior_level_variance(means)
-    noise = build_state_space_noise(background, block_s, duration_s)
+    duration_s = means.size * block_s
+    noise = build_state_space_noise(background, means, block_s)
 
     def poisson_log_likelihood(rate: float, height: float, odds: float = 1.0) -> float:
-        return _log_likelihood(means, noise, level_variance, rate * block_s, height, odds)
+        return _log_likelihood(means, noise, rate * block_s, height, odds)
 
     rates = np.geomspace(
         2.0 / duration_s, max(MAX_START_JUMPS * K / background.white**0.5, 4.0 / duration_s), START_RATES
@@ -126,15 +119,11 @@ def fit_poisson_jumps(means: Floats, block_s: float, background: BackgroundNoise
     return fit_event_process(poisson_log_likelihood, {"rate": rate, "height": K / rate**0.5})
 
 
-def _log_likelihood(
-    means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: float, height: float, odds: float = 1.0
-) -> float:
+def _log_likelihood(means: Floats, noise: StateSpaceNoise, jumps: float, height: float, odds: float = 1.0) -> float:
     """Return the log-likelihood of Poisson steps, with the jump probability multiplied by ``odds``."""
     some = -expm1(-jumps)
     variance = jumps / some * height**2  # variance of the sum of all jumps in a block with at least one jump
-    return float(
-        _jump_log_likelihood(means, noise, level_variance, _JumpProbabilities(exp(-jumps), odds * some, variance))
-    )
+    return float(_jump_log_likelihood(means, noise, _JumpProbabilities(exp(-jumps), odds * some, variance)))
 
 
 class _JumpProbabilities(NamedTuple):
@@ -161,13 +150,11 @@ class _JumpFilterUpdate(NamedTuple):
 
 
 @compiled
-def _jump_log_likelihood(
-    means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: _JumpProbabilities
-) -> float:
+def _jump_log_likelihood(means: Floats, noise: StateSpaceNoise, jumps: _JumpProbabilities) -> float:
     d, last = noise.table.shape[0], JUMP_AGES - 1
     state = _JumpFilterState(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
     state.probability[last] = 1.0
-    state.covariance[last] = initial_state_covariance(noise, level_variance)
+    state.covariance[last] = initial_state_covariance(noise)
     update = _JumpFilterUpdate(
         np.zeros((2, JUMP_AGES)), np.zeros((2, JUMP_AGES)), np.zeros((2, JUMP_AGES, d)), np.zeros((2, JUMP_AGES, d))
     )
@@ -214,14 +201,9 @@ def _weigh_branches(
     log_scale : float
         Logarithm of the factor by which the weights were multiplied.
     """
-    table, probability, mean, covariance = noise.table, state.probability, state.mean, state.covariance
-    weight, inverse_variance, state_covariance, next_mean = (
-        update.weight,
-        update.inverse_variance,
-        update.state_covariance,
-        update.mean,
-    )
-    d = table.shape[0]
+    table, d = noise.table, noise.table.shape[0]
+    probability, mean, covariance = state
+    weight, inverse_variance, state_covariance, next_mean = update
     least = np.inf
     for age in range(JUMP_AGES):
         if probability[age] < MIN_HYPOTHESIS_PROBABILITY:
@@ -274,12 +256,7 @@ def _merge(
     The mean and the lower triangle of the covariance are written in place. The jumps are independent of the earlier
     state, and the caller adds their variance.
     """
-    weight, inverse_variance, state_covariance, mean = (
-        update.weight,
-        update.inverse_variance,
-        update.state_covariance,
-        update.mean,
-    )
+    weight, inverse_variance, state_covariance, mean = update
     share = 0.0
     for age in range(first, end):
         share += weight[jump, age]
@@ -297,11 +274,8 @@ def _merge(
             continue
         part, known = weight[jump, age] / share, inverse_variance[jump, age]
         for i in range(d):
-            decay, pull, apart = (
-                table[i, 0],
-                state_covariance[jump, age, i] * known,
-                mean[jump, age, i] - merged_mean[i],
-            )
+            decay, pull = table[i, 0], state_covariance[jump, age, i] * known
+            apart = mean[jump, age, i] - merged_mean[i]
             for j in range(i + 1):
                 own = decay * table[j, 0] * covariance[age, i, j] - pull * state_covariance[jump, age, j]
                 merged_covariance[i, j] += part * (own + apart * (mean[jump, age, j] - merged_mean[j]))
@@ -313,9 +287,8 @@ def _merge(
 @compiled
 def _increase_ages(table: Floats, state: _JumpFilterState, update: _JumpFilterUpdate) -> None:
     """Update the hypotheses with ages from 1 to ``JUMP_AGES`` − 2, which have no jump in the block."""
-    probability, mean, covariance = state.probability, state.mean, state.covariance
-    weight, next_mean = update.weight, update.mean
-    inverse_variance, state_covariance = update.inverse_variance, update.state_covariance
+    probability, mean, covariance = state
+    weight, inverse_variance, state_covariance, next_mean = update
     for age in range(JUMP_AGES - 2, 0, -1):
         old = age - 1
         probability[age] = weight[0, old]

@@ -25,7 +25,6 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
     innovation_variances,
     innovations_of_series,
     kalman_log_likelihood,
-    prior_level_variance,
 )
 
 TIMES_PER_BLOCK: Final = 8
@@ -58,18 +57,11 @@ def compare_poisson_with_single_steps(
     -------
     EventProcessComparison
         Log-likelihood gain, fitted rate and height of Poisson steps, and the numbers of jumps and single steps.
-
-    Raises
-    ------
-    ValueError
-        If the series is too short or the background contains no white noise.
     """
     means, block_s = compute_block_means(
         y, tau0_s, poisson_steps_vs_random_walk.choose_block_length_s(y.size * tau0_s, background, K)
     )
-    single = _fit_single_steps(
-        means, build_state_space_noise(background, block_s, means.size * block_s), max_single_steps
-    )
+    single = _fit_single_steps(means, build_state_space_noise(background, means, block_s), max_single_steps)
     return poisson_steps_vs_random_walk.fit_poisson_jumps(means, block_s, background, K).compare_with_other_effect(
         single.score, single.times.size
     )
@@ -78,7 +70,7 @@ def compare_poisson_with_single_steps(
 def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: int) -> _SingleStepsFit:
     """Return the best fit with 0 to ``max_single_steps`` single steps."""
     blocks: list[int] = []
-    best = _SingleStepsFit(kalman_log_likelihood(means, noise, prior_level_variance(means)), np.empty(0))
+    best = _SingleStepsFit(kalman_log_likelihood(means, noise), np.empty(0))
     for _ in range(max_single_steps):
         blocks.append(int(np.argmax(_shock_gains(means, noise, blocks))))
         for k in range(len(blocks)):
@@ -92,8 +84,8 @@ def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: i
 def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Floats:
     """Return twice the log-likelihood gain of an additional step at the start of each block, shape (m,)."""
     shock_variances = np.zeros(means.size)
-    shock_variances[blocks] = prior_level_variance(means)
-    gains = _shock_statistics(means, noise, prior_level_variance(means), shock_variances)
+    shock_variances[blocks] = noise.level_variance
+    gains = _shock_statistics(means, noise, shock_variances)
     gains[blocks] = 0.0
     return gains
 
@@ -116,7 +108,7 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
     # fraction of each block that lies after the step
     columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
     columns = np.column_stack([means, columns])
-    logarithms = _whiten(columns, noise, prior_level_variance(means))
+    logarithms = _whiten(columns, noise)
     data, design = columns[:, 0], columns[:, 1:]
     normal = np.linalg.inv(design.T @ design)
     heights = normal @ (design.T @ data)
@@ -125,9 +117,9 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
 
 
 @compiled
-def _whiten(columns: Floats, noise: StateSpaceNoise, level_variance: float) -> float:
+def _whiten(columns: Floats, noise: StateSpaceNoise) -> float:
     """Whiten columns, shape (m, c), in place. Return the sum of ln 2πS over all innovation variances S."""
-    variances, state_covariances = innovation_variances(np.zeros(columns.shape[0]), noise, level_variance)
+    variances, state_covariances = innovation_variances(np.zeros(columns.shape[0]), noise)
     total = 0.0
     for c in range(columns.shape[1]):
         innovations = innovations_of_series(columns[:, c].copy(), noise, variances, state_covariances)
@@ -139,9 +131,7 @@ def _whiten(columns: Floats, noise: StateSpaceNoise, level_variance: float) -> f
 
 
 @compiled
-def _shock_statistics(
-    means: Floats, noise: StateSpaceNoise, level_variance: float, extra_level_variance: Floats
-) -> Floats:
+def _shock_statistics(means: Floats, noise: StateSpaceNoise, extra_level_variance: Floats) -> Floats:
     """Return twice the log-likelihood ratio of a step at the start of each block, shape (m,).
 
     The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are r ←
@@ -150,7 +140,7 @@ def _shock_statistics(
     """
     table = noise.table
     d, m = table.shape[0], means.size
-    variances, state_covariances = innovation_variances(extra_level_variance, noise, level_variance)
+    variances, state_covariances = innovation_variances(extra_level_variance, noise)
     innovations = innovations_of_series(means, noise, variances, state_covariances)
     r, N, scores = np.zeros(d), np.zeros((d, d)), np.empty(m)
     L = np.empty((d, d))

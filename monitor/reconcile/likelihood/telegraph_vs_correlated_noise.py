@@ -28,7 +28,6 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
     kalman_log_likelihood,
     maximise_over_log_parameters,
     predict_block_mean_variance,
-    prior_level_variance,
 )
 
 BLOCKS_PER_CORRELATION_TIME: Final = 8.0
@@ -69,24 +68,16 @@ def compare_telegraph_with_correlated_noise(
     -------
     EventProcessComparison
         Log-likelihood gain, fitted amplitude and dwell time, and number of switches of the telegraph.
-
-    Raises
-    ------
-    ValueError
-        If the series is too short or the background contains no white noise.
     """
     means, block_s = compute_block_means(
         y, tau0_s, _choose_block_length_s(y.size * tau0_s, tau0_s, correlation_time, background.white / sigma**2)
     )
-    noise, level_variance = (
-        build_state_space_noise(background, block_s, means.size * block_s),
-        prior_level_variance(means),
-    )
+    noise = build_state_space_noise(background, means, block_s)
 
     def correlated_noise_log_likelihood(sigma: float, time_s: float) -> float:
         row, own = correlated_noise_of_block_means(sigma, time_s, block_s)
-        both = StateSpaceNoise(np.vstack([noise.table, row]), noise.white + own)
-        return float(kalman_log_likelihood(means, both, level_variance))
+        both = StateSpaceNoise(np.vstack([noise.table, row]), noise.white + own, noise.level_variance)
+        return float(kalman_log_likelihood(means, both))
 
     telegraph = _fit_telegraph(means, block_s, noise, sigma, correlation_time)
     return telegraph.compare_with_other_effect(
@@ -109,10 +100,8 @@ def _choose_block_length_s(duration_s: float, tau0_s: float, correlation_time: f
 def _fit_telegraph(
     means: Floats, block_s: float, noise: StateSpaceNoise, sigma: float, correlation_time: float
 ) -> EventProcessFit:
-    level_variance = prior_level_variance(means)
-
     def telegraph_log_likelihood(amplitude: float, dwell_s: float, odds: float) -> float:
-        return _log_likelihood(means, noise, level_variance, amplitude, block_s / dwell_s, odds)
+        return _log_likelihood(means, noise, amplitude, block_s / dwell_s, odds)
 
     starts = [
         (2.0 * sigma * a, 2.0 * correlation_time * d)
@@ -124,7 +113,7 @@ def _fit_telegraph(
 
 
 def _log_likelihood(
-    means: Floats, noise: StateSpaceNoise, level_variance: float, amplitude: float, switches: float, odds: float = 1.0
+    means: Floats, noise: StateSpaceNoise, amplitude: float, switches: float, odds: float = 1.0
 ) -> float:
     """Return the log-likelihood of a random telegraph, with the switch probability multiplied by ``odds``."""
     even, odd = 0.5 * (1.0 + np.exp(-2.0 * switches)), -0.5 * np.expm1(-2.0 * switches)
@@ -137,7 +126,7 @@ def _log_likelihood(
         [odds * odd, 0.0, amplitude**2 / 12.0],
     ])  # fmt: skip
     # The filter runs once for each first level, because one filter would merge the levels too early.
-    states = [_initial_state(noise, level_variance, first_level) for first_level in (0, 1)]
+    states = [_initial_state(noise, first_level) for first_level in (0, 1)]
     first_parts = [_switching_log_likelihood(means[:INITIAL_LEVEL_BLOCKS], noise, cases, state) for state in states]
     second_part = _switching_log_likelihood(
         means[INITIAL_LEVEL_BLOCKS:], noise, cases, states[int(np.argmax(first_parts))]
@@ -164,11 +153,11 @@ class _BlockFilterUpdate(NamedTuple):
 
 
 @compiled
-def _initial_state(noise: StateSpaceNoise, level_variance: float, first_level: int) -> _SwitchingFilterState:
+def _initial_state(noise: StateSpaceNoise, first_level: int) -> _SwitchingFilterState:
     d = noise.table.shape[0]
     state = _SwitchingFilterState(np.zeros(2), np.zeros((2, d)), np.empty((2, d, d)))
     state.probability[first_level] = 1.0
-    state.covariance[:] = initial_state_covariance(noise, level_variance)
+    state.covariance[:] = initial_state_covariance(noise)
     return state
 
 
@@ -246,15 +235,9 @@ def _merge_into_level(
 ) -> None:
     """Merge all cases that end at ``level`` into one Gaussian, and write its mean and covariance in place."""
     d, other = table.shape[0], 1 - level
-    state_covariance, pull, known, at, covariance = (
-        update.state_covariance,
-        update.scaled_innovation,
-        update.inverse_variance,
-        state.mean,
-        state.covariance,
-    )
-    step = update.mean_difference
-    stays, comes = update.weight[level, 0], update.weight[other, 2]
+    _, at, covariance = state
+    weight, pull, known, state_covariance, step = update
+    stays, comes = weight[level, 0], weight[other, 2]
     state.probability[level] = (stays + comes) / density
     came = comes / (stays + comes)
     for i in range(d):

@@ -100,11 +100,6 @@ def compare_variance_change_forms(residuals: Floats, tau0_s: float) -> VarianceC
     tau0_s : float
         Sample period in seconds.
 
-    Raises
-    ------
-    ValueError
-        If the series has fewer than 256 samples.
-
     Examples
     --------
     >>> rng = np.random.default_rng(0)
@@ -114,7 +109,6 @@ def compare_variance_change_forms(residuals: Floats, tau0_s: float) -> VarianceC
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
-    _check_sample_count(residuals, MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES)
     squares = residuals * residuals
     count = count_variance_blocks(residuals.size)
     length = residuals.size // count
@@ -176,11 +170,6 @@ def find_spectrogram_change(residuals: Floats, tau0_s: float) -> SpectrogramChan
     tau0_s : float
         Sample period in seconds.
 
-    Raises
-    ------
-    ValueError
-        If the series has fewer than 2048 samples.
-
     Examples
     --------
     >>> rng = np.random.default_rng(0)
@@ -190,18 +179,12 @@ def find_spectrogram_change(residuals: Floats, tau0_s: float) -> SpectrogramChan
     >>> found.gain > 50.0, found.frequency[0] < 17.3 < found.frequency[1]
     (True, True)
     """
-    _check_sample_count(residuals, MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0])
     pieces = [piece for piece in PIECE_SAMPLES if residuals.size >= MIN_VARIANCE_BLOCKS * piece]
     tiles, rows = zip(*(_best_tiles(_piece_spectra(residuals, piece), piece) for piece in pieces), strict=True)
     best, row = max(tiles), max(rows)
     return SpectrogramChange(
         best.gain, best.time_range_s(tau0_s), best.frequency_range_hz(tau0_s), row.gain, row.frequency_range_hz(tau0_s)
     )
-
-
-def _check_sample_count(w: Floats, minimum: int) -> None:
-    if w.size < minimum:
-        raise ValueError(f"the series has {w.size} samples; at least {minimum} are needed")
 
 
 def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:

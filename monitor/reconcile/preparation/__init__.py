@@ -1,1 +1,1 @@
-"""Preparation of a recording: selection of axes, repair of samples, and cosine transform."""
+"""Preparation of a recording: selection of axes, properties of the values, and cosine transform."""

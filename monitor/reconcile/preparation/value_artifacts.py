@@ -19,7 +19,6 @@ from scipy.special import log_ndtr, ndtr, xlogy
 from drivers.data_types import Floats
 from drivers.units import DEGREE, G0
 from drivers.validation.number_ranges import HOUR_S
-from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
 from monitor.estimation.detection.coarse_quantization import GRID_TOLERANCE, SIGMA_PER_MEAN_DISTANCE
 
@@ -248,15 +247,7 @@ def _finite_values(y: Floats) -> Floats:
 
 
 def _sample_noise(values: Floats) -> float:
-    return SIGMA_PER_MEAN_DISTANCE * float(_total_variation(values)) / (values.size - 1)
-
-
-@compiled
-def _total_variation(values: Floats) -> float:
-    total = 0.0
-    for k in range(1, values.size):
-        total += abs(values[k] - values[k - 1])
-    return total
+    return SIGMA_PER_MEAN_DISTANCE * float(np.abs(np.diff(values)).mean())
 
 
 def _float_spacing(values: Floats) -> float:

@@ -16,17 +16,19 @@ from monitor.reconcile.preparation.reconcile_input import MIN_SAMPLES, Recording
 from monitor.reconcile.recording_checks.axis_permutation import (
     TriadOrder,
     compute_resonance_log_power_variances,
+    compute_robust_spectrum,
     describe_axis_order,
     find_axis_order,
     reorder_axes,
 )
 from monitor.reconcile.recording_checks.corrupt_rows import check_corrupt_rows
-from monitor.reconcile.recording_checks.median_block_spectrum import compute_robust_spectrum
-from monitor.reconcile.recording_checks.missing_rows import check_missing_rows
+from monitor.reconcile.recording_checks.missing_and_repeated_rows import (
+    check_missing_rows,
+    check_repeated_rows,
+    check_stuck_values,
+)
 from monitor.reconcile.recording_checks.motion import check_motion
-from monitor.reconcile.recording_checks.repeated_rows import check_repeated_rows
 from monitor.reconcile.recording_checks.sample_rate_from_features import correct_impossible_sample_rate
-from monitor.reconcile.recording_checks.stuck_values import check_stuck_values
 from monitor.reconcile.recording_checks.temporary_vibration import check_temporary_vibration
 from monitor.reconcile.recording_checks.unit_error import collect_triad_evidence, find_unit_error
 from monitor.reconcile.recording_checks.untestable_slow_terms import check_slow_terms

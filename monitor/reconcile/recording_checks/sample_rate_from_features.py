@@ -31,9 +31,9 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.preparation.cosine_bins import cosine_transform
 from monitor.reconcile.preparation.reconcile_input import Recording
-from monitor.reconcile.preparation.sample_repair import fill_missing_samples
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 from monitor.reconcile.search.sample_rate_from_spectrum import SampleRateErrorEstimate
+from monitor.reconcile.search.sample_repair import fill_missing_samples
 
 MAX_LOG_RATIO: Final = 0.25
 """Largest absolute logarithm of the ratio of true to stated sample rate."""

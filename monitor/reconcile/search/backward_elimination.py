@@ -30,9 +30,9 @@ from monitor.noise.effects import (
     ScaleFactor,
     Sinusoidal,
 )
-from monitor.reconcile.diagnostics.null_distribution import AxisNull, run_diagnostics
-from monitor.reconcile.diagnostics.plot_data import build_plot_data
-from monitor.reconcile.likelihood.effect_roles import SIZE_PARAMETERS, effect_size, with_effect_size
+from monitor.reconcile.diagnostics.null_distribution import AxisNull
+from monitor.reconcile.effect_table import EFFECT_TABLE, PENALTY_NATS, SIZE_PARAMETERS
+from monitor.reconcile.likelihood.effect_roles import effect_size, with_effect_size
 from monitor.reconcile.likelihood.hypothesis_fit import (
     RESIZE_PENALTY_NATS,
     Hypothesis,
@@ -41,13 +41,10 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     fit_shape_parameter,
     noise_effect_indices,
 )
-from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.recording_checks.checks import TRIADS
-from monitor.reconcile.search.candidate_effects import PENALTY_NATS
 from monitor.reconcile.search.cross_validation import accept_without_validation
-from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
+from monitor.reconcile.search.search import AxisSearchResult, SearchRound, diagnose_hypothesis
 from monitor.reconcile.search.trials import SCALE_FACTOR_MARGIN_NATS, SCALE_SEARCH_ITERATIONS, Trial
-from monitor.reconcile.several_recordings.effect_matching import IDENTIFYING_PARAMETERS
 
 PEAKS: Final = (Sinusoidal, Narrowband)
 MAX_PEAK_RATIO: Final = 1.5
@@ -112,13 +109,9 @@ def _accept_if_diagnostics_agree(
     """
     if simpler is search.hypothesis:
         return search
-    whitened = whiten_axis(simpler.fit)
-    findings = run_diagnostics(whitened)
-    for diagnostic, one in findings.items():
-        if (
-            one.gain > null[diagnostic].threshold
-            and not search.final.findings[diagnostic].gain > null[diagnostic].threshold
-        ):
+    final = diagnose_hypothesis(simpler)
+    for diagnostic, one in final.findings.items():
+        if one.gain > null[diagnostic].threshold >= search.final.findings[diagnostic].gain:
             return search
     rounds = search.rounds
     if replacement_reason:
@@ -127,12 +120,7 @@ def _accept_if_diagnostics_agree(
         trial = Trial(effect.name, effect, score)
         reason = accept_without_validation(replacement_reason)
         rounds = (*rounds, SearchRound(search.final, (trial,), simpler, reason, replaces_effects=True))
-    return replace(
-        search,
-        rounds=rounds,
-        hypothesis=simpler,
-        final=HypothesisDiagnostics(findings, build_plot_data(whitened)),
-    )
+    return replace(search, rounds=rounds, hypothesis=simpler, final=final)
 
 
 def _without_unneeded_effects(hypothesis: Hypothesis, others: Sequence[Effect]) -> Hypothesis:
@@ -140,7 +128,7 @@ def _without_unneeded_effects(hypothesis: Hypothesis, others: Sequence[Effect]) 
     while True:
         best: tuple[float, Hypothesis] | None = None
         for at, effect in enumerate(hypothesis.added):
-            removable = type(effect) in SIZE_PARAMETERS or isinstance(effect, BandwidthLimit)
+            removable = effect.name in SIZE_PARAMETERS or isinstance(effect, BandwidthLimit)
             if not removable or isinstance(effect, KEPT_EFFECTS):
                 continue
             less = hypothesis.refit_with_other_added_effects(hypothesis.added[:at] + hypothesis.added[at + 1 :])
@@ -172,11 +160,11 @@ def share_frequency_or_time(a: Effect, b: Effect) -> bool:
     """
     if type(a) is not type(b) and not (isinstance(a, PEAKS) and isinstance(b, PEAKS)):
         return False
-    name, tolerance = IDENTIFYING_PARAMETERS.get(a.name, ("", 0.0))
-    first, second = getattr(a, name, None), getattr(b, name, None)
+    row = EFFECT_TABLE[a.name]
+    first, second = getattr(a, row.identity, None), getattr(b, row.identity, None)
     if not isinstance(first, float) or not isinstance(second, float):
         return False
-    return abs(first - second) <= tolerance * max(abs(first), abs(second))
+    return abs(first - second) <= row.tolerance * max(abs(first), abs(second))
 
 
 def _with_merged_peaks(hypothesis: Hypothesis) -> Hypothesis:

@@ -40,51 +40,13 @@ from monitor.reconcile.diagnostics.whiteness_tests import (
     find_peak_gains_and_frequencies,
     fitted_variance_gain_nats,
 )
+from monitor.reconcile.effect_table import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.effect_roles import linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import find_maximum_by_golden_section, fit_shape_parameter
 from monitor.reconcile.likelihood.periodic_pulse_search import fit_pulses
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 
-PENALTY_NATS: Final[dict[str, float]] = {
-    "quantization_noise": 8.5,
-    "angle_random_walk": 8.5,
-    "bias_instability": 8.5,
-    "rate_random_walk": 8.5,
-    "rate_ramp": 8.5,
-    "exponentially_correlated": 10.0,
-    "sinusoidal": 23.0,
-    "narrowband": 14.5 + 2.0,
-    "wandering_line": 14.5 + 2.0 + 2.0,
-    "common_vibration": 9.5 + 3.5,
-    "temperature_bias": 9.0,
-    "temperature_lag": 10.0,
-    "turn_on_transient": 10.0,
-    "bias_step": 15.0,
-    "g_sensitivity": 9.5,
-    "cross_axis": 9.5,
-    "scale_factor": 8.5,
-    "bandwidth_limit": 9.5 + 3.0,
-    "sample_hold": 12.0,
-    "resolution": 12.0,
-    "saturation": 12.0,
-    "outliers": 14.0,
-    "heavy_tails": 13.0,
-    "noise_step": 14.5,
-    "random_telegraph": 9.5 + 2.0,
-    "poisson_steps": 8.5 + 1.5,
-    "temperature_hysteresis": 9.5 + 4.0,
-    "pulse_train": 23.0 + 7.0,
-    "bias_curve": 9.5,
-    "variance_modulation": 18.0,
-    "power_law": 9.5 + 2.0,
-}
-"""Penalty of each effect in nats.
-
-On an axis without the effect, the gain exceeds the penalty with a probability of about 4e-5. With six axes and twenty
-effects, a wrong effect is then found in about one of 200 recordings for which the model is true. The values come from
-simulations with a true model. For one fitted size without a location, the value is close to the quantile of χ²₁/2.
-"""
 SHAPES_PER_DECADE: Final = 4
 """Number of shape values per decade in the first search."""
 MAX_CORRELATION_FRACTION: Final = 0.1
@@ -114,7 +76,6 @@ FLOOR_PENALTY_NATS: Final = 2.0
 LINE_BLOCKS: Final = 4096
 """Approximate number of blocks over which the series is summed to refine the frequency of a line."""
 LINE_SEARCH_ITERATIONS: Final = 16
-FILTER_ORDERS: Final = (1, 2, 3, 4)
 
 CandidateFunction = Callable[[WhitenedAxis], list[Effect]]
 """Function that proposes effects of one kind."""

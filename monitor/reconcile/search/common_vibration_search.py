@@ -23,8 +23,8 @@ from drivers.data_types import Floats
 from monitor.common.distributions import HALF_CHI2_95
 from monitor.noise.effect import AxisLeak
 from monitor.noise.effects import CommonVibration, ExponentiallyCorrelated, Narrowband
-from monitor.reconcile.diagnostics.null_distribution import AxisNull, run_diagnostics
-from monitor.reconcile.diagnostics.plot_data import build_plot_data
+from monitor.reconcile.diagnostics.null_distribution import AxisNull
+from monitor.reconcile.effect_table import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.hypothesis_fit import (
     RESIZE_PENALTY_NATS,
@@ -35,9 +35,8 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.cosine_bins import FrequencyBins, build_frequency_bins, cosine_transform
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.search.candidate_effects import PENALTY_NATS
 from monitor.reconcile.search.cross_validation import accept_without_validation
-from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
+from monitor.reconcile.search.search import AxisSearchResult, SearchRound, diagnose_hypothesis
 from monitor.reconcile.search.trials import Trial
 
 MAX_SOURCES: Final = 3
@@ -492,7 +491,6 @@ def _with_vibration(search: AxisSearchResult, kept: Effects, trial: Trial) -> Ax
     """Return the result of one axis with the vibration."""
     assert trial.effect is not None
     hypothesis = fit_with_fewest_changes(search.hypothesis.axis, (*kept, trial.effect), search.hypothesis.model)
-    whitened = whiten_axis(hypothesis.fit)
     done = SearchRound(search.final, (trial,), hypothesis, accept_without_validation(VALIDATION_REASON))
-    final = HypothesisDiagnostics(run_diagnostics(whitened), build_plot_data(whitened))
-    return replace(search, rounds=(*search.rounds, done), hypothesis=hypothesis, final=final)
+    rounds, final = (*search.rounds, done), diagnose_hypothesis(hypothesis)
+    return replace(search, rounds=rounds, hypothesis=hypothesis, final=final)

@@ -27,12 +27,9 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
+from monitor.reconcile.effect_table import ONE_TIME_EFFECTS, SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
-from monitor.reconcile.likelihood.effect_roles import (
-    DETERMINISTIC_SIZE_PARAMETERS,
-    ONE_TIME_EFFECTS,
-    linear_coefficient_names,
-)
+from monitor.reconcile.likelihood.effect_roles import linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
@@ -105,7 +102,7 @@ def cross_validate(
         halves = [_half_axis(after.axis, part, before.effects, sources, rng) for part in parts]
         gap_before, gap_after = _summed_gap(halves, before, diagnostic), _summed_gap(repaired, after, diagnostic)
         return CrossValidationResult(gap_before, gap_after, gap_after < gap_before, "")
-    if type(added_effect) in DETERMINISTIC_SIZE_PARAMETERS:
+    if added_effect is not None and added_effect.name in SERIES_SIZE_PARAMETERS:
         gains = [_expected_gain(_fit_half(half, after), after.effects[-1]) for half in repaired]
         if min(gains) < MIN_HALF_GAIN_NATS:
             return accept_without_validation(TOO_LITTLE_EVIDENCE)

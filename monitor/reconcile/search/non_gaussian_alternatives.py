@@ -21,6 +21,7 @@ from monitor.noise.effects import (
     RandomTelegraph,
     RateRandomWalk,
 )
+from monitor.reconcile.effect_table import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size
 from monitor.reconcile.likelihood.event_process_likelihood import BackgroundNoise
@@ -34,7 +35,7 @@ from monitor.reconcile.likelihood.wandering_line_vs_resonance import (
 )
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.search.candidate_effects import PENALTY_NATS, fit_correlated_noise, initial_effect_size
+from monitor.reconcile.search.candidate_effects import fit_correlated_noise, initial_effect_size
 from monitor.reconcile.search.trials import Trial
 
 MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0

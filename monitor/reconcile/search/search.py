@@ -26,14 +26,9 @@ from monitor.noise.effects import (
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
 from monitor.reconcile.diagnostics.plot_data import build_plot_data
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
+from monitor.reconcile.effect_table import MOST_DIRECT_DIAGNOSTIC, ONE_TIME_EFFECTS, PENALTY_NATS, SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
-from monitor.reconcile.likelihood.effect_roles import (
-    MOST_DIRECT_DIAGNOSTIC,
-    ONE_TIME_EFFECTS,
-    SIZE_PARAMETERS,
-    effect_size,
-    is_noise_effect,
-)
+from monitor.reconcile.likelihood.effect_roles import effect_size, is_noise_effect
 from monitor.reconcile.likelihood.hypothesis_fit import (
     Hypothesis,
     fit_with_fewest_changes,
@@ -43,7 +38,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins
 from monitor.reconcile.result import DiagnosticPlotData
-from monitor.reconcile.search.candidate_effects import PENALTY_NATS, find_broad_spectral_peaks
+from monitor.reconcile.search.candidate_effects import find_broad_spectral_peaks
 from monitor.reconcile.search.cross_validation import CrossValidationResult, accept_without_validation, cross_validate
 from monitor.reconcile.search.non_gaussian_alternatives import (
     MIN_ALTERNATIVE_GAIN_NATS,
@@ -79,6 +74,11 @@ class HypothesisDiagnostics:
 
     findings: Findings
     plots: tuple[DiagnosticPlotData, ...]
+
+
+def diagnose_hypothesis(hypothesis: Hypothesis) -> HypothesisDiagnostics:
+    """Run the diagnostics on the residuals of a hypothesis, and build the plots."""
+    return _diagnose(hypothesis).findings_and_plots()
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +293,7 @@ def drop_unneeded_effects(hypothesis: Hypothesis) -> Hypothesis:
     """Drop added effects that no longer contribute. The last added effect is always kept."""
     for at in range(len(hypothesis.added) - 2, -1, -1):
         effect = hypothesis.added[at]
-        if type(effect) not in SIZE_PARAMETERS:
+        if effect.name not in SIZE_PARAMETERS:
             continue
         less = hypothesis.refit_with_other_added_effects(hypothesis.added[:at] + hypothesis.added[at + 1 :])
         if hypothesis.penalised_log_likelihood - less.penalised_log_likelihood < 0.5 * PENALTY_NATS.get(

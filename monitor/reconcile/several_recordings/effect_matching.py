@@ -11,29 +11,9 @@ from typing import Any, Final
 
 from monitor.noise.effect import Effect
 from monitor.noise.model import NoiseModel
+from monitor.reconcile.effect_table import EFFECT_TABLE
 from monitor.reconcile.result import AddedOrResizedEffect, ParameterInterval
 
-IDENTIFYING_PARAMETERS: Final[Mapping[str, tuple[str, float]]] = {
-    "sinusoidal": ("frequency", 0.005),
-    "narrowband": ("frequency", 0.05),
-    "wandering_line": ("frequency", 0.05),
-    "common_vibration": ("source_number", 0.0),
-    "exponentially_correlated": ("correlation_time", 1 / 3),
-    "random_telegraph": ("dwell_time", 1 / 3),
-    "temperature_lag": ("time_constant", 1 / 3),
-    "temperature_hysteresis": ("reversal", 1 / 3),
-    "pulse_train": ("period", 0.005),
-    "variance_modulation": ("period", 0.05),
-    "turn_on_transient": ("time_constant", 1 / 3),
-    "bandwidth_limit": ("cutoff", 0.1),
-    "bias_step": ("time", 0.01),
-    "noise_step": ("time", 0.01),
-    "g_sensitivity": ("source", 0.0),
-    "cross_axis": ("source", 0.0),
-    "power_law": ("exponent", 0.1),
-}
-"""Identifying parameter of each effect, and the relative amount by which the interval is widened on both sides.
-"""
 INTERVAL_STRETCH: Final = 2.0
 """Factor that widens a 95 % interval, so that one effect rarely appears as two effects."""
 SAMPLE_RATE_EFFECT: Final = "sample_rate_error"
@@ -42,7 +22,7 @@ SAMPLE_RATE_EFFECT: Final = "sample_rate_error"
 
 def identifying_parameter_name(effect: str) -> str:
     """Return the name of the identifying parameter of an effect, or an empty string."""
-    return IDENTIFYING_PARAMETERS.get(effect, ("", 0.0))[0]
+    return EFFECT_TABLE[effect].identity if effect in EFFECT_TABLE else ""
 
 
 def find_identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseModel) -> ParameterInterval | None:
@@ -89,7 +69,7 @@ def distance_if_parameters_match(effect: str, a: ParameterInterval | None, b: Pa
         return 0.0
     if isinstance(a.value, str) or isinstance(b.value, str):
         return 0.0 if a.value == b.value else None
-    share = IDENTIFYING_PARAMETERS[effect][1]
+    share = EFFECT_TABLE[effect].tolerance
     (lo, hi), (other_lo, other_hi) = _widened_interval(a, share), _widened_interval(b, share)
     return _relative_difference(a.value, b.value) if lo <= other_hi and other_lo <= hi else None
 

@@ -7,7 +7,7 @@ one finding. The gap of a finding is the sum over its axes. If the model was fit
 do not count as findings.
 
 The whole gap is the sum of the explained and the remaining gaps of all axes. Each share lies between 0 and 1, and the
-sum of all shares is 1. The measure is described in ``gap_decomposition``.
+sum of all shares is 1. The measure is described in ``effect_contributions``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from typing import Final
 from drivers.data_types import AXES
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
-from monitor.reconcile.likelihood.effect_roles import NOISE_SIZE_PARAMETERS
+from monitor.reconcile.effect_table import NOISE_SIZE_PARAMETERS
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AllanInfluence,
@@ -38,7 +38,7 @@ PEAK_NAMES: Final = ("sinusoidal", "narrowband", "wandering_line")
 """Effects that one oscillation produces on different axes."""
 MAX_LOG_RATIO_DIFFERENCE: Final = log(1.1)
 """Largest difference between the logarithms of two size ratios in the same finding."""
-_SIZE_NAMES: Final = {effect.name: size for effect, size in NOISE_SIZE_PARAMETERS.items()} | {"scale_factor": "factor"}
+_SIZE_NAMES: Final = NOISE_SIZE_PARAMETERS | {"scale_factor": "factor"}
 
 
 @dataclass(frozen=True, slots=True)

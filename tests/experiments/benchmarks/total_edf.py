@@ -16,10 +16,10 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds
+from monitor.estimation.allan.curve import VarianceCurve
 from monitor.estimation.allan.hadamard import hadamard_estimator_moments, hadamard_variance
 from monitor.estimation.allan.squared_difference_moments import (
     correct_bias_and_compute_intervals,
-    theta_in_sample_units,
 )
 from monitor.estimation.allan.total import total_estimator_moments, total_variance
 from monitor.estimation.allan.uncertainty import covariance_table
@@ -29,6 +29,7 @@ from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
 from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
+from tests.support.noise_series import draw_next_samples
 
 SHARES: Final = (0.125, 0.25, 0.5, 0.75, 1.0)
 NOISES: Final[dict[str, tuple[float, float, float, float]]] = {  # Q N B K, τ0 = 1
@@ -48,7 +49,7 @@ def simulate_records(coefficients: tuple[float, ...], n: int, count: int, rng: n
     values = np.zeros((n, count))
     for kind, letter, size in zip(kinds, "QNBK", coefficients, strict=True):
         for column in range(count if size else 0):
-            values[:, column] += kind(**{letter: size}).start_series(1.0, rng).draw_next_samples(n)
+            values[:, column] += draw_next_samples(kind(**{letter: size}).start_series(1.0, rng), n)
     return values
 
 
@@ -60,19 +61,16 @@ def fit_noise(values: Floats) -> Floats:
     return fit_coefficients(make_design_matrix(factors, 1.0), covariance_table(len(values), factors), measured).theta
 
 
-Spread = tuple[Floats, Floats, Floats, Floats]
-
-
-def print_row(name: str, curves: tuple[Spread, Spread], truth: Floats) -> None:
+def print_row(name: str, curves: tuple[VarianceCurve, VarianceCurve], truth: Floats) -> None:
     """Print the row of one noise: mean over truth, measured and stated edf, and coverage."""
-    variance, edf, _, _ = curves[0]
+    variance, edf = curves[0].variance, curves[0].edf
     measured_edf = 2.0 * variance.mean(axis=1) ** 2 / variance.var(axis=1)
     cells = [
         f"{mean / true:.3f}; {found:.3g} / {stated:.3g}"
         for mean, true, found, stated in zip(variance.mean(axis=1), truth, measured_edf, edf[:, 0], strict=True)
     ]
-    for _, _, lo, hi in curves:
-        covered = (lo <= np.sqrt(truth)[:, None]) & (np.sqrt(truth)[:, None] <= hi)
+    for curve in curves:
+        covered = (curve.lo <= np.sqrt(truth)[:, None]) & (np.sqrt(truth)[:, None] <= curve.hi)
         cells = [f"{cell}; {100 * share:.1f}" for cell, share in zip(cells, covered.mean(axis=1), strict=True)]
     print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
@@ -97,20 +95,17 @@ def main() -> None:
     for name, coefficients in NOISES.items():
         values = simulate_records(coefficients, n, arguments.records, rng)
         theta = np.append(np.square(coefficients), 0.0)
-        known, found = (
-            np.repeat(theta[:, None], arguments.records, axis=1),
-            theta_in_sample_units(fit_noise(values), 1.0),
-        )
+        known, found = np.repeat(theta[:, None], arguments.records, axis=1), fit_noise(values)
         tvar, terms = total_variance(values, factors)
         totals = (
-            correct_bias_and_compute_intervals(own, known, tvar, terms),
-            correct_bias_and_compute_intervals(own, found, tvar, terms),
+            correct_bias_and_compute_intervals(own, 1.0, known, tvar, terms),
+            correct_bias_and_compute_intervals(own, 1.0, found, tvar, terms),
         )
         print_row(name, totals, np.stack([one.allan for one in own]) @ theta)
         hvar, terms = hadamard_variance(values, thirds)
         hadamards = (
-            correct_bias_and_compute_intervals(other, known, hvar, terms),
-            correct_bias_and_compute_intervals(other, found, hvar, terms),
+            correct_bias_and_compute_intervals(other, 1.0, known, hvar, terms),
+            correct_bias_and_compute_intervals(other, 1.0, found, hvar, terms),
         )
         rows.append((name, hadamards, np.stack([one.mean for one in other]) @ theta))
     print("\n| Hadamard variance | " + " | ".join(f"{m / n:.3f} T" for m in thirds) + " |")

@@ -6,14 +6,16 @@ import pytest
 
 from monitor.noise.effects.ieee952 import bias_instability
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
+from tests.support.noise_series import draw_next_samples
 from tests.support.recordings import recordings
 
 
 def compute_squared_response(frequency: np.ndarray) -> np.ndarray:
     """Return the squared response of the filter at frequencies in units of the sample rate."""
-    flicker = bias_instability._Flicker(1.0, np.random.default_rng(0))
+    gain = (bias_instability.RESPONSE_CONSTANT / (2.0 * np.pi)) ** 0.5
+    direct, poles, residues = bias_instability._partial_fractions(gain)
     z = np.exp(-2j * np.pi * frequency)[:, None]
-    return np.abs(flicker._direct + (flicker._residues / (1.0 - flicker._poles * z)).sum(1)) ** 2
+    return np.abs(direct + (residues / (1.0 - poles * z)).sum(1)) ** 2
 
 
 def test_filter_is_one_over_f_within_a_thousandth_over_eight_decades():
@@ -25,8 +27,8 @@ def test_first_sample_is_as_noisy_as_later_ones():
     # A filter that started at zero would be near zero first and then move away.
     def deviation_after(skip: int) -> float:
         rng = np.random.default_rng(2)
-        series = [bias_instability._Flicker(1.0, rng) for _ in range(3000)]
-        return float(np.std([noise.draw_next_samples(skip + 1)[-1] for noise in series]))
+        series = [BiasInstability(B=1.0).start_series(1.0, rng) for _ in range(3000)]
+        return float(np.std([draw_next_samples(noise, skip + 1)[-1] for noise in series]))
 
     # The bound is two standard deviations of 3000 values each, 1.8 % of their ratio.
     assert deviation_after(0) == pytest.approx(deviation_after(2000), rel=0.08)

@@ -9,9 +9,9 @@ from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
-from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.hadamard import HadamardCurve, compute_hadamard_curve
-from monitor.estimation.allan.total import TotalVarianceCurve, compute_total_curve
+from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
+from monitor.estimation.allan.hadamard import compute_hadamard_curve
+from monitor.estimation.allan.total import compute_total_curve
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison, NoiseModelComparator
 from monitor.estimation.estimate import Estimate
@@ -115,7 +115,7 @@ def make_thermal_result(t_ns: int = 0, bias: float = 3e-4) -> ThermalIntervalRes
     return ThermalIntervalResult(t_ns, 600.0, 25.5, {"gz": gz, "az": az})
 
 
-def make_total_and_hadamard_curves() -> tuple[TotalVarianceCurve, HadamardCurve]:
+def make_total_and_hadamard_curves() -> tuple[VarianceCurve, VarianceCurve]:
     """Return the total and Hadamard deviations of ten seconds of white noise."""
     values = 1e-3 * np.random.default_rng(3).standard_normal((1000, 6))
     theta = np.zeros((5, 6))

@@ -95,7 +95,7 @@ def test_a_line_is_described_with_all_that_it_has():
     assert step.before.is_significant
     assert not step.after.is_significant
     assert step.after.gap < step.before.gap
-    assert step.held_out_before.gap > step.held_out_after.gap
+    assert step.held_out[0] > step.held_out[1]
     assert "17.3 Hz" in step.because
     assert "sinusoidal" in step.because
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from monitor.reconcile.json_report import encode_report
+from monitor.reconcile.json_report import encode_comparison, encode_report
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AxisModelDiagnostics,
@@ -16,7 +16,9 @@ from monitor.reconcile.result import (
     ParameterInterval,
     Reconciliation,
 )
+from monitor.reconcile.several_recordings.comparison import RecordingsComparison, compare_results
 from tests.monitor.reconcile import samples
+from tests.monitor.reconcile.runs_made import line, run, step
 
 
 def written(r: Reconciliation) -> dict[str, Any]:
@@ -147,7 +149,6 @@ def test_numbers_of_numpy_are_numbers() -> None:
         score,
         score,
         None,
-        None,
         "once",
         "it jumps",
         look,
@@ -158,3 +159,49 @@ def test_numbers_of_numpy_are_numbers() -> None:
     report = written(r)
     assert report["samples"] == 20
     assert report["axes"]["gx"]["steps"][0]["found"]["where"] == {"frequency": [1.0, 2.0]}
+
+
+def made() -> RecordingsComparison:
+    leak = step("cross_axis", source=ParameterInterval("gx"), coefficient=ParameterInterval(0.1))
+    return compare_results([run("a", line()), run("b", line(), leak)], None, {"c": "too short"})
+
+
+def written_comparison(c: RecordingsComparison) -> dict[str, Any]:
+    return dict(json.loads(encode_comparison(c)))
+
+
+def test_keys_are_those_of_the_schema() -> None:
+    report = written_comparison(made())
+    assert {name: report[name] for name in ("schema", "verdict", "seed", "fitted_to")} == {
+        "schema": "imu-monitor/reconcile-runs/1", "verdict": "explained", "seed": 7, "fitted_to": None,
+    }  # fmt: skip
+    assert report["recordings"] == [
+        {"name": "a", "folder": "a", "verdict": "explained", "rate": 100.0, "samples": 360_000, "seconds": 600.0},
+        {"name": "b", "folder": "b", "verdict": "explained", "rate": 100.0, "samples": 360_000, "seconds": 600.0},
+        {"name": "c", "folder": "c", "verdict": None, "why": "too short"},
+    ]
+    axis = report["axes"]["gz"]
+    assert axis["verdicts"] == {"a": "explained", "b": "explained"}
+    (common,) = axis["common"]
+    assert common["recordings"] == ["a", "b"]
+    assert common["consistent"] is True
+    assert common["p"] == common["parameters"]["amplitude"]["p"] == 1.0
+    assert common["each"]["a"]["parameters"]["phase"] == {"value": 1.0, "lo": 0.9, "hi": 1.1}
+    assert common["each"]["a"]["gap"] == {"before": 30.0, "after": 1.2}
+
+
+def test_what_is_not_known_is_null_or_absent() -> None:
+    (single,) = written_comparison(made())["axes"]["gz"]["single"]
+    assert single["parameters"] == {"source": {"value": "gx"}, "coefficient": {"value": 0.1, "lo": None, "hi": None}}
+    assert (single["consistent"], single["p"]) == (None, None)
+    assert single["absent"] == [{"run": "a", "meaning": "too_faint", "because": "the recording does not contain gx"}]
+
+
+def test_what_is_no_number_is_null() -> None:
+    wrong = replace(line(), confidence=float("nan"))
+    (single,) = written_comparison(compare_results([run("a", wrong), run("b")]))["axes"]["gz"]["single"]
+    assert single["each"]["a"]["confidence"] is None
+
+
+def test_the_same_comparison_gives_the_same_bytes() -> None:
+    assert encode_comparison(made()) == encode_comparison(made())

@@ -32,19 +32,16 @@ class BiasCurve(BiasWithoutSpectrum):
         if (self.logarithmic is None) != (self.time_constant is None):
             raise ConfigError(f"{self.name}: logarithmic and time_constant need each other")
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Curve":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a drift at the next sample."""
-        return _Curve(self, 1.0 / rate_hz)
+        count = 0
 
+        def add_drift(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal count
+            t_s = 1.0 / rate_hz * np.arange(count, count + values.size)
+            values += (self.slope + (self.curvature or 0.0) * t_s) * t_s
+            if self.logarithmic and self.time_constant is not None:
+                values += self.logarithmic * np.log1p(t_s / self.time_constant)
+            count += values.size
 
-class _Curve(NoiseSeries):
-    def __init__(self, curve: BiasCurve, tau0_s: float) -> None:
-        self._curve, self._tau0_s = curve, tau0_s
-        self._count = 0
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        t_s = self._tau0_s * np.arange(self._count, self._count + values.size)
-        values += (self._curve.slope + (self._curve.curvature or 0.0) * t_s) * t_s
-        if self._curve.logarithmic and self._curve.time_constant is not None:
-            values += self._curve.logarithmic * np.log1p(t_s / self._curve.time_constant)
-        self._count += values.size
+        return NoiseSeries(add_drift)

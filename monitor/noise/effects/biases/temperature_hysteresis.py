@@ -31,23 +31,18 @@ class TemperatureHysteresis(BiasWithoutSpectrum):
     description: ClassVar[str] = "The bias differs between rising and falling temperature."
     uses_temperature: ClassVar[bool] = True
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Hysteresis":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a series midway between the two branches."""
-        return _Hysteresis(self.height, self.reversal)
+        state = 0.0
+        last_c: float | None = None
 
+        def add_hysteresis(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal state, last_c
+            before_c = float(block.temperature_c[0]) if last_c is None else last_c
+            state = _add_hysteresis(values, block.temperature_c, before_c, state, self.height, 1.0 / self.reversal)
+            last_c = float(block.temperature_c[-1])
 
-class _Hysteresis(NoiseSeries):
-    def __init__(self, height: float, reversal_c: float) -> None:
-        self._height, self._reversal_c = height, reversal_c
-        self._state = 0.0
-        self._last_c: float | None = None
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        last_c = float(block.temperature_c[0]) if self._last_c is None else self._last_c
-        self._state = _add_hysteresis(
-            values, block.temperature_c, last_c, self._state, self._height, 1.0 / self._reversal_c
-        )
-        self._last_c = float(block.temperature_c[-1])
+        return NoiseSeries(add_hysteresis)
 
 
 @compiled

@@ -30,21 +30,17 @@ class TemperatureLag(BiasWithoutSpectrum):
     description: ClassVar[str] = "The bias follows the temperature of the sensor with a delay."
     uses_temperature: ClassVar[bool] = True
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a series whose lagged temperature starts at the first temperature."""
-        return _LaggedBias(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
+        share = -expm1(-1.0 / (self.time_constant * rate_hz))
+        lagged_c: float | None = None
 
+        def add_lagged_bias(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal lagged_c
+            inside = float(block.temperature_c[0]) if lagged_c is None else lagged_c
+            lagged_c = _add_lagged_bias(values, block.temperature_c, inside, self.coefficient, self.reference, share)
 
-class _LaggedBias(NoiseSeries):
-    def __init__(self, coefficient: float, reference_c: float, share: float) -> None:
-        self._coefficient, self._reference_c, self._share = coefficient, reference_c, share
-        self._lagged_c: float | None = None
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        inside = float(block.temperature_c[0]) if self._lagged_c is None else self._lagged_c
-        self._lagged_c = _add_lagged_bias(
-            values, block.temperature_c, inside, self._coefficient, self._reference_c, self._share
-        )
+        return NoiseSeries(add_lagged_bias)
 
 
 @compiled

@@ -24,19 +24,16 @@ class TurnOnTransient(BiasWithoutSpectrum):
 
     description: ClassVar[str] = "After the sensor is switched on, the bias decays exponentially to its final value."
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a transient at the next sample."""
-        return _Decay(self.amplitude, 1.0 / (self.time_constant * rate_hz))
+        step, count = 1.0 / (self.time_constant * rate_hz), 0
 
+        def add_decay(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal count
+            _add_decay(values, count, self.amplitude, step)
+            count += values.size
 
-class _Decay(NoiseSeries):
-    def __init__(self, amplitude: float, step: float) -> None:
-        self._amplitude, self._step = amplitude, step
-        self._count = 0
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        _add_decay(values, self._count, self._amplitude, self._step)
-        self._count += values.size
+        return NoiseSeries(add_decay)
 
 
 @compiled

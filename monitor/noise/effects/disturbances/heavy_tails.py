@@ -1,5 +1,6 @@
 """White noise with heavier tails than a Gaussian distribution."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.validation.number_ranges import NumberRange
-from monitor.noise.effect import Effect, RunningEffect, parameter_field
+from monitor.noise.effect import Effect, parameter_field
 
 DEGREES_OF_FREEDOM: Final = NumberRange("", 2.1, 1000.0)
 """Range of ν. The variance of Student's t distribution is infinite for ν ≤ 2."""
@@ -30,19 +31,15 @@ class HeavyTails(Effect):
 
     description: ClassVar[str] = "Large errors of the white noise are more frequent than in Gaussian noise."
 
-    def start_factors(self, rng: np.random.Generator) -> "WhiteNoiseFactors":
-        """Start the series of factors by which the white noise is multiplied."""
-        return WhiteNoiseFactors(self.nu, 1.0 if self.share is None else self.share, rng)
+    def start_factors(self, rng: np.random.Generator) -> Callable[[Floats], None]:
+        """Return a function that multiplies the next samples [n] of the white noise by random factors.
 
+        The factors turn Gaussian samples into samples of Student's t distribution.
+        """
+        choice, share = rng.spawn(1)[0], 1.0 if self.share is None else self.share
 
-class WhiteNoiseFactors(RunningEffect):
-    """Random factors that turn Gaussian samples into samples of Student's t distribution."""
+        def multiply_in_place(white_noise: Floats) -> None:
+            factors = np.sqrt((self.nu - 2.0) / rng.chisquare(self.nu, white_noise.size))
+            white_noise *= np.where(choice.random(white_noise.size) < share, factors, 1.0)
 
-    def __init__(self, nu: float, share: float, rng: np.random.Generator) -> None:
-        self._nu, self._share, self._rng = nu, share, rng
-        self._choice = rng.spawn(1)[0]
-
-    def multiply_in_place(self, white_noise: Floats) -> None:
-        """Multiply the next samples [n] of the white noise by random factors."""
-        factors = np.sqrt((self._nu - 2.0) / self._rng.chisquare(self._nu, white_noise.size))
-        white_noise *= np.where(self._choice.random(white_noise.size) < self._share, factors, 1.0)
+        return multiply_in_place

@@ -43,25 +43,33 @@ class Narrowband(Source):
         peaks = ((self.frequency, self.bandwidth),)
         return replace(gauss_markov_spectrum(self.sigma, self._decay, tau0_s), peaks=peaks)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "ResonanceSeries":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a stationary series."""
-        return ResonanceSeries(self.sigma, self._decay / rate_hz, rng)
+        return start_resonance(self.sigma, self._decay / rate_hz, rng)
 
 
-class ResonanceSeries(NoiseSeries):
-    """Series of the real part of the process z ← φz + w."""
+def start_resonance(sigma: float, step: complex, rng: np.random.Generator) -> NoiseSeries:
+    """Start a stationary series of the real part of the process z ← φz + w.
 
-    def __init__(self, sigma: float, step: complex, rng: np.random.Generator) -> None:
-        self._rng = rng
-        phi = np.exp(-step)
-        self._cos, self._sin = float(phi.real), float(phi.imag)
-        self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step.real)))
-        self._x, self._y = sigma * rng.standard_normal(2)
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation of the series.
+    step : complex
+        Complex decay −ln φ per sample.
+    rng : numpy.random.Generator
+        Random generator of the effect.
+    """
+    phi = np.exp(-step)
+    drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step.real)))
+    x, y = sigma * rng.standard_normal(2)
 
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        """Add the next samples of the process."""
-        white = self._rng.standard_normal((values.size, 2))
-        self._x, self._y = _add_resonance(values, white, self._cos, self._sin, self._drive, self._x, self._y)
+    def add_resonance(values: Floats, block: SampleBlockContext) -> None:
+        nonlocal x, y
+        white = rng.standard_normal((values.size, 2))
+        x, y = _add_resonance(values, white, float(phi.real), float(phi.imag), drive, x, y)
+
+    return NoiseSeries(add_resonance)
 
 
 @compiled

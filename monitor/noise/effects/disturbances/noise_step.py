@@ -25,16 +25,13 @@ class NoiseStep(WhiteNoiseGain):
 
     description: ClassVar[str] = "At one moment, the standard deviation of the white noise changes by a factor."
 
-    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> "_Step":
+    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> RunningGain:
         """Start a gain with a step. ``time`` is relative to the first sample of the stream."""
-        return _Step(first_sample_at_or_after(self.time, rate_hz), self.ratio)
+        step = first_sample_at_or_after(self.time, rate_hz)
 
+        def compute_gain(first: int, n: int) -> Floats:
+            gain = np.ones(n)
+            gain[max(0, step - first) :] = self.ratio
+            return gain
 
-class _Step(RunningGain):
-    def __init__(self, at: int, ratio: float) -> None:
-        self._at, self._ratio = at, ratio
-
-    def compute_gain(self, first: int, n: int) -> Floats:
-        gain = np.ones(n)
-        gain[max(0, self._at - first) :] = self._ratio
-        return gain
+        return RunningGain(compute_gain)

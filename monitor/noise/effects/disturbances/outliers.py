@@ -1,7 +1,7 @@
 """Outliers: single samples with a large error."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,23 +30,16 @@ class Outliers(Source):
         """Return the spectrum of white noise with the same mean square as the errors."""
         return white_noise_spectrum(self.fraction * self.scale**2, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_IsolatedErrors":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a series of outliers with geometrically distributed gaps."""
-        return _IsolatedErrors(self.fraction, self.scale, rate_hz, rng)
 
-
-class _IsolatedErrors(NoiseSeries):
-    def __init__(self, fraction: float, scale: float, rate_hz: float, rng: np.random.Generator) -> None:
         def draw_gaps(n: int) -> Floats:
-            if fraction == 0.0:
-                return np.full(n, np.inf)
-            return rng.geometric(fraction, n).astype(np.float64)
+            return rng.geometric(self.fraction, n).astype(np.float64) if self.fraction else np.full(n, np.inf)
 
-        self._events = RandomEvents(draw_gaps, lambda n: scale * rng.standard_normal(n), rate_hz, before=-1.0)
+        events = RandomEvents(draw_gaps, lambda n: self.scale * rng.standard_normal(n), rate_hz, before=-1.0)
 
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        when, errors = self._events.take_block_events(block.first, values.size)
-        values[when] += errors
+        def add_errors(values: Floats, block: SampleBlockContext) -> None:
+            when, errors = events.take_block_events(block.first, values.size)
+            values[when] += errors
 
-    def drawn_random_values(self) -> dict[str, Any]:
-        return self._events.drawn_random_values("errors")
+        return NoiseSeries(add_errors, lambda: events.drawn_random_values("errors"))

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -38,25 +38,19 @@ class PoissonSteps(Source):
         """Return the spectrum of rate random walk with K² = λh²."""
         return RateRandomWalk(K=self.rate**0.5 * self.height).spectrum(tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_RandomSteps":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a series at zero."""
-        return _RandomSteps(self.rate / rate_hz, self.height, rate_hz, rng)
-
-
-class _RandomSteps(NoiseSeries):
-    def __init__(self, rate: float, height: float, rate_hz: float, rng: np.random.Generator) -> None:
-        gap = 1.0 / rate if rate > 0.0 else np.inf
-        self._events = RandomEvents(
-            lambda n: rng.exponential(gap, n), lambda n: height * rng.standard_normal(n), rate_hz
+        gap, level = 1.0 / (self.rate / rate_hz) if self.rate > 0.0 else np.inf, 0.0
+        events = RandomEvents(
+            lambda n: rng.exponential(gap, n), lambda n: self.height * rng.standard_normal(n), rate_hz
         )
-        self._level = 0.0
 
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        when, heights = self._events.take_block_events(block.first, values.size)
-        edges = [0, *when.tolist(), values.size]
-        for jump, (begin, end) in zip([0.0, *heights.tolist()], pairwise(edges), strict=True):
-            self._level += jump
-            values[begin:end] += self._level
+        def add_steps(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal level
+            when, heights = events.take_block_events(block.first, values.size)
+            edges = [0, *when.tolist(), values.size]
+            for jump, (begin, end) in zip([0.0, *heights.tolist()], pairwise(edges), strict=True):
+                level += jump
+                values[begin:end] += level
 
-    def drawn_random_values(self) -> dict[str, Any]:
-        return self._events.drawn_random_values("heights")
+        return NoiseSeries(add_steps, lambda: events.drawn_random_values("heights"))

@@ -51,44 +51,42 @@ class PowerLaw(Source):
 
         return Spectrum(density, lambda tau_s: allan_variance_of_density(density, tau_s, tau0_s, ()), tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_FractionalNoise":
-        """Start a stationary series or, for exponents of at least 1, a series that starts at zero."""
-        gain = self.density * (2.0 * np.pi / rate_hz) ** (0.5 * self.exponent) * rate_hz**0.5
-        return _FractionalNoise(gain, 0.5 * self.exponent, rng)
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+        """Start a stationary series or, for exponents of at least 1, a series that starts at zero.
 
-
-class _FractionalNoise(NoiseSeries):
-    """Series y = direct·w + walk·W + Σ weight·s, where w is white noise, W ← W + w, and s ← pole·s + w.
-
-    For d ≥ 1, the output is the cumulative sum of y.
-    """
-
-    def __init__(self, gain: float, d: float, rng: np.random.Generator) -> None:
-        self._rng, self._starts_at_zero, self._is_summed = rng, d >= 0.5, d >= 1.0
-        fraction = d - floor(d)
-        scale = sin(pi * fraction) / pi
-        decay = 1.0 / (1.0 + np.exp(-LOG_ODDS))  # 1 − x
-        weights = scale * (1.0 - decay) ** fraction * decay ** (1.0 - fraction)
-        self._poles, self._weights = 1.0 - decay, gain * weights
+        The series is y = direct·w + walk·W + Σ weight·s, where w is white noise, W ← W + w, and s ← pole·s + w. For
+        exponents of at least 2, the output is the cumulative sum of y.
+        """
+        d, gain = 0.5 * self.exponent, self.density * (2.0 * np.pi / rate_hz) ** (0.5 * self.exponent) * rate_hz**0.5
+        decay, weights, direct, walk = _fractional_filter(gain, d - floor(d))
         overlap = decay[:, None] + decay - decay[:, None] * decay  # 1 − x_i x_j
         variances, vectors = np.linalg.eigh(1.0 / overlap)
-        self._states = vectors @ (np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(decay.size))
-        # poles below the smallest node act as one integrator
-        walk = scale * (decay[0] * np.exp(-0.5)) ** (1.0 - fraction) / (1.0 - fraction) if fraction >= 0.5 else 0.0
-        self._walk = gain * float(walk)
-        self._direct = gain * (1.0 - float(weights.sum()) - float(walk))  # ψ_0 = 1
-        self._totals = np.zeros(2)  # of the integrator and of the output
-        self._start: float | None = None
+        states = vectors @ (np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(decay.size))
+        totals = np.zeros(2)  # of the integrator and of the output
+        start: float | None = None
 
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        series = self._rng.standard_normal(out=block.scratch)
-        _integrate(series, self._states, self._poles, self._weights, self._direct, self._walk, self._totals)
-        if self._is_summed:
-            _sum_up(series, self._totals)
-        if self._start is None:
-            self._start = float(series[0]) if self._starts_at_zero else 0.0
-        values += series
-        values -= self._start
+        def add_fractional_noise(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal start
+            series = rng.standard_normal(out=block.scratch)
+            _integrate(series, states, 1.0 - decay, weights, direct, walk, totals)
+            if d >= 1.0:
+                _sum_up(series, totals)
+            if start is None:
+                start = float(series[0]) if d >= 0.5 else 0.0
+            values += series
+            values -= start
+
+        return NoiseSeries(add_fractional_noise)
+
+
+def _fractional_filter(gain: float, d: float) -> tuple[Floats, Floats, float, float]:
+    """Return 1 − pole, weight, direct and walk of the filter gain·(1 − 1/z)^(−d) for 0 ≤ d < 1."""
+    scale = sin(pi * d) / pi
+    decay = 1.0 / (1.0 + np.exp(-LOG_ODDS))  # 1 − x
+    weights = scale * (1.0 - decay) ** d * decay ** (1.0 - d)
+    # poles below the smallest node act as one integrator
+    walk = float(scale * (decay[0] * np.exp(-0.5)) ** (1.0 - d) / (1.0 - d)) if d >= 0.5 else 0.0
+    return decay, gain * weights, gain * (1.0 - float(weights.sum()) - walk), gain * walk  # ψ_0 = 1
 
 
 @compiled

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from fractions import Fraction
 from math import ceil
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -64,24 +64,17 @@ class PulseTrain(Source):
         overlap = np.maximum(duty - shift, 0.0) + np.maximum(duty - 1.0 + shift, 0.0)
         return np.asarray(self.height**2 * (overlap - duty**2))
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Pulses":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a series of pulses. The delay is relative to the first sample of the stream."""
-        drawn = self.delay is None
         delay_s = float(rng.uniform(0.0, self.period)) if self.delay is None else self.delay
-        return _Pulses(self, delay_s, drawn, rate_hz)
+        period, width = self.period * rate_hz, self.width * rate_hz
+        start = delay_s * rate_hz - EDGE_TOLERANCE_SAMPLES
 
+        def add_pulses(values: Floats, block: SampleBlockContext) -> None:
+            since = np.arange(block.first, block.first + values.size) - start
+            values[np.mod(since, period) < width] += self.height
 
-class _Pulses(NoiseSeries):
-    def __init__(self, train: PulseTrain, delay_s: float, drawn: bool, rate_hz: float) -> None:
-        self._height, self._period, self._width = train.height, train.period * rate_hz, train.width * rate_hz
-        self._delay_s, self._drawn, self._first = delay_s, drawn, delay_s * rate_hz - EDGE_TOLERANCE_SAMPLES
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        since = np.arange(block.first, block.first + values.size) - self._first
-        values[np.mod(since, self._period) < self._width] += self._height
-
-    def drawn_random_values(self) -> dict[str, Any]:
-        return {"delay": self._delay_s} if self._drawn else {}
+        return NoiseSeries(add_pulses, lambda: {"delay": delay_s} if self.delay is None else {})
 
 
 def _spectral_lines(covariance: Floats, tau0_s: float) -> tuple[tuple[float, float], ...]:
@@ -111,10 +104,8 @@ def _allan_variance(covariance: Floats, tau0_s: float) -> Curve:
 
     def allan_variance(tau_s: Floats) -> Floats:
         m = np.maximum(np.rint(np.asarray(tau_s) / tau0_s), 1.0).astype(np.int64)
-        (inner, inner_first), (outer, outer_first) = (
-            sum_autocovariance_below_lag(m + 1),
-            sum_autocovariance_below_lag(2 * m),
-        )
+        inner, inner_first = sum_autocovariance_below_lag(m + 1)
+        outer, outer_first = sum_autocovariance_below_lag(2 * m)
         total = 2.0 * m * inner - 3.0 * inner_first + (outer_first - inner_first) - 2.0 * m * (outer - inner)
         return np.asarray(np.maximum(total - m * covariance[0], 0.0) / m.astype(np.float64) ** 2)
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -41,24 +41,19 @@ class RandomTelegraph(Source):
         """Return the spectrum of exponentially correlated noise with σ = a/2 and T_c = T/2."""
         return gauss_markov_spectrum(0.5 * self.amplitude, 2.0 / self.dwell_time, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_TwoLevels":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a series that begins at one of the two levels, chosen at random."""
-        return _TwoLevels(0.5 * self.amplitude, self.dwell_time * rate_hz, rate_hz, rng)
+        first_level = 0.5 * self.amplitude if rng.random() < 0.5 else -0.5 * self.amplitude
+        flips = RandomEvents(lambda n: rng.exponential(self.dwell_time * rate_hz, n), np.zeros, rate_hz)
+        level = first_level
 
+        def add_levels(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal level
+            when, _ = flips.take_block_events(block.first, values.size)
+            edges = [0, *when.tolist(), values.size]
+            for begin, end in pairwise(edges):
+                values[begin:end] += level
+                level = -level
+            level = -level  # undo the level change at the end of the block
 
-class _TwoLevels(NoiseSeries):
-    def __init__(self, level: float, dwell: float, rate_hz: float, rng: np.random.Generator) -> None:
-        self._level = level if rng.random() < 0.5 else -level
-        self._first_level = self._level
-        self._flips = RandomEvents(lambda n: rng.exponential(dwell, n), np.zeros, rate_hz)
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        when, _ = self._flips.take_block_events(block.first, values.size)
-        edges = [0, *when.tolist(), values.size]
-        for begin, end in pairwise(edges):
-            values[begin:end] += self._level
-            self._level = -self._level
-        self._level = -self._level  # undo the level change at the end of the block
-
-    def drawn_random_values(self) -> dict[str, Any]:
-        return {"first_level": self._first_level, **self._flips.drawn_random_values()}
+        return NoiseSeries(add_levels, lambda: {"first_level": first_level, **flips.drawn_random_values()})

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import pi
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,20 +28,13 @@ class VarianceModulation(WhiteNoiseGain):
 
     description: ClassVar[str] = "The variance of the white noise rises and falls periodically."
 
-    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> "_Modulation":
+    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> RunningGain:
         """Start a periodic gain. The time is relative to the first sample of the stream."""
-        drawn = self.phase is None
         phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
-        return _Modulation(self.depth, self.period * rate_hz, phase, drawn)
+        period = self.period * rate_hz
 
+        def compute_gain(first: int, n: int) -> Floats:
+            angle = 2.0 * pi * np.mod(np.arange(first, first + n) / period, 1.0) + phase
+            return np.asarray(np.sqrt(np.maximum(1.0 + self.depth * np.sin(angle), 0.0)))
 
-class _Modulation(RunningGain):
-    def __init__(self, depth: float, period: float, phase: float, drawn: bool) -> None:
-        self._depth, self._period, self._phase, self._drawn = depth, period, phase, drawn
-
-    def compute_gain(self, first: int, n: int) -> Floats:
-        angle = 2.0 * pi * np.mod(np.arange(first, first + n) / self._period, 1.0) + self._phase
-        return np.asarray(np.sqrt(np.maximum(1.0 + self._depth * np.sin(angle), 0.0)))
-
-    def drawn_random_values(self) -> dict[str, Any]:
-        return {"phase": self._phase} if self._drawn else {}
+        return RunningGain(compute_gain, lambda: {"phase": phase} if self.phase is None else {})

@@ -14,7 +14,7 @@ the continued fraction
 
 from dataclasses import dataclass
 from math import pi, sqrt, tanh
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -64,9 +64,33 @@ class WanderingLine(Source):
             density, lambda tau_s: allan_variance_of_density(density, tau_s, tau0_s, peaks), tau0_s, peaks=peaks
         )
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_WanderingSinusoid":
-        """Start an oscillation whose frequency is in its stationary state."""
-        return _WanderingSinusoid(self, rate_hz, rng)
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+        """Start an oscillation whose frequency is in its stationary state.
+
+        The joint distribution of frequency and phase at the samples is exact. With x = τ0/T, the mean of the phase step
+        is 2πT tanh(x/2)(δ + δ'), given the frequencies δ and δ' at its ends. Its variance is
+        (2πsT)²(2x − 4 tanh(x/2)).
+        """
+        start = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
+        x = 1.0 / (rate_hz * self.correlation_time)
+        decay = float(np.exp(-x))
+        drive = self.frequency_deviation * float(np.sqrt(-np.expm1(-2.0 * x)))
+        scatter = x**3 / 6.0 if x < MIN_TANH_ARGUMENT else 2.0 * x - 4.0 * tanh(0.5 * x)
+        cycles = (  # of the centre frequency, of 1 Hz in δ + δ', and of the scatter between two samples
+            self.frequency / rate_hz,
+            self.correlation_time * tanh(0.5 * x),
+            self.frequency_deviation * self.correlation_time * sqrt(scatter),
+        )
+        phase, offset_hz = start / (2.0 * pi), self.frequency_deviation * rng.standard_normal()
+
+        def add_sinusoid(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal phase, offset_hz
+            white = rng.standard_normal((values.size, 2))
+            phase, offset_hz = _add_wandering_sinusoid(
+                values, white, self.amplitude, decay, drive, cycles, phase, offset_hz
+            )
+
+        return NoiseSeries(add_sinusoid, lambda: {"phase": start} if self.phase is None else {})
 
 
 def line_shape(offset_hz: Floats, deviation_hz: float, time_s: float) -> Floats:
@@ -94,37 +118,6 @@ def line_shape(offset_hz: Floats, deviation_hz: float, time_s: float) -> Floats:
     for n in range(FRACTION_TERMS, 0, -1):
         rest = n * a / (z + n / time_s + rest)
     return np.asarray(2.0 * np.real(1.0 / (z + rest)))
-
-
-class _WanderingSinusoid(NoiseSeries):
-    """Series A sin φ with the exact joint distribution of frequency and phase at the samples.
-
-    With x = τ0/T, the mean of the phase step is 2πT tanh(x/2)(δ + δ'), given the frequencies δ and δ' at its ends. Its
-    variance is (2πsT)²(2x − 4 tanh(x/2)).
-    """
-
-    def __init__(self, line: WanderingLine, rate_hz: float, rng: np.random.Generator) -> None:
-        self._rng, self._amplitude, self._drawn = rng, line.amplitude, line.phase is None
-        self._start = float(rng.uniform(0.0, 2.0 * pi)) if line.phase is None else line.phase
-        x = 1.0 / (rate_hz * line.correlation_time)
-        self._decay = float(np.exp(-x))
-        self._drive = line.frequency_deviation * float(np.sqrt(-np.expm1(-2.0 * x)))
-        scatter = x**3 / 6.0 if x < MIN_TANH_ARGUMENT else 2.0 * x - 4.0 * tanh(0.5 * x)
-        self._cycles = (  # of the centre frequency, of 1 Hz in δ + δ', and of the scatter between two samples
-            line.frequency / rate_hz,
-            line.correlation_time * tanh(0.5 * x),
-            line.frequency_deviation * line.correlation_time * sqrt(scatter),
-        )
-        self._phase, self._offset_hz = self._start / (2.0 * pi), line.frequency_deviation * rng.standard_normal()
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        white = self._rng.standard_normal((values.size, 2))
-        self._phase, self._offset_hz = _add_wandering_sinusoid(
-            values, white, self._amplitude, self._decay, self._drive, self._cycles, self._phase, self._offset_hz
-        )
-
-    def drawn_random_values(self) -> dict[str, Any]:
-        return {"phase": self._start} if self._drawn else {}
 
 
 @compiled

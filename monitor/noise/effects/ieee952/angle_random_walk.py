@@ -26,16 +26,12 @@ class AngleRandomWalk(Source):
         """Return the spectrum N² and the Allan variance N²/τ."""
         return Spectrum(lambda f: np.full_like(f, self.N**2), lambda tau: self.N**2 / tau, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_WhiteNoise":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a series of independent samples with the standard deviation N √rate."""
-        return _WhiteNoise(self.N * rate_hz**0.5, rng)
 
+        def add_white_noise(values: Floats, block: SampleBlockContext) -> None:
+            white = rng.standard_normal(out=block.scratch)
+            white *= self.N * rate_hz**0.5
+            values += white
 
-class _WhiteNoise(NoiseSeries):
-    def __init__(self, deviation: float, rng: np.random.Generator) -> None:
-        self._deviation, self._rng = deviation, rng
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        white = self._rng.standard_normal(out=block.scratch)
-        white *= self._deviation
-        values += white
+        return NoiseSeries(add_white_noise)

@@ -74,9 +74,18 @@ class BiasInstability(Source):
 
         return Spectrum(lambda f: self.B**2 / (2.0 * np.pi * f), avar, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Flicker":
-        """Start a stationary series."""
-        return _Flicker(self.B, rng)
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+        """Start a stationary series y = direct·w + Σ residue·s, with white noise w and s ← pole·s + w."""
+        # The output density gain² / (RESPONSE_CONSTANT f) must equal B²/(2πf).
+        gain = self.B * np.sqrt(RESPONSE_CONSTANT / (2.0 * np.pi))
+        direct, poles, residues = _partial_fractions(gain)
+        overlap = ONE_MINUS_POLE[:, None] + ONE_MINUS_POLE - ONE_MINUS_POLE[:, None] * ONE_MINUS_POLE
+        states = np.linalg.cholesky(1.0 / overlap) @ rng.standard_normal(ONE_MINUS_POLE.size)
+
+        def add_flicker_noise(values: Floats, block: SampleBlockContext) -> None:
+            _add_flicker_noise(values, rng.standard_normal(out=block.scratch), states, poles, residues, direct)
+
+        return NoiseSeries(add_flicker_noise)
 
 
 def _sampled_allan_variance(m: Floats) -> Floats:
@@ -87,32 +96,13 @@ def _sampled_allan_variance(m: Floats) -> Floats:
     return integral
 
 
-class _Flicker(NoiseSeries):
-    """Partial-fraction form of the filter: y = direct·w + Σ residue·s, with white noise w and s ← pole·s + w."""
-
-    def __init__(self, B: float, rng: np.random.Generator) -> None:
-        # The output density gain² / (RESPONSE_CONSTANT f) must equal B²/(2πf).
-        gain = B * np.sqrt(RESPONSE_CONSTANT / (2.0 * np.pi))
-        self._rng = rng
-        self._poles = 1.0 - ONE_MINUS_POLE
-        self._direct = gain * float(np.prod((1.0 - ONE_MINUS_ZERO) / self._poles))
-        self._residues = gain * _residues()
-        overlap = ONE_MINUS_POLE[:, None] + ONE_MINUS_POLE - ONE_MINUS_POLE[:, None] * ONE_MINUS_POLE
-        self._states = np.linalg.cholesky(1.0 / overlap) @ rng.standard_normal(ONE_MINUS_POLE.size)
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        white = self._rng.standard_normal(out=block.scratch)
-        _add_flicker_noise(values, white, self._states, self._poles, self._residues, self._direct)
-
-
-def _residues() -> Floats:
-    """Return the residues r_i of the partial fractions H(z) = Π(1 − z_i/z)/Π(1 − p_i/z) = direct + Σ r_i/(1 −
-    p_i/z)."""
+def _partial_fractions(gain: float) -> tuple[float, Floats, Floats]:
+    """Return direct, p and r of the filter gain Π(1 − z_i/z)/Π(1 − p_i/z) = direct + Σ r_i/(1 − p_i/z)."""
     p, z = ONE_MINUS_POLE, ONE_MINUS_ZERO
     others = p[None, :] - p[:, None]
     np.fill_diagonal(others, 1.0)
-    ratios = (z[None, :] - p[:, None]) / others
-    return np.asarray(np.prod(ratios, axis=1) / (1.0 - p))
+    residues = np.prod((z[None, :] - p[:, None]) / others, axis=1) / (1.0 - p)
+    return gain * float(np.prod((1.0 - z) / (1.0 - p))), 1.0 - p, np.asarray(gain * residues)
 
 
 @compiled

@@ -35,23 +35,17 @@ class ExponentiallyCorrelated(Source):
         """Return the spectrum and the Allan variance in closed form."""
         return gauss_markov_spectrum(self.sigma, 1.0 / self.correlation_time, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
-        """Start a stationary series."""
-        return _GaussMarkov(self.sigma, 1.0 / (self.correlation_time * rate_hz), rng)
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+        """Start a stationary series of the recursion x ← φx + σ√(1 − φ²) w with white noise w."""
+        step = 1.0 / (self.correlation_time * rate_hz)
+        phi, drive = float(np.exp(-step)), self.sigma * float(np.sqrt(-np.expm1(-2.0 * step)))
+        state = self.sigma * float(rng.standard_normal())
 
+        def add_correlated_noise(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal state
+            state = _add_gauss_markov(values, rng.standard_normal(out=block.scratch), phi, drive, state)
 
-class _GaussMarkov(NoiseSeries):
-    """Series of the recursion x ← φx + σ√(1 − φ²) w with white noise w."""
-
-    def __init__(self, sigma: float, step: float, rng: np.random.Generator) -> None:
-        self._rng = rng
-        self._phi = float(np.exp(-step))
-        self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step)))
-        self._state = sigma * float(rng.standard_normal())
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        white = self._rng.standard_normal(out=block.scratch)
-        self._state = _add_gauss_markov(values, white, self._phi, self._drive, self._state)
+        return NoiseSeries(add_correlated_noise)
 
 
 @compiled

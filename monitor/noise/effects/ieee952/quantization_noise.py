@@ -30,21 +30,18 @@ class QuantizationNoise(Source):
             tau0_s,
         )
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Differences":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a series of differences of white angle noise."""
-        return _Differences(self.Q, rate_hz, rng)
+        scale = self.Q * rate_hz
+        last = scale * float(rng.standard_normal())  # last angle error, divided by the sample interval
 
+        def add_differences(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal last
+            angles = rng.standard_normal(out=block.scratch)
+            angles *= scale
+            values += angles
+            values[0] -= last
+            values[1:] -= angles[:-1]
+            last = float(angles[-1])
 
-class _Differences(NoiseSeries):
-    def __init__(self, Q: float, rate_hz: float, rng: np.random.Generator) -> None:
-        self._rng = rng
-        self._scale = Q * rate_hz
-        self._angle = self._scale * float(rng.standard_normal())  # last angle error, divided by the sample interval
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        angles = self._rng.standard_normal(out=block.scratch)
-        angles *= self._scale
-        values += angles
-        values[0] -= self._angle
-        values[1:] -= angles[:-1]
-        self._angle = float(angles[-1])
+        return NoiseSeries(add_differences)

@@ -26,16 +26,13 @@ class RateRamp(Source):
         """Return a spectrum with zero density that contains only the slope of the ramp."""
         return Spectrum(np.zeros_like, lambda tau: 0.5 * (self.R * tau) ** 2, tau0_s, slope=self.R)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Ramp":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a ramp at zero."""
-        return _Ramp(self.R / rate_hz)
+        count = 0
 
+        def add_ramp(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal count
+            values += self.R / rate_hz * np.arange(count, count + values.size, dtype=np.float64)
+            count += values.size
 
-class _Ramp(NoiseSeries):
-    def __init__(self, step: float) -> None:
-        self._step = step
-        self._count = 0
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        values += self._step * np.arange(self._count, self._count + values.size, dtype=np.float64)
-        self._count += values.size
+        return NoiseSeries(add_ramp)

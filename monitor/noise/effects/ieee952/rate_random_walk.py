@@ -34,19 +34,15 @@ class RateRandomWalk(Source):
             tau0_s,
         )
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_RandomWalk":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a random walk at zero."""
-        return _RandomWalk(self.K / rate_hz**0.5, rng)
+        level = 0.0
 
+        def add_random_walk(values: Floats, block: SampleBlockContext) -> None:
+            nonlocal level
+            level = _add_random_walk(values, rng.standard_normal(out=block.scratch), self.K / rate_hz**0.5, level)
 
-class _RandomWalk(NoiseSeries):
-    def __init__(self, step: float, rng: np.random.Generator) -> None:
-        self._step, self._rng = step, rng
-        self._level = 0.0
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        steps = self._rng.standard_normal(out=block.scratch)
-        self._level = _add_random_walk(values, steps, self._step, self._level)
+        return NoiseSeries(add_random_walk)
 
 
 @compiled

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import cos, floor, pi, sin
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -38,22 +38,14 @@ class Sinusoidal(Source):
         line = self.frequency, 0.5 * self.amplitude**2
         return Spectrum(np.zeros_like, lambda tau: allan_variance_of_line(*line, tau, tau0_s), tau0_s, lines=(line,))
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Sinusoid":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Start a sinusoid. The time is relative to the first sample of the stream."""
-        drawn = self.phase is None
         phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
-        return _Sinusoid(self.amplitude, self.frequency / rate_hz, phase, drawn)
 
+        def add_sinusoid(values: Floats, block: SampleBlockContext) -> None:
+            _add_sinusoid(values, block.first, self.amplitude, self.frequency / rate_hz, phase)
 
-class _Sinusoid(NoiseSeries):
-    def __init__(self, amplitude: float, step: float, phase: float, drawn: bool) -> None:
-        self._amplitude, self._step, self._phase, self._drawn = amplitude, step, phase, drawn
-
-    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
-        _add_sinusoid(values, block.first, self._amplitude, self._step, self._phase)
-
-    def drawn_random_values(self) -> dict[str, Any]:
-        return {"phase": self._phase} if self._drawn else {}
+        return NoiseSeries(add_sinusoid, lambda: {"phase": phase} if self.phase is None else {})
 
 
 @compiled

@@ -1,6 +1,6 @@
 """Low-pass filter of the sensor, and the white noise that is added after the filter."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -73,16 +73,17 @@ class BandwidthLimit(Transform):
 
         return butterworth
 
-    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Start the filter in the steady state for the first sample."""
         noise = (self.floor or 0.0) * rate_hz**0.5
         if self.kind == "fir":
             length = moving_average_length(self.stages, self.cutoff / rate_hz)
-            return _MovingAverages(self.stages, length, noise, rng)
+            return RunningTransform(_MovingAverages(self.stages, length, noise, rng).transform_in_place)
+        sections = butterworth_sections(self.stages, self.cutoff, rate_hz)
         if self.kind == "iir":
             a = smoothing_factor(self.stages, self.cutoff / rate_hz)
-            return _RecursiveFilter(np.array([[a, 0.0, 0.0, a - 1.0, 0.0]] * self.stages), noise, rng)
-        return _RecursiveFilter(butterworth_sections(self.stages, self.cutoff, rate_hz), noise, rng)
+            sections = np.array([[a, 0.0, 0.0, a - 1.0, 0.0]] * self.stages)
+        return RunningTransform(_RecursiveFilter(sections, noise, rng).transform_in_place)
 
 
 def smoothing_factor(order: int, cutoff_cycles: float) -> float:
@@ -187,7 +188,7 @@ def butterworth_sections(order: int, cutoff_hz: float, rate_hz: float) -> Floats
     return np.array(sections)
 
 
-class _LowPass(RunningTransform):
+class _LowPass(ABC):
     """Filter followed by white noise of a given standard deviation."""
 
     def __init__(self, noise: float, rng: np.random.Generator) -> None:

@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
+from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum, nan_spectrum, white_noise_spectrum
 
 MIN_DEVIATION_STEPS: Final = 0.6
@@ -43,7 +43,7 @@ class Resolution(Transform):
             else nan_spectrum(tau0_s)
         )
 
-    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Start a rounding transform."""
 
         def round_to_steps(values: Floats) -> None:
@@ -51,4 +51,4 @@ class Resolution(Transform):
             np.rint(values, out=values)
             values *= self.step
 
-        return MemorylessTransform(round_to_steps)
+        return RunningTransform(round_to_steps)

@@ -48,12 +48,13 @@ class RandomSampleHold(Transform):
         rest = Spectrum(lambda f: lost * tau0_s * (1.0 - h**2) / squared_denominator(f), None, tau0_s)
         return spectrum.filtered_by(squared_response, narrow_peaks=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
 
-    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> "_RepeatedSamples":
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Start the repetition of samples. The first sample is never a repetition."""
-        return _RepeatedSamples(self.fraction, rng)
+        repetition = _SampleRepetition(self.fraction, rng)
+        return RunningTransform(repetition.transform_in_place, repetition.drawn_random_values)
 
 
-class _RepeatedSamples(RunningTransform):
+class _SampleRepetition:
     def __init__(self, fraction: float, rng: np.random.Generator) -> None:
         self._fraction = fraction
         self._rng = rng

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.validation.number_ranges import RATE_RATIO
-from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
+from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -46,6 +46,6 @@ class SampleRateError(Transform):
             tuple((f / r, width / r) for f, width in spectrum.peaks),
         )
 
-    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Start a transform that does not change the samples."""
-        return MemorylessTransform(lambda values: None)
+        return RunningTransform(lambda values: None)

@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.validation.number_ranges import HOUR_S
-from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
+from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 OBSERVATION_S: Final = float(HOUR_S)
@@ -40,6 +40,6 @@ class Saturation(Transform):
         noise = spectrum.without_lines().mean_square(1.0 / max(OBSERVATION_S, 4.0 * spectrum.tau0_s)) ** 0.5
         return spectrum if steady + NOISE_SIGMAS * noise < self.limit else nan_spectrum(spectrum.tau0_s)
 
-    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Start a clipping transform."""
-        return MemorylessTransform(lambda values: np.clip(values, -self.limit, self.limit, out=values))
+        return RunningTransform(lambda values: np.clip(values, -self.limit, self.limit, out=values))

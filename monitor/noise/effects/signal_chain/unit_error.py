@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
+from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -29,6 +29,6 @@ class UnitError(Transform):
         """Return the spectrum multiplied by f²."""
         return spectrum.scaled_by_amplitude(self.factor)
 
-    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Start a multiplying transform."""
-        return MemorylessTransform(lambda values: np.multiply(values, self.factor, out=values))
+        return RunningTransform(lambda values: np.multiply(values, self.factor, out=values))

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 from drivers.errors import NotReady
 from monitor.drift.compensation import arma
-from monitor.drift.compensation.arma import ArmaModel, compute_likelihood_sums, fit_arma
+from monitor.drift.compensation.arma import compute_likelihood_sums, fit_arma
 
 TRUE_PARAMETERS = ((1.2, -0.5), -0.4)
 
@@ -98,10 +98,6 @@ def test_too_few_or_equal_values_are_refused():
         fit_arma(np.arange(10.0))
     with pytest.raises(NotReady, match="equal"):
         fit_arma(np.ones(100))
-
-
-def test_green_function_values_are_those_of_the_model():
-    assert ArmaModel((0.5, 0.3), -0.2, 1.0).green_function_values == (1.0, pytest.approx(0.3))
 
 
 @pytest.mark.parametrize("white", [0.0, 0.5])

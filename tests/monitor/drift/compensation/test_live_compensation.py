@@ -2,10 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from drivers.data_types import make_block
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.live_compensation import EVENT_KIND, LiveDriftCompensation
+from monitor.drift.compensation.live_compensation import (
+    EVENT_KIND,
+    FALSE_ALARM_PROBABILITY,
+    INTERVALS,
+    LIMIT,
+    InnovationTest,
+    LiveDriftCompensation,
+)
 
 RATE_HZ = 100.0
 SIGMA = 1e-3
@@ -62,3 +70,30 @@ def test_only_a_clearly_different_rate_starts_a_new_compensator():
     live.set_rate(200.0)
     assert live.compensator is not compensator
     assert live.compensator.rate_hz == 200.0
+
+
+def test_white_innovations_cause_no_alarm():
+    """The test uses 150 000 intervals, which are 1.7 days of one axis."""
+    test = InnovationTest()
+    assert not any(test.detect_new_misfit(x) for x in np.random.default_rng(0).standard_normal(150_000).tolist())
+
+
+def test_doubled_noise_is_reported_once_per_occurrence():
+    test = InnovationTest()
+    rng = np.random.default_rng(1)
+
+    def count_alarms(scale: float, n: int) -> int:
+        return sum(test.detect_new_misfit(x) for x in (scale * rng.standard_normal(n)).tolist())
+
+    assert np.isnan(test.mean_square_innovation)
+    assert count_alarms(1.0, 200) == 0
+    assert count_alarms(2.0, 400) == 1
+    assert test.mean_square_innovation > LIMIT
+    assert count_alarms(1.0, 400) == 0
+    assert count_alarms(2.0, 400) == 1
+    test.forget_innovations()
+    assert count_alarms(1.0, INTERVALS - 1) == 0
+
+
+def test_limit_is_a_quantile_of_the_chi2_distribution():
+    assert pytest.approx(chi2.isf(FALSE_ALARM_PROBABILITY, INTERVALS) / INTERVALS, rel=1e-12) == LIMIT

@@ -12,6 +12,7 @@ from monitor.estimation.allan.squared_difference_moments import phase_autocovari
 from monitor.estimation.allan.total import total_estimator_moments
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
 from tests.support.allan_references import columns, nist_1000
+from tests.support.noise_series import draw_next_samples
 
 
 def test_nist_sp_1065_values_are_reproduced():
@@ -103,12 +104,12 @@ def test_intervals_have_the_stated_coverage():
     theta = np.array([0.0, 1.0, 0.02, 1e-3, 0.0])
     sources = AngleRandomWalk(N=1.0), BiasInstability(B=0.02**0.5), RateRandomWalk(K=1e-3**0.5)
     values = sum(
-        np.stack([s.start_series(rate_hz, rng).draw_next_samples(n) for _ in range(runs)], axis=1) for s in sources
+        np.stack([draw_next_samples(s.start_series(rate_hz, rng), n) for _ in range(runs)], axis=1) for s in sources
     )
     factors = np.array([4, 16, 64, 128, 170])
     curve = compute_hadamard_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
     white = 1.0 / curve.tau_s  # white noise makes all but a ten-thousandth of the variance
-    np.testing.assert_allclose(curve.hvar.mean(axis=1), white, rtol=0.1)
+    np.testing.assert_allclose(curve.variance.mean(axis=1), white, rtol=0.1)
     covered = (curve.lo**2 <= white[:, None]) & (white[:, None] <= curve.hi**2)
     assert (covered.mean(axis=1) > 0.94).all()
     assert (covered.mean(axis=1) < 0.982).all()
@@ -118,7 +119,7 @@ def test_gaps_reduce_degrees_of_freedom_and_unknown_noise_gives_no_intervals():
     values = np.random.default_rng(3).standard_normal((400, 2))
     whole = compute_hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, np.nan])
     assert whole.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128]
-    assert np.isfinite(whole.hvar).all()
+    assert np.isfinite(whole.variance).all()
     assert np.isfinite(whole.hi[:, 0]).all()
     assert np.isnan(whole.hi[:, 1]).all()
     values[100, 0] = np.nan

@@ -13,6 +13,7 @@ from monitor.estimation.allan.batch import octave_cluster_sizes, overlapping_ava
 from monitor.estimation.allan.total import MIN_SHARE, compute_total_curve, total_estimator_moments, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from tests.support.allan_references import nist_1000
+from tests.support.noise_series import draw_next_samples
 
 
 def compute_reflected_differences(rate, m):
@@ -137,7 +138,7 @@ def test_pure_ramp_gives_its_allan_variance():
     n, slope = 600, 0.01
     theta = np.array([[0.0], [0.0], [0.0], [0.0], [slope**2]])
     curve = compute_total_curve(slope * np.arange(n)[:, None], 1.0, theta)
-    np.testing.assert_allclose(curve.tvar[:, 0], 0.5 * slope**2 * curve.factors**2, rtol=1e-9)
+    np.testing.assert_allclose(curve.variance[:, 0], 0.5 * slope**2 * curve.factors**2, rtol=1e-9)
     assert np.isnan(curve.edf).all()  # a ramp has no random variation
 
 
@@ -154,12 +155,12 @@ def test_intervals_have_the_stated_coverage_up_to_half_the_recording(rate_hz):
         RateRandomWalk(K=1e-3**0.5),
     )
     values = sum(
-        np.stack([s.start_series(rate_hz, rng).draw_next_samples(n) for _ in range(runs)], axis=1) for s in sources
+        np.stack([draw_next_samples(s.start_series(rate_hz, rng), n) for _ in range(runs)], axis=1) for s in sources
     )
     factors = np.array([64, 128, 256, 384])
     curve = compute_total_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
     truth = sum(s.avar(factors / rate_hz, 1.0 / rate_hz) for s in sources)
-    np.testing.assert_allclose(curve.tvar.mean(axis=1), truth, rtol=0.1)
+    np.testing.assert_allclose(curve.variance.mean(axis=1), truth, rtol=0.1)
     covered = (curve.lo**2 <= truth[:, None]) & (truth[:, None] <= curve.hi**2)
     assert (covered[:3].mean(axis=1) > 0.944).all()
     assert (covered[:3].mean(axis=1) < 0.981).all()
@@ -172,7 +173,7 @@ def test_shortest_cluster_equals_the_allan_variance_and_the_grid_ends_below_the_
     curve = compute_total_curve(values, 50.0, np.tile([[0.0], [0.02], [0.0], [0.0], [0.0]], 6))
     assert curve.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128, 256]
     np.testing.assert_allclose(curve.tau_s, curve.factors / 50.0)
-    np.testing.assert_allclose(curve.tvar[0], overlapping_avar(values, np.array([1]))[0][0], rtol=1e-12)
+    np.testing.assert_allclose(curve.variance[0], overlapping_avar(values, np.array([1]))[0][0], rtol=1e-12)
     assert octave_cluster_sizes(256)[-1] == 256
     assert octave_cluster_sizes(255)[-1] == 128
 
@@ -182,12 +183,12 @@ def test_unknown_noise_or_too_few_terms_give_no_curve():
     values[200, 1] = np.nan
     theta = np.array([[0.0, 0.0], [np.nan, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     curve = compute_total_curve(values, 1.0, theta)
-    assert np.isnan(curve.tvar[:, 0]).all()
+    assert np.isnan(curve.variance[:, 0]).all()
     assert np.isnan(curve.hi[:, 0]).all()
     enough = curve.terms[:, 1] >= MIN_SHARE * 399
     assert enough.any()
     assert not enough.all()
-    assert np.array_equal(np.isfinite(curve.tvar[:, 1]), enough)
+    assert np.array_equal(np.isfinite(curve.variance[:, 1]), enough)
 
 
 # --- published results on real data

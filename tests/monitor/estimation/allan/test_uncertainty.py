@@ -15,6 +15,7 @@ from monitor.estimation.allan.uncertainty import (
     deviation_intervals,
 )
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
+from tests.support.noise_series import draw_next_samples
 
 
 def sum_covariances_directly(n: int, first: int, second: int) -> np.ndarray:
@@ -78,7 +79,7 @@ def test_covariance_agrees_with_simulated_curves(source, pair):
     n, factors, runs = 512, np.array([1, 4, 16, 64, 128]), 3000
     t = covariance_table(n, factors)
     rng = np.random.default_rng(11)
-    records = np.stack([source.start_series(1.0, rng).draw_next_samples(n) for _ in range(runs)], axis=1)
+    records = np.stack([draw_next_samples(source.start_series(1.0, rng), n) for _ in range(runs)], axis=1)
     measured = np.cov(overlapping_avar(records, factors)[0])
     stated = t.covariance[:, :, PAIRS.index(pair)]
     # A sample covariance of 3000 curves scatters by 3–5 % of the product of both standard deviations.

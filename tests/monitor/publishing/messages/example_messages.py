@@ -11,10 +11,8 @@ from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.drift.thermal.temperature_removal import TemperatureRemovalComparison
-from monitor.estimation.allan.curve import AllanCurve
+from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalVarianceCurve
 from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.comparison_with_noise_model import AxisModelComparison, ModelComparison
@@ -97,13 +95,13 @@ def make_thermal_result() -> ThermalIntervalResult:
     return ThermalIntervalResult(0, 600.0, 25.5, {"gz": gz, "az": az})
 
 
-def make_total_and_hadamard_curves() -> tuple[TotalVarianceCurve, HadamardCurve]:
+def make_total_and_hadamard_curves() -> tuple[VarianceCurve, VarianceCurve]:
     found = make_estimate().curve
     lo = found.lo.copy()
     lo[1:] = np.nan
-    total = TotalVarianceCurve(TAU_S, found.factors, found.avar, found.terms, found.edf, lo, found.hi)
+    total = VarianceCurve(TAU_S, found.factors, found.avar, found.terms, found.edf, lo, found.hi)
     two = slice(0, 2)
-    hadamard = HadamardCurve(
+    hadamard = VarianceCurve(
         TAU_S[two], found.factors[two], 0.25 * found.avar[two], found.terms[two], found.edf[two], lo[two], found.hi[two]
     )
     return total, hadamard

@@ -111,7 +111,7 @@ def test_total_and_hadamard_have_their_own_tau() -> None:
     assert found["hadamard"]["tau"] == hadamard.tau_s.tolist()
     assert list(found["total"]["axes"]) == list(AXES)
     gz = found["total"]["axes"]["gz"]
-    assert gz["deviation"] == np.sqrt(total.tvar[:, 2]).tolist()
+    assert gz["deviation"] == np.sqrt(total.variance[:, 2]).tolist()
     assert gz["lo"][0] == total.lo[0, 2]
     assert gz["hi"][-1] is None  # beyond half the window there is no interval
 

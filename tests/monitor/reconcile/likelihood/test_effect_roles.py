@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from monitor.noise.effect import AxisLeak, SampleBlockContext, Source
-from monitor.noise.effects import EFFECTS, BandwidthLimit, CrossAxis, Sinusoidal, TemperatureBias
+from monitor.noise.effects import EFFECTS, Sinusoidal, TemperatureBias
+from monitor.reconcile.effect_table import NOISE_SIZE_PARAMETERS, SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.effect_roles import (
-    DETERMINISTIC_SIZE_PARAMETERS,
-    NOISE_SIZE_PARAMETERS,
     build_unit_regressors,
     effect_size,
     with_effect_size,
@@ -18,8 +17,8 @@ from monitor.reconcile.likelihood.effect_roles import (
 from tests.contracts.effect_examples import make_effect
 from tests.monitor.reconcile.axes import RATE_HZ, warmth
 
-NOISES = [kind for kind in NOISE_SIZE_PARAMETERS if issubclass(kind, Source)]
-COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, AxisLeak)]
+NOISES = [EFFECTS[name] for name in NOISE_SIZE_PARAMETERS if issubclass(EFFECTS[name], Source)]
+COURSES = [EFFECTS[name] for name in SERIES_SIZE_PARAMETERS if not issubclass(EFFECTS[name], AxisLeak)]
 n = 3000
 
 
@@ -34,10 +33,10 @@ def drawn(one):
 def test_every_source_has_its_place():
     # a mean is always free; outliers are single samples; a wandering line is subtracted before the fit
     beside = {"bias", "outliers", "wandering_line"}
-    kinds = {kind for name, kind in EFFECTS.items() if issubclass(kind, Source | AxisLeak) and name not in beside}
+    names = {name for name, kind in EFFECTS.items() if issubclass(kind, Source | AxisLeak) and name not in beside}
     # the noise of a filter is its floor
-    assert set(NOISE_SIZE_PARAMETERS) | set(DETERMINISTIC_SIZE_PARAMETERS) == kinds | {BandwidthLimit}
-    assert not set(NOISE_SIZE_PARAMETERS) & set(DETERMINISTIC_SIZE_PARAMETERS)
+    assert set(NOISE_SIZE_PARAMETERS) | set(SERIES_SIZE_PARAMETERS) == names | {"bandwidth_limit"}
+    assert not set(NOISE_SIZE_PARAMETERS) & set(SERIES_SIZE_PARAMETERS)
 
 
 @pytest.mark.parametrize("kind", NOISES, ids=lambda kind: kind.name)
@@ -95,8 +94,3 @@ def test_size_keeps_its_sign_where_it_has_one():
     assert effect_size(with_effect_size(make_effect("bias_step"), -2.0)) == -2.0
     assert effect_size(with_effect_size(make_effect("sinusoidal"), -2.0)) == 2.0
     assert effect_size(with_effect_size(make_effect("rate_ramp"), -2.0)) == 2.0
-
-
-def test_a_leak_has_no_series_of_its_own():
-    with pytest.raises(TypeError, match="another axis"):
-        build_unit_regressors(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)

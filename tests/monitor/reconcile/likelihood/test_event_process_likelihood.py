@@ -15,7 +15,6 @@ from monitor.reconcile.likelihood.event_process_likelihood import (
     kalman_log_likelihood,
     log_interval,
     maximise_over_log_parameters,
-    prior_level_variance,
 )
 from tests.monitor.reconcile.event_noise import BLOCK_S, dense
 
@@ -32,8 +31,8 @@ from tests.monitor.reconcile.event_noise import BLOCK_S, dense
 def test_filter_is_the_dense_gaussian_likelihood(rest):
     covariance = dense(rest, 300, start=5.0)
     means = np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(300)
-    around = build_state_space_noise(rest, BLOCK_S, 300 * BLOCK_S)
-    found = kalman_log_likelihood(means, around, 5.0)
+    around = build_state_space_noise(rest, means, BLOCK_S)._replace(level_variance=5.0)
+    found = kalman_log_likelihood(means, around)
     assert found == pytest.approx(multivariate_normal.logpdf(means, cov=covariance), abs=1e-6)
 
 
@@ -94,8 +93,5 @@ def test_block_means():
     means, block_s = compute_block_means(y, 0.01, 0.1)
     assert block_s == pytest.approx(0.1)
     assert means + y[:1000].mean() == pytest.approx([y[10 * k : 10 * k + 10].mean() for k in range(100)])
-    assert prior_level_variance(means) == pytest.approx(100.0 * means.var())
-    with pytest.raises(ValueError, match="at least 16"):
-        compute_block_means(y, 0.01, 1.0)
-    with pytest.raises(ValueError, match="above zero"):
-        build_state_space_noise(BackgroundNoise(0.0, walk=1.0), 1.0, 100.0)
+    noise = build_state_space_noise(BackgroundNoise(1.0), means, block_s)
+    assert noise.level_variance == pytest.approx(100.0 * means.var())

@@ -11,6 +11,7 @@ from monitor.noise.effects import (
     AngleRandomWalk,
     BiasStep,
     ExponentiallyCorrelated,
+    Narrowband,
     RateRamp,
     RateRandomWalk,
     Sinusoidal,
@@ -23,7 +24,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     fit_with_fixed_noise,
     with_shape,
 )
-from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, K, N, axis, correlated, time_s, walk, white
+from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, K, N, axis, correlated, ringing, time_s, walk, white
 
 n = 20_000
 MODEL = (WHITE, RateRandomWalk(K=3e-5))
@@ -87,6 +88,13 @@ def test_a_shape_is_at_the_top_of_its_profile():
     assert found.correlation_time == pytest.approx(np.exp(best.x), rel=0.05)
     assert loss(np.log(found.correlation_time)) == pytest.approx(best.fun, abs=0.05)
     assert effects[1].correlation_time == 0.8
+
+
+def test_a_resonance_near_half_the_sample_rate_is_not_its_alias():
+    y = white(n, np.random.default_rng(7)) + ringing(n, np.random.default_rng(6), 1e-3, 48.0, 1.0)
+    start = Narrowband(sigma=1e-4, frequency=49.0, bandwidth=1.0)
+    found = fit_shape_parameter(axis(y), (WHITE,), start, "frequency", 1.2)
+    assert found.frequency == pytest.approx(48.0, abs=0.5)
 
 
 def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():

@@ -42,8 +42,8 @@ def enumerated(means, covariance):
 
 
 def likelihood(means, rest, rate, height, start):
-    around = build_state_space_noise(rest, BLOCK_S, means.size * BLOCK_S)
-    return poisson_steps_vs_random_walk._log_likelihood(means, around, start, rate * BLOCK_S, height)
+    around = build_state_space_noise(rest, means, BLOCK_S)._replace(level_variance=start)
+    return poisson_steps_vs_random_walk._log_likelihood(means, around, rate * BLOCK_S, height)
 
 
 @pytest.mark.parametrize("rest", [BackgroundNoise(1.0), BackgroundNoise(1.0, walk=0.02, correlated=((1.0, 30.0),))])
@@ -62,8 +62,8 @@ def test_many_small_jumps_are_a_random_walk():
     K = 0.1
     rng = np.random.default_rng(0)
     means = np.linalg.cholesky(dense(BackgroundNoise(1.0, walk=K * K), 300)) @ rng.standard_normal(300)
-    around = build_state_space_noise(BackgroundNoise(1.0, walk=K * K), BLOCK_S, 300 * BLOCK_S)
-    gaussian = kalman_log_likelihood(means, around, 9.0)
+    around = build_state_space_noise(BackgroundNoise(1.0, walk=K * K), means, BLOCK_S)._replace(level_variance=9.0)
+    gaussian = kalman_log_likelihood(means, around)
     often = 20.0 / BLOCK_S
     assert likelihood(means, BackgroundNoise(1.0), often, K / often**0.5, 9.0) == pytest.approx(gaussian, abs=1e-4)
 

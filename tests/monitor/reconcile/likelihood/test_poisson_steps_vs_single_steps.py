@@ -27,12 +27,12 @@ def short():
 
 def test_every_shock_gains_what_a_regression_gains(short):
     means, covariance = short
-    around = build_state_space_noise(REST, BLOCK_S, M * BLOCK_S)
+    around = build_state_space_noise(REST, means, BLOCK_S)._replace(level_variance=50.0)
     known = 40
     free = np.zeros(M)
     free[known] = 1e4
     covariance += 1e4 * np.outer(np.arange(M) >= known, np.arange(M) >= known)
-    scores = poisson_steps_vs_single_steps._shock_statistics(means, around, 50.0, free)
+    scores = poisson_steps_vs_single_steps._shock_statistics(means, around, free)
     for k in (3, 17, 39, 55):
         step = (np.arange(M) >= k).astype(float)
         solved = np.linalg.solve(covariance, np.column_stack([step, means]))
@@ -41,9 +41,9 @@ def test_every_shock_gains_what_a_regression_gains(short):
 
 def test_whitened_columns_have_the_dense_likelihood(short):
     means, covariance = short
-    around = build_state_space_noise(REST, BLOCK_S, M * BLOCK_S)
+    around = build_state_space_noise(REST, means, BLOCK_S)._replace(level_variance=50.0)
     columns = np.column_stack([means, np.arange(M) >= 20.0])
-    logs = poisson_steps_vs_single_steps._whiten(columns, around, 50.0)
+    logs = poisson_steps_vs_single_steps._whiten(columns, around)
     assert -0.5 * (logs + columns[:, 0] @ columns[:, 0]) == pytest.approx(
         multivariate_normal.logpdf(means, cov=covariance)
     )
@@ -60,7 +60,7 @@ def test_finds_times():
     times, heights = (700.3, 1801.7, 2950.1), (4e-4, -3e-4, 5e-4)
     y = stepped(times, heights, np.random.default_rng(0))
     means, block_s = compute_block_means(y, TAU0_S, 5.0)
-    noise = build_state_space_noise(BackgroundNoise(N * N), block_s, means.size * block_s)
+    noise = build_state_space_noise(BackgroundNoise(N * N), means, block_s)
     assert poisson_steps_vs_single_steps._fit_single_steps(means, noise, 5).times * block_s == pytest.approx(
         times, abs=3.0
     )
@@ -101,7 +101,7 @@ def test_steps_stay_apart_in_neighbouring_blocks():
     means = np.where(np.arange(M) < 30, 0.0, np.where(np.arange(M) < 31, 20.0, 60.0)) - 29.0
     means = means + 0.1 * np.random.default_rng(0).standard_normal(M)
     found = poisson_steps_vs_single_steps._fit_single_steps(
-        means, build_state_space_noise(BackgroundNoise(0.03), BLOCK_S, M * BLOCK_S), 2
+        means, build_state_space_noise(BackgroundNoise(0.03), means, BLOCK_S), 2
     )
     assert found.times.size == 2
     assert found.times[1] - found.times[0] >= 1.0

@@ -54,8 +54,8 @@ def short(rest, m, seed, start=0.0):
 
 
 def likelihood(means, rest, start):
-    around = build_state_space_noise(rest, BLOCK_S, means.size * BLOCK_S)
-    return telegraph_vs_correlated_noise._log_likelihood(means, around, start, A, BLOCK_S / DWELL)
+    around = build_state_space_noise(rest, means, BLOCK_S)._replace(level_variance=start)
+    return telegraph_vs_correlated_noise._log_likelihood(means, around, A, BLOCK_S / DWELL)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,8 +4,7 @@ import pytest
 from drivers.data_types import AXES
 from monitor.noise.effects import AngleRandomWalk, ExponentiallyCorrelated, RandomSampleHold, RateRandomWalk
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.recording_checks.missing_rows import check_missing_rows
-from monitor.reconcile.recording_checks.repeated_rows import check_repeated_rows
+from monitor.reconcile.recording_checks.missing_and_repeated_rows import check_missing_rows, check_repeated_rows
 from monitor.reconcile.recording_checks.untestable_slow_terms import check_slow_terms
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 

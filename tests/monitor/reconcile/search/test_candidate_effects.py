@@ -23,9 +23,10 @@ from monitor.noise.effects import (
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.spectrum import white_noise_spectrum
+from monitor.reconcile.effect_table import PENALTY_NATS
 from monitor.reconcile.likelihood.effect_roles import build_unit_regressors
 from monitor.reconcile.search import candidate_effects as propose
-from monitor.reconcile.search.candidate_effects import PENALTY_NATS, _line_frequency, find_broad_spectral_peaks
+from monitor.reconcile.search.candidate_effects import _line_frequency, find_broad_spectral_peaks
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     TERMS,

@@ -6,7 +6,7 @@ import pytest
 from monitor.noise.effect import AxisLeak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Narrowband, SampleRateError, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS
+from monitor.reconcile.effect_table import NOISE_SIZE_PARAMETERS, SERIES_SIZE_PARAMETERS
 from monitor.reconcile.search.sample_rate_from_spectrum import convert_effect_to_stated_time, detect_sample_rate_error
 from tests.contracts.effect_examples import make_effect
 from tests.monitor.reconcile.axes import GYRO_AXES, RATE_HZ, WALK, WHITE, axes, recording, warmth
@@ -15,7 +15,11 @@ n = 24_000
 RATIO = 1.13
 
 
-NOISES = [kind for kind in NOISE_SIZE_PARAMETERS if issubclass(kind, Source) and kind.name != "quantization_noise"]
+NOISES = [
+    EFFECTS[name]
+    for name in NOISE_SIZE_PARAMETERS
+    if issubclass(EFFECTS[name], Source) and name != "quantization_noise"
+]
 
 
 @pytest.mark.parametrize("kind", NOISES, ids=lambda kind: kind.name)
@@ -35,7 +39,7 @@ def test_a_spectrum_is_that_of_the_resampled_noise(kind):
     )
 
 
-COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, AxisLeak)]
+COURSES = [EFFECTS[name] for name in SERIES_SIZE_PARAMETERS if not issubclass(EFFECTS[name], AxisLeak)]
 
 
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from monitor.reconcile.likelihood.effect_roles import ONE_TIME_EFFECTS
+from monitor.reconcile.effect_table import ONE_TIME_EFFECTS
 from monitor.reconcile.result import AddedOrResizedEffect, DiagnosticGap, Location, ParameterInterval, Reconciliation
 from monitor.reconcile.several_recordings.absence import Absence, ClearestOccurrence, explain_absence
 from monitor.reconcile.several_recordings.comparison import NamedResult

@@ -6,9 +6,9 @@ import pytest
 
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Sinusoidal
 from monitor.noise.model import NoiseModel
+from monitor.reconcile.effect_table import EFFECT_TABLE
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.several_recordings.effect_matching import (
-    IDENTIFYING_PARAMETERS,
     distance_if_parameters_match,
     find_effect_of_step,
     find_identifying_parameter,
@@ -27,7 +27,7 @@ LINES = NoiseModel(
 )
 
 
-@pytest.mark.parametrize("effect", IDENTIFYING_PARAMETERS)
+@pytest.mark.parametrize("effect", [name for name, row in EFFECT_TABLE.items() if row.identity])
 def test_a_place_is_a_parameter_of_its_effect(effect: str) -> None:
     assert identifying_parameter_name(effect) in {f.name for f in fields(EFFECTS[effect])}  # type: ignore[arg-type]
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.recording_checks.stuck_values import check_stuck_values, find_longest_run_bounds
+from monitor.reconcile.recording_checks.missing_and_repeated_rows import check_stuck_values, find_longest_run_bounds
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 
 

@@ -1,9 +1,4 @@
-"""Check for runs of equal values on one axis or on all axes.
-
-Quantized values also repeat by chance. The length of a run is therefore compared with the repeats in the rest of the
-recording and with the longest run in a simulation of the model. A run at the largest or smallest value of the axis may
-be clipping, which the search for noise effects handles.
-"""
+"""Check for missing rows, for rows that repeat the previous row, and for runs of equal values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,8 +8,17 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats
+from monitor.estimation.detection.repeated_share import estimate_stale_sample_share
+from monitor.noise.effects import RandomSampleHold
+from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
+MIN_AXES: Final = 3
+"""Smallest number of axes with varying values."""
+MIN_SHARE: Final = 0.02
+"""Smallest share of repeated rows that is reported."""
+MAX_CHANCE_SHARE: Final = 0.1
+"""Largest share of rows that repeat by chance. If the resolution is too coarse, the share is larger."""
 MIN_RUN_SAMPLES: Final = 16
 """Smallest number of equal samples in a run that is reported."""
 WINDOW_SAMPLES: Final = 256
@@ -25,6 +29,82 @@ MIN_SIMULATED_RATIO: Final = 3.0
 """Smallest length of a run relative to the longest run in a simulation of the model."""
 SAME_RUN_SHARE: Final = 0.8
 """Smallest overlap of two runs that are reported together, as a fraction of the total duration."""
+
+
+def check_missing_rows(values: Mapping[str, Floats], rate_hz: float) -> list[RecordingFinding]:
+    """Report rows that are missing on all axes.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray, shape (n,)
+        Samples of each axis on a regular grid; NaN means missing.
+    rate_hz : float
+        Sample rate in Hz.
+    """
+    missing = np.logical_and.reduce([~np.isfinite(y) for y in values.values()])
+    if not missing.any():
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(np.int8)))
+    lengths = edges[1::2] - edges[::2]
+    longest = int(lengths.argmax())
+    begin_s, duration_s = edges[2 * longest] / rate_hz, lengths[longest] / rate_hz
+    rows, holes = int(missing.sum()), lengths.size
+    where = f"in one hole at {begin_s:.5g} s" if holes == 1 else f"in {holes} holes, the longest at {begin_s:.5g} s"
+    return [
+        RecordingFinding(
+            "missing_rows",
+            tuple(values),
+            f"{rows} of {missing.size} rows are missing {where} for {duration_s:.3g} s. "
+            f"The missing samples were replaced by draws from their neighbourhood.",
+            {"time": ParameterInterval(begin_s), "duration": ParameterInterval(duration_s)},
+            {"rows": float(rows), "holes": float(holes), "share": rows / missing.size},
+            corrected=True,
+        )
+    ]
+
+
+def check_repeated_rows(
+    values: Mapping[str, Floats], rate_hz: float, model: NoiseModel | None
+) -> list[RecordingFinding]:
+    """Report rows that repeat on all axes more often than by chance.
+
+    Such rows occur throughout a recording that was resampled to a higher rate. Quantized values also repeat by chance,
+    but independently on each axis. The share of rows that repeat on all axes is therefore compared with the product of
+    the shares of single axes. The rows are kept, because the search for noise effects describes the repeats.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray, shape (n,)
+        Samples of each axis; NaN means missing.
+    rate_hz : float
+        Sample rate in Hz.
+    model : NoiseModel or None
+        Model under test. Repeats are not reported if the model contains a random sample hold.
+    """
+    if model is not None and any(isinstance(effect, RandomSampleHold) for _, effect in model):
+        return []
+    varying = [y for y in values.values() if np.isfinite(y).any() and np.nanmin(y) < np.nanmax(y)]
+    if len(varying) < MIN_AXES:
+        return []
+    by_chance = float(np.prod([np.mean(y[1:] == y[:-1]) for y in varying]))
+    if by_chance > MAX_CHANCE_SHARE:
+        return []
+    share = estimate_stale_sample_share(np.column_stack(varying))
+    if share < MIN_SHARE:
+        return []
+    n = varying[0].size
+    error = 2.0 * (share * (1.0 - share) / n) ** 0.5
+    return [
+        RecordingFinding(
+            "repeated_rows",
+            tuple(axis for axis in AXES if axis in values),
+            f"{100.0 * share:.3g} % of the rows repeat the previous row on all axes. "
+            f"The sensor had {rate_hz * (1.0 - share):.4g} new measurements per second. The rows were not changed.",
+            {"share": ParameterInterval(share, max(share - error, 0.0), share + error)},
+            {"share_by_chance": by_chance},
+            corrected=False,
+        )
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +122,10 @@ def check_stuck_values(
 ) -> tuple[dict[str, Floats], list[RecordingFinding]]:
     """Mark stuck samples as missing, and return the values with a finding for each group of stuck axes.
 
+    Quantized values also repeat by chance. The length of a run is therefore compared with the repeats in the rest of
+    the recording and with the longest run in a simulation of the model. A run at the largest or smallest value of the
+    axis may be clipping, which the search for noise effects handles.
+
     Parameters
     ----------
     values : mapping of str to ndarray, shape (n,)
@@ -56,7 +140,7 @@ def check_stuck_values(
     while runs:
         together = [run for run in runs if _overlap_fraction(run, runs[0]) >= SAME_RUN_SHARE]
         runs = [run for run in runs if run not in together]
-        findings.append(_describe(together, values, rate_hz))
+        findings.append(_describe_stuck_values(together, values, rate_hz))
         for run in together:
             y = marked[run.axis].copy()
             y[run.first + 1 : run.last] = np.nan
@@ -117,7 +201,7 @@ def _overlap_fraction(one: Run, other: Run) -> float:
     return common / (max(one.last, other.last) - min(one.first, other.first))
 
 
-def _describe(runs: list[Run], values: Mapping[str, Floats], rate_hz: float) -> RecordingFinding:
+def _describe_stuck_values(runs: list[Run], values: Mapping[str, Floats], rate_hz: float) -> RecordingFinding:
     axes = tuple(axis for axis in AXES if any(run.axis == axis for run in runs))
     first, last = min(run.first for run in runs), max(run.last for run in runs)
     frozen = len(axes) > 1 and len(axes) == len(values)

@@ -6,24 +6,35 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from monitor.noise.effects import AngleRandomWalk, Narrowband, Outliers, PoissonSteps, Resolution, Sinusoidal
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    BandwidthLimit,
+    Narrowband,
+    Outliers,
+    PoissonSteps,
+    Resolution,
+    Sinusoidal,
+)
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fixed_noise
 from monitor.reconcile.result import DiagnosticGap, Location
+from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.cross_validation import accept_without_validation
 from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
 from monitor.reconcile.search.trials import Trial
-from monitor.reconcile.summary.gap_decomposition import (
+from monitor.reconcile.summary.effect_contributions import (
+    compute_allan_influences_of_changes,
     decompose_explained_gain,
     fit_without,
     measure_remaining_gaps,
     value_artifact_gain,
 )
-from tests.monitor.reconcile.axes import WALK, WHITE, N, axis, time_s, walk, white
+from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, N, axis, time_s, walk, white
 
 n = 30_000
 MODEL = (WHITE, WALK)
 LINE, HUMP = Sinusoidal(amplitude=1e-4, frequency=17.3), Narrowband(sigma=1e-6, frequency=8.0, bandwidth=0.5)
 NOTHING = HypothesisDiagnostics({}, ())
+WHITE_MODEL = (AngleRandomWalk(N=N),)
 
 
 @cache
@@ -120,3 +131,39 @@ def test_a_spectrum_that_is_wrong_everywhere_counts_in_every_band():
     wrong = fit_with_fixed_noise(axis(1.2 * (white(n, rng) + walk(n, rng)), MODEL), MODEL)
     (one,) = measure_remaining_gaps(search(wrong), (gap("psd", 60.0),))
     assert one.gain_nats == pytest.approx(0.5 * n * (1.2**2 - 1.0 - 2 * np.log(1.2)), rel=0.15)
+
+
+def influences(y, *added, fixed=frozenset({0})):
+    hypothesis = Hypothesis(WHITE_MODEL, axis(y, WHITE_MODEL).fit((*WHITE_MODEL, *added), fixed))
+    changed = (*changed_sizes(hypothesis), *range(len(WHITE_MODEL), len(hypothesis.effects)))
+    return compute_allan_influences_of_changes(hypothesis, changed)
+
+
+def test_a_line_is_largest_where_its_allan_variance_stands_out_most():
+    f, a = 2.3, 4e-4
+    y = white(n, np.random.default_rng(1)) + a * np.sin(2 * np.pi * f * time_s(n))
+    found = influences(y, Sinusoidal(amplitude=a, frequency=f))[1]
+    tau = 2.0 ** np.arange(12) / RATE_HZ
+    x = np.pi * f * tau
+    ratio = np.sqrt(1.0 + a**2 * np.sin(x) ** 4 / x**2 * tau / N**2)
+    assert found.tau_s == pytest.approx(tau[np.argmax(ratio)])
+    assert found.ratio == pytest.approx(ratio.max(), rel=0.03)
+
+
+def test_a_changed_size_multiplies_the_deviation():
+    found = influences(1.3 * white(n, np.random.default_rng(1)), fixed=frozenset())
+    assert list(found) == [0]
+    assert found[0].ratio == pytest.approx(1.3, rel=0.01)
+
+
+def test_outliers_add_white_noise_and_a_filter_removes_noise():
+    y = white(n, np.random.default_rng(1))
+    outliers = Outliers(fraction=1e-2, scale=1e-2)
+    found = influences(y, outliers)[1]
+    assert found.ratio == pytest.approx(np.sqrt(1.0 + 1e-2 * 1e-4 / (N**2 * RATE_HZ)), rel=0.01)
+    assert influences(y, BandwidthLimit(cutoff=10.0, order=1))[1].ratio < 0.8
+
+
+def test_a_change_without_influence_has_the_ratio_one():
+    found = influences(white(n, np.random.default_rng(1)), Sinusoidal(amplitude=1e-9, frequency=17.3))
+    assert found[1].ratio == pytest.approx(1.0, abs=0.01)
