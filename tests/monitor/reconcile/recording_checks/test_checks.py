@@ -30,10 +30,9 @@ def test_recordings_of_the_model_have_no_findings(model):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("gravity", [False, True])
-def test_at_most_one_of_a_thousand_recordings_of_the_model_has_a_finding(gravity):
-    model = make_model(gravity)
-    assert sum(bool(kinds(draw(model, seed), model)) for seed in range(1000)) <= 1
+def test_at_most_one_of_a_thousand_recordings_of_the_model_has_a_finding():
+    models = make_model(gravity=False), make_model(gravity=True)
+    assert sum(bool(kinds(draw(models[seed % 2], seed), models[seed % 2])) for seed in range(1000)) <= 1
 
 
 def test_without_a_model_a_clean_recording_has_no_findings():
