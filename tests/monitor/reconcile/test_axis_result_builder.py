@@ -1,4 +1,4 @@
-"""A search as people and programs read it: within the contract of the report, and true to what was hidden."""
+"""Tests of the result of an axis: it follows the schema of the report and describes the hidden effects."""
 
 import json
 from dataclasses import replace
@@ -71,7 +71,7 @@ def told(name):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
-def test_the_report_is_as_its_contract_says(name):
+def test_report_follows_its_schema(name):
     result = told(name)
     model = NoiseModel({"gz": MODEL}, RATE_HZ)
     whole = Reconciliation(result.verdict, {"gz": result}, model, model, False, RATE_HZ, n, n / RATE_HZ, 1)
@@ -81,7 +81,7 @@ def test_the_report_is_as_its_contract_says(name):
     assert [score["lens"] for score in report["axes"]["gz"]["scores"]] == list(DIAGNOSTICS)
 
 
-def test_a_line_is_described_with_all_that_it_has():
+def test_description_of_a_line_is_complete():
     (step,) = told("line").steps
     assert (step.kind, step.effect) == ("added", "sinusoidal")
     for name, true in (("frequency", 17.3), ("amplitude", 2e-4), ("phase", 0.7)):
@@ -100,7 +100,7 @@ def test_a_line_is_described_with_all_that_it_has():
     assert "sinusoidal" in step.because
 
 
-def test_another_size_is_told_as_such():
+def test_changed_size_is_a_retuned_step():
     steps = told("louder").steps
     assert {step.kind for step in steps} == {"retuned"}
     (of_white,) = (step for step in steps if step.effect == "angle_random_walk")
@@ -119,7 +119,7 @@ def test_single_samples_are_counted():
     assert "detected events" in step.because
 
 
-def test_the_misfit_of_clustered_outliers_remains():
+def test_misfit_of_clustered_outliers_remains():
     result = told("clustered outliers")
     assert [step.effect for step in result.steps] == ["outliers"]
     assert found("clustered outliers").final.findings["tails"].gain < STRICT["tails"].threshold
@@ -130,7 +130,7 @@ def test_the_misfit_of_clustered_outliers_remains():
     assert told("outliers").verdict == "explained"
 
 
-def test_runners_up_are_other_names_and_never_certain():
+def test_runners_up_are_other_effects_and_never_certain():
     (step,) = told("correlated").steps
     assert step.effect == "exponentially_correlated"
     bounds = step.parameters["correlation_time"]
@@ -141,7 +141,7 @@ def test_runners_up_are_other_names_and_never_certain():
 
 
 @pytest.mark.parametrize(("rival_score", "confidence"), [(0.0, 0.5), (-3.0, 0.95)])
-def test_a_rival_of_another_group_reduces_the_confidence(rival_score, confidence):
+def test_rival_of_another_group_reduces_the_confidence(rival_score, confidence):
     search = found("line")
     (done,) = search.rounds
     rival = Trial("narrowband", None, done.trials[0].score + rival_score - 20.0, slow_noise_score=20.0)
@@ -174,7 +174,7 @@ def test_one_size_and_a_common_factor_of_white_noise_are_equally_likely():
     assert 0.4 < step.confidence < 0.7
 
 
-def test_verdicts_follow_from_steps_and_what_is_left():
+def test_verdict_follows_from_steps_and_remaining_gaps():
     assert build_axis_result(found("nothing"), STRICT, STRICT).verdict == "agrees"
     assert build_axis_result(found("nothing"), STRICT, ALWAYS).verdict == "unexplained"
     assert build_axis_result(found("line"), STRICT, STRICT).verdict == "explained"
@@ -186,7 +186,7 @@ def test_verdicts_follow_from_steps_and_what_is_left():
     assert build_axis_result(found("line"), STRICT, UNREACHED).left_over == ()
 
 
-def test_gaps_before_are_beside_the_model_that_decided_and_after_beside_the_new_one():
+def test_gaps_before_a_step_are_those_of_the_old_model_and_after_it_those_of_the_new_one():
     other = dict.fromkeys(DIAGNOSTICS, NullDistribution(8.0, 18.0))
     (step,) = build_axis_result(found("line"), STRICT, other).steps
     assert step.before.threshold == pytest.approx(30.0**0.5)
@@ -194,8 +194,8 @@ def test_gaps_before_are_beside_the_model_that_decided_and_after_beside_the_new_
     assert step.after.null95 == pytest.approx(4.0)
 
 
-def test_what_did_not_shrink_is_still_told():
-    """A search whose last look sees as much as its first has a step and is partly explained."""
+def test_unreduced_gap_is_still_reported():
+    """A search whose final gap equals its first gap has a step and is partly explained."""
     one = found("line")
     again = replace(one, final=one.rounds[0].before)
     assert build_axis_result(again, STRICT, STRICT).verdict == "partly_explained"

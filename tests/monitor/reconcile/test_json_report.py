@@ -1,4 +1,4 @@
-"""The report for programs: the keys of its schema, numbers that JSON has, the same bytes every time."""
+"""Tests of the JSON report: keys of the schema, valid numbers and reproducible bytes."""
 
 import json
 from dataclasses import replace
@@ -24,12 +24,12 @@ def written(r: Reconciliation) -> dict[str, Any]:
 
 
 def with_step(r: Reconciliation, **changed: object) -> Reconciliation:
-    """The first step of gz, changed."""
+    """Return the reconciliation with changes to the first step of gz."""
     gz = r.axes["gz"]
     return replace(r, axes={**r.axes, "gz": replace(gz, steps=(replace(gz.steps[0], **changed), *gz.steps[1:]))})
 
 
-def test_a_step_is_written_as_its_schema_says() -> None:
+def test_step_follows_its_schema() -> None:
     report = written(samples.explained())
     assert report["schema"] == "imu-monitor/reconcile/1"
     assert report["verdict"] == "explained"
@@ -59,7 +59,7 @@ def test_a_step_is_written_as_its_schema_says() -> None:
     }  # fmt: skip
 
 
-def test_the_summary_and_the_ranked_findings_come_first() -> None:
+def test_summary_and_the_ranked_findings_come_first() -> None:
     report = written(samples.partly_explained())
     assert list(report)[:3] == ["schema", "verdict", "summary"]
     assert report["summary"][0].startswith("The model differs from the recording on gz")
@@ -72,7 +72,7 @@ def test_the_summary_and_the_ranked_findings_come_first() -> None:
     assert line["share"] == report["explained_share"] == 1.0 - left["share"] == 848.0 / 886.0
 
 
-def test_what_was_compared_stands_beside_it() -> None:
+def test_compared_effects_are_written() -> None:
     report = written(samples.explained())
     about = {name: report[name] for name in ("rate", "samples", "seconds", "seed", "fitted_first")}
     assert about == {"rate": 100.0, "samples": 360_000, "seconds": 3600.0, "seed": 7, "fitted_first": False}
@@ -82,21 +82,21 @@ def test_what_was_compared_stands_beside_it() -> None:
     assert [score["lens"] for score in report["axes"]["gz"]["steps"][1]["scores"]] == diagnostics
 
 
-def test_what_happens_once_has_a_reason_instead_of_a_held_out_gap() -> None:
+def test_single_event_has_a_reason_instead_of_a_held_out_gap() -> None:
     first, second = written(samples.explained())["axes"]["gz"]["steps"]
     assert second["held_out_gap"] is None
     assert second["held_out_reason"] == "a known term of another size is not held out"
     assert "held_out_reason" not in first
 
 
-def test_the_threshold_beside_a_gap_is_the_one_after_the_step() -> None:
+def test_threshold_of_a_gap_is_that_after_the_step() -> None:
     after = DiagnosticGap("psd", Location(), 1.0, 1.7, 2.2)
     step = written(with_step(samples.explained(), after=after))["axes"]["gz"]["steps"][0]
     assert step["gap"] == {"before": 41.2, "after": 1.0, "null95": 1.7, "threshold": 2.2}
     assert step["found"]["threshold"] == 2.6
 
 
-def test_what_is_no_number_is_null_and_an_axis_has_no_interval() -> None:
+def test_nan_is_null_and_an_axis_parameter_has_no_interval() -> None:
     parameters = {
         "source": ParameterInterval("ax"),
         "coefficient": ParameterInterval(np.float64(2e-4), np.nan, np.inf),
@@ -117,7 +117,7 @@ def test_what_is_no_number_is_null_and_an_axis_has_no_interval() -> None:
     assert step["confidence"] is None
 
 
-def test_what_is_left_over_has_its_place_and_no_name() -> None:
+def test_remaining_gap_has_a_place_and_no_effect() -> None:
     axis = written(samples.unexplained())["axes"]["ax"]
     assert axis["verdict"] == "unexplained"
     assert axis["steps"] == []
@@ -126,14 +126,14 @@ def test_what_is_left_over_has_its_place_and_no_name() -> None:
     ]
 
 
-def test_the_same_reconciliation_gives_the_same_bytes_in_the_order_of_the_axes() -> None:
+def test_same_reconciliation_gives_the_same_bytes_in_the_order_of_the_axes() -> None:
     r = samples.explained()
     backwards = replace(r, axes=dict(reversed(r.axes.items())))
     assert encode_report(samples.explained()) == encode_report(r) == encode_report(backwards)
     assert list(written(backwards)["axes"]) == ["gx", "gy", "gz", "ax", "ay", "az"]
 
 
-def test_numbers_of_numpy_are_numbers() -> None:
+def test_numpy_numbers_are_written_as_numbers() -> None:
     score = DiagnosticGap(
         "psd", Location(frequency=(np.float64(1), np.float64(2))), np.float64(3), np.float64(1), np.float64(2)
     )

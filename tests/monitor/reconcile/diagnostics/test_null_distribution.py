@@ -1,4 +1,4 @@
-"""Thresholds beside the quantiles of gains that are drawn from the expected law and from other laws."""
+"""Tests of the thresholds with gains that are drawn from the expected distribution and from other distributions."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def quartile(diagnostic):
 
 
 def simulated(count, rng, shift=0.0):
-    """Gains that exceed the upper quartile in a quarter of the recordings, by an exponential excess."""
+    """Draw gains that exceed the upper quartile in a quarter of the recordings, by an exponential excess."""
     found = []
     for _ in range(count):
         excess = rng.exponential(size=len(DIAGNOSTICS)) - np.log(4.0) + shift
@@ -41,7 +41,7 @@ def simulated(count, rng, shift=0.0):
     return found
 
 
-def test_levels_are_those_of_an_exponential():
+def test_quantiles_are_those_of_an_exponential_distribution():
     null = estimate_null_distributions({name: simulated(1, np.random.default_rng(0)) for name in ("gx", "gy", "gz")})
     for diagnostic in DIAGNOSTICS:
         start, scale = quartile(diagnostic), NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale
@@ -51,8 +51,8 @@ def test_levels_are_those_of_an_exponential():
         assert null["gx"][diagnostic].threshold == pytest.approx(start + scale * chance)
 
 
-def test_a_true_model_is_rarely_accused():
-    """Recordings of three axes, all gains drawn from the expected law; as many are simulated as the gains ask for."""
+def test_true_model_rarely_exceeds_a_threshold():
+    """Draw gains of three axes from the expected distribution, with as many simulations as the gains require."""
     names, accused, recordings, simulations = ("gx", "gy", "gz"), 0, 3000, 0
     for seed in range(recordings):
         rng = np.random.default_rng([seed, 1])
@@ -73,7 +73,7 @@ def test_a_true_model_is_rarely_accused():
     assert simulations < 1.1 * recordings * len(names)
 
 
-def test_more_axes_ask_for_more():
+def test_more_axes_raise_the_threshold():
     few = simulated(1, np.random.default_rng(3))
     one = estimate_null_distributions({"gx": few})["gx"]
     six = estimate_null_distributions(dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), few))["gx"]
@@ -84,7 +84,7 @@ def test_more_axes_ask_for_more():
         )
 
 
-def test_an_axis_of_its_own_kind_has_its_own_threshold():
+def test_axis_with_unusual_gains_has_its_own_threshold():
     rng = np.random.default_rng(4)
     odd = simulated(SIMULATED_RECORDINGS, rng, shift=200.0)
     assert all(all_simulations_have_improbable_gain(odd[:count]) for count in range(1, SIMULATED_RECORDINGS))
@@ -96,7 +96,7 @@ def test_an_axis_of_its_own_kind_has_its_own_threshold():
         assert found["gx"][diagnostic].threshold < quartile(diagnostic) + 20.0
 
 
-def test_one_improbable_gain_is_chance_if_the_next_simulation_is_probable():
+def test_improbable_gain_is_discarded_if_the_next_simulation_is_probable():
     rng = np.random.default_rng(5)
     odd, usual = simulated(1, rng, shift=50.0)[0], simulated(1, rng)[0]
     assert all_simulations_have_improbable_gain([odd])
@@ -104,7 +104,7 @@ def test_one_improbable_gain_is_chance_if_the_next_simulation_is_probable():
     assert estimate_null_distributions({"gz": [odd, usual]}) == estimate_null_distributions({"gz": [usual]})
 
 
-def test_a_diagnostic_that_never_sees_anything_has_a_threshold():
+def test_diagnostic_without_gains_has_a_threshold():
     nothing = [{diagnostic: Finding(0.0, Location()) for diagnostic in DIAGNOSTICS}] * SIMULATED_RECORDINGS
     for one in estimate_null_distributions({"gz": nothing})["gz"].values():
         assert 0.0 < one.null95 < one.threshold < np.inf
@@ -118,7 +118,7 @@ def test_non_gaussian_effects_need_all_simulations():
 
 @pytest.mark.parametrize("n", [6000, 140_000])
 @pytest.mark.parametrize("model", [(WHITE,), (WHITE, WALK), (WHITE, RateRandomWalk(K=1e-3))], ids=["N", "NK", "K"])
-def test_gains_of_true_models_follow_the_expected_law(model, n):
+def test_gains_of_true_models_follow_the_expected_distribution(model, n):
     """Of 40 recordings, 1 to 22 exceed the upper quartile, except with a probability of 2e-5 for each diagnostic."""
     above, beyond = dict.fromkeys(DIAGNOSTICS, 0), 0
     runs = 40
@@ -138,7 +138,7 @@ def test_gains_of_true_models_follow_the_expected_law(model, n):
         )  # one axis of continuous values has neither
 
 
-def test_a_gap_is_in_standard_deviations():
+def test_gap_is_in_standard_deviations():
     seen = {diagnostic: Finding(0.5 * k**2, Location(tau=(1.0, 2.0))) for k, diagnostic in enumerate(DIAGNOSTICS)}
     found = compute_diagnostic_gaps(seen, dict.fromkeys(DIAGNOSTICS, NullDistribution(2.0, 8.0)))
     assert [score.diagnostic for score in found] == list(DIAGNOSTICS)

@@ -1,4 +1,4 @@
-"""Pictures: what is drawn is what was measured, and bands hold what they say."""
+"""Tests of the plot data: curves equal the measured values, and bands contain the stated share of recordings."""
 
 import allantools
 import numpy as np
@@ -22,7 +22,7 @@ def drawn(y, model=MODEL, temperature_c=None):
     return {view.diagnostic: view for view in build_plot_data(seen(axis(y, model, temperature_c), model))}
 
 
-def test_every_view_can_be_drawn():
+def test_every_plot_has_data():
     found = drawn(noise() + 0.5, TERMS, warmth(n))
     assert set(found) == {"psd", "allan", "level", "variance", "tails", "autocorrelation", "temperature"}
     for view in found.values():
@@ -41,18 +41,18 @@ def test_every_view_can_be_drawn():
         assert view.y_unit
 
 
-def test_units_are_those_of_the_axis():
+def test_plots_have_the_units_of_the_axis():
     units = {view.diagnostic: view.y_unit for view in build_plot_data(seen(axis(noise()), MODEL))}
     assert units["psd"] == "(rad/s)²/Hz"
     assert units["allan"] == units["level"] == "rad/s"
 
 
-def test_no_temperature_no_picture_of_it():
+def test_without_temperature_there_is_no_temperature_plot():
     assert "temperature" not in drawn(noise())
     assert "temperature" not in drawn(noise(), temperature_c=np.full(n, 25.0))
 
 
-def test_spectrum_is_that_of_the_model_and_holds_the_data():
+def test_spectrum_equals_the_model_and_its_band_contains_the_data():
     inside = []
     for seed in range(6):
         view = drawn(noise(seed))["psd"]
@@ -63,7 +63,7 @@ def test_spectrum_is_that_of_the_model_and_holds_the_data():
     assert np.mean(inside) == pytest.approx(0.95, abs=0.025)
 
 
-def test_allan_deviation_is_that_of_allantools_and_of_the_model():
+def test_allan_deviation_equals_allantools_and_the_model():
     y = noise(1)
     view = drawn(y)["allan"]
     _, peers, _, _ = allantools.oadev(y, rate=RATE_HZ, data_type="freq", taus=view.x)
@@ -74,7 +74,7 @@ def test_allan_deviation_is_that_of_allantools_and_of_the_model():
     assert view.x[0] == pytest.approx(1.0 / RATE_HZ)
 
 
-def test_allan_band_holds_simulated_recordings():
+def test_allan_band_contains_simulated_recordings():
     inside = np.array(
         [(v.lo <= v.measured) & (v.measured <= v.hi) for v in (drawn(noise(k))["allan"] for k in range(40))]
     )
@@ -82,7 +82,7 @@ def test_allan_band_holds_simulated_recordings():
     assert inside[:, short].mean() == pytest.approx(0.95, abs=0.04)
 
 
-def test_level_is_the_mean_of_blocks_and_a_step_leaves_the_band():
+def test_level_is_the_mean_of_blocks_and_a_step_exceeds_the_band():
     y = noise(2) + 0.7
     view = drawn(y)["level"]
     size = n // view.x.size
@@ -93,7 +93,7 @@ def test_level_is_the_mean_of_blocks_and_a_step_leaves_the_band():
     assert np.mean((step.lo <= step.measured) & (step.measured <= step.hi)) < 0.3
 
 
-def test_strength_of_the_noise_over_time():
+def test_noise_level_over_time_is_measured():
     steady = drawn(noise(3))["variance"]
     assert np.mean((steady.lo <= steady.measured) & (steady.measured <= steady.hi)) == pytest.approx(0.95, abs=0.05)
     louder = drawn(noise(3) * np.where(time_s(n) < 120.0, 1.0, 2.0))["variance"]
@@ -101,7 +101,7 @@ def test_strength_of_the_noise_over_time():
     assert louder.measured[half + 2 :].mean() / louder.measured[: half - 2].mean() == pytest.approx(2.0, rel=0.05)
 
 
-def test_tails_are_those_of_a_gaussian():
+def test_tails_equal_those_of_a_gaussian():
     view = drawn(noise(4))["tails"]
     near = view.x < 3.0
     assert view.expected[near] == pytest.approx(erfc(view.x[near] / 2**0.5))
@@ -123,7 +123,7 @@ def test_level_follows_temperature():
     assert np.mean((steady.lo <= steady.measured) & (steady.measured <= steady.hi)) > 0.7
 
 
-def test_neighbouring_samples():
+def test_correlation_of_adjacent_samples_is_measured():
     view = drawn(noise(6))["autocorrelation"]
     assert view.x[0] == pytest.approx(1.0 / RATE_HZ)
     assert np.mean(np.abs(view.measured) <= view.hi) > 0.85

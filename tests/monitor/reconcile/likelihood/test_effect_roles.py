@@ -1,4 +1,4 @@
-"""What is fitted is what would be simulated: sizes, bases and columns beside the effects' own series and spectra."""
+"""Tests that sizes, spectra and regressors of the fit equal the series and spectra of the simulated effects."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def drawn(one):
     return values
 
 
-def test_every_source_has_its_place():
+def test_every_source_has_a_role():
     # a mean is always free; outliers are single samples; a wandering line is subtracted before the fit
     beside = {"bias", "outliers", "wandering_line"}
     kinds = {kind for name, kind in EFFECTS.items() if issubclass(kind, Source | AxisLeak) and name not in beside}
@@ -41,7 +41,7 @@ def test_every_source_has_its_place():
 
 
 @pytest.mark.parametrize("kind", NOISES, ids=lambda kind: kind.name)
-def test_a_spectrum_grows_with_the_square_of_the_size(kind):
+def test_spectrum_is_proportional_to_the_square_of_the_size(kind):
     one = make_effect(kind.name)
     f_hz, tau0_s = np.geomspace(0.01, 0.5 * RATE_HZ, 40), 1.0 / RATE_HZ
     np.testing.assert_allclose(
@@ -57,7 +57,7 @@ def test_a_spectrum_grows_with_the_square_of_the_size(kind):
 
 
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)
-def test_columns_times_factors_are_the_series(kind):
+def test_regressors_times_coefficients_equal_the_series(kind):
     one = make_effect(kind.name)
     if kind.name == "pulse_train":  # a delay that is not given is drawn
         one = replace(one, delay=0.03)
@@ -73,7 +73,7 @@ def test_columns_times_factors_are_the_series(kind):
     assert np.abs(want).max() > 0.0
 
 
-def test_phase_of_a_line_is_in_its_two_columns():
+def test_two_regressors_contain_the_phase_of_a_line():
     line = Sinusoidal(amplitude=0.4, frequency=7.3, phase=2.2)
     made = np.stack(build_unit_regressors(line, n, RATE_HZ, None))
     factors, *_ = np.linalg.lstsq(made.T, drawn(line), rcond=None)
@@ -82,7 +82,7 @@ def test_phase_of_a_line_is_in_its_two_columns():
     assert back.phase == pytest.approx(2.2)
 
 
-def test_a_curve_over_temperature_has_two_columns_and_a_line_one():
+def test_quadratic_temperature_effect_has_two_regressors():
     straight = TemperatureBias(coefficient=0.3, reference=25.0)
     assert len(build_unit_regressors(straight, n, RATE_HZ, warmth(n))) == 1
     bent = TemperatureBias(coefficient=0.3, reference=25.0, quadratic=-0.04)
@@ -91,12 +91,12 @@ def test_a_curve_over_temperature_has_two_columns_and_a_line_one():
     np.testing.assert_allclose(two, (warmth(n) - 25.0) ** 2, atol=1e-12)
 
 
-def test_size_keeps_its_sign_where_it_has_one():
+def test_signed_sizes_keep_their_sign():
     assert effect_size(with_effect_size(make_effect("bias_step"), -2.0)) == -2.0
     assert effect_size(with_effect_size(make_effect("sinusoidal"), -2.0)) == 2.0
     assert effect_size(with_effect_size(make_effect("rate_ramp"), -2.0)) == 2.0
 
 
-def test_a_leak_has_no_series_of_its_own():
+def test_leak_has_no_own_series():
     with pytest.raises(TypeError, match="another axis"):
         build_unit_regressors(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)

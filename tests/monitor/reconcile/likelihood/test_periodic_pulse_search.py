@@ -1,4 +1,4 @@
-"""Pulses that were put into white noise are found with their period and width; other periodic shapes are told apart."""
+"""Tests of the search for periodic pulses in white noise and of the distinction from other periodic shapes."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def found(y):
     ("period_s", "width_s", "height"),
     [(1.0, 0.02, 0.5), (1.000_03, 0.02, 0.6), (0.5, 0.1, -0.2), (7.3, 0.3, 0.4), (0.2007, 0.05, 0.4)],
 )
-def test_period_and_width(period_s, width_s, height):
+def test_period_and_width_of_pulses_are_found(period_s, width_s, height):
     harmonics, one = found(noise(1) + height * pulses(period_s, width_s, 0.13))
     assert harmonics.gain > 25.0
     assert one.is_rectangular
@@ -44,12 +44,12 @@ def test_white_noise_stays_below_the_threshold():
 @pytest.mark.parametrize(
     "shape", [SAW, SAW + 2.0 / np.pi * np.sin(2.0 * np.pi * T), pulses(1.0, 0.02) - pulses(1.0, 0.02, 0.5)]
 )
-def test_another_shape_is_no_rectangle(shape):
-    """Nor is the sawtooth whose first line was found before."""
+def test_other_periodic_shapes_are_no_rectangle(shape):
+    """A sawtooth without its first spectral line is no rectangle either."""
     assert not found(noise(2) + 0.6 * shape)[1].is_rectangular
 
 
 @pytest.mark.parametrize("period_s", [1.0, 1.0003])
-def test_delay_of_known_pulses(period_s):
+def test_delay_of_known_pulses_is_found(period_s):
     y = noise(3) + 0.6 * pulses(period_s, 0.05, 0.37)
     assert find_pulse_delay(y, RATE_HZ, period_s, 0.05) == pytest.approx(0.37, abs=0.02)

@@ -27,7 +27,7 @@ def noisy(rng, y):
 
 @pytest.mark.parametrize("amplitude", [0.15, 0.4, 4.0, 100.0])
 @pytest.mark.parametrize("seed", range(2))
-def test_a_wandering_line_is_no_resonance(amplitude, seed):
+def test_wandering_line_is_no_resonance(amplitude, seed):
     """Weak lines are followed block by block, strong lines by their phase."""
     rng = np.random.default_rng(seed)
     found = compare_wandering_line_with_resonance(noisy(rng, wandering(rng, amplitude, 0.2, 40.0)), RATE_HZ, WIDE)
@@ -43,7 +43,7 @@ def test_a_wandering_line_is_no_resonance(amplitude, seed):
 
 @pytest.mark.parametrize("sigma", [0.08, 0.3, 3.0, 100.0])
 @pytest.mark.parametrize("width_hz", [0.02, 0.2, 1.0])
-def test_a_resonance_is_no_wandering_line(sigma, width_hz):
+def test_resonance_is_no_wandering_line(sigma, width_hz):
     rng = np.random.default_rng(3)
     y = noisy(rng, ringing(n, rng, sigma, 13.0, width_hz))
     found = compare_wandering_line_with_resonance(y, RATE_HZ, Narrowband(sigma, 13.0, width_hz))
@@ -53,7 +53,7 @@ def test_a_resonance_is_no_wandering_line(sigma, width_hz):
 
 
 @pytest.mark.parametrize("depth", [0.5, 0.8, 2.0])
-def test_a_line_of_varying_amplitude_is_neither(depth):
+def test_line_of_varying_amplitude_is_neither(depth):
     rng = np.random.default_rng(4)
     swell = 1.0 + depth * np.sin(2.0 * np.pi * T / 50.0)
     y = noisy(rng, 0.3 * swell * np.sin(2.0 * np.pi * 13.0 * T + 1.0))
@@ -63,7 +63,7 @@ def test_a_line_of_varying_amplitude_is_neither(depth):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_line_whose_frequency_rises_linearly_is_a_sweep(seed):
+def test_line_whose_frequency_rises_linearly_is_a_sweep(seed):
     rng = np.random.default_rng(seed)
     y = noisy(rng, 0.5 * np.sin(2.0 * np.pi * (12.0 * T + 0.5 * 2.0 * T**2 / T[-1])))
     found = compare_wandering_line_with_resonance(y, RATE_HZ, Narrowband(0.35, 13.0, 2.0))
@@ -71,7 +71,7 @@ def test_a_line_whose_frequency_rises_linearly_is_a_sweep(seed):
     assert found.is_sweep
 
 
-def test_a_short_series_is_not_compared():
+def test_short_series_is_not_compared():
     rng = np.random.default_rng(5)
     assert compare_wandering_line_with_resonance(rng.standard_normal(64), RATE_HZ, Narrowband(0.2, 49.99, 0.02)) is None
 
@@ -89,7 +89,7 @@ def test_white_noise_remains_where_the_line_was(amplitude):
         assert power[near].mean() == pytest.approx(1.0, abs=0.26)
 
 
-def test_a_band_is_put_back_where_it_was():
+def test_band_is_put_back_where_it_was():
     rng = np.random.default_rng(7)
     y = np.sin(2.0 * np.pi * 13.01 * T) + 0.01 * rng.standard_normal(n)
     band = extract_band(y, RATE_HZ, 13.0, 1.0)

@@ -1,4 +1,4 @@
-"""The likelihood and its maximum beside dense Gaussian algebra and SciPy's minimisers."""
+"""Tests of the Whittle likelihood and its maximum against dense covariance matrices and SciPy's minimizers."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def dense(y, theta, beta=(0.0, 0.0, 0.0)):
 
 
 def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
-    """Each coefficient in a bin of its own."""
+    """Fit the variances with one coefficient in each bin."""
     products = np.einsum("ik,jk->ijk", regressors, regressors)
     found = BinnedRegressionSums(y**2, regressors * y, products)
     return maximise_whittle_likelihood(np.ones(n - 1), found, BASES, np.full(n - 1, constant), np.array(start))
@@ -47,7 +47,7 @@ def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
-def test_value_and_maximum_are_those_of_a_dense_gaussian(seed):
+def test_likelihood_and_maximum_equal_a_dense_gaussian(seed):
     y = drawn(seed)
     found = fit(y)
     assert found.log_likelihood == pytest.approx(dense(y, found.theta), abs=1e-6)
@@ -79,14 +79,14 @@ def test_regressors_are_fitted_together_with_variances(seed):
     assert found.residual == pytest.approx((y - found.beta @ REGRESSORS) ** 2, abs=1e-9)
 
 
-def test_any_start_finds_the_same_maximum():
+def test_every_start_gives_the_same_maximum():
     y = drawn(5)
     heights = [fit(y, start=start).log_likelihood for start in ((1.0, 1.0), (0.0, 3.0), (100.0, 0.0), (1e-4, 1e-4))]
     assert max(heights) - min(heights) < 1e-3
 
 
-def test_no_variance_is_below_zero():
-    """Series that are whiter than white: the random walk goes, and pulling it below zero would be a gain."""
+def test_variances_are_not_negative():
+    """The lowest coefficients are too small for white noise, so a negative variance would increase the likelihood."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
         y = rng.standard_normal(n - 1)
@@ -98,7 +98,7 @@ def test_no_variance_is_below_zero():
         assert more < found.log_likelihood
 
 
-def test_a_variance_that_is_not_fitted_is_kept():
+def test_constant_variance_is_kept():
     y = drawn(7)
     constant = 0.3
     found = fit(y, constant=constant)
@@ -107,7 +107,7 @@ def test_a_variance_that_is_not_fitted_is_kept():
     assert found.theta[0] + constant == pytest.approx(fit(y).theta[0], rel=1e-3)
 
 
-def test_errors_are_those_of_many_runs():
+def test_stated_errors_equal_the_scatter_of_many_runs():
     found = [fit(drawn(seed, (1.0, 0.3), BETA), REGRESSORS) for seed in range(300)]
     sizes = np.array([np.append(one.theta, one.beta) for one in found])
     stated = [
@@ -118,7 +118,7 @@ def test_errors_are_those_of_many_runs():
     assert np.mean(sizes, axis=0) == pytest.approx((1.0, 0.3, *BETA), rel=0.15)
 
 
-def test_a_bin_of_many_is_the_sum_of_its_coefficients():
+def test_wide_bin_is_the_sum_of_its_coefficients():
     rng = np.random.default_rng(1)
     binned = build_frequency_bins(3000, 100.0)
     y = rng.standard_normal(2999)
@@ -135,7 +135,7 @@ def test_a_bin_of_many_is_the_sum_of_its_coefficients():
     assert found.theta_information == pytest.approx(information, rel=0.01)
 
 
-def test_regressors_that_are_the_same_share_their_size():
+def test_equal_regressors_share_their_coefficient():
     y = drawn(2, beta=(3.0, 0.0, 0.0))
     one = fit(y, REGRESSORS[:1])
     twice = fit(y, REGRESSORS[[0, 0]])
@@ -143,6 +143,6 @@ def test_regressors_that_are_the_same_share_their_size():
     assert twice.beta.sum() == pytest.approx(one.beta[0], rel=1e-4)
 
 
-def test_silence_has_no_infinite_likelihood():
+def test_zeros_have_a_finite_likelihood():
     found = fit(np.zeros(n - 1))
     assert np.isfinite(found.log_likelihood)

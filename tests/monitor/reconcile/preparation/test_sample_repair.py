@@ -1,4 +1,4 @@
-"""What is filled in looks like what was there: level, drift, white variance, spectrum; nothing else is touched."""
+"""Tests that filled samples have the level, drift, white variance and spectrum of the recording."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def rng(seed=0):
     return np.random.default_rng(seed)
 
 
-def test_good_samples_stay_and_the_input_too():
+def test_good_samples_and_the_input_are_not_changed():
     y = rng().standard_normal(5_000)
     y[3] = np.nan
     before = y.copy()
@@ -26,14 +26,14 @@ def test_good_samples_stay_and_the_input_too():
     assert not np.array_equal(new[mask], y[mask])
 
 
-def test_the_same_seed_gives_the_same_samples():
+def test_same_seed_gives_the_same_samples():
     y, mask = rng().standard_normal(5_000), rng(1).random(5_000) < 0.05
     assert np.array_equal(fill_missing_samples(y, mask, rng(2)), fill_missing_samples(y, mask, rng(2)))
     assert not np.array_equal(fill_missing_samples(y, mask, rng(2)), fill_missing_samples(y, mask, rng(3)))
 
 
-def test_the_spectrum_is_unbiased():
-    """One percent missing: less than 0.1 % in every part of the spectrum that is wider than the neighbourhoods."""
+def test_spectrum_is_unbiased():
+    """With one percent of missing samples, the mean of each wide frequency band changes by less than 0.1 %."""
     apart = []
     for seed in range(6):
         y = rng(seed).standard_normal(N)
@@ -45,7 +45,7 @@ def test_the_spectrum_is_unbiased():
     assert np.abs(np.mean(apart, axis=0)).max() < 1e-3
 
 
-def test_white_variance_and_differences_stay():
+def test_white_variance_and_differences_are_kept():
     y = rng().standard_normal(N)
     mask = rng(1).random(N) < 0.4
     new = fill_missing_samples(y, mask, rng(2))
@@ -54,7 +54,7 @@ def test_white_variance_and_differences_stay():
 
 
 @pytest.mark.parametrize("drift", [1e-3, 0.05])
-def test_drift_goes_on_through_short_holes(drift):
+def test_drift_continues_through_short_gaps(drift):
     walk = np.cumsum(drift * rng().standard_normal(N)) + 9.81
     mask = np.zeros(N, dtype=bool)
     for at in range(500, N - 500, 1000):
@@ -65,7 +65,7 @@ def test_drift_goes_on_through_short_holes(drift):
     assert left.std() == pytest.approx(0.3, rel=0.45 if drift > 0.01 else 0.05)
 
 
-def test_a_long_hole_is_bridged_between_its_ends():
+def test_long_gap_is_bridged_between_its_ends():
     level = np.where(np.arange(N) < 120_000, 0.0, 10.0)
     mask = np.zeros(N, dtype=bool)
     mask[100_000:140_000] = True
@@ -75,7 +75,7 @@ def test_a_long_hole_is_bridged_between_its_ends():
     assert np.diff(new[100_000:140_000]).std() == pytest.approx(0.1 * 2.0**0.5, rel=0.05)
 
 
-def test_a_bridge_wanders_as_the_recording_does():
+def test_bridge_has_the_random_walk_of_the_recording():
     spreads = []
     for seed in range(12):
         walk = np.cumsum(0.02 * rng(seed).standard_normal(N))
@@ -88,7 +88,7 @@ def test_a_bridge_wanders_as_the_recording_does():
 
 
 @pytest.mark.parametrize("hole", [slice(0, 6_000), slice(500, 6_500), slice(60_000, 66_000), slice(94_000, 100_000)])
-def test_a_long_hole_continues_the_spectrum_at_all_frequencies(hole):
+def test_long_gap_continues_the_spectrum_at_all_frequencies(hole):
     sos = signal.butter(2, 0.1, output="sos")
     y = signal.sosfilt(sos, rng().standard_normal(100_000)) + 1e-3 * rng(1).standard_normal(100_000)
     mask = np.zeros(y.size, dtype=bool)
@@ -99,7 +99,7 @@ def test_a_long_hole_continues_the_spectrum_at_all_frequencies(hole):
     assert [band.mean() for band in bands] == pytest.approx(np.ones(8), abs=0.25)
 
 
-def test_long_holes_close_together_are_not_filled_with_a_period():
+def test_long_gaps_close_together_are_not_filled_periodically():
     y = rng().standard_normal(20_000)
     mask = np.zeros(y.size, dtype=bool)
     mask[5_000:8_000] = mask[8_005:11_000] = True
@@ -109,7 +109,7 @@ def test_long_holes_close_together_are_not_filled_with_a_period():
     assert filled.std() == pytest.approx(1.0, abs=0.05)
 
 
-def test_holes_at_the_ends_take_the_level_next_to_them():
+def test_gaps_at_the_ends_have_the_adjacent_level():
     y = 5.0 + 0.1 * rng().standard_normal(2_000)
     mask = np.zeros(2_000, dtype=bool)
     mask[:300] = mask[-300:] = True
@@ -118,7 +118,7 @@ def test_holes_at_the_ends_take_the_level_next_to_them():
     assert new[-300:].std() == pytest.approx(0.1, rel=0.2)
 
 
-def test_one_good_sample_is_enough_and_none_is_not():
+def test_at_least_one_good_sample_is_needed():
     assert fill_missing_samples(np.array([np.nan, 2.0, np.nan]), np.zeros(3, dtype=bool), rng()).tolist() == [
         2.0,
         2.0,
@@ -143,7 +143,7 @@ def test_clipped_samples_get_their_distribution_back(limit, mean):
     assert np.quantile(new, 0.999) == pytest.approx(mean + 3.09, abs=0.15)
 
 
-def test_a_level_beyond_the_limit_is_found_and_missing_samples_stay():
+def test_level_beyond_the_limit_is_found_and_missing_samples_stay():
     x = 2.3 + rng().standard_normal(N)
     y = np.minimum(x, 2.0)
     y[::1000] = np.nan
@@ -152,6 +152,6 @@ def test_a_level_beyond_the_limit_is_found_and_missing_samples_stay():
     assert np.nanmean(new) == pytest.approx(2.3, abs=0.1)
 
 
-def test_nothing_clipped_changes_nothing():
+def test_samples_without_clipping_are_not_changed():
     y = rng().standard_normal(1_000)
     assert np.array_equal(restore_clipped_samples(y, 10.0, 1.0, rng(1)), y)

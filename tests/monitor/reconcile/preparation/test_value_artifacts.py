@@ -1,4 +1,4 @@
-"""Grids, ends and repeats are told where they are, with their sizes, and nowhere else."""
+"""Tests of the detection of quantization steps, clipping and repeated samples."""
 
 import numpy as np
 import pytest
@@ -33,18 +33,18 @@ def test_values_on_a_grid_show_its_step(step, scale):
 
 
 @pytest.mark.parametrize("step", [1.3e-3, 0.07, 0.61])
-def test_a_grid_survives_float32_and_nine_digits(step):
+def test_grid_survives_float32_and_nine_digits(step):
     y = 1e-3 * step * np.rint((noise() + 3.3) / step)
     for written in (as_float32(y), np.array([float(f"{x:.9g}") for x in y])):
         assert detect_quantization(written).step.value == pytest.approx(1e-3 * step, rel=1e-4)
 
 
-def test_a_grid_with_an_offset_is_detected():
+def test_grid_with_an_offset_is_detected():
     assert detect_quantization(0.25 * np.rint(noise() / 0.25) + 9.81).step.value == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("decimals", [6, 8])
-def test_a_coarse_grid_rounded_in_text_is_neither_the_grid_of_the_text_nor_clipping(decimals):
+def test_coarse_grid_rounded_in_text_is_neither_the_grid_of_the_text_nor_clipping(decimals):
     step = np.radians(1.0 / 131.0)
     counts = np.rint(0.5 * np.random.default_rng(0).standard_normal(60_000))  # five levels
     written = np.radians(np.round(np.degrees(counts * step), decimals))
@@ -70,28 +70,28 @@ def test_a_coarse_grid_rounded_in_text_is_neither_the_grid_of_the_text_nor_clipp
     ],
     ids=["float64", "float32", "float32 of g", "decimals", "decimals of g", "digits", "degrees", "float32 deg", "g"],
 )
-def test_what_numbers_and_texts_have_of_themselves_is_no_grid(written):
+def test_rounding_of_floats_and_text_is_no_grid(written):
     assert detect_quantization(written(noise())) is None
 
 
-def test_decimals_as_coarse_as_the_noise_are_a_grid_whoever_wrote_them():
+def test_decimals_as_coarse_as_the_noise_are_a_grid():
     assert detect_quantization(noise().round(0)).step.value == pytest.approx(1.0)
 
 
-def test_one_value_off_the_grid_is_enough():
+def test_one_value_off_the_grid_excludes_the_grid():
     y = 0.1 * np.rint(noise() / 0.1)
     y[777] += 0.031
     assert detect_quantization(y) is None
 
 
 @pytest.mark.parametrize("y", [np.zeros(0), np.full(100, np.nan), np.ones(5000), np.arange(9.0)])
-def test_what_says_nothing_gives_nothing(y):
+def test_uninformative_values_give_no_result(y):
     assert detect_quantization(y) is None
     assert detect_clipping(y) is None
     assert detect_repeats(y) is None
 
 
-def test_missing_samples_are_passed_over():
+def test_missing_samples_are_ignored():
     y = held(np.clip(noise(), -2.5, 2.5), 0.02)[0]
     y[noise(3) > 1.0] = np.nan
     assert detect_clipping(y).limit.value == 2.5
@@ -110,7 +110,7 @@ def test_clipped_noise_shows_its_limit(limit, mean):
     assert found.gain > 50.0
 
 
-def test_one_end_alone_and_an_end_that_is_passed_elsewhere():
+def test_clipping_at_one_end_and_a_limit_that_is_exceeded_elsewhere():
     x = noise()
     one = detect_clipping(np.clip(x + 2.0, -3.5, 3.5))
     assert one.symmetric
@@ -143,13 +143,13 @@ def line(n=N):
     ids=["white", "walk", "line", "t", "step", "coloured", "held"],
 )
 @pytest.mark.parametrize("step", [0.0, 0.05, 0.5])
-def test_what_is_not_clipped_is_not_called_clipped(x, step):
+def test_other_signals_are_not_clipped(x, step):
     found = detect_clipping(step * np.rint(x / step) if step else x, step)
     assert found is None or found.gain < 8.0
 
 
 @pytest.mark.parametrize("share", [5e-4, 0.02, 0.4])
-def test_repeats_of_continuous_values_are_each_known(share):
+def test_each_repeat_of_continuous_values_is_known(share):
     y, which = held(noise(), share)
     found = detect_repeats(y)
     assert np.array_equal(found.mask, which)
@@ -186,11 +186,11 @@ def test_clipped_samples_are_no_repeats():
     ids=["white", "coloured", "t", "step", "outliers", "line"],
 )
 @pytest.mark.parametrize("step", [0.0, 0.01, 0.3, 0.9, 3.0])
-def test_what_is_not_held_is_not_called_held(x, step):
+def test_other_signals_have_no_repeats(x, step):
     found = detect_repeats(step * np.rint(x / step) if step else x, step)
     assert found is None or found.gain < 8.0
 
 
-def test_repeats_of_a_grid_that_was_not_told_are_not_taken_for_known_ones():
+def test_repeats_on_an_unknown_grid_are_not_known():
     found = detect_repeats(0.05 * np.rint(noise() / 0.05))
     assert found is None or (found.gain < 8.0 and not found.mask.any())

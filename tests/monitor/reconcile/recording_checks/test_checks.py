@@ -39,13 +39,13 @@ def test_without_a_model_a_clean_recording_has_no_findings():
     assert [kinds(draw(MODEL, seed), None) for seed in range(12)] == [[]] * 12
 
 
-def test_a_clean_recording_is_not_changed():
+def test_clean_recording_is_not_changed():
     recording = draw(MODEL, 1)
     checked = check_recording(recording, MODEL, 1).recording
     assert all(np.array_equal(checked.values[axis], recording.values[axis]) for axis in AXES)
 
 
-def test_a_wrong_unit_and_swapped_axes_are_found_and_corrected_together():
+def test_wrong_unit_and_swapped_axes_are_found_and_corrected_together():
     recording = draw(MODEL, 1)
     wrong = {
         "gx": recording.values["gy"] * np.pi / 180.0,
@@ -59,7 +59,7 @@ def test_a_wrong_unit_and_swapped_axes_are_found_and_corrected_together():
         np.testing.assert_allclose(checked.recording.values[axis], recording.values[axis], rtol=1e-12)
 
 
-def test_the_most_serious_finding_is_first():
+def test_most_serious_finding_is_first():
     recording = draw(MODEL, 1)
     wrong = {axis: 1000.0 * recording.values[axis] for axis in AXES[:3]}
     wrong["ax"] = recording.values["ax"].copy()
@@ -69,7 +69,7 @@ def test_the_most_serious_finding_is_first():
     assert found == sorted(found, key=FINDING_KINDS.index)
 
 
-def test_a_knock_does_not_hide_a_corrupt_row():
+def test_knock_does_not_hide_a_corrupt_row():
     recording = draw(MODEL, 1)
     t = np.arange(60)
     values = {axis: y.copy() for axis, y in recording.values.items()}
@@ -81,6 +81,6 @@ def test_a_knock_does_not_hide_a_corrupt_row():
     assert found[0].parameters["time"].value == pytest.approx(30.0)
 
 
-def test_too_few_samples_are_left_alone():
+def test_too_short_recording_is_not_changed():
     recording = draw(MODEL, 1, 1000)
     assert check_recording(recording, MODEL, 1).recording is recording

@@ -3,13 +3,13 @@ import numpy as np
 from monitor.reconcile.recording_checks.median_block_spectrum import compute_robust_spectrum
 
 
-def test_a_factor_of_the_samples_is_a_factor_of_all_bands():
+def test_factor_of_the_samples_scales_all_bands():
     y = np.random.default_rng(0).standard_normal(20_000)
     one, two = compute_robust_spectrum(y, 100.0), compute_robust_spectrum(np.pi * y + 7.0, 100.0)
     np.testing.assert_allclose(two.log_power - one.log_power, 2.0 * np.log(np.pi), atol=1e-9)
 
 
-def test_the_error_is_the_scatter_between_recordings():
+def test_error_is_the_scatter_between_recordings():
     rng = np.random.default_rng(1)
     many = [compute_robust_spectrum(rng.standard_normal(16_000), 100.0) for _ in range(200)]
     scatter = np.std([one.log_power for one in many], axis=0)
@@ -17,7 +17,7 @@ def test_the_error_is_the_scatter_between_recordings():
     assert 0.8 < np.median(told / scatter) < 1.25
 
 
-def test_a_knock_and_a_hole_change_little():
+def test_knock_and_a_hole_change_little():
     y = np.random.default_rng(2).standard_normal(20_000)
     changed = y.copy()
     changed[5000:5050] += 100.0

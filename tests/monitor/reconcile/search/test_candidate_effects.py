@@ -1,4 +1,4 @@
-"""Each family finds the shape that was hidden, and offers nothing that the axis has or that cannot be asked."""
+"""Tests that each family of candidates finds the hidden effect and proposes no effect that cannot be tested."""
 
 import numpy as np
 import pytest
@@ -53,18 +53,18 @@ def noise(seed=0):
 
 
 def asked(family, one, model=MODEL):
-    """What a family offers, by name."""
+    """Return the candidates of a family by name."""
     return {effect.name: effect for effect in family(seen(one, model))}
 
 
-def test_every_effect_of_the_vocabulary_has_a_price():
+def test_every_effect_has_a_complexity_penalty():
     # a mean is always free; the clock, the unit and the order of the axes are asked for all axes together
     common = {"bias", "sample_rate_error", "unit_error", "axis_permutation"}
     assert set(PENALTY_NATS) == set(EFFECTS) - common
     assert min(PENALTY_NATS.values()) > 0.0
 
 
-def test_classic_terms_that_are_lacking():
+def test_missing_noise_terms_are_proposed():
     assert set(asked(propose.propose_allan_terms, axis(noise()))) == {
         "quantization_noise",
         "bias_instability",
@@ -75,14 +75,14 @@ def test_classic_terms_that_are_lacking():
 
 
 @pytest.mark.parametrize("correlation_s", [0.05, 0.5, 5.0])
-def test_correlation_time(correlation_s):
+def test_correlation_time_is_found(correlation_s):
     y = noise() + correlated(n, np.random.default_rng(1), 5e-4, correlation_s)
     found = asked(propose.propose_correlated_noise, axis(y))["exponentially_correlated"]
     assert isinstance(found, ExponentiallyCorrelated)
     assert found.correlation_time == pytest.approx(correlation_s, rel=0.35)
 
 
-def test_a_correlation_as_long_as_the_recording_is_left_to_the_walk():
+def test_correlation_as_long_as_the_recording_is_no_candidate():
     assert (
         asked(
             propose.propose_correlated_noise,
@@ -94,7 +94,7 @@ def test_a_correlation_as_long_as_the_recording_is_left_to_the_walk():
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.5, 2.4])
-def test_a_power_law(exponent):
+def test_power_law_is_found(exponent):
     hidden = PowerLaw(density=N, exponent=exponent)
     y = NoiseModel({"gz": (WHITE, hidden)}).simulate(n, RATE_HZ, 3)[:, 2].copy()
     found = asked(propose.propose_power_law, axis(y), (WHITE,))["power_law"]
@@ -102,7 +102,7 @@ def test_a_power_law(exponent):
     assert asked(propose.propose_power_law, axis(y), (WHITE, found)) == {}
 
 
-def test_a_resonance():
+def test_resonance_is_found():
     y = noise() + ringing(n, np.random.default_rng(3), 5e-4, 17.3, 1.0)
     found = asked(propose.propose_resonances, axis(y))["narrowband"]
     assert isinstance(found, Narrowband)
@@ -115,8 +115,8 @@ def test_a_resonance():
     assert asked(propose.propose_resonances, axis(noise())) == {}
 
 
-def test_a_line():
-    """Far closer than a bin of the periodogram, which is 1/240 Hz."""
+def test_line_is_found():
+    """The accuracy is far better than a bin of the periodogram, which is 1/240 Hz wide."""
     y = noise() + 2e-4 * np.sin(2 * np.pi * 17.3042 * time_s(n))
     one = axis(y)
     found = asked(propose.propose_sinusoids, one)["sinusoidal"]
@@ -135,7 +135,7 @@ def test_a_line():
     ("kind", "order"), [("butterworth", 1), ("butterworth", 2), ("butterworth", 4), ("iir", 1), ("iir", 2), ("fir", 1)]
 )
 @pytest.mark.parametrize("floor", [None, 0.1 * N])
-def test_a_filter(kind, order, floor):
+def test_filter_is_found(kind, order, floor):
     hidden = BandwidthLimit(cutoff=14.0, order=order, kind=kind, floor=floor)
     y = NoiseModel({"gz": (WHITE, hidden)}).simulate(n, RATE_HZ, 6)[:, 2].copy()
     found = asked(propose.propose_low_pass, axis(y), (WHITE,))["bandwidth_limit"]
@@ -152,7 +152,7 @@ def test_a_filter(kind, order, floor):
     assert asked(propose.propose_low_pass, axis(y), (WHITE, found)) == {}
 
 
-def test_what_follows_the_clock():
+def test_effects_of_time_are_found():
     t = time_s(n)
     y = noise() + 1e-3 * np.exp(-t / 9.0) - 5e-4 * (t >= 130.0)
     found = asked(propose.propose_drifts_and_steps, axis(y))
@@ -168,7 +168,7 @@ def test_what_follows_the_clock():
     assert "rate_ramp" not in with_ramp
 
 
-def test_what_follows_temperature():
+def test_effects_of_temperature_are_found():
     warm = warmth(n)
     found = asked(propose.propose_temperature_effects, axis(noise() + 3e-4 * (warm - 25.0), temperature_c=warm))
     assert isinstance(found["temperature_bias"], TemperatureBias)
@@ -189,7 +189,7 @@ def test_what_follows_temperature():
     assert asked(propose.propose_temperature_effects, axis(noise(), temperature_c=np.full(n, 25.0))) == {}
 
 
-def test_other_axes_by_their_kind():
+def test_other_axes_are_proposed_by_their_kind():
     rng = np.random.default_rng(7)
     values = {name: white(n, rng) for name in ("gy", "gz", "ax", "az")}
     every = axes(values, (WHITE,))
@@ -204,8 +204,8 @@ def test_other_axes_by_their_kind():
     assert {effect.source for effect in rest} == {"ax", "az"}
 
 
-def test_sizes_of_first_guesses_do_not_matter():
-    """What a family offers is fitted by whoever tries it: the unit of the axis changes no shape."""
+def test_shapes_do_not_depend_on_the_initial_sizes():
+    """The sizes of candidates are fitted later, so the unit of the axis changes no shape."""
     y = noise() + correlated(n, np.random.default_rng(8), 5e-4, 0.5)
     one = asked(propose.propose_correlated_noise, axis(y))["exponentially_correlated"]
     scaled = (type(WHITE)(N=1e4 * N), type(WALK)(K=1e4 * WALK.K))

@@ -1,4 +1,4 @@
-"""Vibration that several axes share: one name for all axes, and no name for leaks, knocks and independent noise."""
+"""Tests of the search for vibration that several axes share, and of leaks, shocks and independent noise."""
 
 from functools import cache
 
@@ -47,7 +47,7 @@ def vibrating(unit: np.ndarray, seed: int = 0, names: tuple[str, ...] = GYRO_AXE
 
 
 def searched(values: dict[str, np.ndarray]) -> dict[str, AxisSearchResult]:
-    """The result of the search on each axis and of the search for common vibration."""
+    """Return the result of the search on each axis and of the search for common vibration."""
     null = dict.fromkeys(values, STRICT)
     each = {
         name: search_missing_effects(one, MODEL, STRICT, np.random.default_rng(1))
@@ -66,7 +66,7 @@ def vibrations(found: dict[str, AxisSearchResult]) -> dict[str, CommonVibration]
 
 
 @pytest.mark.parametrize("names", [("gx", "gy"), GYRO_AXES], ids=len)
-def test_a_resonance_of_several_axes_has_one_name(names):
+def test_resonance_of_several_axes_has_one_name(names):
     found = searched(vibrating(ringing(n, np.random.default_rng(5), 1.0, 17.0, 0.5), names=names))
     named = vibrations(found)
     assert set(named) == set(names)
@@ -79,7 +79,7 @@ def test_a_resonance_of_several_axes_has_one_name(names):
         assert found[name].final.findings["other_axes"].gain < STRICT["other_axes"].threshold
 
 
-def test_a_vibration_without_a_peak():
+def test_common_vibration_without_a_peak_is_found():
     named = vibrations(searched(vibrating(correlated(n, np.random.default_rng(6), 1.0, 0.1))))
     assert set(named) == set(GYRO_AXES)
     for name, one in named.items():
@@ -95,7 +95,7 @@ def test_equal_but_independent_resonances_are_no_common_vibration(seed):
     assert vibrations(searched(values)) == {}
 
 
-def test_a_leak_is_no_common_vibration():
+def test_leak_is_no_common_vibration():
     values = vibrating(ringing(n, np.random.default_rng(7), 1.0, 17.0, 0.5), names=("gx",))
     found = searched(values | {"gy": values["gy"] + 0.3 * values["gx"]})
     assert vibrations(found) == {}
@@ -109,14 +109,14 @@ def test_two_axes_with_a_leak_are_not_searched():
     assert any(isinstance(effect, CrossAxis) for one in found.values() for effect in one.hypothesis.added)
 
 
-def test_a_knock_is_no_common_vibration():
+def test_knock_is_no_common_vibration():
     knock = np.zeros(n)
     knock[4000:4100] = 10.0 * np.random.default_rng(8).standard_normal(100)
     assert vibrations(searched(vibrating(knock))) == {}
 
 
 @pytest.mark.parametrize("leak", [0.0, 0.1])
-def test_a_leak_beside_a_known_vibration_is_still_seen(leak):
+def test_leak_beside_a_known_vibration_is_found(leak):
     unit = ringing(60_000, np.random.default_rng(9), 1.0, 17.0, 0.5)
     rng = np.random.default_rng(3)
     values = {name: white(60_000, rng) + GAINS[name] * unit for name in ("gx", "gy")}
@@ -135,7 +135,7 @@ def test_a_leak_beside_a_known_vibration_is_still_seen(leak):
 
 
 @pytest.mark.parametrize("shared", ["whole", "first half", "not at all"])
-def test_an_axis_belongs_to_a_vibration_with_evidence_in_both_halves(shared):
+def test_axis_belongs_to_a_vibration_with_evidence_in_both_halves(shared):
     shape, unit = (17.3, 1.0), ringing(n, np.random.default_rng(7), 1.0, 17.3, 1.0)
     values = vibrating(unit, 3, ("gx", "gy"))
     part = {"whole": n, "first half": n // 2, "not at all": 0}[shared]

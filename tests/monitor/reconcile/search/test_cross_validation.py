@@ -1,4 +1,4 @@
-"""A step is kept where what one half taught holds in the other, and is not where it was there by chance."""
+"""Tests that a step is kept if the fit of one half of the recording is valid for the other half."""
 
 import numpy as np
 import pytest
@@ -66,8 +66,8 @@ REAL = {
 }
 
 
-def test_a_drift_of_one_half_does_not_outweigh_the_effect():
-    """The fitted random walk of the half with the drift is far too large for the other half."""
+def test_drift_of_one_half_does_not_outweigh_the_effect():
+    """The random walk that is fitted to the half with the drift is far too large for the other half."""
     drift = np.where(HALF, 0.02 * np.exp(-time_s(n) / 20.0), 0.0)
     one = axis(noise(4) + RINGING + drift, MODEL)
     found = proven(one, Narrowband(sigma=1e-4, frequency=17.3, bandwidth=1.0), "psd")
@@ -76,7 +76,7 @@ def test_a_drift_of_one_half_does_not_outweigh_the_effect():
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_what_is_there_in_both_halves_is_kept(name):
+def test_effect_of_both_halves_is_kept(name):
     hidden, effect, diagnostic = REAL[name]
     one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
     found = proven(one, effect, diagnostic)
@@ -99,7 +99,7 @@ BY_CHANCE = {
 
 
 @pytest.mark.parametrize("name", BY_CHANCE)
-def test_what_one_half_contradicts_is_not_kept(name):
+def test_effect_that_one_half_contradicts_is_not_kept(name):
     hidden, effect, diagnostic = BY_CHANCE[name]
     hidden = hidden * HALF if diagnostic == "psd" else hidden
     one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
@@ -110,8 +110,8 @@ def test_what_one_half_contradicts_is_not_kept(name):
     assert not found.kept
 
 
-def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
-    """The strongest line of pure noise gains its dozen nats; halves of that decide nothing, and the reason says so."""
+def test_strongest_line_of_noise_is_not_validated():
+    """The strongest line of pure noise gains about twelve nats, which is too little for a decision with halves."""
     one = axis(noise(4))
     view = seen(one, MODEL)
     gain, f_hz = find_peak_gains_and_frequencies(view.periodogram, one.rate_hz, 1)[0]
@@ -121,7 +121,7 @@ def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
     assert np.isnan(found.before) == bool(found.reason)
 
 
-def test_another_size_of_a_known_noise():
+def test_changed_size_of_a_known_noise_is_kept():
     one = axis(1.2 * noise(5))
     before = fit_with_fixed_noise(one, MODEL)
     after = fit_with_fewest_changes(one, (), MODEL)
@@ -135,7 +135,7 @@ def test_another_size_of_a_known_noise():
     ("effect", "model"),
     [(NoiseStep(time=60.0, ratio=2.0), (AngleRandomWalk(N=N),)), (BiasStep(time=30.0, height=1.0), MODEL)],
 )
-def test_what_happens_once_has_no_other_half(effect, model):
+def test_single_event_is_not_validated_by_halves(effect, model):
     course = np.where(time_s(n) < 60.0, 1.0, 2.0) if isinstance(effect, NoiseStep) else 1.0
     y = noise(6) * course + 4e-3 * (time_s(n) >= 30.0) * isinstance(effect, BiasStep)
     found = proven(axis(y), effect, "variance" if isinstance(effect, NoiseStep) else "level", model)
@@ -144,14 +144,14 @@ def test_what_happens_once_has_no_other_half(effect, model):
     assert np.isnan([found.before, found.after]).all()
 
 
-def test_too_faint_for_a_half_is_told():
+def test_effect_too_weak_for_a_half_has_that_reason():
     one = axis(noise(7) + 4e-5 * np.sin(2 * np.pi * 17.3 * time_s(n)))
     found = proven(one, Sinusoidal(amplitude=1.0, frequency=17.3, phase=0.0), "lines")
     assert "half" in found.reason
 
 
 @pytest.mark.parametrize("kind", ["outliers", "resolution"])
-def test_single_samples_are_looked_at_in_each_half(kind):
+def test_outliers_are_tested_in_each_half(kind):
     rng = np.random.default_rng(8)
     y = noise(8)
     if kind == "outliers":

@@ -1,4 +1,4 @@
-"""Of two effects with one spectrum, the one that made the data is named: both ways, three pairs."""
+"""Tests that of two effects with equal spectra, the simulated effect is named."""
 
 import numpy as np
 import pytest
@@ -39,14 +39,14 @@ def jumps(rng, rate, height):
 
 
 def found_as_noise(y):
-    """After a search has found correlated noise."""
+    """Return the result of a search that has found correlated noise."""
     one = axis(y)
     effects = (*MODEL, ExponentiallyCorrelated(sigma=3e-4, correlation_time=5.0))
     return fit_with_fewest_changes(one, effects[2:], effects[:2])
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_telegraph_is_no_correlated_noise(seed):
+def test_telegraph_signal_is_no_correlated_noise(seed):
     rng = np.random.default_rng(seed)
     state = found_as_noise(noise(rng) + two_levels(rng, 6e-4, 10.0))
     twin = fit_telegraph_alternative(state, 2)
@@ -62,13 +62,13 @@ def test_a_telegraph_is_no_correlated_noise(seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_correlated_noise_is_no_telegraph(seed):
+def test_correlated_noise_is_no_telegraph_signal(seed):
     rng = np.random.default_rng(seed)
     state = found_as_noise(noise(rng) + correlated(n, rng, 3e-4, 5.0))
     assert fit_telegraph_alternative(state, 2).gain < -5.0
 
 
-def test_nothing_is_asked_where_there_is_no_white_noise():
+def test_without_white_noise_no_alternative_is_tested():
     rng = np.random.default_rng(2)
     one = axis(noise(rng) + correlated(n, rng, 3e-4, 5.0))
     state = fit_with_fewest_changes(one, (ExponentiallyCorrelated(sigma=3e-4, correlation_time=5.0),), (WALK,))
@@ -93,7 +93,7 @@ def test_poisson_steps_are_no_random_walk(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_random_walk_is_no_poisson_steps(seed):
+def test_random_walk_is_no_poisson_steps(seed):
     rng = np.random.default_rng(seed)
     one = axis(noise(rng) + walk(n, rng, 1e-4))
     state = fit_with_fewest_changes(one, (), MODEL)
@@ -101,7 +101,7 @@ def test_a_random_walk_is_no_poisson_steps(seed):
     assert fit_poisson_alternative(state).gain < 0.0
 
 
-def test_a_random_walk_that_the_model_has_not():
+def test_missing_random_walk_is_compared_with_poisson_steps():
     rng = np.random.default_rng(5)
     y = white(n, rng) + walk(n, rng, 1e-4)
     one = axis(y)
@@ -113,7 +113,7 @@ def test_a_random_walk_that_the_model_has_not():
     assert not any(isinstance(effect, RateRandomWalk) for effect in twin.added)
 
 
-def test_the_noise_around_has_the_spectrum_of_its_effects():
+def test_remaining_noise_has_the_spectrum_of_its_effects():
     effects = (
         WHITE,
         RateRandomWalk(K=2e-3),
@@ -132,7 +132,7 @@ def test_the_noise_around_has_the_spectrum_of_its_effects():
         np.testing.assert_allclose(density, expected, rtol=2e-3)
 
 
-def test_a_model_that_is_right_is_not_asked():
+def test_true_model_is_not_tested():
     one = axis(noise(np.random.default_rng(6)))
     assert fit_poisson_alternative(fit_with_fewest_changes(one, (), MODEL)) is None
     step = noise(np.random.default_rng(7)) + 5e-4 * (time_s(n) > 200.0)
@@ -141,7 +141,7 @@ def test_a_model_that_is_right_is_not_asked():
     assert fit_poisson_alternative(state).gain < 0.0  # one step is a step
 
 
-def test_jumps_are_told_from_correlated_noise_that_absorbed_them():
+def test_jumps_are_distinguished_from_correlated_noise_that_contains_them():
     rng = np.random.default_rng(3)
     stepped = compare_poisson_with_added_noise(found_as_noise(noise(rng) + jumps(rng, 0.05, 6e-4)))
     assert stepped.gain > 5.0

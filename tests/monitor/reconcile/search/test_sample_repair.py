@@ -1,4 +1,4 @@
-"""What is wrong with single samples is put right only where the model says that it is there."""
+"""Tests that missing, repeated, clipped and outlying samples are repaired only if the model has these effects."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def noise(seed=0):
     return white(n, np.random.default_rng(seed))
 
 
-def test_holes_are_filled_from_around_them():
+def test_gaps_are_filled_from_adjacent_samples():
     y = correlated(n, np.random.default_rng(1), 1e-3, 2.0) + white(n, np.random.default_rng(2), 0.1 * N)
     holed = y.copy()
     lost = np.random.default_rng(3).random(n) < 0.1
@@ -43,7 +43,7 @@ def test_input_is_not_changed():
     np.testing.assert_array_equal(y, kept)
 
 
-def test_repeats_are_mended_where_the_model_has_them():
+def test_repeats_are_repaired_if_the_model_has_them():
     y, rng = noise(), np.random.default_rng(4)
     held = rng.random(n) < 0.2
     held[0] = False
@@ -60,7 +60,7 @@ def test_repeats_are_mended_where_the_model_has_them():
     assert np.std(put_right) == pytest.approx(SIGMA, rel=0.03)
 
 
-def test_clipped_samples_are_drawn_from_beyond_the_limit():
+def test_clipped_samples_are_drawn_beyond_the_limit():
     y = noise()
     limit = 2.0 * SIGMA
     clipped = np.clip(y, -limit, limit)
@@ -76,7 +76,7 @@ def test_clipped_samples_are_drawn_from_beyond_the_limit():
     np.testing.assert_array_equal(_repair_samples(clipped, shown, (WHITE,), np.random.default_rng(RNG)), clipped)
 
 
-def test_outliers_are_taken_for_missing_where_the_model_has_them():
+def test_outliers_are_treated_as_missing_if_the_model_has_them():
     y, rng = noise(), np.random.default_rng(5)
     far = rng.choice(n, 30, replace=False)
     y[far] += 20.0 * SIGMA * rng.choice([-1.0, 1.0], 30)
@@ -90,7 +90,7 @@ def test_outliers_are_taken_for_missing_where_the_model_has_them():
     np.testing.assert_array_equal(mended.raw, y)
 
 
-def test_the_same_generator_gives_the_same_axis():
+def test_same_generator_gives_the_same_axis():
     y = noise()
     y[::9] = np.nan
     one, other = axis(y, (WHITE,)), axis(y, (WHITE,))
@@ -99,7 +99,7 @@ def test_the_same_generator_gives_the_same_axis():
     assert not np.array_equal(one.coefficients, third.coefficients)
 
 
-def test_put_right_for_other_effects_is_prepared_for_them():
+def test_repair_for_other_effects_equals_a_new_preparation():
     y = np.clip(noise(), -1.5 * SIGMA, 1.5 * SIGMA)
     model = (WHITE, Saturation(limit=1.5 * SIGMA))
     later = repair_axis_again(axis(y, (WHITE,)), model, np.random.default_rng(0))
@@ -108,7 +108,7 @@ def test_put_right_for_other_effects_is_prepared_for_them():
     np.testing.assert_array_equal(back.repaired, y)
 
 
-def test_which_axes_may_leak_into_which():
+def test_axes_leak_only_into_possible_targets():
     into = {one: {other for other in AXES if _may_leak(other, one)} for one in AXES}
     assert into["gx"] == {"gy", "gz", "ax", "ay", "az"}
     assert into["ay"] == {"ax", "az"}
@@ -116,7 +116,7 @@ def test_which_axes_may_leak_into_which():
     assert {name: set(one.leak_sources) for name, one in every.items()} == into
 
 
-def test_what_the_values_show():
+def test_artifacts_of_values_are_detected():
     y = noise()
     shown = ValueArtifacts(y)
     assert shown.quantization is None

@@ -1,4 +1,4 @@
-"""The report of several recordings for programs: its keys, numbers that JSON has, the same bytes every time."""
+"""Tests of the JSON report of several recordings: keys, valid numbers and reproducible bytes."""
 
 import json
 from dataclasses import replace
@@ -39,18 +39,18 @@ def test_keys_are_those_of_the_schema() -> None:
     assert common["each"]["a"]["gap"] == {"before": 30.0, "after": 1.2}
 
 
-def test_what_is_not_known_is_null_or_absent() -> None:
+def test_unknown_values_are_null_or_absent() -> None:
     (single,) = written(made())["axes"]["gz"]["single"]
     assert single["parameters"] == {"source": {"value": "gx"}, "coefficient": {"value": 0.1, "lo": None, "hi": None}}
     assert (single["consistent"], single["p"]) == (None, None)
     assert single["absent"] == [{"run": "a", "meaning": "too_faint", "because": "the recording does not contain gx"}]
 
 
-def test_what_is_no_number_is_null() -> None:
+def test_nan_is_null() -> None:
     wrong = replace(line(), confidence=float("nan"))
     (single,) = written(compare_results([run("a", wrong), run("b")]))["axes"]["gz"]["single"]
     assert single["each"]["a"]["confidence"] is None
 
 
-def test_the_same_comparison_gives_the_same_bytes() -> None:
+def test_same_comparison_gives_the_same_bytes() -> None:
     assert encode_comparison(made()) == encode_comparison(made())

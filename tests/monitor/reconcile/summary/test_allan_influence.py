@@ -1,4 +1,4 @@
-"""The influence of a change on the Allan deviation, against formulas."""
+"""Tests of the influence of a change on the Allan deviation against formulas."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def influences(y, *added, fixed=frozenset({0})):
     return compute_allan_influences_of_changes(hypothesis, changed)
 
 
-def test_a_line_is_largest_where_its_allan_variance_stands_out_most():
+def test_line_is_largest_where_its_allan_variance_stands_out_most():
     f, a = 2.3, 4e-4
     y = white(n, np.random.default_rng(1)) + a * np.sin(2 * np.pi * f * time_s(n))
     found = influences(y, Sinusoidal(amplitude=a, frequency=f))[1]
@@ -30,7 +30,7 @@ def test_a_line_is_largest_where_its_allan_variance_stands_out_most():
     assert found.ratio == pytest.approx(ratio.max(), rel=0.03)
 
 
-def test_a_changed_size_multiplies_the_deviation():
+def test_changed_size_multiplies_the_deviation():
     found = influences(1.3 * white(n, np.random.default_rng(1)), fixed=frozenset())
     assert list(found) == [0]
     assert found[0].ratio == pytest.approx(1.3, rel=0.01)
@@ -44,6 +44,6 @@ def test_outliers_add_white_noise_and_a_filter_removes_noise():
     assert influences(y, BandwidthLimit(cutoff=10.0, order=1))[1].ratio < 0.8
 
 
-def test_a_change_without_influence_has_the_ratio_one():
+def test_change_without_influence_has_the_ratio_one():
     found = influences(white(n, np.random.default_rng(1)), Sinusoidal(amplitude=1e-9, frequency=17.3))
     assert found[1].ratio == pytest.approx(1.0, abs=0.01)

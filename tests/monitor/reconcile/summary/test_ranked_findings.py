@@ -1,4 +1,4 @@
-"""One cause is one finding, and the findings stand in the order of their share."""
+"""Tests that each cause is one finding and that findings are sorted by their share of the gap."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def made(steps, remaining=None, effects=None, fitted_first=False) -> Reconciliat
     return Reconciliation("explained", axes, given, given, fitted_first, 100.0, 1000, 10.0, 1)
 
 
-def test_a_line_on_three_axes_is_one_finding():
+def test_line_on_three_axes_is_one_finding():
     r = made({
         "gx": [of("sinusoidal", 100.0, frequency=around(17.3, 1e-3), ratio=1.1)],
         "gy": [of("narrowband", 300.0, frequency=around(17.31, 1e-2), bandwidth=0.1, ratio=0.5)],
@@ -63,7 +63,7 @@ def test_steps_at_different_times_and_kinds_are_apart():
     assert [one.axes for one in rank_findings(r).findings] == [("gx", "gy"), ("gz",)]
 
 
-def test_changed_sizes_are_one_finding_if_their_factors_agree():
+def test_changed_sizes_with_equal_factors_are_one_finding():
     r = made({
         axis: [of("angle_random_walk", 10.0, kind="retuned", N=factor * N)]
         for axis, factor in (("gx", 1.2), ("gy", 1.21), ("gz", 1.5), ("ax", 1.2))
@@ -75,7 +75,7 @@ def test_changed_sizes_are_one_finding_if_their_factors_agree():
     assert rank_findings(replace(r, fitted_first=True)).findings == ()
 
 
-def test_an_absent_resonance_says_which_one():
+def test_absent_resonance_is_named_with_its_frequency():
     effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
     r = made({"gx": [of("narrowband", 10.0, kind="absent", sigma=ParameterInterval(0.0))]}, effects=effects)
     gone = replace(r, model=NoiseModel({"gx": (effects[0], replace(effects[1], sigma=0.0))}))
@@ -83,7 +83,7 @@ def test_an_absent_resonance_says_which_one():
     assert (one.kind, one.parameters["frequency"].value, one.size_ratio) == ("absent", 20.0, None)
 
 
-def test_a_retuned_resonance_is_compared_with_the_same_resonance():
+def test_retuned_resonance_is_compared_with_the_same_resonance():
     effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
     r = made({"gx": [of("narrowband", 10.0, kind="retuned", sigma=around(1e-3, 1e-5))]}, effects=effects)
     changed = replace(r, model=NoiseModel({"gx": (replace(effects[0], sigma=3e-3), replace(effects[1], sigma=1e-3))}))
@@ -92,14 +92,14 @@ def test_a_retuned_resonance_is_compared_with_the_same_resonance():
     assert one.old_frequency is None
 
 
-def test_a_size_that_the_model_lacks_has_no_ratio():
+def test_size_that_the_model_lacks_has_no_ratio():
     effects = (BandwidthLimit(cutoff=20.0),)
     r = made({"gx": [of("bandwidth_limit", 10.0, kind="retuned", floor=around(1e-4, 1e-6))]}, effects=effects)
     (one,) = rank_findings(r).findings
     assert one.size_ratio is None
 
 
-def test_a_moved_resonance_states_the_old_frequency():
+def test_moved_resonance_states_the_old_frequency():
     effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
     moved = of("narrowband", 10.0, kind="retuned", sigma=around(2e-3, 1e-5), frequency=around(19.5, 0.01))
     model = NoiseModel({"gx": (effects[0], replace(effects[1], frequency=19.5))})
@@ -107,7 +107,7 @@ def test_a_moved_resonance_states_the_old_frequency():
     assert (one.old_frequency, one.size_ratio) == (20.0, pytest.approx(1.0))
 
 
-def test_the_shares_of_findings_and_remainders_make_one():
+def test_shares_of_findings_and_remaining_gaps_sum_to_one():
     line = of("sinusoidal", 60.0, frequency=17.3)
     r = made({"gx": [line], "gy": []}, {"gx": [left("spectrum", 30.0)], "gy": [left("distribution", 10.0)]})
     ranking = rank_findings(r)
@@ -117,7 +117,7 @@ def test_the_shares_of_findings_and_remainders_make_one():
     assert ranking.explained_share == pytest.approx(0.6)
 
 
-def test_the_dependence_of_two_axes_on_each_other_counts_once():
+def test_dependence_of_two_axes_on_each_other_counts_once():
     leaks = {"gx": [left("other_axes", 30.0, "gy")], "gy": [left("other_axes", 40.0, "gx")]}
     ranking = rank_findings(made({"gx": [], "gy": []}, leaks))
     assert [(one.axis, one.gap.gain_nats) for one in ranking.remainders] == [("gy", 40.0)]
@@ -125,6 +125,6 @@ def test_the_dependence_of_two_axes_on_each_other_counts_once():
     assert len(rank_findings(made({"gx": [], "gy": []}, same)).remainders) == 1
 
 
-def test_a_recording_without_a_gap_is_explained():
+def test_recording_without_a_gap_is_explained():
     ranking = rank_findings(made({"gx": []}))
     assert (ranking.whole_nats, ranking.findings, ranking.explained_share) == (0.0, (), 1.0)
