@@ -45,7 +45,7 @@ def correlated(n: int, rng: np.random.Generator, sigma: float, time_s: float) ->
     return np.asarray(lfilter([1.0], [1.0, -decay], drawn))
 
 
-def ringing(n: int, rng: np.random.Generator, sigma: float, f_hz: float, width_hz: float) -> Floats:
+def draw_resonance(n: int, rng: np.random.Generator, sigma: float, f_hz: float, width_hz: float) -> Floats:
     """Draw a second-order autoregression with a pole at the frequency."""
     radius = np.exp(-np.pi * width_hz / RATE_HZ)
     poles = [1.0, -2.0 * radius * np.cos(2.0 * np.pi * f_hz / RATE_HZ), radius**2]
@@ -57,7 +57,7 @@ def time_s(n: int) -> Floats:
     return np.arange(n) / RATE_HZ
 
 
-def warmth(n: int) -> Floats:
+def make_temperature(n: int) -> Floats:
     """Return an oscillating temperature with a drift in °C, shape [n]."""
     t = np.arange(n) / n
     return 25.0 + 3.0 * np.sin(2.0 * np.pi * 1.7 * t) + 2.0 * t
@@ -81,7 +81,7 @@ def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | No
     return axes({"gz": y}, effects, temperature_c)["gz"]
 
 
-def seen(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
+def whiten(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
     """Whiten an axis by a model without fitting its parameters."""
     return whiten_axis(fit_with_fixed_noise(one, effects).fit)
 

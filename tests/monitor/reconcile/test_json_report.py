@@ -19,7 +19,7 @@ from monitor.reconcile.result import (
 from tests.monitor.reconcile import samples
 
 
-def written(r: Reconciliation) -> dict[str, Any]:
+def write_json(r: Reconciliation) -> dict[str, Any]:
     return dict(json.loads(encode_report(r)))
 
 
@@ -30,7 +30,7 @@ def with_step(r: Reconciliation, **changed: object) -> Reconciliation:
 
 
 def test_step_follows_its_schema() -> None:
-    report = written(samples.explained())
+    report = write_json(samples.explained())
     assert report["schema"] == "imu-monitor/reconcile/1"
     assert report["verdict"] == "explained"
     assert report["axes"]["gz"]["verdict"] == "explained"
@@ -60,7 +60,7 @@ def test_step_follows_its_schema() -> None:
 
 
 def test_summary_and_the_ranked_findings_come_first() -> None:
-    report = written(samples.partly_explained())
+    report = write_json(samples.partly_explained())
     assert list(report)[:3] == ["schema", "verdict", "summary"]
     assert report["summary"][0].startswith("The model differs from the recording on gz")
     assert report["gap_nats"] == 886.0
@@ -72,8 +72,8 @@ def test_summary_and_the_ranked_findings_come_first() -> None:
     assert line["share"] == report["explained_share"] == 1.0 - left["share"] == 848.0 / 886.0
 
 
-def test_compared_effects_are_written() -> None:
-    report = written(samples.explained())
+def test_report_states_settings_notes_and_diagnostics() -> None:
+    report = write_json(samples.explained())
     about = {name: report[name] for name in ("rate", "samples", "seconds", "seed", "fitted_first")}
     assert about == {"rate": 100.0, "samples": 360_000, "seconds": 3600.0, "seed": 7, "fitted_first": False}
     assert report["notes"] == ["12 missing samples <in 1 gap> & filled"]
@@ -83,7 +83,7 @@ def test_compared_effects_are_written() -> None:
 
 
 def test_single_event_has_a_reason_instead_of_a_held_out_gap() -> None:
-    first, second = written(samples.explained())["axes"]["gz"]["steps"]
+    first, second = write_json(samples.explained())["axes"]["gz"]["steps"]
     assert second["held_out_gap"] is None
     assert second["held_out_reason"] == "a known term of another size is not held out"
     assert "held_out_reason" not in first
@@ -91,7 +91,7 @@ def test_single_event_has_a_reason_instead_of_a_held_out_gap() -> None:
 
 def test_threshold_of_a_gap_is_that_after_the_step() -> None:
     after = DiagnosticGap("psd", Location(), 1.0, 1.7, 2.2)
-    step = written(with_step(samples.explained(), after=after))["axes"]["gz"]["steps"][0]
+    step = write_json(with_step(samples.explained(), after=after))["axes"]["gz"]["steps"][0]
     assert step["gap"] == {"before": 41.2, "after": 1.0, "null95": 1.7, "threshold": 2.2}
     assert step["found"]["threshold"] == 2.6
 
@@ -104,7 +104,7 @@ def test_nan_is_null_and_an_axis_parameter_has_no_interval() -> None:
     }
     found = DiagnosticGap("other_axes", Location(source="ax", value=(-np.inf, 0.1)), np.inf, np.nan, 2.5)
     changed = with_step(samples.explained(), parameters=parameters, before=found, confidence=np.nan)
-    step = written(changed)["axes"]["gz"]["steps"][0]
+    step = write_json(changed)["axes"]["gz"]["steps"][0]
     assert step["parameters"] == {
         "source": {"value": "ax"},
         "coefficient": {"value": 2e-4, "lo": None, "hi": None},
@@ -118,7 +118,7 @@ def test_nan_is_null_and_an_axis_parameter_has_no_interval() -> None:
 
 
 def test_remaining_gap_has_a_place_and_no_effect() -> None:
-    axis = written(samples.unexplained())["axes"]["ax"]
+    axis = write_json(samples.unexplained())["axes"]["ax"]
     assert axis["verdict"] == "unexplained"
     assert axis["steps"] == []
     assert axis["left_over"] == [
@@ -130,7 +130,7 @@ def test_same_reconciliation_gives_the_same_bytes_in_the_order_of_the_axes() -> 
     r = samples.explained()
     backwards = replace(r, axes=dict(reversed(r.axes.items())))
     assert encode_report(samples.explained()) == encode_report(r) == encode_report(backwards)
-    assert list(written(backwards)["axes"]) == ["gx", "gy", "gz", "ax", "ay", "az"]
+    assert list(write_json(backwards)["axes"]) == ["gx", "gy", "gz", "ax", "ay", "az"]
 
 
 def test_numpy_numbers_are_written_as_numbers() -> None:
@@ -155,6 +155,6 @@ def test_numpy_numbers_are_written_as_numbers() -> None:
     axes = {"gx": AxisResult("gx", "explained", look, (step,), (), look)}
     model = samples.explained().model
     r = Reconciliation("explained", axes, model, model, False, np.float64(10), np.int64(20), np.float64(2), np.int64(1))
-    report = written(r)
+    report = write_json(r)
     assert report["samples"] == 20
     assert report["axes"]["gx"]["steps"][0]["found"]["where"] == {"frequency": [1.0, 2.0]}

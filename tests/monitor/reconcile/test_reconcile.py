@@ -52,7 +52,7 @@ pytestmark = pytest.mark.long
 n = 60_000
 
 
-def changing(size):
+def make_changing_temperature(size):
     """Return a temperature in °C that is no sine, so that no line can replace it, shape [size]."""
     t = np.arange(size) / size
     return 25.0 + 6.0 * np.abs(t - 0.35) + 2.0 * np.sin(2 * np.pi * 2.3 * t**2)
@@ -68,7 +68,7 @@ HIDDEN = {
 @cache
 def result(name, seed=1):
     more = NoiseModel({HIDDEN[name][0]: (HIDDEN[name][1],)}) if name else NoiseModel({})
-    return reconcile(recording(MODEL + more, n, seed + 50, changing(n)), MODEL, seed)
+    return reconcile(recording(MODEL + more, n, seed + 50, make_changing_temperature(n)), MODEL, seed)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -105,7 +105,7 @@ def test_hidden_effect_is_found_on_its_axis(name):
 def test_resulting_model_agrees_with_another_recording():
     found = result("sinusoidal")
     where, effect = HIDDEN["sinusoidal"]
-    other = recording(MODEL + NoiseModel({where: (effect,)}), n, 77, changing(n))
+    other = recording(MODEL + NoiseModel({where: (effect,)}), n, 77, make_changing_temperature(n))
     assert reconcile(other, found.model, 3).verdict == "agrees"
 
 
@@ -207,7 +207,7 @@ def test_only_terms_that_the_data_support_are_fitted():
 # --- what cannot be compared
 
 
-def drawn(**changed):
+def draw_recording(**changed):
     small = recording(MODEL, MIN_SAMPLES, 1)
     return Recording({**small.values, **changed}, RATE_HZ)
 
@@ -215,15 +215,15 @@ def drawn(**changed):
 def test_error_for_too_few_samples_states_the_minimum():
     with pytest.raises(NotReady, match=rf"{MIN_SAMPLES - 1} samples; at least {MIN_SAMPLES} .*100 Hz"):
         select_axes_and_smooth_temperature(recording(MODEL, MIN_SAMPLES - 1, 1), MODEL)
-    assert select_axes_and_smooth_temperature(drawn(), MODEL)[1] == ()
+    assert select_axes_and_smooth_temperature(draw_recording(), MODEL)[1] == ()
 
 
 def test_axes_that_cannot_be_compared_are_left_out_with_a_note():
-    values = drawn().values
+    values = draw_recording().values
     holed = values["gx"].copy()
     holed[10:] = np.nan
     kept, notes = select_axes_and_smooth_temperature(
-        drawn(gx=holed, gy=np.full(MIN_SAMPLES, 0.3), ax=values["gz"]), MODEL
+        draw_recording(gx=holed, gy=np.full(MIN_SAMPLES, 0.3), ax=values["gz"]), MODEL
     )
     assert list(kept.values) == ["gz"]
     assert [note.split(":")[0] for note in notes] == ["gx", "gy", "ax"]
@@ -234,13 +234,13 @@ def test_axes_that_cannot_be_compared_are_left_out_with_a_note():
 
 def test_constant_bias_is_no_part_of_the_comparison():
     model = MODEL + NoiseModel({"gz": (ConstantBias(value=0.3),)})
-    assert _effects_by_axis(model, drawn())["gz"] == TERMS
-    assert _effects_by_axis(NoiseModel({}), drawn()) == dict.fromkeys(GYRO_AXES, ())
+    assert _effects_by_axis(model, draw_recording())["gz"] == TERMS
+    assert _effects_by_axis(NoiseModel({}), draw_recording()) == dict.fromkeys(GYRO_AXES, ())
 
 
 def test_temperature_is_smoothed_and_gaps_are_filled():
     rng = np.random.default_rng(1)
-    true = changing(n)
+    true = make_changing_temperature(n)
     noisy = true + 0.3 * rng.standard_normal(n)
     noisy[rng.random(n) < 0.5] = np.nan
     found = _smooth_temperature(noisy)

@@ -36,9 +36,9 @@ from tests.monitor.reconcile.axes import (
     axes,
     axis,
     correlated,
+    make_temperature,
     time_s,
     walk,
-    warmth,
     white,
 )
 
@@ -86,7 +86,7 @@ def test_sizes_are_estimated_with_their_errors():
 
 def test_regressors_and_noise_are_fitted_together():
     rng = np.random.default_rng(1)
-    t, warm = time_s(n), warmth(n)
+    t, warm = time_s(n), make_temperature(n)
     gx = correlated(n, rng, 1e-2, 2.0)
     line = 2e-4 * np.sin(2.0 * np.pi * 7.3 * t + 0.8)
     gz = white(n, rng) + line + 1e-4 * (warm - 25.0) - 0.03 * gx + 4.0
@@ -149,7 +149,7 @@ def test_white_noise_is_that_before_its_step():
     assert pytest.approx(N, rel=0.03) == found.effects[0].N
 
 
-def test_stop_band_has_no_influence():
+def test_bins_of_the_stop_band_are_not_used():
     effects = (WHITE, BandwidthLimit(cutoff=0.8, order=4))
     y = NoiseModel({"gz": effects}).simulate(n, RATE_HZ, 1)[:, 2].copy()
     one = axis(y, effects)
@@ -172,17 +172,19 @@ def test_result_does_not_depend_on_the_bins():
 
 
 def test_regressor_is_computed_once_for_all_sizes():
-    made = RegressorCache(n, RATE_HZ, warmth(n))
+    made = RegressorCache(n, RATE_HZ, make_temperature(n))
     one = made.regressor_cosine_transforms(Sinusoidal(amplitude=3.0, frequency=5.0, phase=1.0))
     assert made.regressor_cosine_transforms(Sinusoidal(amplitude=0.1, frequency=5.0, phase=2.0)) is one
     assert made.regressor_cosine_transforms(Sinusoidal(amplitude=0.1, frequency=5.1, phase=2.0)) is not one
     sine = np.sin(2.0 * np.pi * 5.0 * time_s(n))
     np.testing.assert_allclose(one[0], cosine_transform(sine), atol=1e-9)
     bias = TemperatureBias(coefficient=4.0, reference=25.0)
-    np.testing.assert_allclose(made.regressor_cosine_transforms(bias)[0], cosine_transform(warmth(n)), atol=1e-9)
+    np.testing.assert_allclose(
+        made.regressor_cosine_transforms(bias)[0], cosine_transform(make_temperature(n)), atol=1e-9
+    )
 
 
-def test_terms_of_size_zero_stay_zero():
+def test_terms_of_size_zero_stay_small():
     found = axis(white(n, np.random.default_rng(8))).fit((WHITE, BiasInstability(B=1.0), WALK))
     assert found.effects[1].B < 0.3 * N
     assert found.effects[2].K < 20 * K
@@ -190,10 +192,10 @@ def test_terms_of_size_zero_stay_zero():
 
 def test_cache_of_a_part_contains_only_its_samples():
     size = 9000
-    whole = RegressorCache(size, RATE_HZ, warmth(size))
+    whole = RegressorCache(size, RATE_HZ, make_temperature(size))
     first, second = whole.restrict_to_part(slice(0, 4500)), whole.restrict_to_part(slice(4500, 9000))
     assert whole.restrict_to_part(slice(0, 4500)) is first is not second
     effect = TemperatureBias(coefficient=1.0, reference=20.0)
     np.testing.assert_allclose(
-        second.regressor_cosine_transforms(effect)[0], cosine_transform(warmth(size)[4500:]), atol=1e-9
+        second.regressor_cosine_transforms(effect)[0], cosine_transform(make_temperature(size)[4500:]), atol=1e-9
     )

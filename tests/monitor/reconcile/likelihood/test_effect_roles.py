@@ -16,17 +16,17 @@ from monitor.reconcile.likelihood.effect_roles import (
     with_regression_coefficients,
 )
 from tests.contracts.effect_examples import make_effect
-from tests.monitor.reconcile.axes import RATE_HZ, warmth
+from tests.monitor.reconcile.axes import RATE_HZ, make_temperature
 
 NOISES = [kind for kind in NOISE_SIZE_PARAMETERS if issubclass(kind, Source)]
 COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, AxisLeak)]
 n = 3000
 
 
-def drawn(one):
+def draw_series(one):
     values = np.zeros(n)
     one.start_series(RATE_HZ, np.random.default_rng(1)).add_next_samples(
-        values, SampleBlockContext(0, warmth(n), np.empty(n))
+        values, SampleBlockContext(0, make_temperature(n), np.empty(n))
     )
     return values
 
@@ -61,10 +61,10 @@ def test_regressors_times_coefficients_equal_the_series(kind):
     one = make_effect(kind.name)
     if kind.name == "pulse_train":  # a delay that is not given is drawn
         one = replace(one, delay=0.03)
-    made = build_unit_regressors(one, n, RATE_HZ, warmth(n))
+    made = build_unit_regressors(one, n, RATE_HZ, make_temperature(n))
     factors = np.array([0.8, -1.7, 0.6])[: len(made)]
     fitted = with_regression_coefficients(one, factors)
-    want = drawn(fitted)
+    want = draw_series(fitted)
     summed = sum(factor * column for factor, column in zip(factors, made, strict=True))
     if kind.name == "rate_ramp":  # a ramp's R is a size without a sign
         factors = np.abs(factors)
@@ -76,7 +76,7 @@ def test_regressors_times_coefficients_equal_the_series(kind):
 def test_two_regressors_contain_the_phase_of_a_line():
     line = Sinusoidal(amplitude=0.4, frequency=7.3, phase=2.2)
     made = np.stack(build_unit_regressors(line, n, RATE_HZ, None))
-    factors, *_ = np.linalg.lstsq(made.T, drawn(line), rcond=None)
+    factors, *_ = np.linalg.lstsq(made.T, draw_series(line), rcond=None)
     back = with_regression_coefficients(line, factors)
     assert back.amplitude == pytest.approx(0.4)
     assert back.phase == pytest.approx(2.2)
@@ -84,11 +84,11 @@ def test_two_regressors_contain_the_phase_of_a_line():
 
 def test_quadratic_temperature_effect_has_two_regressors():
     straight = TemperatureBias(coefficient=0.3, reference=25.0)
-    assert len(build_unit_regressors(straight, n, RATE_HZ, warmth(n))) == 1
+    assert len(build_unit_regressors(straight, n, RATE_HZ, make_temperature(n))) == 1
     bent = TemperatureBias(coefficient=0.3, reference=25.0, quadratic=-0.04)
-    one, two = build_unit_regressors(bent, n, RATE_HZ, warmth(n))
-    np.testing.assert_allclose(one, warmth(n) - 25.0, atol=1e-12)
-    np.testing.assert_allclose(two, (warmth(n) - 25.0) ** 2, atol=1e-12)
+    one, two = build_unit_regressors(bent, n, RATE_HZ, make_temperature(n))
+    np.testing.assert_allclose(one, make_temperature(n) - 25.0, atol=1e-12)
+    np.testing.assert_allclose(two, (make_temperature(n) - 25.0) ** 2, atol=1e-12)
 
 
 def test_signed_sizes_keep_their_sign():

@@ -29,7 +29,7 @@ n = 20_000
 MODEL = (WHITE, RateRandomWalk(K=3e-5))
 
 
-def drawn(seed, more=0.0):
+def draw_axis(seed, more=0.0):
     rng = np.random.default_rng(seed)
     return white(n, rng) + walk(n, rng, 3e-5) + more
 
@@ -37,7 +37,7 @@ def drawn(seed, more=0.0):
 def test_true_model_is_not_changed():
     resized_model_effect_count = 0
     for seed in range(20):
-        one = axis(drawn(seed))
+        one = axis(draw_axis(seed))
         state = fit_with_fewest_changes(one, (), MODEL)
         resized_model_effect_count += state.resized_model_effect_count
         assert fit_with_fixed_noise(one, MODEL).fit.log_likelihood <= state.fit.log_likelihood + 1e-6
@@ -46,7 +46,7 @@ def test_true_model_is_not_changed():
 
 @pytest.mark.parametrize(("wrong", "at"), [((1.1, 1.0), 0), ((0.93, 1.0), 0), ((1.0, 4.0), 1), ((1.0, 0.2), 1)])
 def test_wrong_size_is_changed_and_the_right_one_stays(wrong, at):
-    one = axis(drawn(1))
+    one = axis(draw_axis(1))
     given = (AngleRandomWalk(N=wrong[0] * N), RateRandomWalk(K=wrong[1] * 3e-5))
     state = fit_with_fewest_changes(one, (), given)
     assert state.fit.fitted_noise == (at,)
@@ -58,18 +58,18 @@ def test_wrong_size_is_changed_and_the_right_one_stays(wrong, at):
 
 
 def test_both_wrong_sizes_are_found():
-    state = fit_with_fewest_changes(axis(drawn(2)), (), (AngleRandomWalk(N=1.3 * N), RateRandomWalk(K=2e-4)))
+    state = fit_with_fewest_changes(axis(draw_axis(2)), (), (AngleRandomWalk(N=1.3 * N), RateRandomWalk(K=2e-4)))
     assert state.resized_model_effect_count == 2
     assert pytest.approx(N, rel=0.03) == state.effects[0].N
     assert pytest.approx(3e-5, rel=0.5) == state.effects[1].K
 
 
 def test_added_effects_are_always_fitted():
-    y = drawn(3) + 5e-5 * time_s(n)
+    y = draw_axis(3) + 5e-5 * time_s(n)
     state = fit_with_fewest_changes(axis(y), (RateRamp(R=1.0),), MODEL)
     assert state.resized_model_effect_count == 0
     assert pytest.approx(5e-5, abs=5 * state.fit.size_standard_error(2)) == state.effects[2].R
-    alone = fit_with_fewest_changes(axis(drawn(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
+    alone = fit_with_fewest_changes(axis(draw_axis(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
     assert pytest.approx(N, rel=0.03) == alone.effects[0].N
     assert alone.resized_model_effect_count == 0  # nothing was given
 
@@ -125,7 +125,7 @@ def test_intervals_of_a_line_contain_its_frequency():
 def test_intervals_of_sizes_contain_the_true_sizes():
     inside = []
     for seed in range(40):
-        y = drawn(seed, np.where(time_s(n) < 80.0, 0.0, -3e-4))
+        y = draw_axis(seed, np.where(time_s(n) < 80.0, 0.0, -3e-4))
         state = fit_with_fewest_changes(axis(y), (*MODEL, BiasStep(time=80.0, height=1.0)), ())
         white_noise, _, step = (compute_size_interval(state.fit, at) for at in range(3))
         inside += [white_noise.lo < N < white_noise.hi, step.lo < -3e-4 < step.hi]

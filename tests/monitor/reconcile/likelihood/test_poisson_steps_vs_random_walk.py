@@ -19,7 +19,7 @@ RATE, HEIGHT = 0.05, 2.0  # of the short series, beside white noise of density o
 BLOCKS = 11
 
 
-def enumerated(means, covariance):
+def sum_over_all_sets_of_jumps(means, covariance):
     """Return the log-likelihood as a sum over all sets of blocks with Gaussian jumps."""
     chance = 1.0 - np.exp(-RATE * BLOCK_S)
     variance = RATE * BLOCK_S * HEIGHT**2 / chance
@@ -54,7 +54,7 @@ def test_likelihood_nearly_equals_the_sum_over_all_sets_of_jumps(rest):
         covariance = dense(rest, BLOCKS, start=4.0)
         level = HEIGHT * np.cumsum(rng.standard_normal(BLOCKS) * np.sqrt(rng.poisson(RATE * BLOCK_S, BLOCKS)))
         means = np.linalg.cholesky(covariance) @ rng.standard_normal(BLOCKS) + level
-        off.append(likelihood(means, rest, RATE, HEIGHT, 4.0) - enumerated(means, covariance))
+        off.append(likelihood(means, rest, RATE, HEIGHT, 4.0) - sum_over_all_sets_of_jumps(means, covariance))
     assert np.abs(off).max() < 0.1
 
 

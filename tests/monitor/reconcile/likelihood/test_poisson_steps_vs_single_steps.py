@@ -18,7 +18,7 @@ M = 60
 
 
 @pytest.fixture
-def short():
+def draw_means():
     """Return block means of noise with a step, and their covariance."""
     covariance = dense(REST, M, start=50.0)
     means = np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(M)
@@ -51,14 +51,14 @@ def test_whitened_regressors_give_the_dense_likelihood(short):
     assert columns[:, 0] @ columns[:, 1] == pytest.approx(step @ np.linalg.solve(covariance, means))
 
 
-def stepped(times, heights, rng):
+def draw_steps(times, heights, rng):
     t = TAU0_S * np.arange(HOUR)
     return white(HOUR, rng) + sum(height * (t >= time) for time, height in zip(times, heights, strict=True))
 
 
 def test_times_of_steps_are_found():
     times, heights = (700.3, 1801.7, 2950.1), (4e-4, -3e-4, 5e-4)
-    y = stepped(times, heights, np.random.default_rng(0))
+    y = draw_steps(times, heights, np.random.default_rng(0))
     means, block_s = compute_block_means(y, TAU0_S, 5.0)
     noise = build_state_space_noise(BackgroundNoise(N * N), block_s, means.size * block_s)
     assert poisson_steps_vs_single_steps._fit_single_steps(means, noise, 5).times * block_s == pytest.approx(
@@ -78,7 +78,7 @@ def test_noise_has_no_step():
 
 
 def test_number_of_steps_is_limited():
-    y = stepped((500.0, 1500.0, 2500.0), (4e-4, 4e-4, 4e-4), np.random.default_rng(2))
+    y = draw_steps((500.0, 1500.0, 2500.0), (4e-4, 4e-4, 4e-4), np.random.default_rng(2))
     assert (
         compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5, max_single_steps=2).single_steps == 2
     )
@@ -86,7 +86,7 @@ def test_number_of_steps_is_limited():
 
 def test_one_step_is_no_poisson_process():
     for seed in range(3):
-        y = stepped((1234.5,), (3e-4,), np.random.default_rng(seed))
+        y = draw_steps((1234.5,), (3e-4,), np.random.default_rng(seed))
         assert compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 5e-6).gain < 2.0
 
 

@@ -21,19 +21,19 @@ NONE = np.zeros((0, n - 1))
 BETA = (3.0, -2.0, 1.0)
 
 
-def drawn(seed, theta=(1.0, 0.02), beta=(0.0, 0.0, 0.0)):
+def draw_coefficients(seed, theta=(1.0, 0.02), beta=(0.0, 0.0, 0.0)):
     rng = np.random.default_rng(seed)
     y = theta[0] ** 0.5 * rng.standard_normal(n) + theta[1] ** 0.5 * np.cumsum(rng.standard_normal(n))
     return cosine_transform(y) + np.asarray(beta) @ REGRESSORS
 
 
-def whole(theta):
+def compute_covariance(theta):
     return np.einsum("j,jab->ab", theta, COVARIANCES)
 
 
-def dense(y, theta, beta=(0.0, 0.0, 0.0)):
+def dense_log_likelihood(y, theta, beta=(0.0, 0.0, 0.0)):
     """Return the log-likelihood without the constant term of 2π."""
-    factor = np.linalg.cholesky(whole(theta))
+    factor = np.linalg.cholesky(compute_covariance(theta))
     whitened = solve_triangular(factor, y - np.asarray(beta) @ REGRESSORS, lower=True)
     return -np.sum(np.log(np.diag(factor))) - 0.5 * whitened @ whitened
 
@@ -48,10 +48,12 @@ def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_likelihood_and_maximum_equal_a_dense_gaussian(seed):
-    y = drawn(seed)
+    y = draw_coefficients(seed)
     found = fit(y)
-    assert found.log_likelihood == pytest.approx(dense(y, found.theta), abs=1e-6)
-    best = minimize(lambda x: -dense(y, np.exp(x)), [0.0, -3.0], method="Nelder-Mead", options={"fatol": 1e-6})
+    assert found.log_likelihood == pytest.approx(dense_log_likelihood(y, found.theta), abs=1e-6)
+    best = minimize(
+        lambda x: -dense_log_likelihood(y, np.exp(x)), [0.0, -3.0], method="Nelder-Mead", options={"fatol": 1e-6}
+    )
     assert found.log_likelihood == pytest.approx(-best.fun, abs=1e-3)
     assert found.theta == pytest.approx(np.exp(best.x), rel=0.02)
     assert found.residual == pytest.approx(y**2)
@@ -61,18 +63,18 @@ def test_likelihood_and_maximum_equal_a_dense_gaussian(seed):
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_regressors_are_fitted_together_with_variances(seed):
-    y = drawn(seed, beta=BETA)
+    y = draw_coefficients(seed, beta=BETA)
     found = fit(y, REGRESSORS)
-    assert found.log_likelihood == pytest.approx(dense(y, found.theta, found.beta), abs=1e-6)
+    assert found.log_likelihood == pytest.approx(dense_log_likelihood(y, found.theta, found.beta), abs=1e-6)
     best = minimize(
-        lambda x: -dense(y, np.exp(x[:2]), x[2:]),
+        lambda x: -dense_log_likelihood(y, np.exp(x[:2]), x[2:]),
         [0.0, -3.0, *BETA],
         method="Nelder-Mead",
         options={"fatol": 1e-6, "maxfev": 4000},
     )
     assert found.log_likelihood == pytest.approx(-best.fun, abs=1e-3)
     assert found.beta == pytest.approx(best.x[2:], abs=0.05)
-    weighted = np.linalg.solve(whole(found.theta), REGRESSORS.T)
+    weighted = np.linalg.solve(compute_covariance(found.theta), REGRESSORS.T)
     covariance = np.linalg.inv(REGRESSORS @ weighted)
     np.testing.assert_allclose(found.beta_covariance, covariance, rtol=1e-3)
     assert found.beta == pytest.approx(covariance @ weighted.T @ y, rel=1e-3, abs=1e-5)
@@ -80,7 +82,7 @@ def test_regressors_are_fitted_together_with_variances(seed):
 
 
 def test_every_start_gives_the_same_maximum():
-    y = drawn(5)
+    y = draw_coefficients(5)
     heights = [fit(y, start=start).log_likelihood for start in ((1.0, 1.0), (0.0, 3.0), (100.0, 0.0), (1e-4, 1e-4))]
     assert max(heights) - min(heights) < 1e-3
 
@@ -94,12 +96,12 @@ def test_variances_are_not_negative():
         found = fit(y)
         assert found.theta[1] == 0.0
         assert found.theta[0] == pytest.approx(np.mean(y**2), rel=1e-4)
-        more = dense(y, (found.theta[0], 1e-4))
+        more = dense_log_likelihood(y, (found.theta[0], 1e-4))
         assert more < found.log_likelihood
 
 
 def test_constant_variance_is_kept():
-    y = drawn(7)
+    y = draw_coefficients(7)
     constant = 0.3
     found = fit(y, constant=constant)
     assert found.variance == pytest.approx(found.theta @ BASES + constant)
@@ -108,7 +110,7 @@ def test_constant_variance_is_kept():
 
 
 def test_stated_errors_equal_the_scatter_of_many_runs():
-    found = [fit(drawn(seed, (1.0, 0.3), BETA), REGRESSORS) for seed in range(300)]
+    found = [fit(draw_coefficients(seed, (1.0, 0.3), BETA), REGRESSORS) for seed in range(300)]
     sizes = np.array([np.append(one.theta, one.beta) for one in found])
     stated = [
         np.append(np.linalg.inv(one.theta_information).diagonal(), one.beta_covariance.diagonal()) for one in found
@@ -136,7 +138,7 @@ def test_wide_bin_is_the_sum_of_its_coefficients():
 
 
 def test_equal_regressors_share_their_coefficient():
-    y = drawn(2, beta=(3.0, 0.0, 0.0))
+    y = draw_coefficients(2, beta=(3.0, 0.0, 0.0))
     one = fit(y, REGRESSORS[:1])
     twice = fit(y, REGRESSORS[[0, 0]])
     assert twice.log_likelihood == pytest.approx(one.log_likelihood, abs=1e-3)

@@ -9,7 +9,7 @@ from scipy.signal import lfilter, periodogram
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
 
 
-def matrix(n):
+def make_transform_matrix(n):
     """Return the matrix of the transform from its definition, shape [n − 1, n]."""
     k, j = np.arange(1, n)[:, None], np.arange(n)
     return np.sqrt(2.0 / n) * np.cos(np.pi * k * (2 * j + 1) / (2 * n))
@@ -17,14 +17,14 @@ def matrix(n):
 
 def test_transform_is_the_cosine_sum_without_the_mean():
     y = np.random.default_rng(0).standard_normal(200) + 7.0
-    assert cosine_transform(y) == pytest.approx(matrix(200) @ y, abs=1e-12)
+    assert cosine_transform(y) == pytest.approx(make_transform_matrix(200) @ y, abs=1e-12)
     assert np.sum(cosine_transform(y) ** 2) == pytest.approx(np.sum((y - y.mean()) ** 2))
     assert inverse_cosine_transform(cosine_transform(y)) == pytest.approx(y - y.mean(), abs=1e-12)
 
 
 def test_white_noise_and_random_walk_have_independent_coefficients():
     n, k = 60, np.arange(1, 60)
-    d = matrix(n)
+    d = make_transform_matrix(n)
     np.testing.assert_allclose(d @ d.T, np.eye(n - 1), atol=1e-12)
     steps = np.tril(np.ones((n, n)))
     np.testing.assert_allclose(

@@ -10,7 +10,7 @@ from tests.monitor.reconcile.recording_checks.recordings import changed, draw, m
 MODEL = make_model(gravity=True)
 
 
-def kinds(recording, model=MODEL):
+def list_finding_kinds(recording, model=MODEL):
     return [one.kind for one in check_recording(recording, model, 1).findings]
 
 
@@ -26,17 +26,17 @@ def kinds(recording, model=MODEL):
     ids=["gravity", "no gravity", "coarse", "outliers", "steps"],
 )
 def test_recordings_of_the_model_have_no_findings(model):
-    assert [kinds(draw(model, seed), model) for seed in range(12)] == [[]] * 12
+    assert [list_finding_kinds(draw(model, seed), model) for seed in range(12)] == [[]] * 12
 
 
 @pytest.mark.long
 def test_at_most_one_of_a_thousand_recordings_of_the_model_has_a_finding():
     models = make_model(gravity=False), make_model(gravity=True)
-    assert sum(bool(kinds(draw(models[seed % 2], seed), models[seed % 2])) for seed in range(1000)) <= 1
+    assert sum(bool(list_finding_kinds(draw(models[seed % 2], seed), models[seed % 2])) for seed in range(1000)) <= 1
 
 
 def test_without_a_model_a_clean_recording_has_no_findings():
-    assert [kinds(draw(MODEL, seed), None) for seed in range(12)] == [[]] * 12
+    assert [list_finding_kinds(draw(MODEL, seed), None) for seed in range(12)] == [[]] * 12
 
 
 def test_clean_recording_is_not_changed():
@@ -64,7 +64,7 @@ def test_most_serious_finding_is_first():
     wrong = {axis: 1000.0 * recording.values[axis] for axis in AXES[:3]}
     wrong["ax"] = recording.values["ax"].copy()
     wrong["ax"][0] = 50.0
-    found = kinds(changed(recording, **wrong))
+    found = list_finding_kinds(changed(recording, **wrong))
     assert found == ["unit_error", "corrupt_rows"]
     assert found == sorted(found, key=FINDING_KINDS.index)
 

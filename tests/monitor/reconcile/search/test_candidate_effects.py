@@ -35,26 +35,26 @@ from tests.monitor.reconcile.axes import (
     axes,
     axis,
     correlated,
-    ringing,
-    seen,
+    draw_resonance,
+    make_temperature,
     time_s,
     walk,
-    warmth,
     white,
+    whiten,
 )
 
 n = 24_000
 MODEL = (WHITE, WALK)
 
 
-def noise(seed=0):
+def draw_noise(seed=0):
     rng = np.random.default_rng(seed)
     return white(n, rng) + walk(n, rng)
 
 
-def asked(family, one, model=MODEL):
+def list_candidates(family, one, model=MODEL):
     """Return the candidates of a family by name."""
-    return {effect.name: effect for effect in family(seen(one, model))}
+    return {effect.name: effect for effect in family(whiten(one, model))}
 
 
 def test_every_effect_has_a_complexity_penalty():
@@ -65,28 +65,28 @@ def test_every_effect_has_a_complexity_penalty():
 
 
 def test_missing_noise_terms_are_proposed():
-    assert set(asked(propose.propose_allan_terms, axis(noise()))) == {
+    assert set(list_candidates(propose.propose_allan_terms, axis(draw_noise()))) == {
         "quantization_noise",
         "bias_instability",
     }
-    assert set(asked(propose.propose_allan_terms, axis(noise()), TERMS)) == {"quantization_noise"}
+    assert set(list_candidates(propose.propose_allan_terms, axis(draw_noise()), TERMS)) == {"quantization_noise"}
     model = (QuantizationNoise(Q=1e-8), *TERMS)
-    assert asked(propose.propose_allan_terms, axis(noise()), model) == {}
+    assert list_candidates(propose.propose_allan_terms, axis(draw_noise()), model) == {}
 
 
 @pytest.mark.parametrize("correlation_s", [0.05, 0.5, 5.0])
 def test_correlation_time_is_found(correlation_s):
-    y = noise() + correlated(n, np.random.default_rng(1), 5e-4, correlation_s)
-    found = asked(propose.propose_correlated_noise, axis(y))["exponentially_correlated"]
+    y = draw_noise() + correlated(n, np.random.default_rng(1), 5e-4, correlation_s)
+    found = list_candidates(propose.propose_correlated_noise, axis(y))["exponentially_correlated"]
     assert isinstance(found, ExponentiallyCorrelated)
     assert found.correlation_time == pytest.approx(correlation_s, rel=0.35)
 
 
 def test_correlation_as_long_as_the_recording_is_no_candidate():
     assert (
-        asked(
+        list_candidates(
             propose.propose_correlated_noise,
-            axis(noise() + walk(n, np.random.default_rng(2), 1e-3)),
+            axis(draw_noise() + walk(n, np.random.default_rng(2), 1e-3)),
             (WHITE,),
         )
         == {}
@@ -97,38 +97,38 @@ def test_correlation_as_long_as_the_recording_is_no_candidate():
 def test_power_law_is_found(exponent):
     hidden = PowerLaw(density=N, exponent=exponent)
     y = NoiseModel({"gz": (WHITE, hidden)}).simulate(n, RATE_HZ, 3)[:, 2].copy()
-    found = asked(propose.propose_power_law, axis(y), (WHITE,))["power_law"]
+    found = list_candidates(propose.propose_power_law, axis(y), (WHITE,))["power_law"]
     assert found.exponent == pytest.approx(exponent, abs=0.2)
-    assert asked(propose.propose_power_law, axis(y), (WHITE, found)) == {}
+    assert list_candidates(propose.propose_power_law, axis(y), (WHITE, found)) == {}
 
 
 def test_resonance_is_found():
-    y = noise() + ringing(n, np.random.default_rng(3), 5e-4, 17.3, 1.0)
-    found = asked(propose.propose_resonances, axis(y))["narrowband"]
+    y = draw_noise() + draw_resonance(n, np.random.default_rng(3), 5e-4, 17.3, 1.0)
+    found = list_candidates(propose.propose_resonances, axis(y))["narrowband"]
     assert isinstance(found, Narrowband)
     assert found.frequency == pytest.approx(17.3, abs=0.2)
     assert found.bandwidth == pytest.approx(1.0, rel=0.3)
     one = axis(y)
-    middle, width = find_broad_spectral_peaks(seen(one, MODEL))[0]
+    middle, width = find_broad_spectral_peaks(whiten(one, MODEL))[0]
     assert middle == pytest.approx(17.3, abs=0.5)
     assert 0.2 < width < 5.0
-    assert asked(propose.propose_resonances, axis(noise())) == {}
+    assert list_candidates(propose.propose_resonances, axis(draw_noise())) == {}
 
 
 def test_line_is_found():
     """The accuracy is far better than a bin of the periodogram, which is 1/240 Hz wide."""
-    y = noise() + 2e-4 * np.sin(2 * np.pi * 17.3042 * time_s(n))
+    y = draw_noise() + 2e-4 * np.sin(2 * np.pi * 17.3042 * time_s(n))
     one = axis(y)
-    found = asked(propose.propose_sinusoids, one)["sinusoidal"]
+    found = list_candidates(propose.propose_sinusoids, one)["sinusoidal"]
     assert isinstance(found, Sinusoidal)
     assert found.frequency == pytest.approx(17.3042, abs=5e-4)
-    view = seen(one, MODEL)
+    view = whiten(one, MODEL)
     t = time_s(n)
     best = minimize_scalar(
         lambda f: -abs(np.exp(-2j * np.pi * f * t) @ view.series), bounds=(17.303, 17.306), method="bounded"
     )
     assert _line_frequency(view, 17.303) == pytest.approx(best.x, abs=1e-5)
-    assert asked(propose.propose_sinusoids, axis(noise(5))) == {}
+    assert list_candidates(propose.propose_sinusoids, axis(draw_noise(5))) == {}
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_line_is_found():
 def test_filter_is_found(kind, order, floor):
     hidden = BandwidthLimit(cutoff=14.0, order=order, kind=kind, floor=floor)
     y = NoiseModel({"gz": (WHITE, hidden)}).simulate(n, RATE_HZ, 6)[:, 2].copy()
-    found = asked(propose.propose_low_pass, axis(y), (WHITE,))["bandwidth_limit"]
+    found = list_candidates(propose.propose_low_pass, axis(y), (WHITE,))["bandwidth_limit"]
     assert isinstance(found, BandwidthLimit)
     if floor is None:  # a little noise behind one kind can look like another kind
         assert (found.kind, found.order) == (kind, order)
@@ -149,44 +149,50 @@ def test_filter_is_found(kind, order, floor):
     assert found.cutoff == pytest.approx(14.0, rel=0.05)
     if kind != "iir":  # exponential averages let some noise pass at half the sample rate
         assert (found.floor is None) == (floor is None)
-    assert asked(propose.propose_low_pass, axis(y), (WHITE, found)) == {}
+    assert list_candidates(propose.propose_low_pass, axis(y), (WHITE, found)) == {}
 
 
 def test_effects_of_time_are_found():
     t = time_s(n)
-    y = noise() + 1e-3 * np.exp(-t / 9.0) - 5e-4 * (t >= 130.0)
-    found = asked(propose.propose_drifts_and_steps, axis(y))
+    y = draw_noise() + 1e-3 * np.exp(-t / 9.0) - 5e-4 * (t >= 130.0)
+    found = list_candidates(propose.propose_drifts_and_steps, axis(y))
     assert isinstance(found["rate_ramp"], RateRamp)
     transient, step = found["turn_on_transient"], found["bias_step"]
     assert isinstance(transient, TurnOnTransient)
     assert isinstance(step, BiasStep)
-    alone = asked(propose.propose_drifts_and_steps, axis(noise() + 1e-3 * np.exp(-t / 9.0)))["turn_on_transient"]
+    alone = list_candidates(propose.propose_drifts_and_steps, axis(draw_noise() + 1e-3 * np.exp(-t / 9.0)))[
+        "turn_on_transient"
+    ]
     assert alone.time_constant == pytest.approx(9.0, rel=0.3)
-    stepped = asked(propose.propose_drifts_and_steps, axis(noise() - 5e-4 * (t >= 130.0)))["bias_step"]
+    stepped = list_candidates(propose.propose_drifts_and_steps, axis(draw_noise() - 5e-4 * (t >= 130.0)))["bias_step"]
     assert stepped.time == pytest.approx(130.0, abs=0.5)
-    with_ramp = asked(propose.propose_drifts_and_steps, axis(noise()), (*MODEL, RateRamp(R=1e-6)))
+    with_ramp = list_candidates(propose.propose_drifts_and_steps, axis(draw_noise()), (*MODEL, RateRamp(R=1e-6)))
     assert "rate_ramp" not in with_ramp
 
 
 def test_effects_of_temperature_are_found():
-    warm = warmth(n)
-    found = asked(propose.propose_temperature_effects, axis(noise() + 3e-4 * (warm - 25.0), temperature_c=warm))
+    warm = make_temperature(n)
+    found = list_candidates(
+        propose.propose_temperature_effects, axis(draw_noise() + 3e-4 * (warm - 25.0), temperature_c=warm)
+    )
     assert isinstance(found["temperature_bias"], TemperatureBias)
     inside = np.empty(n)  # 20 s behind
     inside[0] = warm[0]
     for k in range(1, n):
         inside[k] = warm[k - 1] + (inside[k - 1] - warm[k - 1]) * np.exp(-1.0 / (20.0 * RATE_HZ))
-    late = asked(propose.propose_temperature_effects, axis(noise() + 3e-4 * (inside - 25.0), temperature_c=warm))[
-        "temperature_lag"
-    ]
+    late = list_candidates(
+        propose.propose_temperature_effects, axis(draw_noise() + 3e-4 * (inside - 25.0), temperature_c=warm)
+    )["temperature_lag"]
     assert isinstance(late, TemperatureLag)
     assert late.time_constant == pytest.approx(20.0, rel=0.3)
     loop = TemperatureHysteresis(height=1e-3, reversal=0.8)
     (both,) = build_unit_regressors(loop, n, RATE_HZ, warm)
-    found = asked(propose.propose_temperature_effects, axis(noise() + 1e-3 * both, temperature_c=warm))
+    found = list_candidates(propose.propose_temperature_effects, axis(draw_noise() + 1e-3 * both, temperature_c=warm))
     assert found["temperature_hysteresis"].reversal == pytest.approx(0.8, rel=0.2)
-    assert asked(propose.propose_temperature_effects, axis(noise())) == {}
-    assert asked(propose.propose_temperature_effects, axis(noise(), temperature_c=np.full(n, 25.0))) == {}
+    assert list_candidates(propose.propose_temperature_effects, axis(draw_noise())) == {}
+    assert (
+        list_candidates(propose.propose_temperature_effects, axis(draw_noise(), temperature_c=np.full(n, 25.0))) == {}
+    )
 
 
 def test_other_axes_are_proposed_by_their_kind():
@@ -195,19 +201,19 @@ def test_other_axes_are_proposed_by_their_kind():
     every = axes(values, (WHITE,))
     found = {}
     for name, one in every.items():
-        offered = propose.propose_leaks_from_other_axes(seen(one, (WHITE,)))
+        offered = propose.propose_leaks_from_other_axes(whiten(one, (WHITE,)))
         found[name] = {(type(effect), effect.source) for effect in offered}
     assert found["gz"] == {(CrossAxis, "gy"), (GSensitivity, "ax"), (GSensitivity, "az")}
     assert found["ax"] == {(CrossAxis, "az")}
     known = (WHITE, CrossAxis(source="gy", coefficient=0.1))
-    rest = propose.propose_leaks_from_other_axes(seen(every["gz"], known))
+    rest = propose.propose_leaks_from_other_axes(whiten(every["gz"], known))
     assert {effect.source for effect in rest} == {"ax", "az"}
 
 
 def test_shapes_do_not_depend_on_the_initial_sizes():
     """The sizes of candidates are fitted later, so the unit of the axis changes no shape."""
-    y = noise() + correlated(n, np.random.default_rng(8), 5e-4, 0.5)
-    one = asked(propose.propose_correlated_noise, axis(y))["exponentially_correlated"]
+    y = draw_noise() + correlated(n, np.random.default_rng(8), 5e-4, 0.5)
+    one = list_candidates(propose.propose_correlated_noise, axis(y))["exponentially_correlated"]
     scaled = (type(WHITE)(N=1e4 * N), type(WALK)(K=1e4 * WALK.K))
-    other = asked(propose.propose_correlated_noise, axis(1e4 * y), scaled)["exponentially_correlated"]
+    other = list_candidates(propose.propose_correlated_noise, axis(1e4 * y), scaled)["exponentially_correlated"]
     assert other.correlation_time == pytest.approx(one.correlation_time, rel=1e-2)

@@ -9,7 +9,7 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS
 from monitor.reconcile.search.sample_rate_from_spectrum import convert_effect_to_stated_time, detect_sample_rate_error
 from tests.contracts.effect_examples import make_effect
-from tests.monitor.reconcile.axes import GYRO_AXES, RATE_HZ, WALK, WHITE, axes, recording, warmth
+from tests.monitor.reconcile.axes import GYRO_AXES, RATE_HZ, WALK, WHITE, axes, make_temperature, recording
 
 n = 24_000
 RATIO = 1.13
@@ -43,7 +43,7 @@ def test_series_equals_that_at_the_true_rate(kind):
     def drawn(one: Source, rate_hz: float):
         values = np.zeros(n)
         one.start_series(rate_hz, np.random.default_rng(1)).add_next_samples(
-            values, SampleBlockContext(0, warmth(n), np.empty(n))
+            values, SampleBlockContext(0, make_temperature(n), np.empty(n))
         )
         return values
 
@@ -67,7 +67,7 @@ RESONANCE = Narrowband(sigma=8e-4, frequency=31.0, bandwidth=0.8)
 HUM = Narrowband(sigma=4e-4, frequency=12.0, bandwidth=0.5)
 
 
-def measured(feature, ratio, seed=1):
+def measure_at_wrong_rate(feature, ratio, seed=1):
     """Return three axes of a sensor with a wrong sample rate. The features are on gy."""
     plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK)), RATE_HZ)
     model = plain + NoiseModel({"gy": feature})
@@ -78,7 +78,7 @@ def measured(feature, ratio, seed=1):
 
 @pytest.mark.parametrize("ratio", [1.0007, 0.992, 1.05])
 def test_ratio_is_found_by_a_line(ratio):
-    found = detect_sample_rate_error(*measured((LINE, OTHER), ratio))
+    found = detect_sample_rate_error(*measure_at_wrong_rate((LINE, OTHER), ratio))
     assert found is not None
     assert found.axis == "gy"
     assert found.ratio.value == pytest.approx(ratio, abs=3e-5)
@@ -89,7 +89,7 @@ def test_ratio_is_found_by_a_line(ratio):
 
 
 def test_ratio_is_found_by_a_resonance():
-    found = detect_sample_rate_error(*measured((RESONANCE, HUM), 1.02))
+    found = detect_sample_rate_error(*measure_at_wrong_rate((RESONANCE, HUM), 1.02))
     assert found is not None
     assert found.ratio.lo < 1.02 < found.ratio.hi
     assert found.axis == "gy"
@@ -97,20 +97,20 @@ def test_ratio_is_found_by_a_resonance():
 
 
 def test_one_moved_line_is_no_wrong_rate():
-    assert detect_sample_rate_error(*measured((LINE,), 1.0007)) is None
+    assert detect_sample_rate_error(*measure_at_wrong_rate((LINE,), 1.0007)) is None
 
 
 def test_right_rate_is_not_changed():
     for seed in range(3):
-        assert detect_sample_rate_error(*measured((LINE, RESONANCE), 1.0, seed)) is None
+        assert detect_sample_rate_error(*measure_at_wrong_rate((LINE, RESONANCE), 1.0, seed)) is None
 
 
 def test_without_a_feature_the_rate_is_not_changed():
-    assert detect_sample_rate_error(*measured((), 1.01)) is None
+    assert detect_sample_rate_error(*measure_at_wrong_rate((), 1.01)) is None
 
 
 def test_absent_line_is_no_wrong_rate():
-    every, effects = measured((), 1.0)
+    every, effects = measure_at_wrong_rate((), 1.0)
     assert detect_sample_rate_error(every, {**effects, "gy": (*effects["gy"], LINE)}) is None
 
 

@@ -18,7 +18,7 @@ SIGMA = N * RATE_HZ**0.5
 RNG = 7
 
 
-def noise(seed=0):
+def draw_noise(seed=0):
     return white(n, np.random.default_rng(seed))
 
 
@@ -36,15 +36,15 @@ def test_gaps_are_filled_from_adjacent_samples():
 
 
 def test_input_is_not_changed():
-    y = noise()
+    y = draw_noise()
     y[::50] = np.nan
     kept = y.copy()
-    axes({"gx": y, "gz": noise(1)}, (WHITE, Outliers(fraction=0.01, scale=1e-2), Saturation(limit=1.5e-3)))
+    axes({"gx": y, "gz": draw_noise(1)}, (WHITE, Outliers(fraction=0.01, scale=1e-2), Saturation(limit=1.5e-3)))
     np.testing.assert_array_equal(y, kept)
 
 
 def test_repeats_are_repaired_if_the_model_has_them():
-    y, rng = noise(), np.random.default_rng(4)
+    y, rng = draw_noise(), np.random.default_rng(4)
     held = rng.random(n) < 0.2
     held[0] = False
     for at in np.flatnonzero(held):
@@ -61,7 +61,7 @@ def test_repeats_are_repaired_if_the_model_has_them():
 
 
 def test_clipped_samples_are_drawn_beyond_the_limit():
-    y = noise()
+    y = draw_noise()
     limit = 2.0 * SIGMA
     clipped = np.clip(y, -limit, limit)
     shown = ValueArtifacts(clipped)
@@ -77,7 +77,7 @@ def test_clipped_samples_are_drawn_beyond_the_limit():
 
 
 def test_outliers_are_treated_as_missing_if_the_model_has_them():
-    y, rng = noise(), np.random.default_rng(5)
+    y, rng = draw_noise(), np.random.default_rng(5)
     far = rng.choice(n, 30, replace=False)
     y[far] += 20.0 * SIGMA * rng.choice([-1.0, 1.0], 30)
     plain = axis(y, (WHITE,))
@@ -91,7 +91,7 @@ def test_outliers_are_treated_as_missing_if_the_model_has_them():
 
 
 def test_same_generator_gives_the_same_axis():
-    y = noise()
+    y = draw_noise()
     y[::9] = np.nan
     one, other = axis(y, (WHITE,)), axis(y, (WHITE,))
     np.testing.assert_array_equal(one.coefficients, other.coefficients)
@@ -100,7 +100,7 @@ def test_same_generator_gives_the_same_axis():
 
 
 def test_repair_for_other_effects_equals_a_new_preparation():
-    y = np.clip(noise(), -1.5 * SIGMA, 1.5 * SIGMA)
+    y = np.clip(draw_noise(), -1.5 * SIGMA, 1.5 * SIGMA)
     model = (WHITE, Saturation(limit=1.5 * SIGMA))
     later = repair_axis_again(axis(y, (WHITE,)), model, np.random.default_rng(0))
     np.testing.assert_allclose(later.coefficients, axis(y, model).coefficients)
@@ -112,12 +112,12 @@ def test_axes_leak_only_into_possible_targets():
     into = {one: {other for other in AXES if _may_leak(other, one)} for one in AXES}
     assert into["gx"] == {"gy", "gz", "ax", "ay", "az"}
     assert into["ay"] == {"ax", "az"}
-    every = axes({name: noise(k) for k, name in enumerate(AXES)}, (AngleRandomWalk(N=N),))
+    every = axes({name: draw_noise(k) for k, name in enumerate(AXES)}, (AngleRandomWalk(N=N),))
     assert {name: set(one.leak_sources) for name, one in every.items()} == into
 
 
 def test_artifacts_of_values_are_detected():
-    y = noise()
+    y = draw_noise()
     shown = ValueArtifacts(y)
     assert shown.quantization is None
     coarse = ValueArtifacts(4e-4 * np.rint(y / 4e-4))

@@ -16,18 +16,18 @@ from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import DIAGNOSTIC, around, known_lines, line, run, step, with_axes
 
 
-def gz(*runs: NamedResult) -> AxisComparison:
+def compare_gz(*runs: NamedResult) -> AxisComparison:
     return compare_results(runs).axes["gz"]
 
 
-def only(found: tuple[EffectInRecordings, ...]) -> EffectInRecordings:
+def get_only_effect(found: tuple[EffectInRecordings, ...]) -> EffectInRecordings:
     (one,) = found
     return one
 
 
 def test_line_of_every_recording_is_common_and_pooled() -> None:
     c = compare_results([run("a", line(1.50e-4)), run("b", line(1.52e-4)), run("c", line(1.48e-4, 17.302))])
-    seen = only(c.axes["gz"].common)
+    seen = get_only_effect(c.axes["gz"].common)
     assert c.axes["gz"].single == ()
     assert list(seen.steps) == ["a", "b", "c"]
     amplitude = seen.parameters["amplitude"].bounds
@@ -41,14 +41,14 @@ def test_line_of_every_recording_is_common_and_pooled() -> None:
 
 
 def test_different_sizes_are_common_and_not_consistent() -> None:
-    seen = only(gz(run("a", line(1.5e-4)), run("b", line(2.5e-4))).common)
+    seen = get_only_effect(compare_gz(run("a", line(1.5e-4)), run("b", line(2.5e-4))).common)
     assert seen.sizes_agree is False
     assert seen.p is not None
     assert seen.p < 1e-6
 
 
 def test_equal_sizes_are_consistent_at_any_frequency() -> None:
-    seen = only(gz(run("a", line(1.50e-4)), run("b", line(1.51e-4, 17.35))).common)
+    seen = get_only_effect(compare_gz(run("a", line(1.50e-4)), run("b", line(1.51e-4, 17.35))).common)
     assert seen.sizes_agree is True
     moved = seen.parameters["frequency"].p_value
     assert moved is not None
@@ -57,9 +57,9 @@ def test_equal_sizes_are_consistent_at_any_frequency() -> None:
 
 def test_one_recordings_own_effect_is_single_with_its_absence_elsewhere() -> None:
     own = step("bias_step", time=around(350.0, 0.1), height=around(1e-3, 1e-4))
-    axis = gz(run("a", line()), run("b", line(), own), run("c", line()))
-    assert only(axis.common).effect == "sinusoidal"
-    seen = only(axis.single)
+    axis = compare_gz(run("a", line()), run("b", line(), own), run("c", line()))
+    assert get_only_effect(axis.common).effect == "sinusoidal"
+    seen = get_only_effect(axis.single)
     assert (seen.effect, list(seen.steps)) == ("bias_step", ["b"])
     assert [(one.run, one.meaning) for one in seen.absent] == [("a", "may_differ"), ("c", "may_differ")]
     assert seen.sizes_agree is None
@@ -67,13 +67,13 @@ def test_one_recordings_own_effect_is_single_with_its_absence_elsewhere() -> Non
 
 def test_steps_at_different_times_are_two_effects() -> None:
     first, second = (step("bias_step", time=t, height=1e-3) for t in (100.0, 400.0))
-    axis = gz(run("a", first), run("b", second))
+    axis = compare_gz(run("a", first), run("b", second))
     assert axis.common == ()
     assert [list(seen.steps) for seen in axis.single] == [["a"], ["b"]]
 
 
 def test_each_line_is_matched_to_the_nearest() -> None:
-    axis = gz(run("a", line(1e-4, 17.30), line(3e-4, 17.36)), run("b", line(3e-4, 17.37), line(1e-4, 17.31)))
+    axis = compare_gz(run("a", line(1e-4, 17.30), line(3e-4, 17.36)), run("b", line(3e-4, 17.37), line(1e-4, 17.31)))
     assert axis.single == ()
     assert [round(float(one.parameters["amplitude"].bounds.value), 6) for one in axis.common] == [1e-4, 3e-4]
     assert all(one.sizes_agree for one in axis.common)
@@ -81,7 +81,7 @@ def test_each_line_is_matched_to_the_nearest() -> None:
 
 def test_different_effects_are_not_matched() -> None:
     narrow = step("narrowband", sigma=1e-4, frequency=17.3, bandwidth=0.5)
-    axis = gz(run("a", line()), run("b", narrow))
+    axis = compare_gz(run("a", line()), run("b", narrow))
     assert axis.common == ()
     assert [seen.effect for seen in axis.single] == ["sinusoidal", "narrowband"]
 
@@ -90,13 +90,13 @@ def test_axis_of_one_recording_has_nothing_in_common() -> None:
     both = with_axes(run("a", line()), run("a", line(), axis="gx"))
     c = compare_results([both, run("b", line())])
     assert list(c.axes) == ["gx", "gz"]
-    assert only(c.axes["gx"].single).absent == ()
-    assert only(c.axes["gz"].common).effect == "sinusoidal"
+    assert get_only_effect(c.axes["gx"].single).absent == ()
+    assert get_only_effect(c.axes["gz"].common).effect == "sinusoidal"
 
 
 def test_common_effects_are_those_of_all_recordings_with_the_axis() -> None:
     c = compare_results([run("a", line()), run("b", line()), run("c", axis="gx")])
-    assert only(c.axes["gz"].common).steps.keys() == {"a", "b"}
+    assert get_only_effect(c.axes["gz"].common).steps.keys() == {"a", "b"}
 
 
 def test_model_has_the_common_effects_and_no_other() -> None:
@@ -138,7 +138,7 @@ def test_parameter_without_an_interval_is_that_of_the_first_recording() -> None:
     c = compare_results([run("a", low_pass), run("b", low_pass)])
     found = c.model.effects["gz"][-1]
     assert found == BandwidthLimit(cutoff=20.0, order=2)
-    assert only(c.axes["gz"].common).sizes_agree is True  # by its cutoff, as it has no size
+    assert get_only_effect(c.axes["gz"].common).sizes_agree is True  # by its cutoff, as it has no size
 
 
 def test_curved_temperature_effect_is_pooled_at_one_reference() -> None:
@@ -149,7 +149,7 @@ def test_curved_temperature_effect_is_pooled_at_one_reference() -> None:
         "temperature_bias", coefficient=around(4e-4, 4e-6), quadratic=curve, reference=ParameterInterval(30.0)
     )
     c = compare_results([run("a", first), run("b", second)])
-    seen = only(c.axes["gz"].common)
+    seen = get_only_effect(c.axes["gz"].common)
     assert seen.sizes_agree is True
     found = c.model.effects["gz"][-1]
     assert isinstance(found, TemperatureBias)
@@ -160,14 +160,14 @@ def test_retuned_term_is_a_contradiction_only_if_its_size_is_another() -> None:
     """A change of 1 % with an interval of 2 % is insignificant, however large the closed gap is."""
     for size, half, meaning in ((1.01, 0.02, "too_faint"), (1.2, 0.02, "contradiction")):
         retuned = step("angle_random_walk", kind="retuned", N=around(size * samples.N, half * samples.N))
-        seen = only(gz(run("a", retuned), run("b")).single)
+        seen = get_only_effect(compare_gz(run("a", retuned), run("b")).single)
         assert [one.meaning for one in seen.absent] == [meaning]
 
 
 def test_clock_is_one_for_all_axes() -> None:
     slow = step("sample_rate_error", ratio=around(1.01, 1e-4))
     c = compare_results([run("a", slow, axis="gx"), run("b", slow, axis="gz")])
-    assert only(c.axes["gx"].common).steps.keys() == {"a", "b"}
+    assert get_only_effect(c.axes["gx"].common).steps.keys() == {"a", "b"}
     assert c.axes["gz"].common == c.axes["gz"].single == ()
     assert [(axis, effect.name) for axis, effect in c.model if effect.name == slow.effect] == [("gx", slow.effect)]
 

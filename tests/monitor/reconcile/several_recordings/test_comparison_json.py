@@ -10,17 +10,17 @@ from monitor.reconcile.several_recordings.comparison_json import encode_comparis
 from tests.monitor.reconcile.runs_made import line, run, step
 
 
-def made() -> RecordingsComparison:
+def make_comparison() -> RecordingsComparison:
     leak = step("cross_axis", source=ParameterInterval("gx"), coefficient=ParameterInterval(0.1))
     return compare_results([run("a", line()), run("b", line(), leak)], None, {"c": "too short"})
 
 
-def written(c: RecordingsComparison) -> dict[str, Any]:
+def write_json(c: RecordingsComparison) -> dict[str, Any]:
     return dict(json.loads(encode_comparison(c)))
 
 
 def test_keys_are_those_of_the_schema() -> None:
-    report = written(made())
+    report = write_json(make_comparison())
     assert {name: report[name] for name in ("schema", "verdict", "seed", "fitted_to")} == {
         "schema": "imu-monitor/reconcile-runs/1", "verdict": "explained", "seed": 7, "fitted_to": None,
     }  # fmt: skip
@@ -40,7 +40,7 @@ def test_keys_are_those_of_the_schema() -> None:
 
 
 def test_unknown_values_are_null_or_absent() -> None:
-    (single,) = written(made())["axes"]["gz"]["single"]
+    (single,) = write_json(make_comparison())["axes"]["gz"]["single"]
     assert single["parameters"] == {"source": {"value": "gx"}, "coefficient": {"value": 0.1, "lo": None, "hi": None}}
     assert (single["consistent"], single["p"]) == (None, None)
     assert single["absent"] == [{"run": "a", "meaning": "too_faint", "because": "the recording does not contain gx"}]
@@ -48,9 +48,9 @@ def test_unknown_values_are_null_or_absent() -> None:
 
 def test_nan_is_null() -> None:
     wrong = replace(line(), confidence=float("nan"))
-    (single,) = written(compare_results([run("a", wrong), run("b")]))["axes"]["gz"]["single"]
+    (single,) = write_json(compare_results([run("a", wrong), run("b")]))["axes"]["gz"]["single"]
     assert single["each"]["a"]["confidence"] is None
 
 
 def test_same_comparison_gives_the_same_bytes() -> None:
-    assert encode_comparison(made()) == encode_comparison(made())
+    assert encode_comparison(make_comparison()) == encode_comparison(make_comparison())

@@ -100,13 +100,19 @@ def test_quantization_counts_with_its_noise(step_to_noise, share):
     assert one.value_artifacts.quantization.gain > 20.0 * value_artifact_gain(fit, Resolution)
 
 
-def gap(diagnostic, gain):
+def make_gap(diagnostic, gain):
     return DiagnosticGap(diagnostic, Location(), sqrt(2.0 * gain), 2.0, 5.0)
 
 
 def test_diagnostics_of_one_group_count_once():
     hypothesis = louder_with_line()
-    left = (gap("lines", 40.0), gap("psd", 60.0), gap("tails", 30.0), gap("variance", 20.0), gap("level", 25.0))
+    left = (
+        make_gap("lines", 40.0),
+        make_gap("psd", 60.0),
+        make_gap("tails", 30.0),
+        make_gap("variance", 20.0),
+        make_gap("level", 25.0),
+    )
     found = measure_remaining_gaps(search(hypothesis), left)
     assert [(one.group, one.strongest.diagnostic) for one in found] == [
         ("spectrum", "psd"), ("distribution", "tails"), ("level", "level"),
@@ -118,5 +124,5 @@ def test_diagnostics_of_one_group_count_once():
 def test_spectrum_that_is_wrong_everywhere_counts_in_every_band():
     rng = np.random.default_rng(3)
     wrong = fit_with_fixed_noise(axis(1.2 * (white(n, rng) + walk(n, rng)), MODEL), MODEL)
-    (one,) = measure_remaining_gaps(search(wrong), (gap("psd", 60.0),))
+    (one,) = measure_remaining_gaps(search(wrong), (make_gap("psd", 60.0),))
     assert one.gain_nats == pytest.approx(0.5 * n * (1.2**2 - 1.0 - 2 * np.log(1.2)), rel=0.15)
