@@ -18,15 +18,15 @@ M = 60
 
 
 @pytest.fixture
-def draw_means():
+def noisy_step():
     """Return block means of noise with a step, and their covariance."""
     covariance = dense(REST, M, start=50.0)
     means = np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(M)
     return means + 3.0 * (np.arange(M) >= 40), covariance
 
 
-def test_gain_of_each_shock_equals_a_regression(short):
-    means, covariance = short
+def test_gain_of_each_shock_equals_a_regression(noisy_step):
+    means, covariance = noisy_step
     around = build_state_space_noise(REST, BLOCK_S, M * BLOCK_S)
     known = 40
     free = np.zeros(M)
@@ -39,8 +39,8 @@ def test_gain_of_each_shock_equals_a_regression(short):
         assert scores[k] == pytest.approx((step @ solved[:, 1]) ** 2 / (step @ solved[:, 0]), rel=1e-6)
 
 
-def test_whitened_regressors_give_the_dense_likelihood(short):
-    means, covariance = short
+def test_whitened_regressors_give_the_dense_likelihood(noisy_step):
+    means, covariance = noisy_step
     around = build_state_space_noise(REST, BLOCK_S, M * BLOCK_S)
     columns = np.column_stack([means, np.arange(M) >= 20.0])
     logs = poisson_steps_vs_single_steps._whiten(columns, around, 50.0)
