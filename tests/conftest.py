@@ -9,6 +9,9 @@ from typing import Final
 import pytest
 from hypothesis import HealthCheck, settings
 
+# This must be set before NumPy is imported. As in the program, the matrices are too small for parallel linear algebra.
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ.get("OPENBLAS_NUM_THREADS", "1")
+
 from tests.support.kernels import compile_kernels
 from tests.support.ports import release_claims
 from tests.support.waiting import PATIENCE_S

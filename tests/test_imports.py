@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,17 @@ HEAVY = {"numba", "llvmlite", "structlog", "asyncio", "zenoh", "rich", "serial"}
 PROGRAM = """
 import atexit, json, sys
 sys.path.insert(0, sys.argv.pop(1))
-absent, loaded = json.loads(sys.argv.pop(1)), sys.argv.pop(1)
+absent, loaded, commands = json.loads(sys.argv[1]), sys.argv[2], json.loads(sys.argv[3])
 sys.modules.update(dict.fromkeys(absent))  # as if they were not installed
 atexit.register(lambda: open(loaded, "w").write(json.dumps([name for name in sys.modules if sys.modules[name]])))
 import imu_monitor
-imu_monitor.main()
+for command in commands:
+    sys.argv[1:] = command
+    try:
+        imu_monitor.main()
+    except SystemExit as end:
+        if end.code:
+            raise
 """
 SERIAL = """
 [zenoh]
@@ -58,13 +64,23 @@ driver = {{ link = "serial", port = "{port}", baudrate = 921600, decoder = "text
 
 def build_command(folder: Path, *arguments: object, absent: tuple[str, ...] = ()) -> list[str]:
     """Return a command that runs the program and writes the names of its loaded modules to ``folder`` at its end."""
-    loaded = str(folder / "modules.json")
-    return [sys.executable, "-c", PROGRAM, str(ROOT), json.dumps(absent), loaded, *map(str, arguments)]
+    return build_command_sequence(folder, [arguments], absent)
+
+
+def build_command_sequence(folder: Path, commands: Sequence[Sequence[object]], absent: tuple[str, ...]) -> list[str]:
+    """Return a command that runs the program once for each list of arguments, up to the first failure."""
+    arguments = json.dumps([list(map(str, command)) for command in commands])
+    return [sys.executable, "-c", PROGRAM, str(ROOT), json.dumps(absent), str(folder / "modules.json"), arguments]
 
 
 def run_program(folder: Path, *arguments: object, absent: tuple[str, ...] = ()) -> tuple[int, str]:
     """Run the program and return its exit status and standard error."""
-    command = build_command(folder, *arguments, absent=absent)
+    return run_sequence(folder, [arguments], absent)
+
+
+def run_sequence(folder: Path, commands: Sequence[Sequence[object]], absent: tuple[str, ...]) -> tuple[int, str]:
+    """Run the program once for each list of arguments, and return the exit status and standard error."""
+    command = build_command_sequence(folder, commands, absent)
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     return done.returncode, done.stderr
 
@@ -184,16 +200,16 @@ def test_offline_commands_except_reconcile_need_no_extra(tmp_path: Path) -> None
     t = np.arange(columns["gx"].size) / 20.0
     temperature = 25.0 + 5.0 * np.sin(2.0 * np.pi * t / 3000.0)
     np.savez(tmp_path / "warm.npz", **{**columns, "gx": columns["gx"] + 1e-4 * temperature, "temperature": temperature})
-    for arguments in (
+    commands: list[tuple[object, ...]] = [
         ("analyze", "warm.npz", "--json", "result.json"),
         ("thermal", "fit", "warm.npz", "--out", "model.json"),
         ("thermal", "predict", "warm.npz", "--model", "model.json"),
         ("compensate", "warm.npz", "--out", "compensated.npz"),
         ("compensate", "warm.npz", "--out", "ar.npz", "--method", "ar"),
         ("export", CONFIG_FOLDER / "models" / "consumer-mems.toml", "--format", "kalibr", "--out", "imu.yaml"),
-    ):
-        assert run_program(tmp_path, *arguments, absent=absent) == (0, ""), arguments
-        assert not read_loaded_modules(tmp_path) & OPTIONAL
+    ]
+    assert run_sequence(tmp_path, commands, absent) == (0, "")
+    assert not read_loaded_modules(tmp_path) & OPTIONAL
     result = json.loads((tmp_path / "result.json").read_text())
     assert '"without_temperature"' in json.dumps(result)
 

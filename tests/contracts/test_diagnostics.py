@@ -16,7 +16,19 @@ from monitor.reconcile.diagnostics.null_distribution import estimate_null_distri
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, inverse_cosine_transform
-from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, N, axes, correlated, seen, time_s, walk, warmth, white
+from tests.monitor.reconcile.axes import (
+    RATE_HZ,
+    WALK,
+    WHITE,
+    N,
+    axes,
+    correlated,
+    make_temperature,
+    time_s,
+    walk,
+    white,
+    whiten,
+)
 
 NAMES = sorted(DIAGNOSTICS)
 n = 6000
@@ -27,7 +39,7 @@ OTHER = correlated(n, np.random.default_rng(99_999), 1e-2, 1.0)
 
 def whiten_by_white_noise(y: np.ndarray) -> WhitenedAxis:
     """Whiten a series by white noise of the same size."""
-    return seen(axes({"gx": OTHER, "gz": y}, (WHITE,), warmth(n))["gz"], (WHITE,))
+    return whiten(axes({"gx": OTHER, "gz": y}, (WHITE,), make_temperature(n))["gz"], (WHITE,))
 
 
 @cache
@@ -37,8 +49,8 @@ def simulate_findings(first: int, runs: int) -> list[dict[str, Finding]]:
     for seed in range(first, first + runs):
         rng = np.random.default_rng(seed)
         y = white(n, rng) + walk(n, rng)
-        axis = axes({"gx": OTHER, "gz": y}, {"gx": (WHITE,), "gz": (WHITE, WALK)}, warmth(n))["gz"]
-        found.append(dict(run_diagnostics(seen(axis, (WHITE, WALK)))))
+        axis = axes({"gx": OTHER, "gz": y}, {"gx": (WHITE,), "gz": (WHITE, WALK)}, make_temperature(n))["gz"]
+        found.append(dict(run_diagnostics(whiten(axis, (WHITE, WALK)))))
     return found
 
 
@@ -97,7 +109,7 @@ DATA_EQUAL_TO_EXPECTATION: dict[str, Callable[[], np.ndarray]] = {
     "lines": make_impulse,
     "autocorrelation": lambda: inverse_cosine_transform(draw_signs(n - 1)),
     "level": make_noise_without_low_frequencies,
-    "temperature": lambda: make_noise_without_column(warmth(n) - 25.0),
+    "temperature": lambda: make_noise_without_column(make_temperature(n) - 25.0),
     "other_axes": lambda: make_noise_without_column(OTHER),
     "tails": lambda: np.random.default_rng(5).permutation(SIGMA * norm.ppf((np.arange(n) + 0.5) / n)),
     "variance": lambda: draw_signs(n),
@@ -111,7 +123,7 @@ ADD_DIFFERENCE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "lines": lambda y: y + 4e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n)),
     "autocorrelation": lambda y: y + np.append(0.3 * y[1:], 0.0),
     "level": lambda y: y + 4e-4 * (time_s(n) > 23.0),
-    "temperature": lambda y: y + 1e-4 * (warmth(n) - 25.0),
+    "temperature": lambda y: y + 1e-4 * (make_temperature(n) - 25.0),
     "other_axes": lambda y: y + 0.02 * OTHER,
     "tails": lambda y: np.where(np.random.default_rng(7).random(n) < 2e-3, 8.0 * y, y),
     "variance": lambda y: np.where(time_s(n) < 40.0, y, 1.4 * y),
@@ -184,7 +196,7 @@ def test_location_is_inside_the_recording(name):
         "frequency": (-0.05, 0.5 * RATE_HZ + 0.05),
         "tau": (0.0, n / RATE_HZ),
         "time": (0.0, n / RATE_HZ),
-        "temperature": (warmth(n).min() - 1e-9, warmth(n).max() + 1e-9),
+        "temperature": (make_temperature(n).min() - 1e-9, make_temperature(n).max() + 1e-9),
     }
     for kind, place in where.resolved_location_dimensions().items():
         if kind in limits:

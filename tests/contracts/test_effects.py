@@ -108,11 +108,8 @@ def test_each_effect_has_a_variance_or_a_series_to_compare_with():
 def test_simulated_allan_variance_equals_the_stated_one(name):
     # the largest of six τ exceeds 5 standard errors of 16 runs once in 1500 tests (Student's t)
     assert compute_standard_errors(name, simulate_records(name)).max() < 5.0
-
-
-@pytest.mark.parametrize("name", [name for name in WITH_STATED_AVAR if get_stated_avar(name).any()])
-def test_level_wrong_by_three_percent_is_detected(name):
-    assert compute_standard_errors(name, 1.03 * simulate_records(name)).max() > 5.0
+    if get_stated_avar(name).any():  # a level that is wrong by 3 % would be detected
+        assert compute_standard_errors(name, 1.03 * simulate_records(name)).max() > 5.0
 
 
 @pytest.mark.long

@@ -1,4 +1,4 @@
-"""Tests that the warm-up compiles every kernel of the service with exactly one signature."""
+"""Tests that the warm-up compiles every kernel exactly once and leaves nothing to compile at a start."""
 
 import json
 import os
@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 import monitor.common.compiled
+from monitor.daemon.kernels.kernel_compilation import COMPILER
 from tests.support.waiting import PATIENCE_S
 
-PROGRAM = """
+USE_ALL_KERNELS = """
     import json, sys
 
     import numpy as np
@@ -68,18 +69,42 @@ PROGRAM = """
     thermal_response.apply_first_order_lag(values[:, 0].copy(), 0.5)
     print(json.dumps([before, count_signatures(), len(found)]))
 """
+LIST_COMPILATIONS = """
+    from numba.core import event
+
+    from monitor.daemon.kernels import kernel_groups
+
+    with event.install_recorder("numba:compile") as recorder:
+        for group in kernel_groups.GROUPS:
+            for part in group.parts:
+                part.prepare()
+    print([str(each.data["dispatcher"]) for _, each in recorder.buffer if each.is_start])
+"""
 
 
 @pytest.mark.long
-def test_warm_up_compiles_every_kernel_with_one_signature(tmp_path: Path) -> None:
-    root = Path(monitor.common.compiled.__file__).parents[1]
-    command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
-    cold = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}  # otherwise inner functions would not be compiled
-    timeout_s = 2.0 * PATIENCE_S  # one process compiles everything
-    done = subprocess.run(command, cwd=root, env=cold, timeout=timeout_s, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    before, after, found = json.loads(done.stdout)
+def test_warm_up_compiles_every_kernel_once_and_leaves_nothing_to_compile(tmp_path: Path) -> None:
+    def run_program(*command: str) -> "subprocess.CompletedProcess[str]":
+        root = Path(monitor.common.compiled.__file__).parents[2]
+        cold = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}  # otherwise inner functions would not be compiled
+        timeout_s = 2.0 * PATIENCE_S  # one process compiles all kernels of the service
+        done = subprocess.run(
+            command, cwd=root, env=cold, timeout=timeout_s, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done
+
+    before, after, found = json.loads(run_program(sys.executable, "-c", textwrap.dedent(USE_ALL_KERNELS)).stdout)
     assert found, "the samples must contain motion and changes"
     assert {name: counts for name, counts in after.items() if counts != before.get(name)} == {}
     assert {name: counts for name, counts in after.items() if max(counts) > 1} == {}
     assert after["monitor.estimation.allan.window_kernel.append_staged_samples"] == [1, 1]
+
+    # The kernels of the service are in the cache now. The command compiles the kernels for recordings.
+    command = COMPILER[:-1]
+    first, second = run_program(*command), run_program(*command)
+    compiled, _, cache_folder = first.stdout.partition("; kernels are kept in ")
+    assert compiled.startswith("compiled ")
+    assert "compiling 2 of " in first.stderr
+    assert (second.stdout, second.stderr) == (f"nothing to compile; kernels are kept in {cache_folder}", "")
+    assert run_program(sys.executable, "-c", textwrap.dedent(LIST_COMPILATIONS)).stdout == "[]\n"

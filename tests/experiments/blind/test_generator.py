@@ -198,7 +198,7 @@ def test_foreign_effects_change_the_signal(name: str) -> None:
 
 
 def test_case_is_reproducible_and_depends_on_the_seed() -> None:
-    first, again, other = (cases.make_case("bias_step", "plain", seed, seconds=100.0, axes=2) for seed in (4, 4, 5))
+    first, again, other = (cases.make_case("bias_step", "plain", seed, seconds=100.0, axes=1) for seed in (4, 4, 5))
     assert first.model == again.model
     assert first.truth == again.truth
     assert all(np.array_equal(first.columns[axis], again.columns[axis]) for axis in first.columns)
@@ -235,7 +235,7 @@ def test_hidden_term_is_not_in_the_model() -> None:
 
 
 def test_pair_on_one_axis() -> None:
-    case = cases.make_case("bias_step@same+outliers", "plain", 0, seconds=200.0, axes=2)
+    case = cases.make_case("bias_step@same+outliers", "plain", 0, seconds=100.0, axes=2)
     first, second = case.truth["hidden"]
     assert first["axis"] == second["axis"]
     assert (first["effect"], second["effect"]) == ("bias_step", "outliers")

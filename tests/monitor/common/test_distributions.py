@@ -14,7 +14,7 @@ def test_chi2_quantile(probability: float) -> None:
     edf = np.concatenate([np.geomspace(0.01, 1e12, 20_001), np.arange(1.0, 2001.0)])
     expected = chdtri(edf, 1.0 - probability)
     comparable = expected > 1e-290  # smaller numbers have fewer digits
-    assert chi2_quantile(edf, probability)[comparable] == pytest.approx(expected[comparable], rel=TOLERANCE)
+    np.testing.assert_allclose(chi2_quantile(edf, probability)[comparable], expected[comparable], rtol=TOLERANCE)
 
 
 def test_chi2_quantile_underflows_to_zero() -> None:
@@ -45,13 +45,11 @@ def test_student_quantile(probability: float) -> None:
 
 
 def test_incomplete_beta() -> None:
-    """Cover all F tests of up to 1000 and 20 degrees of freedom; near 1, the test covers the complement."""
+    """Cover F tests of up to 1000 and 20 degrees of freedom; near 1, the test covers the complement."""
     x = np.concatenate([[0.0, 1.0], np.linspace(0.001, 0.999, 201), np.geomspace(1e-9, 1e-3, 61)])
-    for a in (*(0.5 * np.arange(1, 160)), 250.0, 500.0):
+    for a in (*(0.5 * np.arange(1, 20)), *(0.5 * np.arange(20, 160, 7)), 250.0, 500.0):
         for b in 0.5 * np.arange(1, 21):
             expected = betainc(a, b, x)
             comparable = expected > 1e-290
-            assert incomplete_beta(a, b, x)[comparable] == pytest.approx(expected[comparable], rel=5.0 * TOLERANCE), (
-                a,
-                b,
-            )
+            found = incomplete_beta(a, b, x)[comparable]
+            np.testing.assert_allclose(found, expected[comparable], 5.0 * TOLERANCE, err_msg=f"{a} {b}")

@@ -21,6 +21,8 @@ from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[3]
 RATE_HZ = 100.0
+SIGNAL_KINDS = 8
+"""Gap, missing samples, motion, larger noise, step, constant axis, outliers and missing accelerometer."""
 INTERPRETING_PROGRAM = """
 import pickle, sys
 from monitor.common.compiled import interpret_uncompiled_kernels
@@ -39,13 +41,13 @@ def list_compiled_kernels() -> list[str]:
     return sorted(kernel.py_func.__qualname__ for kernel in kernels if kernel.signatures)
 
 
-def draw_random_signal(rng: np.random.Generator, n: int) -> Floats:
-    """Draw noise of six axes with gaps, outliers, steps, a tone, motion, or a constant or missing axis."""
+def draw_random_signal(rng: np.random.Generator, n: int, kind: int) -> Floats:
+    """Draw noise of six axes with one of ``SIGNAL_KINDS`` disturbances."""
     values = rng.standard_normal((n, 6)) * 10.0 ** rng.uniform(-6.0, 0.0, 6)
     values += np.cumsum(rng.standard_normal((n, 6)), axis=0) * 1e-3 * rng.uniform(0.0, 1.0, 6) * values.std(0)
     values[:, 2] += 9.81
     start, end = np.sort(rng.integers(0, n, 2))
-    match rng.integers(0, 8):
+    match kind:
         case 0:
             values[start:end, rng.integers(0, 6)] = np.nan
         case 1:
@@ -69,7 +71,7 @@ def process_random_samples(seed: int) -> list[Any]:
     """Process a random stream of samples and return all results as arrays and lists."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(200, 700))
-    values = draw_random_signal(rng, n)
+    values = draw_random_signal(rng, n, seed % SIGNAL_KINDS)
     estimator = Estimator(RATE_HZ, float(rng.choice([2.0, 10.0, 60.0])), every_sample=seed % 4 == 0)
     monitor, compensation = (
         MotionAndChangeMonitor(RATE_HZ, bool(seed % 2), 10.0, keep_samples_at_rest=True),
@@ -127,7 +129,7 @@ def assert_same_results(first: Any, second: Any) -> None:
 
 def test_interpreted_kernels_give_the_results_of_compiled_ones(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-W", "error", "-c", INTERPRETING_PROGRAM, "12"]
+    command = [sys.executable, "-W", "error", "-c", INTERPRETING_PROGRAM, str(SIGNAL_KINDS)]
     run = subprocess.run(command, env=environment, cwd=ROOT, timeout=PATIENCE_S, stdout=subprocess.PIPE, check=True)
     for seed, found in enumerate(pickle.loads(run.stdout)):
         assert_same_results(found, process_random_samples(seed))

@@ -18,19 +18,6 @@ from tests.support.waiting import PATIENCE_S
 ECHO_ALL_LINES = "import sys\nfor line in sys.stdin: print(line, end='', flush=True)"
 ECHO_ONE_LINE = "import sys\nprint(sys.stdin.readline(), end='', flush=True)"
 EXIT_WITH_ERROR = "import sys\nsys.exit(1)"
-LIST_COMPILATIONS = """
-import sys
-from drivers.errors import ConfigError
-from monitor.common import compiled
-from monitor.daemon.kernels import kernel_compilation, kernel_groups
-from monitor.cli.warm_up import warm_up
-from numba.core import event
-with event.install_recorder("numba:compile") as recorder:
-    for group in kernel_groups.GROUPS:
-        for part in group.parts:
-            part.prepare()
-print([str(each.data["dispatcher"]) for _, each in recorder.buffer if each.is_start])
-"""
 
 
 @pytest.fixture
@@ -120,26 +107,6 @@ def test_compiling_child_ends_with_its_parent() -> None:
         assert child.stdout.readline() == f"{kernel_groups.WINDOW}\n"
         child.stdin.close()
         assert child.wait(PATIENCE_S) == 0
-
-
-@pytest.mark.long
-def test_warm_up_command_fills_an_empty_cache_completely(tmp_path: Path) -> None:
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-
-    def run_program(*arguments: str) -> "subprocess.CompletedProcess[str]":
-        return subprocess.run(arguments, env=environment, capture_output=True, text=True, check=True)
-
-    command = kernel_compilation.COMPILER[:-1]
-    first, second = run_program(*command), run_program(*command)
-    assert first.stdout.startswith("compiled ")
-    assert "compiling 2 of " in first.stderr
-    assert second.stdout == f"nothing to compile; kernels are kept in {extract_cache_folder(first.stdout)}\n"
-    assert second.stderr == ""
-    assert run_program(sys.executable, "-c", LIST_COMPILATIONS).stdout == "[]\n"
-
-
-def extract_cache_folder(text: str) -> str:
-    return text.rstrip("\n").partition(" are kept in ")[2]
 
 
 def test_warm_up_command_reports_a_missing_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:

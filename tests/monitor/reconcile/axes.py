@@ -1,4 +1,4 @@
-"""Axes, recordings and reports for the tests of the search: series made by SciPy, not by the simulator."""
+"""Noise series, axes and recordings for the tests of the search. SciPy draws the series, not the simulator."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -26,7 +26,7 @@ WHITE, WALK = TERMS[0], TERMS[2]
 GYRO_AXES = ("gx", "gy", "gz")
 MODEL = NoiseModel(dict.fromkeys(GYRO_AXES, TERMS), RATE_HZ)
 STRICT = dict.fromkeys(DIAGNOSTICS, NullDistribution(7.0, 15.0))
-"""Null and threshold in nats, near those of a true model; what is hidden in these tests gains far more."""
+"""Null quantile and threshold in nats, close to those of a true model. The hidden effects have far larger gains."""
 
 
 def white(n: int, rng: np.random.Generator, size: float = N) -> Floats:
@@ -38,15 +38,15 @@ def walk(n: int, rng: np.random.Generator, size: float = K) -> Floats:
 
 
 def correlated(n: int, rng: np.random.Generator, sigma: float, time_s: float) -> Floats:
-    """Gauss-Markov, by its recursion from a stationary start."""
+    """Draw Gauss-Markov noise by its recursion from a stationary start."""
     decay = np.exp(-1.0 / (RATE_HZ * time_s))
     drawn = rng.standard_normal(n) * sigma * np.sqrt(1.0 - decay**2)
     drawn[0] = sigma * rng.standard_normal()
     return np.asarray(lfilter([1.0], [1.0, -decay], drawn))
 
 
-def ringing(n: int, rng: np.random.Generator, sigma: float, f_hz: float, width_hz: float) -> Floats:
-    """Second-order autoregression with a pole at the frequency."""
+def draw_resonance(n: int, rng: np.random.Generator, sigma: float, f_hz: float, width_hz: float) -> Floats:
+    """Draw a second-order autoregression with a pole at the frequency."""
     radius = np.exp(-np.pi * width_hz / RATE_HZ)
     poles = [1.0, -2.0 * radius * np.cos(2.0 * np.pi * f_hz / RATE_HZ), radius**2]
     made = lfilter([1.0], poles, rng.standard_normal(n + 5000))[5000:]
@@ -57,8 +57,8 @@ def time_s(n: int) -> Floats:
     return np.arange(n) / RATE_HZ
 
 
-def warmth(n: int) -> Floats:
-    """Temperature [n], °C: up and down with a drift."""
+def make_temperature(n: int) -> Floats:
+    """Return an oscillating temperature with a drift in °C, shape [n]."""
     t = np.arange(n) / n
     return 25.0 + 3.0 * np.sin(2.0 * np.pi * 1.7 * t) + 2.0 * t
 
@@ -69,7 +69,7 @@ def axes(
     temperature_c: Floats | None = None,
     seed: int = 0,
 ) -> dict[str, Axis]:
-    """As a search gets them."""
+    """Prepare the axes of a recording for the search."""
     n = next(iter(values.values())).size
     each = effects if isinstance(effects, Mapping) else dict.fromkeys(values, effects)
     given = Recording(values, RATE_HZ, temperature_c)
@@ -77,19 +77,19 @@ def axes(
 
 
 def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | None = None) -> Axis:
-    """One axis alone."""
+    """Prepare a recording with a single axis for the search."""
     return axes({"gz": y}, effects, temperature_c)["gz"]
 
 
-def seen(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
-    """Beside a model as it stands."""
+def whiten(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
+    """Whiten an axis by a model without fitting its parameters."""
     return whiten_axis(fit_with_fixed_noise(one, effects).fit)
 
 
 def recording(
     model: NoiseModel, n: int, seed: int, temperature_c: Floats | None = None, names: tuple[str, ...] = GYRO_AXES
 ) -> Recording:
-    """Drawn by the simulator."""
+    """Return a recording that the simulator has drawn."""
     drawn = model.simulate(n, RATE_HZ, seed, temperature_c)
     return Recording({name: drawn[:, AXES.index(name)].copy() for name in names}, RATE_HZ, temperature_c)
 
@@ -101,7 +101,7 @@ SCORE = {"lens", "where", "gap", "null95", "threshold"}
 
 
 def check_report(report: dict[str, Any]) -> None:
-    """All that the schema imu-monitor/reconcile/1 promises of a report with a verdict."""
+    """Check a report with a verdict against the schema imu-monitor/reconcile/1."""
     assert report["schema"] == "imu-monitor/reconcile/1"
     assert report["verdict"] in VERDICTS
     assert report["axes"]

@@ -1,4 +1,4 @@
-"""Noise whose effects share a spectrum, made here by other means than those of the simulator."""
+"""Noise of effects with equal spectra, drawn independently of the simulator."""
 
 import numpy as np
 
@@ -9,7 +9,10 @@ BLOCK_S = 3.0
 
 
 def dense(rest, m, start=0.0):
-    """Covariance [m, m] of block means from integrals of autocovariances; the level begins with variance ``start``."""
+    """Return the covariance of block means from integrals of autocovariances, shape [m, m].
+
+    ``start`` is the variance of the initial level.
+    """
     k = np.arange(m)
     apart = np.abs(k[:, None] - k)
     covariance = np.full((m, m), start) + rest.white / BLOCK_S * np.eye(m)
@@ -27,13 +30,13 @@ def white(n, rng):
 
 
 def two_levels(n, amplitude, dwell_s, rng):
-    """By the parity of a Poisson count in each sample, with a first level at random."""
+    """Draw a telegraph signal from the parity of a Poisson count in each sample, with a random initial level."""
     flips = rng.poisson(TAU0_S / dwell_s, n)
     return 0.5 * amplitude * (1.0 - 2.0 * ((rng.integers(2) + np.cumsum(flips)) % 2))
 
 
 def wandering(n, sigma, time_s, rng):
-    """Gauss-Markov noise as circulant of its autocovariance."""
+    """Draw Gauss-Markov noise from the circulant matrix of its autocovariance."""
     lag = np.minimum(np.arange(2 * n), 2 * n - np.arange(2 * n)) * TAU0_S
     power = np.fft.rfft(sigma**2 * np.exp(-lag / time_s)).real.clip(0.0)
     return np.fft.irfft(np.sqrt(power) * np.fft.rfft(rng.standard_normal(2 * n)), 2 * n)[:n]
@@ -44,5 +47,5 @@ def walk(n, K, rng):
 
 
 def jumps(n, rate, height, rng):
-    """By the number of jumps in each sample."""
+    """Draw Poisson steps from the number of jumps in each sample."""
     return height * np.cumsum(np.sqrt(rng.poisson(rate * TAU0_S, n)) * rng.standard_normal(n))

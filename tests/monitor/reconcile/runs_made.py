@@ -1,4 +1,4 @@
-"""Runs of one sensor made by hand: the line of ``samples`` on gz, of any size and place, and what else is wanted."""
+"""Reconciliations of one sensor without a search, with the line of ``samples`` on gz and other effects."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,13 +20,13 @@ from monitor.reconcile.several_recordings.comparison import NamedResult
 from tests.monitor.reconcile import samples
 
 DIAGNOSTIC = DiagnosticGap("lines", Location(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)
-"""What a diagnostic shows of an axis of which nothing is to be said."""
+"""Result of a diagnostic on an axis without findings."""
 
 
 def step(
     effect: str, gap: float = 30.0, rivals: Sequence[str] = (), kind: str = "added", **given: ParameterInterval | float
 ) -> AddedOrResizedEffect:
-    """Found through ``DIAGNOSTIC`` with that gap; a bare number has an interval of one in a hundred."""
+    """Return a step that ``DIAGNOSTIC`` found with this gap. A plain number gets an interval of one percent."""
     before = replace(DIAGNOSTIC, gap=gap)
     parameters = {
         name: one if isinstance(one, ParameterInterval) else around(one, 0.01 * abs(one)) for name, one in given.items()
@@ -57,7 +57,7 @@ def run(
     seconds: float = 600.0,
     left: Sequence[DiagnosticGap] = (),
 ) -> NamedResult:
-    """A recording of one axis with these steps; its model has their effects."""
+    """Return the result for one axis with these steps. Its model contains their effects."""
     verdict: Decision = ("partly_explained" if steps else "unexplained") if left else "explained" if steps else "agrees"
     result = AxisResult(
         axis,
@@ -89,7 +89,7 @@ def made(one: AddedOrResizedEffect) -> Effect:
 
 
 def with_axes(first: NamedResult, *others: NamedResult) -> NamedResult:
-    """One recording with the axes of all."""
+    """Return one result with the axes of all results."""
     axes = {axis: one for run in (first, *others) for axis, one in run.result.axes.items()}
     models = [
         NoiseModel(
@@ -102,6 +102,6 @@ def with_axes(first: NamedResult, *others: NamedResult) -> NamedResult:
 
 
 def known_lines(models: Sequence[Sinusoidal], one: NamedResult) -> NamedResult:
-    """The same beside a model that has these lines as well."""
+    """Return the result for a model that also contains these lines."""
     effects = {axis: (*given, *models) for axis, given in one.result.baseline.effects.items()}
     return replace(one, result=replace(one.result, baseline=NoiseModel(effects, samples.RATE_HZ)))

@@ -33,17 +33,17 @@ ACCELEROMETER = 6.0  # times as much of everything, in m/s²
 
 
 def spectrum(f_hz: Floats, n: float) -> Floats:
-    """Two-sided, of white noise, flicker and random walk (IEEE Std 952, annex B)."""
+    """Return the two-sided spectrum of white noise, flicker and random walk (IEEE Std 952, annex B)."""
     return n**2 + B**2 / (2 * np.pi * f_hz) + K**2 / (2 * np.pi * f_hz) ** 2
 
 
 def avar(tau_s: Floats, n: float) -> Floats:
-    """The same terms over averaging time."""
+    """Return the Allan variance of the same terms."""
     return n**2 / tau_s + 2 * np.log(2) / np.pi * B**2 + K**2 * tau_s / 3
 
 
 def line_avar(tau_s: Floats, amplitude: float = A) -> Floats:
-    """Of a sinusoid, continuous."""
+    """Return the Allan variance of a continuous sinusoid."""
     at = np.pi * LINE_HZ * tau_s
     return amplitude**2 * np.sin(at) ** 4 / at**2
 
@@ -56,7 +56,7 @@ def look(
     known_line: bool = False,
     hump: bool = False,
 ) -> AxisModelDiagnostics:
-    """One axis beside a model through four diagnostics; ``line`` is measured, ``known_line`` is in the model too."""
+    """Return plot data of four diagnostics. ``line`` is in the data, ``known_line`` also in the model."""
     rng = np.random.default_rng(AXES.index(axis))  # the same measurement beside every model
     size = 1.0 if axis.startswith("g") else ACCELEROMETER
     views = (
@@ -79,14 +79,14 @@ def look(
 
 
 def agrees(fitted_first: bool = False) -> Reconciliation:
-    """Six axes of which nothing is to be said."""
+    """Return the result of six axes that agree with the model."""
     axes = {a: AxisResult(a, "agrees", look(a), (), (), look(a)) for a in AXES}
     model = NoiseModel(dict.fromkeys(axes, _terms()), sample_rate_hz=RATE_HZ)
     return Reconciliation("agrees", axes, model, model, fitted_first, RATE_HZ, 360_000, SECONDS, 7)
 
 
 def explained() -> Reconciliation:
-    """Two steps on gz: a line is added, the white noise is retuned."""
+    """Return a result with two steps on gz: a new line and another size of the white noise."""
     start = look("gz", n_true=MORE_N, line=True)
     with_line = look("gz", n_true=MORE_N, line=True, known_line=True)
     with_all = look("gz", n_model=MORE_N, n_true=MORE_N, line=True, known_line=True)
@@ -137,7 +137,7 @@ def explained() -> Reconciliation:
 
 
 def partly_explained() -> Reconciliation:
-    """The line of ``explained`` alone: the white noise is left over."""
+    """Return a result with the line of ``explained``, but without the step of the white noise."""
     whole = explained()
     gz = whole.axes["gz"]
     left = tuple(score for score in gz.steps[0].snapshot_after.gaps if score.is_significant)
@@ -147,7 +147,7 @@ def partly_explained() -> Reconciliation:
 
 
 def unexplained() -> Reconciliation:
-    """One accelerometer with a hump in its spectrum."""
+    """Return a result with an unexplained hump in the spectrum of one accelerometer."""
     start = look("ax", hump=True)
     remaining = (RemainingGap("spectrum", start.gaps[0], 31.2),)
     result = AxisResult("ax", "unexplained", start, (), (start.gaps[0],), start, remaining)
@@ -169,7 +169,7 @@ def _psd(
     known_line: bool,
     hump: bool,
 ) -> DiagnosticPlotData:
-    """Bins of a log-binned DCT: the first 48 single, then 16 an octave, at most 0.1 Hz wide."""
+    """Return bins of a cosine transform: 48 single coefficients, then 16 per octave, at most 0.1 Hz wide."""
     single = np.arange(1, 49) / (2 * SECONDS)
     edges = [float(single[-1])]
     while edges[-1] < RATE_HZ / 2:
@@ -204,7 +204,7 @@ def _allan(
 
 
 def _level(axis: str, rng: np.random.Generator, size: float) -> DiagnosticPlotData:
-    """Means of 10 s."""
+    """Return means of 10 s."""
     t = np.arange(5.0, SECONDS, 10.0)
     sigma = size * np.sqrt(avar(np.array([10.0]), N)[0] + K**2 * 300)
     measured = sigma * rng.standard_normal(t.size)
@@ -214,7 +214,7 @@ def _level(axis: str, rng: np.random.Generator, size: float) -> DiagnosticPlotDa
 
 
 def _distribution(rng: np.random.Generator, ratio: float) -> DiagnosticPlotData:
-    """Density of the whitened samples."""
+    """Return the density of the whitened samples."""
     x = np.linspace(-4.5, 4.5, 73)
     expected = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
     truth = np.exp(-0.5 * (x / ratio) ** 2) / np.sqrt(2 * np.pi) / ratio

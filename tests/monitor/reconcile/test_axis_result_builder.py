@@ -1,4 +1,4 @@
-"""A search as people and programs read it: within the contract of the report, and true to what was hidden."""
+"""Tests of the result of an axis: it follows the schema of the report and describes the hidden effects."""
 
 import json
 from dataclasses import replace
@@ -37,22 +37,22 @@ UNREACHED = dict.fromkeys(DIAGNOSTICS, NullDistribution(1e6, 1e9))
 ALWAYS = dict.fromkeys(DIAGNOSTICS, NullDistribution(0.0, 0.0))
 
 
-def noise(seed=0):
+def draw_noise(seed=0):
     rng = np.random.default_rng(seed)
     return white(n, rng) + walk(n, rng)
 
 
-def hidden(name):
+def make_hidden_effect(name):
     rng = np.random.default_rng(1)
     return {
-        "nothing": noise(),
-        "line": noise() + LINE,
-        "louder": 1.15 * noise(),
-        "outliers": noise() + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
-        "line and outliers": noise() + LINE + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
-        "clustered outliers": noise() + np.repeat(rng.random(n // 4) < 1e-3, 4) * 1.5e-2 * rng.standard_normal(n),
-        "correlated": noise() + correlated(n, rng, 3e-4, 0.5),
-        "filtered and coarse": 4e-4 * np.rint(noise() / 4e-4),
+        "nothing": draw_noise(),
+        "line": draw_noise() + LINE,
+        "louder": 1.15 * draw_noise(),
+        "outliers": draw_noise() + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
+        "line and outliers": draw_noise() + LINE + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
+        "clustered outliers": draw_noise() + np.repeat(rng.random(n // 4) < 1e-3, 4) * 1.5e-2 * rng.standard_normal(n),
+        "correlated": draw_noise() + correlated(n, rng, 3e-4, 0.5),
+        "filtered and coarse": 4e-4 * np.rint(draw_noise() / 4e-4),
     }[name]
 
 
@@ -60,19 +60,19 @@ NAMES = ("nothing", "line", "louder", "outliers", "correlated", "filtered and co
 
 
 @cache
-def found(name):
-    return search_missing_effects(axis(hidden(name), MODEL), MODEL, STRICT, np.random.default_rng(0))
+def search_effect(name):
+    return search_missing_effects(axis(make_hidden_effect(name), MODEL), MODEL, STRICT, np.random.default_rng(0))
 
 
 @cache
-def told(name):
-    return build_axis_result(found(name), STRICT, STRICT)
+def describe_effect(name):
+    return build_axis_result(search_effect(name), STRICT, STRICT)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
-def test_the_report_is_as_its_contract_says(name):
-    result = told(name)
+def test_report_follows_its_schema(name):
+    result = describe_effect(name)
     model = NoiseModel({"gz": MODEL}, RATE_HZ)
     whole = Reconciliation(result.verdict, {"gz": result}, model, model, False, RATE_HZ, n, n / RATE_HZ, 1)
     report = json.loads(encode_report(whole))
@@ -81,8 +81,8 @@ def test_the_report_is_as_its_contract_says(name):
     assert [score["lens"] for score in report["axes"]["gz"]["scores"]] == list(DIAGNOSTICS)
 
 
-def test_a_line_is_described_with_all_that_it_has():
-    (step,) = told("line").steps
+def test_description_of_a_line_is_complete():
+    (step,) = describe_effect("line").steps
     assert (step.kind, step.effect) == ("added", "sinusoidal")
     for name, true in (("frequency", 17.3), ("amplitude", 2e-4), ("phase", 0.7)):
         bounds = step.parameters[name]
@@ -100,8 +100,8 @@ def test_a_line_is_described_with_all_that_it_has():
     assert "sinusoidal" in step.because
 
 
-def test_another_size_is_told_as_such():
-    steps = told("louder").steps
+def test_changed_size_is_a_retuned_step():
+    steps = describe_effect("louder").steps
     assert {step.kind for step in steps} == {"retuned"}
     (of_white,) = (step for step in steps if step.effect == "angle_random_walk")
     bounds = of_white.parameters["N"]
@@ -111,7 +111,7 @@ def test_another_size_is_told_as_such():
 
 
 def test_single_samples_are_counted():
-    (step,) = told("outliers").steps
+    (step,) = describe_effect("outliers").steps
     assert step.effect == "outliers"
     assert step.before.diagnostic == "tails"
     assert step.parameters["fraction"].lo < 1e-3 < step.parameters["fraction"].hi
@@ -119,19 +119,19 @@ def test_single_samples_are_counted():
     assert "detected events" in step.because
 
 
-def test_the_misfit_of_clustered_outliers_remains():
-    result = told("clustered outliers")
+def test_misfit_of_clustered_outliers_remains():
+    result = describe_effect("clustered outliers")
     assert [step.effect for step in result.steps] == ["outliers"]
-    assert found("clustered outliers").final.findings["tails"].gain < STRICT["tails"].threshold
+    assert search_effect("clustered outliers").final.findings["tails"].gain < STRICT["tails"].threshold
     assert [gap.diagnostic for gap in result.left_over] == ["tails"]
     assert result.verdict == "partly_explained"
     (rest,) = result.remaining
     assert 0.0 < rest.gain_nats < 0.1 * result.steps[0].gain_nats
-    assert told("outliers").verdict == "explained"
+    assert describe_effect("outliers").verdict == "explained"
 
 
-def test_runners_up_are_other_names_and_never_certain():
-    (step,) = told("correlated").steps
+def test_runners_up_are_other_effects_and_never_certain():
+    (step,) = describe_effect("correlated").steps
     assert step.effect == "exponentially_correlated"
     bounds = step.parameters["correlation_time"]
     assert bounds.lo < 0.5 < bounds.hi
@@ -141,8 +141,8 @@ def test_runners_up_are_other_names_and_never_certain():
 
 
 @pytest.mark.parametrize(("rival_score", "confidence"), [(0.0, 0.5), (-3.0, 0.95)])
-def test_a_rival_of_another_group_reduces_the_confidence(rival_score, confidence):
-    search = found("line")
+def test_rival_of_another_group_reduces_the_confidence(rival_score, confidence):
+    search = search_effect("line")
     (done,) = search.rounds
     rival = Trial("narrowband", None, done.trials[0].score + rival_score - 20.0, slow_noise_score=20.0)
     changed = replace(search, rounds=(replace(done, trials=(done.trials[0], rival)),))
@@ -152,7 +152,7 @@ def test_a_rival_of_another_group_reduces_the_confidence(rival_score, confidence
 
 
 def test_effect_that_is_added_too_does_not_reduce_the_confidence():
-    search = found("line and outliers")
+    search = search_effect("line and outliers")
     added = search.hypothesis.added
     rounds = list(search.rounds)
     at = next(k for k, one in enumerate(rounds) if one.trials[0].name == "sinusoidal")
@@ -174,28 +174,28 @@ def test_one_size_and_a_common_factor_of_white_noise_are_equally_likely():
     assert 0.4 < step.confidence < 0.7
 
 
-def test_verdicts_follow_from_steps_and_what_is_left():
-    assert build_axis_result(found("nothing"), STRICT, STRICT).verdict == "agrees"
-    assert build_axis_result(found("nothing"), STRICT, ALWAYS).verdict == "unexplained"
-    assert build_axis_result(found("line"), STRICT, STRICT).verdict == "explained"
-    left = build_axis_result(found("line"), STRICT, ALWAYS)
+def test_verdict_follows_from_steps_and_remaining_gaps():
+    assert build_axis_result(search_effect("nothing"), STRICT, STRICT).verdict == "agrees"
+    assert build_axis_result(search_effect("nothing"), STRICT, ALWAYS).verdict == "unexplained"
+    assert build_axis_result(search_effect("line"), STRICT, STRICT).verdict == "explained"
+    left = build_axis_result(search_effect("line"), STRICT, ALWAYS)
     assert left.verdict == "partly_explained"
     assert {score.diagnostic for score in left.left_over} == {
-        diagnostic for diagnostic, one in found("line").final.findings.items() if one.gain
+        diagnostic for diagnostic, one in search_effect("line").final.findings.items() if one.gain
     }
-    assert build_axis_result(found("line"), STRICT, UNREACHED).left_over == ()
+    assert build_axis_result(search_effect("line"), STRICT, UNREACHED).left_over == ()
 
 
-def test_gaps_before_are_beside_the_model_that_decided_and_after_beside_the_new_one():
+def test_gaps_before_a_step_are_those_of_the_old_model_and_after_it_those_of_the_new_one():
     other = dict.fromkeys(DIAGNOSTICS, NullDistribution(8.0, 18.0))
-    (step,) = build_axis_result(found("line"), STRICT, other).steps
+    (step,) = build_axis_result(search_effect("line"), STRICT, other).steps
     assert step.before.threshold == pytest.approx(30.0**0.5)
     assert step.after.threshold == pytest.approx(36.0**0.5)
     assert step.after.null95 == pytest.approx(4.0)
 
 
-def test_what_did_not_shrink_is_still_told():
-    """A search whose last look sees as much as its first has a step and is partly explained."""
-    one = found("line")
+def test_unreduced_gap_is_still_reported():
+    """A search whose final gap equals its first gap has a step and is partly explained."""
+    one = search_effect("line")
     again = replace(one, final=one.rounds[0].before)
     assert build_axis_result(again, STRICT, STRICT).verdict == "partly_explained"

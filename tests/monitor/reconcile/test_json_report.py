@@ -1,4 +1,4 @@
-"""The report for programs: the keys of its schema, numbers that JSON has, the same bytes every time."""
+"""Tests of the JSON report: keys of the schema, valid numbers and reproducible bytes."""
 
 import json
 from dataclasses import replace
@@ -21,18 +21,18 @@ from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import line, run, step
 
 
-def written(r: Reconciliation) -> dict[str, Any]:
+def write_json(r: Reconciliation) -> dict[str, Any]:
     return dict(json.loads(encode_report(r)))
 
 
 def with_step(r: Reconciliation, **changed: object) -> Reconciliation:
-    """The first step of gz, changed."""
+    """Return the reconciliation with changes to the first step of gz."""
     gz = r.axes["gz"]
     return replace(r, axes={**r.axes, "gz": replace(gz, steps=(replace(gz.steps[0], **changed), *gz.steps[1:]))})
 
 
-def test_a_step_is_written_as_its_schema_says() -> None:
-    report = written(samples.explained())
+def test_step_follows_its_schema() -> None:
+    report = write_json(samples.explained())
     assert report["schema"] == "imu-monitor/reconcile/1"
     assert report["verdict"] == "explained"
     assert report["axes"]["gz"]["verdict"] == "explained"
@@ -61,8 +61,8 @@ def test_a_step_is_written_as_its_schema_says() -> None:
     }  # fmt: skip
 
 
-def test_the_summary_and_the_ranked_findings_come_first() -> None:
-    report = written(samples.partly_explained())
+def test_summary_and_the_ranked_findings_come_first() -> None:
+    report = write_json(samples.partly_explained())
     assert list(report)[:3] == ["schema", "verdict", "summary"]
     assert report["summary"][0].startswith("The model differs from the recording on gz")
     assert report["gap_nats"] == 886.0
@@ -74,8 +74,8 @@ def test_the_summary_and_the_ranked_findings_come_first() -> None:
     assert line["share"] == report["explained_share"] == 1.0 - left["share"] == 848.0 / 886.0
 
 
-def test_what_was_compared_stands_beside_it() -> None:
-    report = written(samples.explained())
+def test_report_states_settings_notes_and_diagnostics() -> None:
+    report = write_json(samples.explained())
     about = {name: report[name] for name in ("rate", "samples", "seconds", "seed", "fitted_first")}
     assert about == {"rate": 100.0, "samples": 360_000, "seconds": 3600.0, "seed": 7, "fitted_first": False}
     assert report["notes"] == ["12 missing samples <in 1 gap> & filled"]
@@ -84,21 +84,21 @@ def test_what_was_compared_stands_beside_it() -> None:
     assert [score["lens"] for score in report["axes"]["gz"]["steps"][1]["scores"]] == diagnostics
 
 
-def test_what_happens_once_has_a_reason_instead_of_a_held_out_gap() -> None:
-    first, second = written(samples.explained())["axes"]["gz"]["steps"]
+def test_single_event_has_a_reason_instead_of_a_held_out_gap() -> None:
+    first, second = write_json(samples.explained())["axes"]["gz"]["steps"]
     assert second["held_out_gap"] is None
     assert second["held_out_reason"] == "a known term of another size is not held out"
     assert "held_out_reason" not in first
 
 
-def test_the_threshold_beside_a_gap_is_the_one_after_the_step() -> None:
+def test_threshold_of_a_gap_is_that_after_the_step() -> None:
     after = DiagnosticGap("psd", Location(), 1.0, 1.7, 2.2)
-    step = written(with_step(samples.explained(), after=after))["axes"]["gz"]["steps"][0]
+    step = write_json(with_step(samples.explained(), after=after))["axes"]["gz"]["steps"][0]
     assert step["gap"] == {"before": 41.2, "after": 1.0, "null95": 1.7, "threshold": 2.2}
     assert step["found"]["threshold"] == 2.6
 
 
-def test_what_is_no_number_is_null_and_an_axis_has_no_interval() -> None:
+def test_nan_is_null_and_an_axis_parameter_has_no_interval() -> None:
     parameters = {
         "source": ParameterInterval("ax"),
         "coefficient": ParameterInterval(np.float64(2e-4), np.nan, np.inf),
@@ -106,7 +106,7 @@ def test_what_is_no_number_is_null_and_an_axis_has_no_interval() -> None:
     }
     found = DiagnosticGap("other_axes", Location(source="ax", value=(-np.inf, 0.1)), np.inf, np.nan, 2.5)
     changed = with_step(samples.explained(), parameters=parameters, before=found, confidence=np.nan)
-    step = written(changed)["axes"]["gz"]["steps"][0]
+    step = write_json(changed)["axes"]["gz"]["steps"][0]
     assert step["parameters"] == {
         "source": {"value": "ax"},
         "coefficient": {"value": 2e-4, "lo": None, "hi": None},
@@ -119,8 +119,8 @@ def test_what_is_no_number_is_null_and_an_axis_has_no_interval() -> None:
     assert step["confidence"] is None
 
 
-def test_what_is_left_over_has_its_place_and_no_name() -> None:
-    axis = written(samples.unexplained())["axes"]["ax"]
+def test_remaining_gap_has_a_place_and_no_effect() -> None:
+    axis = write_json(samples.unexplained())["axes"]["ax"]
     assert axis["verdict"] == "unexplained"
     assert axis["steps"] == []
     assert axis["left_over"] == [
@@ -128,14 +128,14 @@ def test_what_is_left_over_has_its_place_and_no_name() -> None:
     ]
 
 
-def test_the_same_reconciliation_gives_the_same_bytes_in_the_order_of_the_axes() -> None:
+def test_same_reconciliation_gives_the_same_bytes_in_the_order_of_the_axes() -> None:
     r = samples.explained()
     backwards = replace(r, axes=dict(reversed(r.axes.items())))
     assert encode_report(samples.explained()) == encode_report(r) == encode_report(backwards)
-    assert list(written(backwards)["axes"]) == ["gx", "gy", "gz", "ax", "ay", "az"]
+    assert list(write_json(backwards)["axes"]) == ["gx", "gy", "gz", "ax", "ay", "az"]
 
 
-def test_numbers_of_numpy_are_numbers() -> None:
+def test_numpy_numbers_are_written_as_numbers() -> None:
     score = DiagnosticGap(
         "psd", Location(frequency=(np.float64(1), np.float64(2))), np.float64(3), np.float64(1), np.float64(2)
     )
@@ -156,7 +156,7 @@ def test_numbers_of_numpy_are_numbers() -> None:
     axes = {"gx": AxisResult("gx", "explained", look, (step,), (), look)}
     model = samples.explained().model
     r = Reconciliation("explained", axes, model, model, False, np.float64(10), np.int64(20), np.float64(2), np.int64(1))
-    report = written(r)
+    report = write_json(r)
     assert report["samples"] == 20
     assert report["axes"]["gx"]["steps"][0]["found"]["where"] == {"frequency": [1.0, 2.0]}
 

@@ -1,4 +1,4 @@
-"""The whole walk on ten minutes of three axes: nothing, one thing, or too little to say anything."""
+"""Tests of the complete reconciliation of ten minutes of three axes with no, one or several hidden effects."""
 
 import json
 from concurrent.futures import ThreadPoolExecutor
@@ -52,8 +52,8 @@ pytestmark = pytest.mark.long
 n = 60_000
 
 
-def changing(size):
-    """Temperature [size], °C: no sine, so that no line stands in for it."""
+def make_changing_temperature(size):
+    """Return a temperature in °C that is no sine, so that no line can replace it, shape [size]."""
     t = np.arange(size) / size
     return 25.0 + 6.0 * np.abs(t - 0.35) + 2.0 * np.sin(2 * np.pi * 2.3 * t**2)
 
@@ -68,11 +68,11 @@ HIDDEN = {
 @cache
 def result(name, seed=1):
     more = NoiseModel({HIDDEN[name][0]: (HIDDEN[name][1],)}) if name else NoiseModel({})
-    return reconcile(recording(MODEL + more, n, seed + 50, changing(n)), MODEL, seed)
+    return reconcile(recording(MODEL + more, n, seed + 50, make_changing_temperature(n)), MODEL, seed)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_true_model_agrees(seed):
+def test_true_model_agrees(seed):
     found = result("", seed)
     assert found.verdict == "agrees"
     assert {one.verdict for one in found.axes.values()} == {"agrees"}
@@ -83,7 +83,7 @@ def test_a_true_model_agrees(seed):
 
 
 @pytest.mark.parametrize("name", HIDDEN)
-def test_what_was_hidden_is_found_on_its_axis(name):
+def test_hidden_effect_is_found_on_its_axis(name):
     found, (where, effect) = result(name), HIDDEN[name]
     check_report(json.loads(encode_report(found)))
     assert found.verdict == "explained"
@@ -102,14 +102,14 @@ def test_what_was_hidden_is_found_on_its_axis(name):
     assert NoiseModel.from_toml(found.model.to_toml()) == found.model
 
 
-def test_the_model_that_was_found_agrees_with_another_run():
+def test_resulting_model_agrees_with_another_recording():
     found = result("sinusoidal")
     where, effect = HIDDEN["sinusoidal"]
-    other = recording(MODEL + NoiseModel({where: (effect,)}), n, 77, changing(n))
+    other = recording(MODEL + NoiseModel({where: (effect,)}), n, 77, make_changing_temperature(n))
     assert reconcile(other, found.model, 3).verdict == "agrees"
 
 
-def test_same_seed_same_bytes_also_in_threads():
+def test_same_seed_gives_the_same_bytes_also_in_threads():
     small = recording(MODEL + NoiseModel({"gy": (HIDDEN["outliers"][1],)}), 12_000, 5)
     first = reconcile(small, MODEL, 4)
     one = encode_report(first)
@@ -122,7 +122,7 @@ def test_same_seed_same_bytes_also_in_threads():
     assert ends[0] != ends[1]
 
 
-def test_a_line_at_another_frequency_is_one_retuned_step():
+def test_moved_line_is_one_retuned_step():
     known, other = Sinusoidal(amplitude=3e-4, frequency=17.3), Sinusoidal(amplitude=3e-4, frequency=5.0)
     plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK))) + NoiseModel({"gy": (known, other)})
     true = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK))) + NoiseModel(
@@ -140,7 +140,7 @@ def test_a_line_at_another_frequency_is_one_retuned_step():
     assert lines == [pytest.approx(16.1, abs=1e-3), 5.0]
 
 
-def test_a_wrong_clock_is_one_step_for_all_axes():
+def test_wrong_sample_rate_is_one_step_for_all_axes():
     line = Sinusoidal(amplitude=3e-4, frequency=17.3)
     other = Sinusoidal(amplitude=3e-4, frequency=9.0)
     plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK))) + NoiseModel({"gy": (line,), "gx": (other,)})
@@ -158,7 +158,7 @@ def test_a_wrong_clock_is_one_step_for_all_axes():
     assert added.frequency == pytest.approx(31.0, abs=4e-3)
 
 
-def test_of_two_axes_that_correlate_one_leaks():
+def test_leak_between_correlated_axes_has_one_direction():
     loud = (AngleRandomWalk(N=20 * N),)
     plain = NoiseModel({"gx": (WHITE,), "gy": loud, "gz": (WHITE,)})
     leaking = plain + NoiseModel({"gx": (CrossAxis(source="gy", coefficient=0.02),)})
@@ -171,7 +171,7 @@ def test_of_two_axes_that_correlate_one_leaks():
     assert parameters["coefficient"].lo < 0.02 < parameters["coefficient"].hi
 
 
-def test_without_a_model_the_five_terms_come_first():
+def test_without_a_model_the_five_noise_terms_are_fitted_first():
     drawn = recording(MODEL, 24_000, 8)
     told = []
     found = reconcile(drawn, None, 1, report_stage=lambda what, share: told.append((what, share)))
@@ -207,23 +207,23 @@ def test_only_terms_that_the_data_support_are_fitted():
 # --- what cannot be compared
 
 
-def drawn(**changed):
+def draw_recording(**changed):
     small = recording(MODEL, MIN_SAMPLES, 1)
     return Recording({**small.values, **changed}, RATE_HZ)
 
 
-def test_too_few_samples_say_how_many_are_needed():
+def test_error_for_too_few_samples_states_the_minimum():
     with pytest.raises(NotReady, match=rf"{MIN_SAMPLES - 1} samples; at least {MIN_SAMPLES} .*100 Hz"):
         select_axes_and_smooth_temperature(recording(MODEL, MIN_SAMPLES - 1, 1), MODEL)
-    assert select_axes_and_smooth_temperature(drawn(), MODEL)[1] == ()
+    assert select_axes_and_smooth_temperature(draw_recording(), MODEL)[1] == ()
 
 
-def test_axes_that_cannot_be_compared_are_left_out_and_told():
-    values = drawn().values
+def test_axes_that_cannot_be_compared_are_left_out_with_a_note():
+    values = draw_recording().values
     holed = values["gx"].copy()
     holed[10:] = np.nan
     kept, notes = select_axes_and_smooth_temperature(
-        drawn(gx=holed, gy=np.full(MIN_SAMPLES, 0.3), ax=values["gz"]), MODEL
+        draw_recording(gx=holed, gy=np.full(MIN_SAMPLES, 0.3), ax=values["gz"]), MODEL
     )
     assert list(kept.values) == ["gz"]
     assert [note.split(":")[0] for note in notes] == ["gx", "gy", "ax"]
@@ -232,15 +232,15 @@ def test_axes_that_cannot_be_compared_are_left_out_and_told():
         select_axes_and_smooth_temperature(Recording({"gx": holed, "gy": holed}, RATE_HZ), MODEL)
 
 
-def test_a_constant_bias_is_no_part_of_the_comparison():
+def test_constant_bias_is_no_part_of_the_comparison():
     model = MODEL + NoiseModel({"gz": (ConstantBias(value=0.3),)})
-    assert _effects_by_axis(model, drawn())["gz"] == TERMS
-    assert _effects_by_axis(NoiseModel({}), drawn()) == dict.fromkeys(GYRO_AXES, ())
+    assert _effects_by_axis(model, draw_recording())["gz"] == TERMS
+    assert _effects_by_axis(NoiseModel({}), draw_recording()) == dict.fromkeys(GYRO_AXES, ())
 
 
-def test_temperature_is_made_smooth_and_whole():
+def test_temperature_is_smoothed_and_gaps_are_filled():
     rng = np.random.default_rng(1)
-    true = changing(n)
+    true = make_changing_temperature(n)
     noisy = true + 0.3 * rng.standard_normal(n)
     noisy[rng.random(n) < 0.5] = np.nan
     found = _smooth_temperature(noisy)
@@ -261,9 +261,9 @@ def test_temperature_is_made_smooth_and_whole():
         (["agrees", "partly_explained"], "partly_explained"),
     ],
 )
-def test_verdict_of_the_whole(axes, whole):
+def test_verdict_includes_all_axes(axes, whole):
     assert combine_decisions(axes) == whole
 
 
-def test_sizes_are_told_in_the_order_of_the_axes():
+def test_sizes_are_listed_in_the_order_of_the_axes():
     assert list(result("outliers").axes) == [axis for axis in AXES if axis in GYRO_AXES]

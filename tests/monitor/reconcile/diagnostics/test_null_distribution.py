@@ -1,4 +1,4 @@
-"""Thresholds beside the quantiles of gains that are drawn from the expected law and from other laws."""
+"""Tests of the thresholds with gains that are drawn from the expected distribution and from other distributions."""
 
 import numpy as np
 import pytest
@@ -18,52 +18,54 @@ from monitor.reconcile.diagnostics.null_distribution import (
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
 from monitor.reconcile.likelihood.effect_roles import is_stationary_gaussian
 from monitor.reconcile.result import Location
-from tests.monitor.reconcile.axes import WALK, WHITE, axis, seen, walk, warmth, white
+from tests.monitor.reconcile.axes import WALK, WHITE, axis, make_temperature, walk, white, whiten
 
 PLACES = 500.0
 
 
-def quartile(diagnostic):
+def upper_quartile(diagnostic):
     law = NULL_GAIN_QUANTILE_PARAMETERS[diagnostic]
     return law.offset + law.slope * np.log(PLACES)
 
 
-def simulated(count, rng, shift=0.0):
-    """Gains that exceed the upper quartile in a quarter of the recordings, by an exponential excess."""
+def draw_findings(count, rng, shift=0.0):
+    """Draw gains that exceed the upper quartile in a quarter of the recordings, by an exponential excess."""
     found = []
     for _ in range(count):
         excess = rng.exponential(size=len(DIAGNOSTICS)) - np.log(4.0) + shift
         gains = {
-            diagnostic: quartile(diagnostic) + NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale * e
+            diagnostic: upper_quartile(diagnostic) + NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale * e
             for diagnostic, e in zip(DIAGNOSTICS, excess, strict=True)
         }
         found.append({diagnostic: Finding(float(g), Location(), PLACES) for diagnostic, g in gains.items()})
     return found
 
 
-def test_levels_are_those_of_an_exponential():
-    null = estimate_null_distributions({name: simulated(1, np.random.default_rng(0)) for name in ("gx", "gy", "gz")})
+def test_quantiles_are_those_of_an_exponential_distribution():
+    null = estimate_null_distributions(
+        {name: draw_findings(1, np.random.default_rng(0)) for name in ("gx", "gy", "gz")}
+    )
     for diagnostic in DIAGNOSTICS:
-        start, scale = quartile(diagnostic), NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale
+        start, scale = upper_quartile(diagnostic), NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale
         assert null["gx"][diagnostic].null95 == pytest.approx(start + scale * (expon.isf(0.05) - np.log(4.0)))
         # once in 100 recordings, of all diagnostics and axes together
         chance = expon.isf(0.01 / (len(DIAGNOSTICS) * 3)) - np.log(4.0)
         assert null["gx"][diagnostic].threshold == pytest.approx(start + scale * chance)
 
 
-def test_a_true_model_is_rarely_accused():
-    """Recordings of three axes, all gains drawn from the expected law; as many are simulated as the gains ask for."""
+def test_true_model_rarely_exceeds_a_threshold():
+    """Draw gains of three axes from the expected distribution, with as many simulations as the gains require."""
     names, accused, recordings, simulations = ("gx", "gy", "gz"), 0, 3000, 0
     for seed in range(recordings):
         rng = np.random.default_rng([seed, 1])
         found = {}
         for name in names:
-            found[name] = simulated(1, rng)
+            found[name] = draw_findings(1, rng)
             while all_simulations_have_improbable_gain(found[name]) and len(found[name]) < SIMULATED_RECORDINGS:
-                found[name] += simulated(1, rng)
+                found[name] += draw_findings(1, rng)
             simulations += len(found[name])
         null = estimate_null_distributions(found)
-        tested = {name: simulated(1, rng)[0] for name in names}
+        tested = {name: draw_findings(1, rng)[0] for name in names}
         accused += any(
             tested[name][diagnostic].gain > null[name][diagnostic].threshold
             for name in names
@@ -73,8 +75,8 @@ def test_a_true_model_is_rarely_accused():
     assert simulations < 1.1 * recordings * len(names)
 
 
-def test_more_axes_ask_for_more():
-    few = simulated(1, np.random.default_rng(3))
+def test_more_axes_raise_the_threshold():
+    few = draw_findings(1, np.random.default_rng(3))
     one = estimate_null_distributions({"gx": few})["gx"]
     six = estimate_null_distributions(dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), few))["gx"]
     for diagnostic in DIAGNOSTICS:
@@ -84,27 +86,27 @@ def test_more_axes_ask_for_more():
         )
 
 
-def test_an_axis_of_its_own_kind_has_its_own_threshold():
+def test_axis_with_unusual_gains_has_its_own_threshold():
     rng = np.random.default_rng(4)
-    odd = simulated(SIMULATED_RECORDINGS, rng, shift=200.0)
+    odd = draw_findings(SIMULATED_RECORDINGS, rng, shift=200.0)
     assert all(all_simulations_have_improbable_gain(odd[:count]) for count in range(1, SIMULATED_RECORDINGS))
-    found = estimate_null_distributions({"gx": simulated(1, rng), "gz": odd})
+    found = estimate_null_distributions({"gx": draw_findings(1, rng), "gz": odd})
     for diagnostic in DIAGNOSTICS:
         smallest, largest = (pick(one[diagnostic].gain for one in odd) for pick in (min, max))
         assert found["gz"][diagnostic].threshold > max(largest, found["gz"][diagnostic].null95)
         assert found["gz"][diagnostic].null95 > smallest
-        assert found["gx"][diagnostic].threshold < quartile(diagnostic) + 20.0
+        assert found["gx"][diagnostic].threshold < upper_quartile(diagnostic) + 20.0
 
 
-def test_one_improbable_gain_is_chance_if_the_next_simulation_is_probable():
+def test_improbable_gain_is_discarded_if_the_next_simulation_is_probable():
     rng = np.random.default_rng(5)
-    odd, usual = simulated(1, rng, shift=50.0)[0], simulated(1, rng)[0]
+    odd, usual = draw_findings(1, rng, shift=50.0)[0], draw_findings(1, rng)[0]
     assert all_simulations_have_improbable_gain([odd])
     assert not all_simulations_have_improbable_gain([odd, usual])
     assert estimate_null_distributions({"gz": [odd, usual]}) == estimate_null_distributions({"gz": [usual]})
 
 
-def test_a_diagnostic_that_never_sees_anything_has_a_threshold():
+def test_diagnostic_without_gains_has_a_threshold():
     nothing = [{diagnostic: Finding(0.0, Location()) for diagnostic in DIAGNOSTICS}] * SIMULATED_RECORDINGS
     for one in estimate_null_distributions({"gz": nothing})["gz"].values():
         assert 0.0 < one.null95 < one.threshold < np.inf
@@ -118,14 +120,14 @@ def test_non_gaussian_effects_need_all_simulations():
 
 @pytest.mark.parametrize("n", [6000, 140_000])
 @pytest.mark.parametrize("model", [(WHITE,), (WHITE, WALK), (WHITE, RateRandomWalk(K=1e-3))], ids=["N", "NK", "K"])
-def test_gains_of_true_models_follow_the_expected_law(model, n):
+def test_gains_of_true_models_follow_the_expected_distribution(model, n):
     """Of 40 recordings, 1 to 22 exceed the upper quartile, except with a probability of 2e-5 for each diagnostic."""
     above, beyond = dict.fromkeys(DIAGNOSTICS, 0), 0
     runs = 40
     for seed in range(runs):
         rng = np.random.default_rng([n, seed])
         y = white(n, rng) + sum(walk(n, rng, one.K) for one in model if isinstance(one, RateRandomWalk))
-        for diagnostic, found in run_diagnostics(seen(axis(y, (), warmth(n)), model)).items():
+        for diagnostic, found in run_diagnostics(whiten(axis(y, (), make_temperature(n)), model)).items():
             above[diagnostic] += found.gain > NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].quantile(found.places, 0.25)
             beyond += found.gain > NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].quantile(
                 found.places, FALSE_ALARM_PROBABILITY / 60.0
@@ -138,7 +140,7 @@ def test_gains_of_true_models_follow_the_expected_law(model, n):
         )  # one axis of continuous values has neither
 
 
-def test_a_gap_is_in_standard_deviations():
+def test_gap_is_in_standard_deviations():
     seen = {diagnostic: Finding(0.5 * k**2, Location(tau=(1.0, 2.0))) for k, diagnostic in enumerate(DIAGNOSTICS)}
     found = compute_diagnostic_gaps(seen, dict.fromkeys(DIAGNOSTICS, NullDistribution(2.0, 8.0)))
     assert [score.diagnostic for score in found] == list(DIAGNOSTICS)

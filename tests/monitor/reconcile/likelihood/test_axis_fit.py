@@ -1,4 +1,4 @@
-"""An axis finds the sizes that made it, in the spectrum that the model itself states."""
+"""Tests of the fit of one axis: estimated sizes equal the simulated ones, and spectra equal those of the model."""
 
 from dataclasses import replace
 
@@ -36,9 +36,9 @@ from tests.monitor.reconcile.axes import (
     axes,
     axis,
     correlated,
+    make_temperature,
     time_s,
     walk,
-    warmth,
     white,
 )
 
@@ -57,7 +57,7 @@ COMPANY = {
 
 
 @pytest.mark.parametrize("name", COMPANY)
-def test_spectrum_is_the_one_that_the_model_states(name):
+def test_spectrum_equals_that_of_the_model(name):
     effects = COMPANY[name]
     y = NoiseModel({"gz": effects}).simulate(n, RATE_HZ, 3)[:, 2].copy()
     one = axis(y, effects)
@@ -68,7 +68,7 @@ def test_spectrum_is_the_one_that_the_model_states(name):
     assert found.effects == effects
 
 
-def test_sizes_are_found_with_their_errors():
+def test_sizes_are_estimated_with_their_errors():
     off = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -84,9 +84,9 @@ def test_sizes_are_found_with_their_errors():
     assert np.abs(np.mean(off, axis=0)).max() < 0.55
 
 
-def test_courses_and_noises_are_fitted_together():
+def test_regressors_and_noise_are_fitted_together():
     rng = np.random.default_rng(1)
-    t, warm = time_s(n), warmth(n)
+    t, warm = time_s(n), make_temperature(n)
     gx = correlated(n, rng, 1e-2, 2.0)
     line = 2e-4 * np.sin(2.0 * np.pi * 7.3 * t + 0.8)
     gz = white(n, rng) + line + 1e-4 * (warm - 25.0) - 0.03 * gx + 4.0
@@ -110,7 +110,7 @@ def test_courses_and_noises_are_fitted_together():
     assert np.std(found.cosine_transform_without_deterministic_effects() - clean) < 0.03 * np.std(clean)
 
 
-def test_a_size_that_is_held_stays_and_costs_likelihood():
+def test_fixed_size_stays_and_reduces_the_likelihood():
     rng = np.random.default_rng(2)
     one = axis(white(n, rng) + walk(n, rng, 1e-4))
     wrong = (AngleRandomWalk(N=1.1 * N), RateRandomWalk(K=1e-4))
@@ -122,7 +122,7 @@ def test_a_size_that_is_held_stays_and_costs_likelihood():
     assert free.log_likelihood - held.log_likelihood == pytest.approx(n * (np.log(1.1) - 0.5 * (1 - 1 / 1.21)), rel=0.3)
 
 
-def test_courses_of_any_size_beside_the_same_noise():
+def test_regressors_of_any_size_leave_the_noise_unchanged():
     rng = np.random.default_rng(3)
     one = axis(white(n, rng) + 3e-5 * time_s(n))
     found = one.fit((WHITE, RateRamp(R=1.0)), frozenset({0}))
@@ -134,7 +134,7 @@ def test_courses_of_any_size_beside_the_same_noise():
         assert found.log_likelihood - moved.log_likelihood == pytest.approx(0.5 * shift**2, rel=1e-3)
 
 
-def test_unit_does_not_matter():
+def test_result_does_not_depend_on_the_unit():
     rng = np.random.default_rng(4)
     y = white(n, rng) + walk(n, rng)
     one, other = axis(y).fit(TERMS), axis(1e4 * y + 9.81).fit(TERMS)
@@ -142,14 +142,14 @@ def test_unit_does_not_matter():
     assert other.log_likelihood == pytest.approx(one.log_likelihood - (n - 1) * np.log(1e4), abs=0.05)
 
 
-def test_white_noise_is_that_before_a_step_of_it():
+def test_white_noise_is_that_before_its_step():
     rng = np.random.default_rng(5)
     y = white(n, rng) * np.where(time_s(n) < 50.0, 1.0, 3.0)
     found = axis(y).fit((AngleRandomWalk(N=1.0), NoiseStep(time=50.0, ratio=3.0)))
     assert pytest.approx(N, rel=0.03) == found.effects[0].N
 
 
-def test_a_stop_band_is_not_heard():
+def test_bins_of_the_stop_band_are_not_used():
     effects = (WHITE, BandwidthLimit(cutoff=0.8, order=4))
     y = NoiseModel({"gz": effects}).simulate(n, RATE_HZ, 1)[:, 2].copy()
     one = axis(y, effects)
@@ -161,7 +161,7 @@ def test_a_stop_band_is_not_heard():
     assert whole.used_bins[whole.bins.count > 4].all()
 
 
-def test_other_bins_are_the_same_axis():
+def test_result_does_not_depend_on_the_bins():
     rng = np.random.default_rng(7)
     one = axis(white(n, rng) + walk(n, rng))
     finer = replace(one, bins=build_frequency_bins(n, RATE_HZ, [(20.0, 0.1)]))
@@ -171,29 +171,31 @@ def test_other_bins_are_the_same_axis():
     assert pytest.approx(one.fit(TERMS).effects[0].N, rel=1e-3) == finer.fit(TERMS).effects[0].N
 
 
-def test_a_course_is_made_once_for_all_sizes():
-    made = RegressorCache(n, RATE_HZ, warmth(n))
+def test_regressor_is_computed_once_for_all_sizes():
+    made = RegressorCache(n, RATE_HZ, make_temperature(n))
     one = made.regressor_cosine_transforms(Sinusoidal(amplitude=3.0, frequency=5.0, phase=1.0))
     assert made.regressor_cosine_transforms(Sinusoidal(amplitude=0.1, frequency=5.0, phase=2.0)) is one
     assert made.regressor_cosine_transforms(Sinusoidal(amplitude=0.1, frequency=5.1, phase=2.0)) is not one
     sine = np.sin(2.0 * np.pi * 5.0 * time_s(n))
     np.testing.assert_allclose(one[0], cosine_transform(sine), atol=1e-9)
     bias = TemperatureBias(coefficient=4.0, reference=25.0)
-    np.testing.assert_allclose(made.regressor_cosine_transforms(bias)[0], cosine_transform(warmth(n)), atol=1e-9)
+    np.testing.assert_allclose(
+        made.regressor_cosine_transforms(bias)[0], cosine_transform(make_temperature(n)), atol=1e-9
+    )
 
 
-def test_terms_of_size_zero_stay_as_small_as_they_are():
+def test_terms_of_size_zero_stay_small():
     found = axis(white(n, np.random.default_rng(8))).fit((WHITE, BiasInstability(B=1.0), WALK))
     assert found.effects[1].B < 0.3 * N
     assert found.effects[2].K < 20 * K
 
 
-def test_cache_of_a_part_belongs_to_the_samples_of_the_part():
+def test_cache_of_a_part_contains_only_its_samples():
     size = 9000
-    whole = RegressorCache(size, RATE_HZ, warmth(size))
+    whole = RegressorCache(size, RATE_HZ, make_temperature(size))
     first, second = whole.restrict_to_part(slice(0, 4500)), whole.restrict_to_part(slice(4500, 9000))
     assert whole.restrict_to_part(slice(0, 4500)) is first is not second
     effect = TemperatureBias(coefficient=1.0, reference=20.0)
     np.testing.assert_allclose(
-        second.regressor_cosine_transforms(effect)[0], cosine_transform(warmth(size)[4500:]), atol=1e-9
+        second.regressor_cosine_transforms(effect)[0], cosine_transform(make_temperature(size)[4500:]), atol=1e-9
     )

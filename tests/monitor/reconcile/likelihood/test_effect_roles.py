@@ -1,4 +1,4 @@
-"""What is fitted is what would be simulated: sizes, bases and columns beside the effects' own series and spectra."""
+"""Tests that sizes, spectra and regressors of the fit equal the series and spectra of the simulated effects."""
 
 from dataclasses import replace
 
@@ -15,22 +15,22 @@ from monitor.reconcile.likelihood.effect_roles import (
     with_regression_coefficients,
 )
 from tests.contracts.effect_examples import make_effect
-from tests.monitor.reconcile.axes import RATE_HZ, warmth
+from tests.monitor.reconcile.axes import RATE_HZ, make_temperature
 
 NOISES = [EFFECTS[name] for name in NOISE_SIZE_PARAMETERS if issubclass(EFFECTS[name], Source)]
 COURSES = [EFFECTS[name] for name in SERIES_SIZE_PARAMETERS if not issubclass(EFFECTS[name], AxisLeak)]
 n = 3000
 
 
-def drawn(one):
+def draw_series(one):
     values = np.zeros(n)
     one.start_series(RATE_HZ, np.random.default_rng(1)).add_next_samples(
-        values, SampleBlockContext(0, warmth(n), np.empty(n))
+        values, SampleBlockContext(0, make_temperature(n), np.empty(n))
     )
     return values
 
 
-def test_every_source_has_its_place():
+def test_every_source_has_a_role():
     # a mean is always free; outliers are single samples; a wandering line is subtracted before the fit
     beside = {"bias", "outliers", "wandering_line"}
     names = {name for name, kind in EFFECTS.items() if issubclass(kind, Source | AxisLeak) and name not in beside}
@@ -40,7 +40,7 @@ def test_every_source_has_its_place():
 
 
 @pytest.mark.parametrize("kind", NOISES, ids=lambda kind: kind.name)
-def test_a_spectrum_grows_with_the_square_of_the_size(kind):
+def test_spectrum_is_proportional_to_the_square_of_the_size(kind):
     one = make_effect(kind.name)
     f_hz, tau0_s = np.geomspace(0.01, 0.5 * RATE_HZ, 40), 1.0 / RATE_HZ
     np.testing.assert_allclose(
@@ -56,14 +56,14 @@ def test_a_spectrum_grows_with_the_square_of_the_size(kind):
 
 
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)
-def test_columns_times_factors_are_the_series(kind):
+def test_regressors_times_coefficients_equal_the_series(kind):
     one = make_effect(kind.name)
     if kind.name == "pulse_train":  # a delay that is not given is drawn
         one = replace(one, delay=0.03)
-    made = build_unit_regressors(one, n, RATE_HZ, warmth(n))
+    made = build_unit_regressors(one, n, RATE_HZ, make_temperature(n))
     factors = np.array([0.8, -1.7, 0.6])[: len(made)]
     fitted = with_regression_coefficients(one, factors)
-    want = drawn(fitted)
+    want = draw_series(fitted)
     summed = sum(factor * column for factor, column in zip(factors, made, strict=True))
     if kind.name == "rate_ramp":  # a ramp's R is a size without a sign
         factors = np.abs(factors)
@@ -72,25 +72,25 @@ def test_columns_times_factors_are_the_series(kind):
     assert np.abs(want).max() > 0.0
 
 
-def test_phase_of_a_line_is_in_its_two_columns():
+def test_two_regressors_contain_the_phase_of_a_line():
     line = Sinusoidal(amplitude=0.4, frequency=7.3, phase=2.2)
     made = np.stack(build_unit_regressors(line, n, RATE_HZ, None))
-    factors, *_ = np.linalg.lstsq(made.T, drawn(line), rcond=None)
+    factors, *_ = np.linalg.lstsq(made.T, draw_series(line), rcond=None)
     back = with_regression_coefficients(line, factors)
     assert back.amplitude == pytest.approx(0.4)
     assert back.phase == pytest.approx(2.2)
 
 
-def test_a_curve_over_temperature_has_two_columns_and_a_line_one():
+def test_quadratic_temperature_effect_has_two_regressors():
     straight = TemperatureBias(coefficient=0.3, reference=25.0)
-    assert len(build_unit_regressors(straight, n, RATE_HZ, warmth(n))) == 1
+    assert len(build_unit_regressors(straight, n, RATE_HZ, make_temperature(n))) == 1
     bent = TemperatureBias(coefficient=0.3, reference=25.0, quadratic=-0.04)
-    one, two = build_unit_regressors(bent, n, RATE_HZ, warmth(n))
-    np.testing.assert_allclose(one, warmth(n) - 25.0, atol=1e-12)
-    np.testing.assert_allclose(two, (warmth(n) - 25.0) ** 2, atol=1e-12)
+    one, two = build_unit_regressors(bent, n, RATE_HZ, make_temperature(n))
+    np.testing.assert_allclose(one, make_temperature(n) - 25.0, atol=1e-12)
+    np.testing.assert_allclose(two, (make_temperature(n) - 25.0) ** 2, atol=1e-12)
 
 
-def test_size_keeps_its_sign_where_it_has_one():
+def test_signed_sizes_keep_their_sign():
     assert effect_size(with_effect_size(make_effect("bias_step"), -2.0)) == -2.0
     assert effect_size(with_effect_size(make_effect("sinusoidal"), -2.0)) == 2.0
     assert effect_size(with_effect_size(make_effect("rate_ramp"), -2.0)) == 2.0

@@ -1,4 +1,4 @@
-"""Noise in block means has the covariance that integrals give, and a maximum knows how wide it is."""
+"""Tests of the covariance of block means and of the width of a likelihood maximum."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ from tests.monitor.reconcile.event_noise import BLOCK_S, dense
         BackgroundNoise(1e-3, correlated=((0.7, 20.0),)),
     ],
 )
-def test_filter_is_the_dense_gaussian_likelihood(rest):
+def test_filter_equals_the_dense_gaussian_likelihood(rest):
     covariance = dense(rest, 300, start=5.0)
     means = np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(300)
     around = build_state_space_noise(rest, means, BLOCK_S)._replace(level_variance=5.0)
@@ -36,7 +36,7 @@ def test_filter_is_the_dense_gaussian_likelihood(rest):
     assert found == pytest.approx(multivariate_normal.logpdf(means, cov=covariance), abs=1e-6)
 
 
-def test_slow_process_is_a_random_walk_in_a_block():
+def test_slow_process_equals_a_random_walk_in_a_block():
     for block_s in (0.0999, 0.1001):  # either side of where a series takes over
         row, own = correlated_noise_of_block_means(1.0, 10.0, block_s)
         walk = 2.0 / 10.0 * block_s
@@ -47,7 +47,7 @@ def test_slow_process_is_a_random_walk_in_a_block():
     )
 
 
-def test_flicker_is_one_over_f_until_white_noise_rules():
+def test_flicker_is_one_over_f_below_the_white_noise():
     rest, span_s = BackgroundNoise(2.25e-8, flicker=9e-10), 3600.0
     f = np.geomspace(1.0 / span_s, rest.flicker / (2.0 * np.pi * rest.white), 50)
     summed = sum(2.0 * s * s * t / (1.0 + (2.0 * np.pi * f * t) ** 2) for s, t in _flicker_processes(rest, 1.0, span_s))
@@ -57,7 +57,7 @@ def test_flicker_is_one_over_f_until_white_noise_rules():
     assert _flicker_processes(BackgroundNoise(1.0), 1.0, span_s) == []
 
 
-def test_maximum_and_its_width():
+def test_maximum_has_the_width_of_the_likelihood():
     target, inverse = np.log([3e-4, 20.0]), np.array([[25.0, -6.0], [-6.0, 4.0]])
 
     def likelihood(a, b):
@@ -77,18 +77,18 @@ def test_maximum_and_its_width():
         assert bounds.lo * bounds.hi == pytest.approx(bounds.value**2)
 
 
-def test_no_interval_without_a_peak():
+def test_without_a_maximum_there_is_no_interval():
     flat = fit_event_process(lambda a, b, _odds: -0.0 * a * b, {"a": 1.0, "b": 1.0})
     assert flat.parameters["a"].lo is None
     assert log_interval(1.0, MAX_LOG_PARAMETER_RANGE).hi is None
 
 
-def test_search_does_not_leave_the_neighbourhood_of_its_start():
+def test_search_stays_near_its_start():
     _, (at,) = maximise_over_log_parameters(np.log, (2.0,))
     assert 2.0 < np.exp(at) <= 60.0 * (1.0 + 1e-9)
 
 
-def test_block_means():
+def test_block_means_are_means_of_their_samples():
     y = np.random.default_rng(0).standard_normal(1003) + 5.0
     means, block_s = compute_block_means(y, 0.01, 0.1)
     assert block_s == pytest.approx(0.1)

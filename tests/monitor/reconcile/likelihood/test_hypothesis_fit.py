@@ -1,4 +1,4 @@
-"""A model is believed until the data object; shapes and intervals beside SciPy's."""
+"""Tests of the fit with the fewest changes to a model. SciPy computes reference shapes and intervals."""
 
 from dataclasses import replace
 
@@ -30,15 +30,15 @@ n = 20_000
 MODEL = (WHITE, RateRandomWalk(K=3e-5))
 
 
-def drawn(seed, more=0.0):
+def draw_axis(seed, more=0.0):
     rng = np.random.default_rng(seed)
     return white(n, rng) + walk(n, rng, 3e-5) + more
 
 
-def test_a_true_model_is_believed():
+def test_true_model_is_not_changed():
     resized_model_effect_count = 0
     for seed in range(20):
-        one = axis(drawn(seed))
+        one = axis(draw_axis(seed))
         state = fit_with_fewest_changes(one, (), MODEL)
         resized_model_effect_count += state.resized_model_effect_count
         assert fit_with_fixed_noise(one, MODEL).fit.log_likelihood <= state.fit.log_likelihood + 1e-6
@@ -46,8 +46,8 @@ def test_a_true_model_is_believed():
 
 
 @pytest.mark.parametrize(("wrong", "at"), [((1.1, 1.0), 0), ((0.93, 1.0), 0), ((1.0, 4.0), 1), ((1.0, 0.2), 1)])
-def test_a_wrong_size_is_another_size_and_the_right_one_stays(wrong, at):
-    one = axis(drawn(1))
+def test_wrong_size_is_changed_and_the_right_one_stays(wrong, at):
+    one = axis(draw_axis(1))
     given = (AngleRandomWalk(N=wrong[0] * N), RateRandomWalk(K=wrong[1] * 3e-5))
     state = fit_with_fewest_changes(one, (), given)
     assert state.fit.fitted_noise == (at,)
@@ -59,23 +59,23 @@ def test_a_wrong_size_is_another_size_and_the_right_one_stays(wrong, at):
 
 
 def test_both_wrong_sizes_are_found():
-    state = fit_with_fewest_changes(axis(drawn(2)), (), (AngleRandomWalk(N=1.3 * N), RateRandomWalk(K=2e-4)))
+    state = fit_with_fewest_changes(axis(draw_axis(2)), (), (AngleRandomWalk(N=1.3 * N), RateRandomWalk(K=2e-4)))
     assert state.resized_model_effect_count == 2
     assert pytest.approx(N, rel=0.03) == state.effects[0].N
     assert pytest.approx(3e-5, rel=0.5) == state.effects[1].K
 
 
-def test_what_was_found_is_always_fitted():
-    y = drawn(3) + 5e-5 * time_s(n)
+def test_added_effects_are_always_fitted():
+    y = draw_axis(3) + 5e-5 * time_s(n)
     state = fit_with_fewest_changes(axis(y), (RateRamp(R=1.0),), MODEL)
     assert state.resized_model_effect_count == 0
     assert pytest.approx(5e-5, abs=5 * state.fit.size_standard_error(2)) == state.effects[2].R
-    alone = fit_with_fewest_changes(axis(drawn(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
+    alone = fit_with_fewest_changes(axis(draw_axis(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
     assert pytest.approx(N, rel=0.03) == alone.effects[0].N
     assert alone.resized_model_effect_count == 0  # nothing was given
 
 
-def test_a_shape_is_at_the_top_of_its_profile():
+def test_shape_maximizes_its_profile_likelihood():
     rng = np.random.default_rng(4)
     one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
     effects = (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.8))
@@ -90,14 +90,14 @@ def test_a_shape_is_at_the_top_of_its_profile():
     assert effects[1].correlation_time == 0.8
 
 
-def test_a_resonance_near_half_the_sample_rate_is_not_its_alias():
+def test_resonance_near_half_the_sample_rate_is_not_its_alias():
     y = white(n, np.random.default_rng(7)) + ringing(n, np.random.default_rng(6), 1e-3, 48.0, 1.0)
     start = Narrowband(sigma=1e-4, frequency=49.0, bandwidth=1.0)
     found = fit_shape_parameter(axis(y), (WHITE,), start, "frequency", 1.2)
     assert found.frequency == pytest.approx(48.0, abs=0.5)
 
 
-def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
+def test_interval_of_a_shape_ends_at_the_limit_of_its_profile_likelihood():
     rng = np.random.default_rng(5)
     one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
     start = ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5)
@@ -113,8 +113,8 @@ def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
 
 
 @pytest.mark.long
-def test_intervals_of_a_line_hold_its_frequency():
-    """The error of a frequency is √(6/n)/(π T) × σ/A (Rife and Boorstyn 1974)."""
+def test_intervals_of_a_line_contain_its_frequency():
+    """The standard error of a frequency is √(6/n)/(π T) × σ/A (Rife and Boorstyn 1974)."""
     inside = []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -130,10 +130,10 @@ def test_intervals_of_a_line_hold_its_frequency():
     assert np.mean(inside) >= 0.75
 
 
-def test_intervals_of_sizes():
+def test_intervals_of_sizes_contain_the_true_sizes():
     inside = []
     for seed in range(40):
-        y = drawn(seed, np.where(time_s(n) < 80.0, 0.0, -3e-4))
+        y = draw_axis(seed, np.where(time_s(n) < 80.0, 0.0, -3e-4))
         state = fit_with_fewest_changes(axis(y), (*MODEL, BiasStep(time=80.0, height=1.0)), ())
         white_noise, _, step = (compute_size_interval(state.fit, at) for at in range(3))
         inside += [white_noise.lo < N < white_noise.hi, step.lo < -3e-4 < step.hi]
@@ -153,7 +153,7 @@ def test_interval_of_an_insignificant_size_begins_at_zero(size):
     assert found.hi == pytest.approx(np.sqrt((size * K) ** 2 + 1.96 * deviation), rel=1e-3)
 
 
-def test_a_size_that_is_held_or_zero_has_no_interval():
+def test_fixed_or_zero_size_has_no_interval():
     one = axis(white(n, np.random.default_rng(0)))
     held = compute_size_interval(fit_with_fixed_noise(one, (WHITE, WALK)).fit, 0)
     assert (held.value, held.lo, held.hi) == (N, None, None)

@@ -1,4 +1,4 @@
-"""Pulses that were put into white noise are found with their period and width; other periodic shapes are told apart."""
+"""Tests of the search for periodic pulses in white noise and of the distinction from other periodic shapes."""
 
 import numpy as np
 import pytest
@@ -11,15 +11,15 @@ T = np.arange(n) / RATE_HZ
 SAW = 2.0 * np.mod(T + 1e-9, 1.0) - 1.0
 
 
-def noise(seed):
+def draw_noise(seed):
     return np.random.default_rng(seed).standard_normal(n)
 
 
-def pulses(period_s, width_s, delay_s=0.0):
+def make_pulses(period_s, width_s, delay_s=0.0):
     return (np.mod(T - delay_s + 1e-9, period_s) < width_s).astype(float)
 
 
-def found(y):
+def search_pulses(y):
     harmonics = find_harmonic_series(compute_periodogram(y), n, RATE_HZ)
     return harmonics, fit_pulses(y, RATE_HZ, harmonics)
 
@@ -28,8 +28,8 @@ def found(y):
     ("period_s", "width_s", "height"),
     [(1.0, 0.02, 0.5), (1.000_03, 0.02, 0.6), (0.5, 0.1, -0.2), (7.3, 0.3, 0.4), (0.2007, 0.05, 0.4)],
 )
-def test_period_and_width(period_s, width_s, height):
-    harmonics, one = found(noise(1) + height * pulses(period_s, width_s, 0.13))
+def test_period_and_width_of_pulses_are_found(period_s, width_s, height):
+    harmonics, one = search_pulses(draw_noise(1) + height * make_pulses(period_s, width_s, 0.13))
     assert harmonics.gain > 25.0
     assert one.is_rectangular
     assert one.period_s == pytest.approx(period_s, rel=3e-5)
@@ -37,19 +37,19 @@ def test_period_and_width(period_s, width_s, height):
 
 
 def test_white_noise_stays_below_the_threshold():
-    gains = [find_harmonic_series(compute_periodogram(noise(seed)), n, RATE_HZ).gain for seed in range(20)]
+    gains = [find_harmonic_series(compute_periodogram(draw_noise(seed)), n, RATE_HZ).gain for seed in range(20)]
     assert max(gains) < np.log(n) + 8.0  # about 3 n independent sums, each beyond x with exp(−x)
 
 
 @pytest.mark.parametrize(
-    "shape", [SAW, SAW + 2.0 / np.pi * np.sin(2.0 * np.pi * T), pulses(1.0, 0.02) - pulses(1.0, 0.02, 0.5)]
+    "shape", [SAW, SAW + 2.0 / np.pi * np.sin(2.0 * np.pi * T), make_pulses(1.0, 0.02) - make_pulses(1.0, 0.02, 0.5)]
 )
-def test_another_shape_is_no_rectangle(shape):
-    """Nor is the sawtooth whose first line was found before."""
-    assert not found(noise(2) + 0.6 * shape)[1].is_rectangular
+def test_other_periodic_shapes_are_no_rectangle(shape):
+    """A sawtooth without its first spectral line is no rectangle either."""
+    assert not search_pulses(draw_noise(2) + 0.6 * shape)[1].is_rectangular
 
 
 @pytest.mark.parametrize("period_s", [1.0, 1.0003])
-def test_delay_of_known_pulses(period_s):
-    y = noise(3) + 0.6 * pulses(period_s, 0.05, 0.37)
+def test_delay_of_known_pulses_is_found(period_s):
+    y = draw_noise(3) + 0.6 * make_pulses(period_s, 0.05, 0.37)
     assert find_pulse_delay(y, RATE_HZ, period_s, 0.05) == pytest.approx(0.37, abs=0.02)

@@ -1,4 +1,4 @@
-"""Poisson steps' likelihood is a sum over all blocks that may have a jump, and a random walk is its limit."""
+"""Tests of the likelihood of Poisson steps, a sum over all sets of blocks with jumps. Its limit is a random walk."""
 
 from itertools import product
 
@@ -19,8 +19,8 @@ RATE, HEIGHT = 0.05, 2.0  # of the short series, beside white noise of density o
 BLOCKS = 11
 
 
-def enumerated(means, covariance):
-    """Log-likelihood as the sum over all sets of blocks with a jump; jumps of one block are a Gaussian."""
+def sum_over_all_sets_of_jumps(means, covariance):
+    """Return the log-likelihood as a sum over all sets of blocks with Gaussian jumps."""
     chance = 1.0 - np.exp(-RATE * BLOCK_S)
     variance = RATE * BLOCK_S * HEIGHT**2 / chance
     terms = []
@@ -47,14 +47,14 @@ def likelihood(means, rest, rate, height, start):
 
 
 @pytest.mark.parametrize("rest", [BackgroundNoise(1.0), BackgroundNoise(1.0, walk=0.02, correlated=((1.0, 30.0),))])
-def test_nearly_equals_the_sum_over_all_sets_of_jumps(rest):
+def test_likelihood_nearly_equals_the_sum_over_all_sets_of_jumps(rest):
     off = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
         covariance = dense(rest, BLOCKS, start=4.0)
         level = HEIGHT * np.cumsum(rng.standard_normal(BLOCKS) * np.sqrt(rng.poisson(RATE * BLOCK_S, BLOCKS)))
         means = np.linalg.cholesky(covariance) @ rng.standard_normal(BLOCKS) + level
-        off.append(likelihood(means, rest, RATE, HEIGHT, 4.0) - enumerated(means, covariance))
+        off.append(likelihood(means, rest, RATE, HEIGHT, 4.0) - sum_over_all_sets_of_jumps(means, covariance))
     assert np.abs(off).max() < 0.1
 
 
@@ -76,7 +76,7 @@ def test_many_small_jumps_are_a_random_walk():
         BackgroundNoise(N * N, correlated=((2e-5, 50.0),)),
     ],
 )
-def test_tells_jumps_from_a_walk(rest):
+def test_jumps_are_distinguished_from_a_random_walk(rest):
     for seed in range(2):
         rng = np.random.default_rng(seed)
         around = white(HOUR, rng) + walk(HOUR, rest.walk**0.5, rng)
@@ -87,7 +87,7 @@ def test_tells_jumps_from_a_walk(rest):
 
 
 @pytest.mark.long
-def test_parameters_lie_in_their_intervals_and_jumps_are_counted():
+def test_intervals_contain_the_parameters_and_jumps_are_counted():
     inside, counted = [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)

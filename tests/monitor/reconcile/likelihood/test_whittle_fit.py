@@ -1,9 +1,9 @@
-"""The likelihood and its maximum beside dense Gaussian algebra and SciPy's minimisers."""
+"""Tests of the Whittle likelihood and its maximum against dense covariance matrices and SciPy's minimizers."""
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
-from scipy.stats import multivariate_normal
 
 from monitor.reconcile.likelihood.whittle_fit import BinnedRegressionSums, maximise_whittle_likelihood
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform
@@ -21,24 +21,25 @@ NONE = np.zeros((0, n - 1))
 BETA = (3.0, -2.0, 1.0)
 
 
-def drawn(seed, theta=(1.0, 0.02), beta=(0.0, 0.0, 0.0)):
+def draw_coefficients(seed, theta=(1.0, 0.02), beta=(0.0, 0.0, 0.0)):
     rng = np.random.default_rng(seed)
     y = theta[0] ** 0.5 * rng.standard_normal(n) + theta[1] ** 0.5 * np.cumsum(rng.standard_normal(n))
     return cosine_transform(y) + np.asarray(beta) @ REGRESSORS
 
 
-def whole(theta):
+def compute_covariance(theta):
     return np.einsum("j,jab->ab", theta, COVARIANCES)
 
 
-def dense(y, theta, beta=(0.0, 0.0, 0.0)):
-    """ln L without its 2π."""
-    found = multivariate_normal.logpdf(y - np.asarray(beta) @ REGRESSORS, cov=whole(theta))
-    return found + 0.5 * (n - 1) * np.log(2.0 * np.pi)
+def dense_log_likelihood(y, theta, beta=(0.0, 0.0, 0.0)):
+    """Return the log-likelihood without the constant term of 2π."""
+    factor = np.linalg.cholesky(compute_covariance(theta))
+    whitened = solve_triangular(factor, y - np.asarray(beta) @ REGRESSORS, lower=True)
+    return -np.sum(np.log(np.diag(factor))) - 0.5 * whitened @ whitened
 
 
 def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
-    """Each coefficient in a bin of its own."""
+    """Fit the variances with one coefficient in each bin."""
     products = np.einsum("ik,jk->ijk", regressors, regressors)
     found = BinnedRegressionSums(y**2, regressors * y, products)
     return maximise_whittle_likelihood(np.ones(n - 1), found, BASES, np.full(n - 1, constant), np.array(start))
@@ -46,11 +47,13 @@ def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
-def test_value_and_maximum_are_those_of_a_dense_gaussian(seed):
-    y = drawn(seed)
+def test_likelihood_and_maximum_equal_a_dense_gaussian(seed):
+    y = draw_coefficients(seed)
     found = fit(y)
-    assert found.log_likelihood == pytest.approx(dense(y, found.theta), abs=1e-6)
-    best = minimize(lambda x: -dense(y, np.exp(x)), [0.0, -3.0], method="Nelder-Mead", options={"fatol": 1e-6})
+    assert found.log_likelihood == pytest.approx(dense_log_likelihood(y, found.theta), abs=1e-6)
+    best = minimize(
+        lambda x: -dense_log_likelihood(y, np.exp(x)), [0.0, -3.0], method="Nelder-Mead", options={"fatol": 1e-6}
+    )
     assert found.log_likelihood == pytest.approx(-best.fun, abs=1e-3)
     assert found.theta == pytest.approx(np.exp(best.x), rel=0.02)
     assert found.residual == pytest.approx(y**2)
@@ -60,32 +63,32 @@ def test_value_and_maximum_are_those_of_a_dense_gaussian(seed):
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_regressors_are_fitted_together_with_variances(seed):
-    y = drawn(seed, beta=BETA)
+    y = draw_coefficients(seed, beta=BETA)
     found = fit(y, REGRESSORS)
-    assert found.log_likelihood == pytest.approx(dense(y, found.theta, found.beta), abs=1e-6)
+    assert found.log_likelihood == pytest.approx(dense_log_likelihood(y, found.theta, found.beta), abs=1e-6)
     best = minimize(
-        lambda x: -dense(y, np.exp(x[:2]), x[2:]),
+        lambda x: -dense_log_likelihood(y, np.exp(x[:2]), x[2:]),
         [0.0, -3.0, *BETA],
         method="Nelder-Mead",
         options={"fatol": 1e-6, "maxfev": 4000},
     )
     assert found.log_likelihood == pytest.approx(-best.fun, abs=1e-3)
     assert found.beta == pytest.approx(best.x[2:], abs=0.05)
-    weighted = np.linalg.solve(whole(found.theta), REGRESSORS.T)
+    weighted = np.linalg.solve(compute_covariance(found.theta), REGRESSORS.T)
     covariance = np.linalg.inv(REGRESSORS @ weighted)
     np.testing.assert_allclose(found.beta_covariance, covariance, rtol=1e-3)
     assert found.beta == pytest.approx(covariance @ weighted.T @ y, rel=1e-3, abs=1e-5)
     assert found.residual == pytest.approx((y - found.beta @ REGRESSORS) ** 2, abs=1e-9)
 
 
-def test_any_start_finds_the_same_maximum():
-    y = drawn(5)
+def test_every_start_gives_the_same_maximum():
+    y = draw_coefficients(5)
     heights = [fit(y, start=start).log_likelihood for start in ((1.0, 1.0), (0.0, 3.0), (100.0, 0.0), (1e-4, 1e-4))]
     assert max(heights) - min(heights) < 1e-3
 
 
-def test_no_variance_is_below_zero():
-    """Series that are whiter than white: the random walk goes, and pulling it below zero would be a gain."""
+def test_variances_are_not_negative():
+    """The lowest coefficients are too small for white noise, so a negative variance would increase the likelihood."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
         y = rng.standard_normal(n - 1)
@@ -93,12 +96,12 @@ def test_no_variance_is_below_zero():
         found = fit(y)
         assert found.theta[1] == 0.0
         assert found.theta[0] == pytest.approx(np.mean(y**2), rel=1e-4)
-        more = dense(y, (found.theta[0], 1e-4))
+        more = dense_log_likelihood(y, (found.theta[0], 1e-4))
         assert more < found.log_likelihood
 
 
-def test_a_variance_that_is_not_fitted_is_kept():
-    y = drawn(7)
+def test_constant_variance_is_kept():
+    y = draw_coefficients(7)
     constant = 0.3
     found = fit(y, constant=constant)
     assert found.variance == pytest.approx(found.theta @ BASES + constant)
@@ -106,8 +109,8 @@ def test_a_variance_that_is_not_fitted_is_kept():
     assert found.theta[0] + constant == pytest.approx(fit(y).theta[0], rel=1e-3)
 
 
-def test_errors_are_those_of_many_runs():
-    found = [fit(drawn(seed, (1.0, 0.3), BETA), REGRESSORS) for seed in range(300)]
+def test_stated_errors_equal_the_scatter_of_many_runs():
+    found = [fit(draw_coefficients(seed, (1.0, 0.3), BETA), REGRESSORS) for seed in range(300)]
     sizes = np.array([np.append(one.theta, one.beta) for one in found])
     stated = [
         np.append(np.linalg.inv(one.theta_information).diagonal(), one.beta_covariance.diagonal()) for one in found
@@ -117,7 +120,7 @@ def test_errors_are_those_of_many_runs():
     assert np.mean(sizes, axis=0) == pytest.approx((1.0, 0.3, *BETA), rel=0.15)
 
 
-def test_a_bin_of_many_is_the_sum_of_its_coefficients():
+def test_wide_bin_is_the_sum_of_its_coefficients():
     rng = np.random.default_rng(1)
     binned = build_frequency_bins(3000, 100.0)
     y = rng.standard_normal(2999)
@@ -134,14 +137,14 @@ def test_a_bin_of_many_is_the_sum_of_its_coefficients():
     assert found.theta_information == pytest.approx(information, rel=0.01)
 
 
-def test_regressors_that_are_the_same_share_their_size():
-    y = drawn(2, beta=(3.0, 0.0, 0.0))
+def test_equal_regressors_share_their_coefficient():
+    y = draw_coefficients(2, beta=(3.0, 0.0, 0.0))
     one = fit(y, REGRESSORS[:1])
     twice = fit(y, REGRESSORS[[0, 0]])
     assert twice.log_likelihood == pytest.approx(one.log_likelihood, abs=1e-3)
     assert twice.beta.sum() == pytest.approx(one.beta[0], rel=1e-4)
 
 
-def test_silence_has_no_infinite_likelihood():
+def test_zeros_have_a_finite_likelihood():
     found = fit(np.zeros(n - 1))
     assert np.isfinite(found.log_likelihood)

@@ -1,4 +1,4 @@
-"""The cosine transform is orthonormal, has the spectrum as its variance, and its bins lose no coefficient."""
+"""Tests that the cosine transform is orthonormal, that its variance is the spectrum, and that bins are complete."""
 
 import numpy as np
 import pytest
@@ -9,22 +9,22 @@ from scipy.signal import lfilter, periodogram
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
 
 
-def matrix(n):
-    """The transform by its definition, [n − 1, n]."""
+def make_transform_matrix(n):
+    """Return the matrix of the transform from its definition, shape [n − 1, n]."""
     k, j = np.arange(1, n)[:, None], np.arange(n)
     return np.sqrt(2.0 / n) * np.cos(np.pi * k * (2 * j + 1) / (2 * n))
 
 
 def test_transform_is_the_cosine_sum_without_the_mean():
     y = np.random.default_rng(0).standard_normal(200) + 7.0
-    assert cosine_transform(y) == pytest.approx(matrix(200) @ y, abs=1e-12)
+    assert cosine_transform(y) == pytest.approx(make_transform_matrix(200) @ y, abs=1e-12)
     assert np.sum(cosine_transform(y) ** 2) == pytest.approx(np.sum((y - y.mean()) ** 2))
     assert inverse_cosine_transform(cosine_transform(y)) == pytest.approx(y - y.mean(), abs=1e-12)
 
 
 def test_white_noise_and_random_walk_have_independent_coefficients():
     n, k = 60, np.arange(1, 60)
-    d = matrix(n)
+    d = make_transform_matrix(n)
     np.testing.assert_allclose(d @ d.T, np.eye(n - 1), atol=1e-12)
     steps = np.tril(np.ones((n, n)))
     np.testing.assert_allclose(
@@ -65,7 +65,7 @@ def test_every_coefficient_is_in_one_bin(n, rate_hz, peaks):
     assert np.all(found.f_hz <= f_hz[last] * (1.0 + 1e-12))
 
 
-def test_bins_are_narrow_where_spectra_are_steep():
+def test_bins_are_narrow_at_steep_spectra():
     n, rate_hz = 360_000, 100.0
     found = build_frequency_bins(n, rate_hz)
     step_hz = 0.5 * rate_hz / n
@@ -81,7 +81,7 @@ def test_bins_are_narrow_where_spectra_are_steep():
     assert np.max((around.count * step_hz)[near]) < 0.01
 
 
-def test_sums_are_those_of_each_bin_and_spread_is_their_way_back():
+def test_values_are_summed_over_bins_and_expanded_again():
     found = build_frequency_bins(5000, 100.0, [(10.0, 0.5)])
     values = np.random.default_rng(0).standard_normal(4999)
     direct, at = [], 0
@@ -94,7 +94,7 @@ def test_sums_are_those_of_each_bin_and_spread_is_their_way_back():
     assert found.sum_over_bins(each) == pytest.approx(np.arange(found.count.size) * found.count)
 
 
-def test_sums_of_a_short_array_are_those_with_zeros():
+def test_short_array_is_summed_as_if_padded_with_zeros():
     bins = build_frequency_bins(10_000, 100.0)
     products = np.random.default_rng(0).standard_normal(9999)
     for size in (1, 48, 5000, 9999):

@@ -14,7 +14,7 @@ GRAVITY = (0.3, -0.2, 9.8)
 
 
 def make_model(gravity: bool = False, step: float = 0.0) -> NoiseModel:
-    """Six axes with different noise and one resonance each, optionally with gravity and quantization steps."""
+    """Return a model of six axes with different noise and one resonance each."""
     effects = {}
     for k, axis in enumerate(AXES):
         scale = (1e-4 if k < 3 else 1e-3) * (1.0, 1.5, 2.5)[k % 3]
@@ -32,11 +32,11 @@ def make_model(gravity: bool = False, step: float = 0.0) -> NoiseModel:
 
 
 def draw(model: NoiseModel, seed: int, samples: int = SAMPLES) -> Recording:
-    """Simulated recording of six axes."""
+    """Simulate a recording of six axes."""
     drawn = model.simulate(samples, RATE_HZ, seed)
     return Recording({axis: np.ascontiguousarray(drawn[:, k]) for k, axis in enumerate(AXES)}, RATE_HZ)
 
 
 def changed(recording: Recording, **values: Floats) -> Recording:
-    """The recording with other values on some axes."""
+    """Return the recording with other values on some axes."""
     return Recording({**recording.values, **values}, recording.rate_hz, recording.temperature_c)

@@ -19,7 +19,7 @@ MODEL = make_model()
 
 @pytest.mark.parametrize("order", [one for one in permutations((0, 1, 2)) if one != (0, 1, 2)])
 @pytest.mark.parametrize("triad", [AXES[:3], AXES[3:]])
-def test_axes_in_another_order_are_put_back(order, triad):
+def test_permuted_axes_are_restored(order, triad):
     recording = draw(MODEL, 5)
     wrong = changed(recording, **{triad[at]: recording.values[triad[to]] for at, to in enumerate(order)})
     checked = check_recording(wrong, MODEL, 1)
@@ -40,14 +40,14 @@ def test_axes_with_the_same_noise_keep_their_order():
     assert check_recording(swapped, model, 1).findings == ()
 
 
-def test_another_noise_level_on_one_axis_is_no_other_order():
+def test_other_noise_level_on_one_axis_is_no_permutation():
     recording = draw(MODEL, 5)
     assert check_recording(changed(recording, gx=1.3 * recording.values["gx"]), MODEL, 1).findings == ()
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_slow_noise_on_one_of_two_similar_axes_is_no_other_order(seed):
-    """With the slow noise, gx is closer to the model of gy than to the model of gx, but fits neither model."""
+def test_slow_noise_on_one_of_two_similar_axes_is_no_permutation(seed):
+    """With slow noise, gx is closer to the model of gy than to its own model, but fits neither."""
     densities = {"gx": 1.0e-4, "gy": 1.1e-4, "gz": 0.8e-4}
     model = NoiseModel({axis: (AngleRandomWalk(N=N),) for axis, N in densities.items()}, RATE_HZ)
     recording = draw(model, seed)
@@ -62,7 +62,7 @@ def test_reordering_is_the_inverse_of_the_permutation():
     assert reorder_axes(values, AXES[3:], (2, 0, 1)) == {**values, "az": 3, "ax": 4, "ay": 5}
 
 
-def test_the_power_of_a_narrow_resonance_is_uncertain():
+def test_power_of_a_narrow_resonance_is_uncertain():
     ((f_hz, variance),) = compute_resonance_log_power_variances(
         [Narrowband(sigma=1.0, frequency=9.0, bandwidth=1e-3), AngleRandomWalk(N=1.0)], 10.0
     )

@@ -16,7 +16,7 @@ def check(recorded):
 
 
 @pytest.mark.parametrize("row", [0, 1, 7000, 15_998, 15_999])
-def test_a_row_far_out_is_marked_on_all_axes(row):
+def test_corrupt_row_is_marked_on_all_axes(row):
     recorded = values()
     recorded["gy"][row] += 40.0 * np.std(np.diff(recorded["gy"]))
     marked, (finding,) = check(recorded)
@@ -25,7 +25,7 @@ def test_a_row_far_out_is_marked_on_all_axes(row):
     assert all(np.flatnonzero(np.isnan(y)).tolist() == [row] for y in marked.values())
 
 
-def test_a_first_row_of_zeros_is_found_by_gravity():
+def test_first_row_of_zeros_is_found_by_gravity():
     recorded = values()
     for y in recorded.values():
         y[0] = 0.0
@@ -41,13 +41,13 @@ def test_three_rows_in_succession_are_one_finding():
     assert np.flatnonzero(np.isnan(marked["gx"])).tolist() == [5000, 5001, 5002]
 
 
-def test_a_step_is_no_spike():
+def test_step_is_no_spike():
     recorded = values()
     recorded["ax"][5000:] += 100.0
     assert check(recorded)[1] == []
 
 
-def test_outliers_at_several_times_are_left_to_the_search():
+def test_outliers_at_several_times_are_no_finding():
     recorded = values()
     recorded["ax"][[2000, 9000]] += 100.0
     assert check(recorded)[1] == []
@@ -68,5 +68,5 @@ def test_missing_samples_are_no_spikes():
     assert distances.max() < 8.0
 
 
-def test_a_constant_axis_has_no_distances():
+def test_constant_axis_has_no_distances():
     assert compute_distances_from_neighbours(np.ones(1000))[0].size == 0

@@ -11,7 +11,7 @@ def values(step=0.0, seed=2):
 
 @pytest.mark.parametrize("step", [0.0, 8.0], ids=["fine", "coarse"])
 @pytest.mark.parametrize("length", [200, 8000])
-def test_a_stuck_axis_is_marked(step, length):
+def test_stuck_axis_is_marked(step, length):
     recorded = values(step)
     recorded["gz"][4000 : 4000 + length] = recorded["gz"][3999]
     marked, (finding,) = check_stuck_values(recorded, RATE_HZ, draw(make_model(step=step), 9).values)
@@ -31,7 +31,7 @@ def test_rows_that_keep_all_values_are_one_finding():
     assert (finding.kind, len(finding.axes)) == ("frozen_rows", 6)
 
 
-def test_a_constant_axis_is_kept_for_the_note_about_it():
+def test_constant_axis_is_kept_for_the_note_about_it():
     recorded = values()
     recorded["ax"][:] = 0.0
     marked, (finding,) = check_stuck_values(recorded, RATE_HZ, None)
@@ -54,5 +54,5 @@ def test_coarse_values_repeat_by_chance(noise):
         assert check_stuck_values({"gx": y}, RATE_HZ, None)[1] == []
 
 
-def test_the_longest_run_ignores_missing_samples():
+def test_longest_run_ignores_missing_samples():
     assert find_longest_run_bounds(np.array([1.0, np.nan, np.nan, np.nan, 2.0, 2.0])) == (4, 6)

@@ -28,7 +28,7 @@ def test_motion_is_removed_from_all_axes():
     assert missing.size < 600
 
 
-def test_a_disturbance_of_one_axis_is_left_to_the_search():
+def test_disturbance_of_one_axis_is_no_motion():
     assert check(moved(("gx",)))[1] == []
 
 
@@ -36,7 +36,7 @@ def test_without_a_model_motion_is_removed_too():
     assert len(check(moved(("gx", "ay")), None)[1]) == 1
 
 
-def test_a_recording_in_motion_for_much_of_the_time_is_kept():
+def test_recording_in_motion_for_much_of_the_time_is_kept():
     recorded = {axis: y.copy() for axis, y in draw(MODEL, 4).values.items()}
     for begin in (2000, 7000, 12_000):
         for axis in ("gx", "gy", "ax"):

@@ -26,7 +26,7 @@ def test_holes_are_counted():
     assert (finding.parameters["time"].value, finding.parameters["duration"].value) == (50.0, 2.0)
 
 
-def test_a_complete_recording_has_no_holes():
+def test_complete_recording_has_no_holes():
     assert check_missing_rows(values(), RATE_HZ) == []
 
 
@@ -41,7 +41,7 @@ def test_repeated_rows_are_measured_and_kept():
     assert not finding.corrected
 
 
-def test_repeats_that_the_model_knows_or_chance_explains_are_no_finding():
+def test_repeats_of_the_model_or_by_chance_are_no_finding():
     assert check_repeated_rows(values(), RATE_HZ, MODEL) == []
     held = MODEL + NoiseModel({"gx": (RandomSampleHold(fraction=0.2),)})
     recorded = {axis: y.repeat(2) for axis, y in values().items()}
@@ -49,7 +49,7 @@ def test_repeats_that_the_model_knows_or_chance_explains_are_no_finding():
     assert len(check_repeated_rows(recorded, RATE_HZ, MODEL)) == 1
 
 
-def test_a_term_slower_than_the_recording_is_named():
+def test_term_slower_than_the_recording_is_named():
     slow = NoiseModel({
         "gx": (AngleRandomWalk(N=1e-4), ExponentiallyCorrelated(sigma=1e-4, correlation_time=500.0)),
         "gy": (AngleRandomWalk(N=1e-4), RateRandomWalk(K=1e-7)),

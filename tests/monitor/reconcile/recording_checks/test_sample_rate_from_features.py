@@ -19,7 +19,7 @@ MODEL = make_model()
 
 
 def estimate(ratio, model_rate_hz, model=MODEL, seed=3):
-    """Estimate from a recording with a true rate of ``ratio`` times the stated rate."""
+    """Return the estimate for a recording whose true rate is ``ratio`` times the stated rate."""
     recording = draw(model, seed)
     coefficients = {axis: cosine_transform(y) for axis, y in recording.values.items()}
     return estimate_sample_rate_error(coefficients, RATE_HZ / ratio, model.effects, model_rate_hz, None)
@@ -42,7 +42,7 @@ def test_one_feature_is_sufficient_if_the_model_states_the_other_rate(ratio):
     assert estimate(ratio, None, model) is None
 
 
-def test_a_right_rate_is_not_blamed():
+def test_right_rate_is_no_finding():
     for seed in range(20):
         assert estimate(1.0, None, seed=seed) is None
         assert estimate(1.0, RATE_HZ * 1.05, seed=seed) is None
@@ -73,7 +73,7 @@ def test_harmonics_are_one_group():
     assert len(groups) == 2
 
 
-def test_a_feature_above_half_the_stated_rate_needs_the_rate_of_the_model():
+def test_feature_above_half_the_stated_rate_needs_the_rate_of_the_model():
     model = NoiseModel(
         {"gx": (AngleRandomWalk(N=1e-4), Narrowband(sigma=1e-3, frequency=45.0, bandwidth=0.1))}, RATE_HZ
     )
@@ -88,7 +88,7 @@ def test_a_feature_above_half_the_stated_rate_needs_the_rate_of_the_model():
     assert correct_impossible_sample_rate(white, model) is None
 
 
-def test_a_simulated_sample_rate_error_is_estimated():
+def test_simulated_sample_rate_error_is_estimated():
     wrong = MODEL + NoiseModel({"gx": (SampleRateError(ratio=1.04),)})
     recording = draw(wrong, 3)
     coefficients = {axis: cosine_transform(y) for axis, y in recording.values.items()}

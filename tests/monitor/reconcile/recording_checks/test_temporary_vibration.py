@@ -83,7 +83,7 @@ def test_missing_samples_stay_missing():
     ],
     ids=["constant line", "sweep", "louder noise", "modulated line", "spike", "step"],
 )
-def test_other_changes_are_left_to_the_search(change):
+def test_other_changes_are_no_temporary_vibration(change):
     recorded = dict(draw(MODEL, 4).values)
     recorded["gx"] = change(recorded["gx"], noise_levels(recorded)["gx"])
     assert check(recorded)[1] == []

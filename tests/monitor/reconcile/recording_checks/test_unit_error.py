@@ -28,7 +28,7 @@ def factor_of(triad, evidence):
 
 
 @pytest.mark.parametrize("name", ["π/180", "180/π", "1000", "1/1000", "2", "1/2", "4"])
-def test_a_wrong_unit_of_the_gyroscopes_is_corrected(name):
+def test_wrong_unit_of_the_gyroscopes_is_corrected(name):
     model, factor = make_model(), {**CONVERSIONS, **FULL_SCALES}[name]
     recording = draw(model, 3)
     wrong = changed(recording, **{axis: factor * recording.values[axis] for axis in GYROS})
@@ -48,7 +48,7 @@ def test_a_wrong_unit_of_the_gyroscopes_is_corrected(name):
         *((name, m) for name in ("1/9.80665", "1000", "1000/9.80665", "2", "1/4") for m in (True, False)),
     ],
 )
-def test_a_wrong_unit_of_the_accelerometers_is_corrected(name, with_model):
+def test_wrong_unit_of_the_accelerometers_is_corrected(name, with_model):
     model, factor = make_model(gravity=True), {**CONVERSIONS, **FULL_SCALES}[name]
     recording = draw(model, 3)
     wrong = changed(recording, **{axis: factor * recording.values[axis] for axis in ACCELEROMETERS})
@@ -57,7 +57,7 @@ def test_a_wrong_unit_of_the_accelerometers_is_corrected(name, with_model):
     assert finding.evidence["nearest_factor"] == factor
 
 
-def test_a_factor_far_from_the_list_is_no_unit_error():
+def test_factor_far_from_the_list_is_no_unit_error():
     assert factor_of(GYROS, TriadEvidence(noise(5.7, 5.6, 5.8), None, None)) is None
     assert factor_of(GYROS, TriadEvidence(noise(30.0, 30.0, 30.0), None, None)) is None
 
@@ -78,7 +78,7 @@ def test_quantization_steps_decide_between_near_factors():
     assert factor_of(GYROS, TriadEvidence(noise(1.0, 1.0, 1.0), None, 1.0)) is None
 
 
-def test_the_ratio_of_the_steps_is_measured():
+def test_ratio_of_the_steps_is_measured():
     model = make_model(step=8.0)
     recording = draw(model, 1)
     for factor in (1.0, 0.5, np.pi / 180.0, 1000.0):
@@ -91,7 +91,7 @@ def test_gravity_distinguishes_g_from_a_full_scale():
     assert factor_of(ACCELEROMETERS, TriadEvidence(noise(9.0, 8.8, 8.9), 8.02, None)) == 8.0
 
 
-def test_the_interval_holds_the_scatter_from_run_to_run():
+def test_interval_holds_the_scatter_from_run_to_run():
     found = find_unit_error(GYROS, TriadEvidence(noise(57.0, 60.0, 55.0), None, None))
     assert found is not None
     bounds = found[1].parameters["factor"]

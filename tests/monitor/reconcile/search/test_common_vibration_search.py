@@ -1,4 +1,4 @@
-"""Vibration that several axes share: one name for all axes, and no name for leaks, knocks and independent noise."""
+"""Tests of the search for vibration that several axes share, and of leaks, shocks and independent noise."""
 
 from functools import cache
 
@@ -26,7 +26,7 @@ from tests.monitor.reconcile.axes import (
     N,
     axes,
     correlated,
-    ringing,
+    draw_resonance,
     walk,
     white,
 )
@@ -37,17 +37,17 @@ GAINS = {"gx": 2e-4, "gy": -4e-4, "gz": 3e-4}
 
 
 @cache
-def quiet(seed: int) -> dict[str, np.ndarray]:
+def draw_noise(seed: int) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     return {name: white(n, rng) + walk(n, rng) for name in GYRO_AXES}
 
 
-def vibrating(unit: np.ndarray, seed: int = 0, names: tuple[str, ...] = GYRO_AXES) -> dict[str, np.ndarray]:
-    return {name: y + (GAINS[name] * unit if name in names else 0.0) for name, y in quiet(seed).items()}
+def add_vibration(unit: np.ndarray, seed: int = 0, names: tuple[str, ...] = GYRO_AXES) -> dict[str, np.ndarray]:
+    return {name: y + (GAINS[name] * unit if name in names else 0.0) for name, y in draw_noise(seed).items()}
 
 
-def searched(values: dict[str, np.ndarray]) -> dict[str, AxisSearchResult]:
-    """The result of the search on each axis and of the search for common vibration."""
+def search_all_axes(values: dict[str, np.ndarray]) -> dict[str, AxisSearchResult]:
+    """Return the result of the search on each axis and of the search for common vibration."""
     null = dict.fromkeys(values, STRICT)
     each = {
         name: search_missing_effects(one, MODEL, STRICT, np.random.default_rng(1))
@@ -56,7 +56,7 @@ def searched(values: dict[str, np.ndarray]) -> dict[str, AxisSearchResult]:
     return name_common_vibrations(each, null)
 
 
-def vibrations(found: dict[str, AxisSearchResult]) -> dict[str, CommonVibration]:
+def list_vibrations(found: dict[str, AxisSearchResult]) -> dict[str, CommonVibration]:
     return {
         name: effect
         for name, one in found.items()
@@ -66,9 +66,9 @@ def vibrations(found: dict[str, AxisSearchResult]) -> dict[str, CommonVibration]
 
 
 @pytest.mark.parametrize("names", [("gx", "gy"), GYRO_AXES], ids=len)
-def test_a_resonance_of_several_axes_has_one_name(names):
-    found = searched(vibrating(ringing(n, np.random.default_rng(5), 1.0, 17.0, 0.5), names=names))
-    named = vibrations(found)
+def test_resonance_of_several_axes_has_one_name(names):
+    found = search_all_axes(add_vibration(draw_resonance(n, np.random.default_rng(5), 1.0, 17.0, 0.5), names=names))
+    named = list_vibrations(found)
     assert set(named) == set(names)
     assert {one.source_number for one in named.values()} == {1.0}
     sign = np.sign(named["gx"].gain)  # the sign of the source is arbitrary
@@ -79,8 +79,8 @@ def test_a_resonance_of_several_axes_has_one_name(names):
         assert found[name].final.findings["other_axes"].gain < STRICT["other_axes"].threshold
 
 
-def test_a_vibration_without_a_peak():
-    named = vibrations(searched(vibrating(correlated(n, np.random.default_rng(6), 1.0, 0.1))))
+def test_common_vibration_without_a_peak_is_found():
+    named = list_vibrations(search_all_axes(add_vibration(correlated(n, np.random.default_rng(6), 1.0, 0.1))))
     assert set(named) == set(GYRO_AXES)
     for name, one in named.items():
         assert one.frequency is None
@@ -91,33 +91,33 @@ def test_a_vibration_without_a_peak():
 @pytest.mark.parametrize("seed", range(3))
 def test_equal_but_independent_resonances_are_no_common_vibration(seed):
     rng = np.random.default_rng(seed + 50)
-    values = {name: y + GAINS[name] * ringing(n, rng, 1.0, 17.0, 0.5) for name, y in quiet(seed).items()}
-    assert vibrations(searched(values)) == {}
+    values = {name: y + GAINS[name] * draw_resonance(n, rng, 1.0, 17.0, 0.5) for name, y in draw_noise(seed).items()}
+    assert list_vibrations(search_all_axes(values)) == {}
 
 
-def test_a_leak_is_no_common_vibration():
-    values = vibrating(ringing(n, np.random.default_rng(7), 1.0, 17.0, 0.5), names=("gx",))
-    found = searched(values | {"gy": values["gy"] + 0.3 * values["gx"]})
-    assert vibrations(found) == {}
+def test_leak_is_no_common_vibration():
+    values = add_vibration(draw_resonance(n, np.random.default_rng(7), 1.0, 17.0, 0.5), names=("gx",))
+    found = search_all_axes(values | {"gy": values["gy"] + 0.3 * values["gx"]})
+    assert list_vibrations(found) == {}
     assert any(isinstance(effect, CrossAxis) for effect in found["gy"].hypothesis.added)
 
 
 def test_two_axes_with_a_leak_are_not_searched():
-    values = {name: y for name, y in quiet(4).items() if name != "gz"}
-    found = searched(values | {"gy": values["gy"] + 0.3 * values["gx"]})
-    assert vibrations(found) == {}
+    values = {name: y for name, y in draw_noise(4).items() if name != "gz"}
+    found = search_all_axes(values | {"gy": values["gy"] + 0.3 * values["gx"]})
+    assert list_vibrations(found) == {}
     assert any(isinstance(effect, CrossAxis) for one in found.values() for effect in one.hypothesis.added)
 
 
-def test_a_knock_is_no_common_vibration():
+def test_knock_is_no_common_vibration():
     knock = np.zeros(n)
     knock[4000:4100] = 10.0 * np.random.default_rng(8).standard_normal(100)
-    assert vibrations(searched(vibrating(knock))) == {}
+    assert list_vibrations(search_all_axes(add_vibration(knock))) == {}
 
 
 @pytest.mark.parametrize("leak", [0.0, 0.1])
-def test_a_leak_beside_a_known_vibration_is_still_seen(leak):
-    unit = ringing(60_000, np.random.default_rng(9), 1.0, 17.0, 0.5)
+def test_leak_beside_a_known_vibration_is_found(leak):
+    unit = draw_resonance(60_000, np.random.default_rng(9), 1.0, 17.0, 0.5)
     rng = np.random.default_rng(3)
     values = {name: white(60_000, rng) + GAINS[name] * unit for name in ("gx", "gy")}
     values["gx"] -= leak * white(60_000, np.random.default_rng(11), N)
@@ -135,9 +135,9 @@ def test_a_leak_beside_a_known_vibration_is_still_seen(leak):
 
 
 @pytest.mark.parametrize("shared", ["whole", "first half", "not at all"])
-def test_an_axis_belongs_to_a_vibration_with_evidence_in_both_halves(shared):
-    shape, unit = (17.3, 1.0), ringing(n, np.random.default_rng(7), 1.0, 17.3, 1.0)
-    values = vibrating(unit, 3, ("gx", "gy"))
+def test_axis_belongs_to_a_vibration_with_evidence_in_both_halves(shared):
+    shape, unit = (17.3, 1.0), draw_resonance(n, np.random.default_rng(7), 1.0, 17.3, 1.0)
+    values = add_vibration(unit, 3, ("gx", "gy"))
     part = {"whole": n, "first half": n // 2, "not at all": 0}[shared]
     values["gz"] = values["gz"] + np.where(np.arange(n) < part, GAINS["gz"] * unit, 0.0)
     hypotheses = [fit_with_fixed_noise(one, MODEL) for one in axes(values, MODEL).values()]

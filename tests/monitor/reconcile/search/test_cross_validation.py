@@ -1,4 +1,4 @@
-"""A step is kept where what one half taught holds in the other, and is not where it was there by chance."""
+"""Tests that a step is kept if the fit of one half of the recording is valid for the other half."""
 
 import numpy as np
 import pytest
@@ -28,12 +28,12 @@ from tests.monitor.reconcile.axes import (
     axes,
     axis,
     correlated,
-    ringing,
-    seen,
+    draw_resonance,
+    make_temperature,
     time_s,
     walk,
-    warmth,
     white,
+    whiten,
 )
 
 n = 24_000
@@ -42,18 +42,18 @@ NULL = NullDistribution(7.0, 15.0)
 HALF = time_s(n) < 120.0
 
 
-def noise(seed=0):
+def draw_noise(seed=0):
     rng = np.random.default_rng(seed)
     return white(n, rng) + walk(n, rng)
 
 
-def proven(one, effect, diagnostic, model=MODEL):
+def validate_step(one, effect, diagnostic, model=MODEL):
     before, after = fit_with_fixed_noise(one, model), fit_with_fewest_changes(one, (effect,), model)
     return cross_validate(before, after, after.effects[-1], diagnostic, NULL, np.random.default_rng(0))
 
 
 LINE = 3e-4 * np.sin(2 * np.pi * 17.3 * time_s(n))
-RINGING = ringing(n, np.random.default_rng(1), 5e-4, 17.3, 1.0)
+RINGING = draw_resonance(n, np.random.default_rng(1), 5e-4, 17.3, 1.0)
 SLOW = correlated(n, np.random.default_rng(2), 5e-4, 0.3)
 OTHER = correlated(n, np.random.default_rng(3), 1e-2, 1.0)
 REAL = {
@@ -61,25 +61,29 @@ REAL = {
     "resonance": (RINGING, Narrowband(sigma=1e-4, frequency=17.3, bandwidth=1.0), "psd"),
     "correlated": (SLOW, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.3), "psd"),
     "slope": (1e-5 * time_s(n), RateRamp(R=1.0), "level"),
-    "temperature": (2e-4 * (warmth(n) - 25.0), TemperatureBias(coefficient=1.0, reference=25.0), "temperature"),
+    "temperature": (
+        2e-4 * (make_temperature(n) - 25.0),
+        TemperatureBias(coefficient=1.0, reference=25.0),
+        "temperature",
+    ),
     "leak": (0.05 * OTHER, CrossAxis(source="gx", coefficient=1.0), "other_axes"),
 }
 
 
-def test_a_drift_of_one_half_does_not_outweigh_the_effect():
-    """The fitted random walk of the half with the drift is far too large for the other half."""
+def test_drift_of_one_half_does_not_outweigh_the_effect():
+    """The random walk that is fitted to the half with the drift is far too large for the other half."""
     drift = np.where(HALF, 0.02 * np.exp(-time_s(n) / 20.0), 0.0)
-    one = axis(noise(4) + RINGING + drift, MODEL)
-    found = proven(one, Narrowband(sigma=1e-4, frequency=17.3, bandwidth=1.0), "psd")
+    one = axis(draw_noise(4) + RINGING + drift, MODEL)
+    found = validate_step(one, Narrowband(sigma=1e-4, frequency=17.3, bandwidth=1.0), "psd")
     assert found.reason == ""
     assert found.kept
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_what_is_there_in_both_halves_is_kept(name):
+def test_effect_of_both_halves_is_kept(name):
     hidden, effect, diagnostic = REAL[name]
-    one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
-    found = proven(one, effect, diagnostic)
+    one = axes({"gx": OTHER, "gz": draw_noise() + hidden}, {"gx": (), "gz": MODEL}, make_temperature(n))["gz"]
+    found = validate_step(one, effect, diagnostic)
     assert found.reason == ""
     assert found.kept
     assert found.after < 0.7 * found.before
@@ -91,7 +95,7 @@ BY_CHANCE = {
     "correlated": (SLOW, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.3), "psd"),
     "leak": (0.05 * OTHER * np.where(HALF, 1.0, -0.6), CrossAxis(source="gx", coefficient=1.0), "other_axes"),
     "temperature": (
-        4e-4 * (warmth(n) - 25.0) * np.where(HALF, 1.0, -0.6),
+        4e-4 * (make_temperature(n) - 25.0) * np.where(HALF, 1.0, -0.6),
         TemperatureBias(coefficient=1.0, reference=25.0),
         "temperature",
     ),
@@ -99,10 +103,10 @@ BY_CHANCE = {
 
 
 @pytest.mark.parametrize("name", BY_CHANCE)
-def test_what_one_half_contradicts_is_not_kept(name):
+def test_effect_that_one_half_contradicts_is_not_kept(name):
     hidden, effect, diagnostic = BY_CHANCE[name]
     hidden = hidden * HALF if diagnostic == "psd" else hidden
-    one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
+    one = axes({"gx": OTHER, "gz": draw_noise() + hidden}, {"gx": (), "gz": MODEL}, make_temperature(n))["gz"]
     before, after = fit_with_fixed_noise(one, MODEL), fit_with_fewest_changes(one, (effect,), MODEL)
     # on the data that chose it, it is worth its name
     assert after.fit.log_likelihood - before.fit.log_likelihood > 20.0
@@ -110,19 +114,19 @@ def test_what_one_half_contradicts_is_not_kept(name):
     assert not found.kept
 
 
-def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
-    """The strongest line of pure noise gains its dozen nats; halves of that decide nothing, and the reason says so."""
-    one = axis(noise(4))
-    view = seen(one, MODEL)
+def test_strongest_line_of_noise_is_not_validated():
+    """The strongest line of pure noise gains about twelve nats, which is too little for a decision with halves."""
+    one = axis(draw_noise(4))
+    view = whiten(one, MODEL)
     gain, f_hz = find_peak_gains_and_frequencies(view.periodogram, one.rate_hz, 1)[0]
     assert gain > 7.0
-    found = proven(one, Sinusoidal(amplitude=1.0, frequency=f_hz, phase=0.0), "lines")
+    found = validate_step(one, Sinusoidal(amplitude=1.0, frequency=f_hz, phase=0.0), "lines")
     assert found.reason or not found.kept
     assert np.isnan(found.before) == bool(found.reason)
 
 
-def test_another_size_of_a_known_noise():
-    one = axis(1.2 * noise(5))
+def test_changed_size_of_a_known_noise_is_kept():
+    one = axis(1.2 * draw_noise(5))
     before = fit_with_fixed_noise(one, MODEL)
     after = fit_with_fewest_changes(one, (), MODEL)
     assert after.resized_model_effect_count >= 1
@@ -135,25 +139,25 @@ def test_another_size_of_a_known_noise():
     ("effect", "model"),
     [(NoiseStep(time=60.0, ratio=2.0), (AngleRandomWalk(N=N),)), (BiasStep(time=30.0, height=1.0), MODEL)],
 )
-def test_what_happens_once_has_no_other_half(effect, model):
+def test_single_event_is_not_validated_by_halves(effect, model):
     course = np.where(time_s(n) < 60.0, 1.0, 2.0) if isinstance(effect, NoiseStep) else 1.0
-    y = noise(6) * course + 4e-3 * (time_s(n) >= 30.0) * isinstance(effect, BiasStep)
-    found = proven(axis(y), effect, "variance" if isinstance(effect, NoiseStep) else "level", model)
+    y = draw_noise(6) * course + 4e-3 * (time_s(n) >= 30.0) * isinstance(effect, BiasStep)
+    found = validate_step(axis(y), effect, "variance" if isinstance(effect, NoiseStep) else "level", model)
     assert found.reason
     assert found.kept
     assert np.isnan([found.before, found.after]).all()
 
 
-def test_too_faint_for_a_half_is_told():
-    one = axis(noise(7) + 4e-5 * np.sin(2 * np.pi * 17.3 * time_s(n)))
-    found = proven(one, Sinusoidal(amplitude=1.0, frequency=17.3, phase=0.0), "lines")
+def test_effect_too_weak_for_a_half_has_that_reason():
+    one = axis(draw_noise(7) + 4e-5 * np.sin(2 * np.pi * 17.3 * time_s(n)))
+    found = validate_step(one, Sinusoidal(amplitude=1.0, frequency=17.3, phase=0.0), "lines")
     assert "half" in found.reason
 
 
 @pytest.mark.parametrize("kind", ["outliers", "resolution"])
-def test_single_samples_are_looked_at_in_each_half(kind):
+def test_outliers_are_tested_in_each_half(kind):
     rng = np.random.default_rng(8)
-    y = noise(8)
+    y = draw_noise(8)
     if kind == "outliers":
         y = y + (rng.random(n) < 2e-3) * 1e-2 * rng.standard_normal(n)
         effect, diagnostic = Outliers(fraction=2e-3, scale=1e-2), "tails"

@@ -1,4 +1,4 @@
-"""Of two effects with one spectrum, the one that made the data is named: both ways, three pairs."""
+"""Tests that of two effects with equal spectra, the simulated effect is named."""
 
 import numpy as np
 import pytest
@@ -24,31 +24,31 @@ n = 60_000
 MODEL = (WHITE, WALK)
 
 
-def noise(rng):
+def draw_noise(rng):
     return white(n, rng) + walk(n, rng)
 
 
-def two_levels(rng, amplitude, dwell_s):
+def draw_telegraph(rng, amplitude, dwell_s):
     flips = np.cumsum(rng.poisson(1.0 / (RATE_HZ * dwell_s), n))
     return 0.5 * amplitude * (1.0 - 2.0 * (flips % 2))
 
 
-def jumps(rng, rate, height):
+def draw_poisson_steps(rng, rate, height):
     count = rng.poisson(rate / RATE_HZ, n)
     return height * np.cumsum(np.sqrt(count) * rng.standard_normal(n))
 
 
-def found_as_noise(y):
-    """After a search has found correlated noise."""
+def find_noise(y):
+    """Return the result of a search that has found correlated noise."""
     one = axis(y)
     effects = (*MODEL, ExponentiallyCorrelated(sigma=3e-4, correlation_time=5.0))
     return fit_with_fewest_changes(one, effects[2:], effects[:2])
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_telegraph_is_no_correlated_noise(seed):
+def test_telegraph_signal_is_no_correlated_noise(seed):
     rng = np.random.default_rng(seed)
-    state = found_as_noise(noise(rng) + two_levels(rng, 6e-4, 10.0))
+    state = find_noise(draw_noise(rng) + draw_telegraph(rng, 6e-4, 10.0))
     twin = fit_telegraph_alternative(state, 2)
     assert twin.gain > 5.0
     effect = twin.added[-1]
@@ -62,15 +62,15 @@ def test_a_telegraph_is_no_correlated_noise(seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_correlated_noise_is_no_telegraph(seed):
+def test_correlated_noise_is_no_telegraph_signal(seed):
     rng = np.random.default_rng(seed)
-    state = found_as_noise(noise(rng) + correlated(n, rng, 3e-4, 5.0))
+    state = find_noise(draw_noise(rng) + correlated(n, rng, 3e-4, 5.0))
     assert fit_telegraph_alternative(state, 2).gain < -5.0
 
 
-def test_nothing_is_asked_where_there_is_no_white_noise():
+def test_without_white_noise_no_alternative_is_tested():
     rng = np.random.default_rng(2)
-    one = axis(noise(rng) + correlated(n, rng, 3e-4, 5.0))
+    one = axis(draw_noise(rng) + correlated(n, rng, 3e-4, 5.0))
     state = fit_with_fewest_changes(one, (ExponentiallyCorrelated(sigma=3e-4, correlation_time=5.0),), (WALK,))
     assert fit_telegraph_alternative(state, 1) is None
 
@@ -78,7 +78,7 @@ def test_nothing_is_asked_where_there_is_no_white_noise():
 @pytest.mark.parametrize("seed", range(3))
 def test_poisson_steps_are_no_random_walk(seed):
     rng = np.random.default_rng(seed)
-    y = noise(rng) + jumps(rng, 0.05, 5e-4)
+    y = draw_noise(rng) + draw_poisson_steps(rng, 0.05, 5e-4)
     one = axis(y)
     state = fit_with_fewest_changes(one, (), MODEL)
     assert 1 in state.fit.fitted_noise  # a stronger walk stands in for the steps
@@ -93,27 +93,27 @@ def test_poisson_steps_are_no_random_walk(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_random_walk_is_no_poisson_steps(seed):
+def test_random_walk_is_no_poisson_steps(seed):
     rng = np.random.default_rng(seed)
-    one = axis(noise(rng) + walk(n, rng, 1e-4))
+    one = axis(draw_noise(rng) + walk(n, rng, 1e-4))
     state = fit_with_fewest_changes(one, (), MODEL)
     assert state.effects[1].K > 10 * WALK.K
     assert fit_poisson_alternative(state).gain < 0.0
 
 
-def test_a_random_walk_that_the_model_has_not():
+def test_missing_random_walk_is_compared_with_poisson_steps():
     rng = np.random.default_rng(5)
     y = white(n, rng) + walk(n, rng, 1e-4)
     one = axis(y)
     state = fit_with_fewest_changes(one, (RateRandomWalk(K=1e-5),), (WHITE,))
     assert fit_poisson_alternative(state).gain < 0.0
-    stepped = axis(white(n, rng) + jumps(rng, 0.05, 5e-4))
+    stepped = axis(white(n, rng) + draw_poisson_steps(rng, 0.05, 5e-4))
     twin = fit_poisson_alternative(fit_with_fewest_changes(stepped, (RateRandomWalk(K=1e-5),), (WHITE,)))
     assert twin.gain > 5.0
     assert not any(isinstance(effect, RateRandomWalk) for effect in twin.added)
 
 
-def test_the_noise_around_has_the_spectrum_of_its_effects():
+def test_remaining_noise_has_the_spectrum_of_its_effects():
     effects = (
         WHITE,
         RateRandomWalk(K=2e-3),
@@ -132,21 +132,21 @@ def test_the_noise_around_has_the_spectrum_of_its_effects():
         np.testing.assert_allclose(density, expected, rtol=2e-3)
 
 
-def test_a_model_that_is_right_is_not_asked():
-    one = axis(noise(np.random.default_rng(6)))
+def test_true_model_is_not_tested():
+    one = axis(draw_noise(np.random.default_rng(6)))
     assert fit_poisson_alternative(fit_with_fewest_changes(one, (), MODEL)) is None
-    step = noise(np.random.default_rng(7)) + 5e-4 * (time_s(n) > 200.0)
+    step = draw_noise(np.random.default_rng(7)) + 5e-4 * (time_s(n) > 200.0)
     stepped = axis(step)
     state = fit_with_fewest_changes(stepped, (BiasStep(time=200.0, height=1.0),), MODEL)
     assert fit_poisson_alternative(state).gain < 0.0  # one step is a step
 
 
-def test_jumps_are_told_from_correlated_noise_that_absorbed_them():
+def test_jumps_are_distinguished_from_correlated_noise_that_contains_them():
     rng = np.random.default_rng(3)
-    stepped = compare_poisson_with_added_noise(found_as_noise(noise(rng) + jumps(rng, 0.05, 6e-4)))
+    stepped = compare_poisson_with_added_noise(find_noise(draw_noise(rng) + draw_poisson_steps(rng, 0.05, 6e-4)))
     assert stepped.gain > 5.0
     assert isinstance(stepped.added[-1], PoissonSteps)
     assert not any(isinstance(one, ExponentiallyCorrelated) for one in stepped.added)
-    smooth = compare_poisson_with_added_noise(found_as_noise(noise(rng) + correlated(n, rng, 3e-4, 5.0)))
+    smooth = compare_poisson_with_added_noise(find_noise(draw_noise(rng) + correlated(n, rng, 3e-4, 5.0)))
     assert smooth is None or smooth.gain < 0.0
-    assert compare_poisson_with_added_noise(fit_with_fewest_changes(axis(noise(rng)), (), MODEL)) is None
+    assert compare_poisson_with_added_noise(fit_with_fewest_changes(axis(draw_noise(rng)), (), MODEL)) is None

@@ -1,4 +1,4 @@
-"""What is filled in looks like what was there: level, drift, white variance, spectrum; nothing else is touched."""
+"""Tests that filled and repaired samples have the level, drift, variance and spectrum of the recording."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def rng(seed=0):
     return np.random.default_rng(seed)
 
 
-def test_good_samples_stay_and_the_input_too():
+def test_good_samples_and_the_input_are_not_changed():
     y = rng().standard_normal(5_000)
     y[3] = np.nan
     before = y.copy()
@@ -39,14 +39,14 @@ def test_good_samples_stay_and_the_input_too():
     assert not np.array_equal(new[mask], y[mask])
 
 
-def test_the_same_seed_gives_the_same_samples():
+def test_same_seed_gives_the_same_samples():
     y, mask = rng().standard_normal(5_000), rng(1).random(5_000) < 0.05
     assert np.array_equal(fill_missing_samples(y, mask, rng(2)), fill_missing_samples(y, mask, rng(2)))
     assert not np.array_equal(fill_missing_samples(y, mask, rng(2)), fill_missing_samples(y, mask, rng(3)))
 
 
-def test_the_spectrum_is_unbiased():
-    """One percent missing: less than 0.1 % in every part of the spectrum that is wider than the neighbourhoods."""
+def test_spectrum_is_unbiased():
+    """With one percent of missing samples, the mean of each wide frequency band changes by less than 0.1 %."""
     apart = []
     for seed in range(6):
         y = rng(seed).standard_normal(SAMPLES)
@@ -60,7 +60,7 @@ def test_the_spectrum_is_unbiased():
     assert np.abs(np.mean(apart, axis=0)).max() < 1e-3
 
 
-def test_white_variance_and_differences_stay():
+def test_white_variance_and_differences_are_kept():
     y = rng().standard_normal(SAMPLES)
     mask = rng(1).random(SAMPLES) < 0.4
     new = fill_missing_samples(y, mask, rng(2))
@@ -69,7 +69,7 @@ def test_white_variance_and_differences_stay():
 
 
 @pytest.mark.parametrize("drift", [1e-3, 0.05])
-def test_drift_goes_on_through_short_holes(drift):
+def test_drift_continues_through_short_gaps(drift):
     walk = np.cumsum(drift * rng().standard_normal(SAMPLES)) + 9.81
     mask = np.zeros(SAMPLES, dtype=bool)
     for at in range(500, SAMPLES - 500, 1000):
@@ -80,7 +80,7 @@ def test_drift_goes_on_through_short_holes(drift):
     assert left.std() == pytest.approx(0.3, rel=0.45 if drift > 0.01 else 0.05)
 
 
-def test_a_long_hole_is_bridged_between_its_ends():
+def test_long_gap_is_bridged_between_its_ends():
     level = np.where(np.arange(SAMPLES) < 120_000, 0.0, 10.0)
     mask = np.zeros(SAMPLES, dtype=bool)
     mask[100_000:140_000] = True
@@ -90,7 +90,7 @@ def test_a_long_hole_is_bridged_between_its_ends():
     assert np.diff(new[100_000:140_000]).std() == pytest.approx(0.1 * 2.0**0.5, rel=0.05)
 
 
-def test_a_bridge_wanders_as_the_recording_does():
+def test_bridge_has_the_random_walk_of_the_recording():
     spreads = []
     for seed in range(12):
         walk = np.cumsum(0.02 * rng(seed).standard_normal(SAMPLES))
@@ -103,7 +103,7 @@ def test_a_bridge_wanders_as_the_recording_does():
 
 
 @pytest.mark.parametrize("hole", [slice(0, 6_000), slice(500, 6_500), slice(60_000, 66_000), slice(94_000, 100_000)])
-def test_a_long_hole_continues_the_spectrum_at_all_frequencies(hole):
+def test_long_gap_continues_the_spectrum_at_all_frequencies(hole):
     sos = signal.butter(2, 0.1, output="sos")
     y = signal.sosfilt(sos, rng().standard_normal(100_000)) + 1e-3 * rng(1).standard_normal(100_000)
     mask = np.zeros(y.size, dtype=bool)
@@ -114,7 +114,7 @@ def test_a_long_hole_continues_the_spectrum_at_all_frequencies(hole):
     assert [band.mean() for band in bands] == pytest.approx(np.ones(8), abs=0.25)
 
 
-def test_long_holes_close_together_are_not_filled_with_a_period():
+def test_long_gaps_close_together_are_not_filled_periodically():
     y = rng().standard_normal(20_000)
     mask = np.zeros(y.size, dtype=bool)
     mask[5_000:8_000] = mask[8_005:11_000] = True
@@ -124,7 +124,7 @@ def test_long_holes_close_together_are_not_filled_with_a_period():
     assert filled.std() == pytest.approx(1.0, abs=0.05)
 
 
-def test_holes_at_the_ends_take_the_level_next_to_them():
+def test_gaps_at_the_ends_have_the_adjacent_level():
     y = 5.0 + 0.1 * rng().standard_normal(2_000)
     mask = np.zeros(2_000, dtype=bool)
     mask[:300] = mask[-300:] = True
@@ -133,7 +133,7 @@ def test_holes_at_the_ends_take_the_level_next_to_them():
     assert new[-300:].std() == pytest.approx(0.1, rel=0.2)
 
 
-def test_one_good_sample_is_enough_and_none_is_not():
+def test_at_least_one_good_sample_is_needed():
     assert fill_missing_samples(np.array([np.nan, 2.0, np.nan]), np.zeros(3, dtype=bool), rng()).tolist() == [
         2.0,
         2.0,
@@ -158,7 +158,7 @@ def test_clipped_samples_get_their_distribution_back(limit, mean):
     assert np.quantile(new, 0.999) == pytest.approx(mean + 3.09, abs=0.15)
 
 
-def test_a_level_beyond_the_limit_is_found_and_missing_samples_stay():
+def test_level_beyond_the_limit_is_found_and_missing_samples_stay():
     x = 2.3 + rng().standard_normal(SAMPLES)
     y = np.minimum(x, 2.0)
     y[::1000] = np.nan
@@ -167,16 +167,16 @@ def test_a_level_beyond_the_limit_is_found_and_missing_samples_stay():
     assert np.nanmean(new) == pytest.approx(2.3, abs=0.1)
 
 
-def test_nothing_clipped_changes_nothing():
+def test_samples_without_clipping_are_not_changed():
     y = rng().standard_normal(1_000)
     assert np.array_equal(restore_clipped_samples(y, 10.0, 1.0, rng(1)), y)
 
 
-def noise(seed=0):
+def draw_noise(seed=0):
     return white(n, np.random.default_rng(seed))
 
 
-def test_holes_are_filled_from_around_them():
+def test_gaps_are_filled_from_adjacent_samples():
     y = correlated(n, np.random.default_rng(1), 1e-3, 2.0) + white(n, np.random.default_rng(2), 0.1 * N)
     holed = y.copy()
     lost = np.random.default_rng(3).random(n) < 0.1
@@ -190,15 +190,15 @@ def test_holes_are_filled_from_around_them():
 
 
 def test_input_is_not_changed():
-    y = noise()
+    y = draw_noise()
     y[::50] = np.nan
     kept = y.copy()
-    axes({"gx": y, "gz": noise(1)}, (WHITE, Outliers(fraction=0.01, scale=1e-2), Saturation(limit=1.5e-3)))
+    axes({"gx": y, "gz": draw_noise(1)}, (WHITE, Outliers(fraction=0.01, scale=1e-2), Saturation(limit=1.5e-3)))
     np.testing.assert_array_equal(y, kept)
 
 
-def test_repeats_are_mended_where_the_model_has_them():
-    y, rng = noise(), np.random.default_rng(4)
+def test_repeats_are_repaired_if_the_model_has_them():
+    y, rng = draw_noise(), np.random.default_rng(4)
     held = rng.random(n) < 0.2
     held[0] = False
     for at in np.flatnonzero(held):
@@ -214,8 +214,8 @@ def test_repeats_are_mended_where_the_model_has_them():
     assert np.std(put_right) == pytest.approx(SIGMA, rel=0.03)
 
 
-def test_clipped_samples_are_drawn_from_beyond_the_limit():
-    y = noise()
+def test_clipped_samples_are_drawn_beyond_the_limit():
+    y = draw_noise()
     limit = 2.0 * SIGMA
     clipped = np.clip(y, -limit, limit)
     shown = ValueArtifacts(clipped)
@@ -230,8 +230,8 @@ def test_clipped_samples_are_drawn_from_beyond_the_limit():
     np.testing.assert_array_equal(_repair_samples(clipped, shown, (WHITE,), np.random.default_rng(RNG)), clipped)
 
 
-def test_outliers_are_taken_for_missing_where_the_model_has_them():
-    y, rng = noise(), np.random.default_rng(5)
+def test_outliers_are_treated_as_missing_if_the_model_has_them():
+    y, rng = draw_noise(), np.random.default_rng(5)
     far = rng.choice(n, 30, replace=False)
     y[far] += 20.0 * SIGMA * rng.choice([-1.0, 1.0], 30)
     plain = axis(y, (WHITE,))
@@ -244,8 +244,8 @@ def test_outliers_are_taken_for_missing_where_the_model_has_them():
     np.testing.assert_array_equal(mended.raw, y)
 
 
-def test_the_same_generator_gives_the_same_axis():
-    y = noise()
+def test_same_generator_gives_the_same_axis():
+    y = draw_noise()
     y[::9] = np.nan
     one, other = axis(y, (WHITE,)), axis(y, (WHITE,))
     np.testing.assert_array_equal(one.coefficients, other.coefficients)
@@ -253,8 +253,8 @@ def test_the_same_generator_gives_the_same_axis():
     assert not np.array_equal(one.coefficients, third.coefficients)
 
 
-def test_put_right_for_other_effects_is_prepared_for_them():
-    y = np.clip(noise(), -1.5 * SIGMA, 1.5 * SIGMA)
+def test_repair_for_other_effects_equals_a_new_preparation():
+    y = np.clip(draw_noise(), -1.5 * SIGMA, 1.5 * SIGMA)
     model = (WHITE, Saturation(limit=1.5 * SIGMA))
     later = repair_axis_again(axis(y, (WHITE,)), model, np.random.default_rng(0))
     np.testing.assert_allclose(later.coefficients, axis(y, model).coefficients)
@@ -262,16 +262,16 @@ def test_put_right_for_other_effects_is_prepared_for_them():
     np.testing.assert_array_equal(back.repaired, y)
 
 
-def test_which_axes_may_leak_into_which():
+def test_axes_leak_only_into_possible_targets():
     into = {one: {other for other in AXES if _may_leak(other, one)} for one in AXES}
     assert into["gx"] == {"gy", "gz", "ax", "ay", "az"}
     assert into["ay"] == {"ax", "az"}
-    every = axes({name: noise(k) for k, name in enumerate(AXES)}, (AngleRandomWalk(N=N),))
+    every = axes({name: draw_noise(k) for k, name in enumerate(AXES)}, (AngleRandomWalk(N=N),))
     assert {name: set(one.leak_sources) for name, one in every.items()} == into
 
 
-def test_what_the_values_show():
-    y = noise()
+def test_artifacts_of_values_are_detected():
+    y = draw_noise()
     shown = ValueArtifacts(y)
     assert shown.quantization is None
     coarse = ValueArtifacts(4e-4 * np.rint(y / 4e-4))

@@ -1,4 +1,4 @@
-"""Names that do not stand once everything is found, and those that do."""
+"""Tests of the withdrawal of effects that other effects or diagnostics contradict."""
 
 import pytest
 
@@ -21,84 +21,86 @@ QUIET |= {diagnostic: Finding(1.0, Location()) for diagnostic in ("level", "othe
 NULL = dict.fromkeys(QUIET, NullDistribution(6.0, 12.0))
 
 
-def lines(*f_hz):
+def make_lines(*f_hz):
     return tuple(Sinusoidal(amplitude=1e-4, frequency=f, phase=0.0) for f in f_hz)
 
 
-def kept(found, seen=QUIET, closing=None):
+def list_kept(found, seen=QUIET, closing=None):
     return [type(effect) for effect in keep_uncontradicted_effects(found, closing or {}, seen, NULL)]
 
 
-def test_lines_apart_from_each_other_stand():
-    assert kept(lines(7.0, 17.3, 31.0)) == [Sinusoidal] * 3
+def test_distant_lines_are_kept():
+    assert list_kept(make_lines(7.0, 17.3, 31.0)) == [Sinusoidal] * 3
 
 
-def test_lines_in_one_place_are_one_that_wavers():
-    assert kept((*lines(17.28, 17.3, 17.32), BiasStep(time=60.0, height=1.0))) == [BiasStep]
+def test_lines_at_one_frequency_are_withdrawn_as_an_unstable_line():
+    assert list_kept((*make_lines(17.28, 17.3, 17.32), BiasStep(time=60.0, height=1.0))) == [BiasStep]
 
 
-def test_a_line_on_a_resonance_is_neither():
-    assert kept((*lines(17.3), Narrowband(sigma=1e-4, frequency=17.0, bandwidth=1.0))) == []
+def test_line_on_a_resonance_is_withdrawn_with_it():
+    assert list_kept((*make_lines(17.3), Narrowband(sigma=1e-4, frequency=17.0, bandwidth=1.0))) == []
 
 
-def test_a_comb_is_a_pulse():
-    assert kept(lines(3.0, 5.0, 9.0, 14.0)) == []
-    assert kept((*lines(3.0, 5.0, 9.0, 14.0), Narrowband(sigma=1e-4, frequency=33.3, bandwidth=1.0))) == [Narrowband]
+def test_comb_of_lines_is_withdrawn_as_a_pulse():
+    assert list_kept(make_lines(3.0, 5.0, 9.0, 14.0)) == []
+    assert list_kept((*make_lines(3.0, 5.0, 9.0, 14.0), Narrowband(sigma=1e-4, frequency=33.3, bandwidth=1.0))) == [
+        Narrowband
+    ]
 
 
-def test_three_harmonics_may_be_a_motor():
-    assert kept(lines(10.0, 20.0, 30.0)) == [Sinusoidal] * 3
+def test_three_harmonics_are_kept():
+    assert list_kept(make_lines(10.0, 20.0, 30.0)) == [Sinusoidal] * 3
 
 
 @pytest.mark.parametrize(("left", "stands"), [(50.0, False), (15.0, True)])
-def test_a_resonance_stands_when_it_closed_most_of_its_gap(left, stands):
+def test_resonance_is_kept_if_it_closed_most_of_its_gap(left, stands):
     seen = {**QUIET, "psd": Finding(left, Location(frequency=(16.0, 18.0)))}
     found = (Narrowband(sigma=1e-4, frequency=17.0, bandwidth=1.0),)
-    assert bool(kept(found, seen, {Narrowband: 200.0})) == stands
+    assert bool(list_kept(found, seen, {Narrowband: 200.0})) == stands
 
 
 @pytest.mark.parametrize(("left", "stands"), [(5.0, True), (30.0, True), (60.0, False)])
-def test_pulses_stand_when_they_closed_most_of_the_harmonics(left, stands):
+def test_pulses_are_kept_if_they_closed_most_of_the_harmonics(left, stands):
     pulses = (PulseTrain(height=1.0, period=1.0, width=0.1, delay=0.0),)
     seen = {**QUIET, "lines": Finding(left, Location(frequency=(1.0, 1.1)))}
-    assert bool(kept(pulses, seen, {PulseTrain: 400.0})) == stands
+    assert bool(list_kept(pulses, seen, {PulseTrain: 400.0})) == stands
 
 
 def test_pulses_with_lines_on_their_harmonics_have_another_shape():
     pulses = PulseTrain(height=1.0, period=0.5, width=0.1, delay=0.0)
-    assert kept((*lines(1.0, 3.0), pulses)) == []
-    assert kept((*lines(1.0, 2.777), pulses)) == [Sinusoidal, Sinusoidal, PulseTrain]
+    assert list_kept((*make_lines(1.0, 3.0), pulses)) == []
+    assert list_kept((*make_lines(1.0, 2.777), pulses)) == [Sinusoidal, Sinusoidal, PulseTrain]
 
 
-def test_a_low_pass_stands_whatever_is_left_elsewhere():
+def test_low_pass_is_kept_in_spite_of_other_gaps():
     seen = {**QUIET, "psd": Finding(150.0, Location(frequency=(0.1, 0.2)))}
-    assert kept((BandwidthLimit(cutoff=20.0, order=2),), seen, {BandwidthLimit: 200.0}) == [BandwidthLimit]
+    assert list_kept((BandwidthLimit(cutoff=20.0, order=2),), seen, {BandwidthLimit: 200.0}) == [BandwidthLimit]
     above = {**QUIET, "psd": Finding(150.0, Location(frequency=(30.0, 40.0)))}
-    assert kept((BandwidthLimit(cutoff=20.0, order=2),), above, {BandwidthLimit: 200.0}) == []
+    assert list_kept((BandwidthLimit(cutoff=20.0, order=2),), above, {BandwidthLimit: 200.0}) == []
 
 
 @pytest.mark.parametrize("left", [150.0, 50.0])
-def test_a_small_difference_at_a_strong_line_is_not_the_low_passs(left):
+def test_small_difference_at_a_strong_line_does_not_contradict_a_low_pass(left):
     found = (BandwidthLimit(cutoff=20.0, order=2), Narrowband(sigma=1e-4, frequency=33.0, bandwidth=0.1))
     seen = {**QUIET, "spectrogram": Finding(left, Location(frequency=(32.0, 34.0)))}
-    stands = kept(found, seen, {BandwidthLimit: 200.0, Narrowband: 1000.0})
+    stands = list_kept(found, seen, {BandwidthLimit: 200.0, Narrowband: 1000.0})
     assert stands == ([BandwidthLimit, Narrowband] if left < 100.0 else [])
 
 
 @pytest.mark.parametrize(("left", "stands"), [(150.0, False), (50.0, True)])
-def test_a_leak_stands_when_it_closed_most_of_what_other_axes_show(left, stands):
+def test_leak_is_kept_if_it_closed_most_of_the_gap_of_other_axes(left, stands):
     seen = {**QUIET, "other_axes": Finding(left, Location(source="ay"))}
-    assert bool(kept((CrossAxis(source="gx", coefficient=0.01),), seen, {CrossAxis: 200.0})) == stands
+    assert bool(list_kept((CrossAxis(source="gx", coefficient=0.01),), seen, {CrossAxis: 200.0})) == stands
 
 
 @pytest.mark.parametrize(("left", "stands"), [(50.0, False), (15.0, True)])
-def test_steps_stand_when_the_level_rests_after_them(left, stands):
+def test_steps_are_kept_if_the_level_stays_constant_afterwards(left, stands):
     seen = {**QUIET, "level": Finding(left, Location(time=(100.0, 100.0)))}
-    assert bool(kept((BiasStep(time=60.0, height=1.0),), seen, {BiasStep: 200.0})) == stands
+    assert bool(list_kept((BiasStep(time=60.0, height=1.0),), seen, {BiasStep: 200.0})) == stands
 
 
 @pytest.mark.parametrize(("left", "stands"), [(2500.0, False), (1500.0, True)])
-def test_a_smooth_spectrum_stands_unless_far_more_is_unsteady(left, stands):
+def test_smooth_spectrum_is_kept_unless_the_variance_changes_far_more(left, stands):
     seen = {**QUIET, "variance": Finding(left, Location(time=(100.0, 200.0)))}
-    found = (ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5), *lines(17.3))
-    assert len(kept(found, seen, {ExponentiallyCorrelated: 20.0})) == 1 + stands
+    found = (ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5), *make_lines(17.3))
+    assert len(list_kept(found, seen, {ExponentiallyCorrelated: 20.0})) == 1 + stands

@@ -1,4 +1,4 @@
-"""What several recordings show together: matched by name and place, pooled, and what only some show."""
+"""Tests of the comparison of several recordings: matched effects, pooled sizes and effects of single recordings."""
 
 from dataclasses import replace
 
@@ -16,18 +16,18 @@ from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import DIAGNOSTIC, around, known_lines, line, run, step, with_axes
 
 
-def gz(*runs: NamedResult) -> AxisComparison:
+def compare_gz(*runs: NamedResult) -> AxisComparison:
     return compare_results(runs).axes["gz"]
 
 
-def only(found: tuple[EffectInRecordings, ...]) -> EffectInRecordings:
+def get_only_effect(found: tuple[EffectInRecordings, ...]) -> EffectInRecordings:
     (one,) = found
     return one
 
 
-def test_a_line_of_every_recording_is_common_and_pooled() -> None:
+def test_line_of_every_recording_is_common_and_pooled() -> None:
     c = compare_results([run("a", line(1.50e-4)), run("b", line(1.52e-4)), run("c", line(1.48e-4, 17.302))])
-    seen = only(c.axes["gz"].common)
+    seen = get_only_effect(c.axes["gz"].common)
     assert c.axes["gz"].single == ()
     assert list(seen.steps) == ["a", "b", "c"]
     amplitude = seen.parameters["amplitude"].bounds
@@ -40,15 +40,15 @@ def test_a_line_of_every_recording_is_common_and_pooled() -> None:
     assert seen.sizes_agree is True
 
 
-def test_sizes_that_differ_are_common_and_not_consistent() -> None:
-    seen = only(gz(run("a", line(1.5e-4)), run("b", line(2.5e-4))).common)
+def test_different_sizes_are_common_and_not_consistent() -> None:
+    seen = get_only_effect(compare_gz(run("a", line(1.5e-4)), run("b", line(2.5e-4))).common)
     assert seen.sizes_agree is False
     assert seen.p is not None
     assert seen.p < 1e-6
 
 
-def test_sizes_that_agree_are_consistent_wherever_the_line_moved() -> None:
-    seen = only(gz(run("a", line(1.50e-4)), run("b", line(1.51e-4, 17.35))).common)
+def test_equal_sizes_are_consistent_at_any_frequency() -> None:
+    seen = get_only_effect(compare_gz(run("a", line(1.50e-4)), run("b", line(1.51e-4, 17.35))).common)
     assert seen.sizes_agree is True
     moved = seen.parameters["frequency"].p_value
     assert moved is not None
@@ -57,49 +57,49 @@ def test_sizes_that_agree_are_consistent_wherever_the_line_moved() -> None:
 
 def test_one_recordings_own_effect_is_single_with_its_absence_elsewhere() -> None:
     own = step("bias_step", time=around(350.0, 0.1), height=around(1e-3, 1e-4))
-    axis = gz(run("a", line()), run("b", line(), own), run("c", line()))
-    assert only(axis.common).effect == "sinusoidal"
-    seen = only(axis.single)
+    axis = compare_gz(run("a", line()), run("b", line(), own), run("c", line()))
+    assert get_only_effect(axis.common).effect == "sinusoidal"
+    seen = get_only_effect(axis.single)
     assert (seen.effect, list(seen.steps)) == ("bias_step", ["b"])
     assert [(one.run, one.meaning) for one in seen.absent] == [("a", "may_differ"), ("c", "may_differ")]
     assert seen.sizes_agree is None
 
 
-def test_steps_at_other_times_are_two() -> None:
+def test_steps_at_different_times_are_two_effects() -> None:
     first, second = (step("bias_step", time=t, height=1e-3) for t in (100.0, 400.0))
-    axis = gz(run("a", first), run("b", second))
+    axis = compare_gz(run("a", first), run("b", second))
     assert axis.common == ()
     assert [list(seen.steps) for seen in axis.single] == [["a"], ["b"]]
 
 
-def test_two_lines_are_matched_one_by_one_to_the_nearest() -> None:
-    axis = gz(run("a", line(1e-4, 17.30), line(3e-4, 17.36)), run("b", line(3e-4, 17.37), line(1e-4, 17.31)))
+def test_each_line_is_matched_to_the_nearest() -> None:
+    axis = compare_gz(run("a", line(1e-4, 17.30), line(3e-4, 17.36)), run("b", line(3e-4, 17.37), line(1e-4, 17.31)))
     assert axis.single == ()
     assert [round(float(one.parameters["amplitude"].bounds.value), 6) for one in axis.common] == [1e-4, 3e-4]
     assert all(one.sizes_agree for one in axis.common)
 
 
-def test_names_that_differ_are_two() -> None:
+def test_different_effects_are_not_matched() -> None:
     narrow = step("narrowband", sigma=1e-4, frequency=17.3, bandwidth=0.5)
-    axis = gz(run("a", line()), run("b", narrow))
+    axis = compare_gz(run("a", line()), run("b", narrow))
     assert axis.common == ()
     assert [seen.effect for seen in axis.single] == ["sinusoidal", "narrowband"]
 
 
-def test_an_axis_of_one_recording_has_nothing_in_common() -> None:
+def test_axis_of_one_recording_has_nothing_in_common() -> None:
     both = with_axes(run("a", line()), run("a", line(), axis="gx"))
     c = compare_results([both, run("b", line())])
     assert list(c.axes) == ["gx", "gz"]
-    assert only(c.axes["gx"].single).absent == ()
-    assert only(c.axes["gz"].common).effect == "sinusoidal"
+    assert get_only_effect(c.axes["gx"].single).absent == ()
+    assert get_only_effect(c.axes["gz"].common).effect == "sinusoidal"
 
 
-def test_common_is_what_all_recordings_with_the_axis_show() -> None:
+def test_common_effects_are_those_of_all_recordings_with_the_axis() -> None:
     c = compare_results([run("a", line()), run("b", line()), run("c", axis="gx")])
-    assert only(c.axes["gz"].common).steps.keys() == {"a", "b"}
+    assert get_only_effect(c.axes["gz"].common).steps.keys() == {"a", "b"}
 
 
-def test_the_model_has_the_common_effects_and_no_other() -> None:
+def test_model_has_the_common_effects_and_no_other() -> None:
     own = step("bias_step", time=350.0, height=1e-3)
     more = step("angle_random_walk", kind="retuned", N=around(1.8e-4, 1e-6))
     most = step("angle_random_walk", kind="retuned", N=around(1.84e-4, 1e-6))
@@ -133,46 +133,46 @@ def test_of_several_lines_in_the_model_the_retuned_one_is_replaced() -> None:
     assert [(one.frequency, round(one.amplitude, 6)) for one in lines] == [(10.0, 1e-4), (17.3, 2e-4)]
 
 
-def test_what_has_no_interval_stays_as_the_first_recording_has_it() -> None:
+def test_parameter_without_an_interval_is_that_of_the_first_recording() -> None:
     low_pass = step("bandwidth_limit", cutoff=around(20.0, 0.1), order=ParameterInterval(2))
     c = compare_results([run("a", low_pass), run("b", low_pass)])
     found = c.model.effects["gz"][-1]
     assert found == BandwidthLimit(cutoff=20.0, order=2)
-    assert only(c.axes["gz"].common).sizes_agree is True  # by its cutoff, as it has no size
+    assert get_only_effect(c.axes["gz"].common).sizes_agree is True  # by its cutoff, as it has no size
 
 
-def test_a_curved_temperature_effect_is_pooled_at_one_reference() -> None:
-    """The same curve, 2e-4 (T − 20) + 1e-5 (T − 20)², told at 20 °C and at 30 °C."""
+def test_curved_temperature_effect_is_pooled_at_one_reference() -> None:
+    """The curve 2e-4 (T − 20) + 1e-5 (T − 20)² is stated at 20 °C and at 30 °C."""
     curve = around(1e-5, 1e-7)
     first = step("temperature_bias", coefficient=around(2e-4, 4e-6), quadratic=curve, reference=ParameterInterval(20.0))
     second = step(
         "temperature_bias", coefficient=around(4e-4, 4e-6), quadratic=curve, reference=ParameterInterval(30.0)
     )
     c = compare_results([run("a", first), run("b", second)])
-    seen = only(c.axes["gz"].common)
+    seen = get_only_effect(c.axes["gz"].common)
     assert seen.sizes_agree is True
     found = c.model.effects["gz"][-1]
     assert isinstance(found, TemperatureBias)
     assert (found.coefficient, found.quadratic, found.reference) == pytest.approx((2e-4, 1e-5, 20.0))
 
 
-def test_a_retuned_term_is_a_contradiction_only_if_its_size_is_another() -> None:
-    """However large the gap that was closed in the same round: 1 % off with an interval of 2 % is nothing."""
+def test_retuned_term_is_a_contradiction_only_if_its_size_is_another() -> None:
+    """A change of 1 % with an interval of 2 % is insignificant, however large the closed gap is."""
     for size, half, meaning in ((1.01, 0.02, "too_faint"), (1.2, 0.02, "contradiction")):
         retuned = step("angle_random_walk", kind="retuned", N=around(size * samples.N, half * samples.N))
-        seen = only(gz(run("a", retuned), run("b")).single)
+        seen = get_only_effect(compare_gz(run("a", retuned), run("b")).single)
         assert [one.meaning for one in seen.absent] == [meaning]
 
 
-def test_a_clock_is_one_for_all_axes() -> None:
+def test_clock_is_one_for_all_axes() -> None:
     slow = step("sample_rate_error", ratio=around(1.01, 1e-4))
     c = compare_results([run("a", slow, axis="gx"), run("b", slow, axis="gz")])
-    assert only(c.axes["gx"].common).steps.keys() == {"a", "b"}
+    assert get_only_effect(c.axes["gx"].common).steps.keys() == {"a", "b"}
     assert c.axes["gz"].common == c.axes["gz"].single == ()
     assert [(axis, effect.name) for axis, effect in c.model if effect.name == slow.effect] == [("gx", slow.effect)]
 
 
-def test_the_verdict_is_that_of_all() -> None:
+def test_verdict_includes_all_recordings() -> None:
     left = replace(DIAGNOSTIC, gap=9.0)
     assert compare_results([run("a"), run("b")]).verdict == "agrees"
     assert compare_results([run("a"), run("b", line())]).verdict == "explained"

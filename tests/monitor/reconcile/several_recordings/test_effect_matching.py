@@ -1,4 +1,4 @@
-"""One effect or two: places of every effect that has one, and the effect of a step in its recording's model."""
+"""Tests of the matching of effects of several recordings by their places."""
 
 from dataclasses import fields
 
@@ -28,7 +28,7 @@ LINES = NoiseModel(
 
 
 @pytest.mark.parametrize("effect", [name for name, row in EFFECT_TABLE.items() if row.identity])
-def test_a_place_is_a_parameter_of_its_effect(effect: str) -> None:
+def test_place_is_a_parameter_of_its_effect(effect: str) -> None:
     assert identifying_parameter_name(effect) in {f.name for f in fields(EFFECTS[effect])}  # type: ignore[arg-type]
 
 
@@ -46,14 +46,14 @@ def test_a_place_is_a_parameter_of_its_effect(effect: str) -> None:
         ("outliers", None, None, True),
     ],
 )  # fmt: skip
-def test_places_drift_with_their_sensors(
+def test_places_may_differ_between_recordings(
     effect: str, a: ParameterInterval | None, b: ParameterInterval | None, same: bool
 ) -> None:
     assert (distance_if_parameters_match(effect, a, b) is not None) is same
     assert (distance_if_parameters_match(effect, b, a) is not None) is same
 
 
-def test_nearer_places_are_nearer() -> None:
+def test_distance_of_places_increases_with_their_difference() -> None:
     near, far = (
         distance_if_parameters_match("sinusoidal", around(17.3, 1e-3), around(f, 1e-3)) for f in (17.31, 17.35)
     )
@@ -62,12 +62,12 @@ def test_nearer_places_are_nearer() -> None:
     assert 0.0 < near < far
 
 
-def test_a_step_is_found_in_the_model_by_its_parameters() -> None:
+def test_step_is_found_in_the_model_by_its_parameters() -> None:
     assert find_effect_of_step(LINES, "gz", line(1.01, 30.1)) is LINES.effects["gz"][2]
     assert find_effect_of_step(LINES, "gz", line(1.9, 16.9)) is LINES.effects["gz"][1]
 
 
-def test_the_place_of_a_retuned_line_is_that_in_the_model() -> None:
+def test_place_of_a_retuned_line_is_that_in_the_model() -> None:
     retuned = step("sinusoidal", kind="retuned", amplitude=1.01)
     assert find_identifying_parameter(retuned, "gz", LINES) == ParameterInterval(30.0)
     assert find_identifying_parameter(step("angle_random_walk", kind="retuned", N=1e-4), "gz", LINES) is None

@@ -1,4 +1,4 @@
-"""The gap in parts: never negative, complete, and without the unbounded likelihood of equal values."""
+"""Tests of the parts of the gap, which are complete and never negative, also for quantized values."""
 
 from functools import cache
 from math import sqrt
@@ -52,7 +52,7 @@ def search(hypothesis, *trials):
     return AxisSearchResult(rounds, hypothesis, NOTHING, None)
 
 
-def test_the_parts_are_not_negative_and_make_the_whole():
+def test_parts_are_not_negative_and_complete():
     hypothesis = louder_with_line()
     gains = decompose_explained_gain(search(hypothesis), fitted_first=False)
     assert set(gains) == {0, 2, 3}
@@ -63,12 +63,12 @@ def test_the_parts_are_not_negative_and_make_the_whole():
     assert 0.0 <= gains[3] < 5.0
 
 
-def test_the_sizes_of_a_model_of_the_same_recording_have_no_gain():
+def test_sizes_of_a_model_of_the_same_recording_have_no_gain():
     gains = decompose_explained_gain(search(louder_with_line()), fitted_first=True)
     assert set(gains) == {2, 3}
 
 
-def test_what_is_removed_has_its_old_size_or_is_left_out():
+def test_removed_effect_has_its_old_size_or_is_left_out():
     hypothesis = louder_with_line()
     without = fit_without(hypothesis, {0, 2, 3})
     assert without.effects[0] == WHITE
@@ -89,7 +89,7 @@ def test_outliers_have_the_gain_of_their_test():
     assert gains == {2: pytest.approx(200.0)}
 
 
-def test_the_power_of_random_jumps_counts_once():
+def test_power_of_random_jumps_counts_once():
     hypothesis = louder_with_line()
     jumps = Hypothesis(MODEL, hypothesis.axis.fit((*MODEL, PoissonSteps(rate=0.1, height=1e-3)), frozenset({0, 1})))
     trial = Trial("poisson_steps", jumps.added[0], 200.0, gain_over_same_spectrum=30.0)
@@ -111,13 +111,19 @@ def test_quantization_counts_with_its_noise(step_to_noise, share):
     assert one.value_artifacts.quantization.gain > 20.0 * value_artifact_gain(fit, Resolution)
 
 
-def gap(diagnostic, gain):
+def make_gap(diagnostic, gain):
     return DiagnosticGap(diagnostic, Location(), sqrt(2.0 * gain), 2.0, 5.0)
 
 
 def test_diagnostics_of_one_group_count_once():
     hypothesis = louder_with_line()
-    left = (gap("lines", 40.0), gap("psd", 60.0), gap("tails", 30.0), gap("variance", 20.0), gap("level", 25.0))
+    left = (
+        make_gap("lines", 40.0),
+        make_gap("psd", 60.0),
+        make_gap("tails", 30.0),
+        make_gap("variance", 20.0),
+        make_gap("level", 25.0),
+    )
     found = measure_remaining_gaps(search(hypothesis), left)
     assert [(one.group, one.strongest.diagnostic) for one in found] == [
         ("spectrum", "psd"), ("distribution", "tails"), ("level", "level"),
@@ -126,10 +132,10 @@ def test_diagnostics_of_one_group_count_once():
     assert measure_remaining_gaps(search(hypothesis), ()) == ()
 
 
-def test_a_spectrum_that_is_wrong_everywhere_counts_in_every_band():
+def test_spectrum_that_is_wrong_everywhere_counts_in_every_band():
     rng = np.random.default_rng(3)
     wrong = fit_with_fixed_noise(axis(1.2 * (white(n, rng) + walk(n, rng)), MODEL), MODEL)
-    (one,) = measure_remaining_gaps(search(wrong), (gap("psd", 60.0),))
+    (one,) = measure_remaining_gaps(search(wrong), (make_gap("psd", 60.0),))
     assert one.gain_nats == pytest.approx(0.5 * n * (1.2**2 - 1.0 - 2 * np.log(1.2)), rel=0.15)
 
 

@@ -1,4 +1,4 @@
-"""One cause is one finding, and the findings stand in the order of their share."""
+"""Tests that each cause is one finding and that findings are sorted by their share of the gap."""
 
 from dataclasses import replace
 
@@ -23,15 +23,15 @@ EMPTY = AxisModelDiagnostics((), ())
 N = 1e-4
 
 
-def of(effect, gain, kind="added", ratio=1.0, **parameters):
+def make_step(effect, gain, kind="added", ratio=1.0, **parameters):
     return replace(step(effect, kind=kind, **parameters), gain_nats=gain, allan=AllanInfluence(ratio, 0.1))
 
 
-def left(group, gain, source=None):
+def make_remaining(group, gain, source=None):
     return RemainingGap(group, DiagnosticGap("psd", Location(source=source), (2.0 * gain) ** 0.5, 1.0, 2.0), gain)
 
 
-def made(steps, remaining=None, effects=None, fitted_first=False) -> Reconciliation:
+def make_result(steps, remaining=None, effects=None, fitted_first=False) -> Reconciliation:
     remaining = remaining or {}
     axes = {
         axis: AxisResult(axis, "explained", EMPTY, tuple(found), (), EMPTY, tuple(remaining.get(axis, ())))
@@ -41,11 +41,14 @@ def made(steps, remaining=None, effects=None, fitted_first=False) -> Reconciliat
     return Reconciliation("explained", axes, given, given, fitted_first, 100.0, 1000, 10.0, 1)
 
 
-def test_a_line_on_three_axes_is_one_finding():
-    r = made({
-        "gx": [of("sinusoidal", 100.0, frequency=around(17.3, 1e-3), ratio=1.1)],
-        "gy": [of("narrowband", 300.0, frequency=around(17.31, 1e-2), bandwidth=0.1, ratio=0.5)],
-        "gz": [of("sinusoidal", 50.0, frequency=around(25.0, 1e-3)), of("sinusoidal", 10.0, frequency=17.3)],
+def test_line_on_three_axes_is_one_finding():
+    r = make_result({
+        "gx": [make_step("sinusoidal", 100.0, frequency=around(17.3, 1e-3), ratio=1.1)],
+        "gy": [make_step("narrowband", 300.0, frequency=around(17.31, 1e-2), bandwidth=0.1, ratio=0.5)],
+        "gz": [
+            make_step("sinusoidal", 50.0, frequency=around(25.0, 1e-3)),
+            make_step("sinusoidal", 10.0, frequency=17.3),
+        ],
     })  # fmt: skip
     first, second = rank_findings(r).findings
     assert (first.effect, first.axes, first.gain_nats) == ("narrowband", ("gx", "gy", "gz"), 410.0)
@@ -55,17 +58,17 @@ def test_a_line_on_three_axes_is_one_finding():
 
 
 def test_steps_at_different_times_and_kinds_are_apart():
-    r = made({
-        "gx": [of("bias_step", 9.0, time=around(100.0, 0.1), height=1.0)],
-        "gy": [of("bias_step", 8.0, time=around(100.1, 0.1), height=2.0)],
-        "gz": [of("bias_step", 7.0, time=around(500.0, 0.1), height=2.0)],
+    r = make_result({
+        "gx": [make_step("bias_step", 9.0, time=around(100.0, 0.1), height=1.0)],
+        "gy": [make_step("bias_step", 8.0, time=around(100.1, 0.1), height=2.0)],
+        "gz": [make_step("bias_step", 7.0, time=around(500.0, 0.1), height=2.0)],
     })  # fmt: skip
     assert [one.axes for one in rank_findings(r).findings] == [("gx", "gy"), ("gz",)]
 
 
-def test_changed_sizes_are_one_finding_if_their_factors_agree():
-    r = made({
-        axis: [of("angle_random_walk", 10.0, kind="retuned", N=factor * N)]
+def test_changed_sizes_with_equal_factors_are_one_finding():
+    r = make_result({
+        axis: [make_step("angle_random_walk", 10.0, kind="retuned", N=factor * N)]
         for axis, factor in (("gx", 1.2), ("gy", 1.21), ("gz", 1.5), ("ax", 1.2))
     })  # fmt: skip
     both, other, accelerometer = rank_findings(r).findings
@@ -75,41 +78,48 @@ def test_changed_sizes_are_one_finding_if_their_factors_agree():
     assert rank_findings(replace(r, fitted_first=True)).findings == ()
 
 
-def test_an_absent_resonance_says_which_one():
+def test_absent_resonance_is_named_with_its_frequency():
     effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
-    r = made({"gx": [of("narrowband", 10.0, kind="absent", sigma=ParameterInterval(0.0))]}, effects=effects)
+    r = make_result(
+        {"gx": [make_step("narrowband", 10.0, kind="absent", sigma=ParameterInterval(0.0))]}, effects=effects
+    )
     gone = replace(r, model=NoiseModel({"gx": (effects[0], replace(effects[1], sigma=0.0))}))
     (one,) = rank_findings(gone).findings
     assert (one.kind, one.parameters["frequency"].value, one.size_ratio) == ("absent", 20.0, None)
 
 
-def test_a_retuned_resonance_is_compared_with_the_same_resonance():
+def test_retuned_resonance_is_compared_with_the_same_resonance():
     effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
-    r = made({"gx": [of("narrowband", 10.0, kind="retuned", sigma=around(1e-3, 1e-5))]}, effects=effects)
+    r = make_result({"gx": [make_step("narrowband", 10.0, kind="retuned", sigma=around(1e-3, 1e-5))]}, effects=effects)
     changed = replace(r, model=NoiseModel({"gx": (replace(effects[0], sigma=3e-3), replace(effects[1], sigma=1e-3))}))
     (one,) = rank_findings(changed).findings
     assert (one.parameters["frequency"].value, one.size_ratio) == (20.0, pytest.approx(0.5))
     assert one.old_frequency is None
 
 
-def test_a_size_that_the_model_lacks_has_no_ratio():
+def test_size_that_the_model_lacks_has_no_ratio():
     effects = (BandwidthLimit(cutoff=20.0),)
-    r = made({"gx": [of("bandwidth_limit", 10.0, kind="retuned", floor=around(1e-4, 1e-6))]}, effects=effects)
+    r = make_result(
+        {"gx": [make_step("bandwidth_limit", 10.0, kind="retuned", floor=around(1e-4, 1e-6))]}, effects=effects
+    )
     (one,) = rank_findings(r).findings
     assert one.size_ratio is None
 
 
-def test_a_moved_resonance_states_the_old_frequency():
+def test_moved_resonance_states_the_old_frequency():
     effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
-    moved = of("narrowband", 10.0, kind="retuned", sigma=around(2e-3, 1e-5), frequency=around(19.5, 0.01))
+    moved = make_step("narrowband", 10.0, kind="retuned", sigma=around(2e-3, 1e-5), frequency=around(19.5, 0.01))
     model = NoiseModel({"gx": (effects[0], replace(effects[1], frequency=19.5))})
-    (one,) = rank_findings(replace(made({"gx": [moved]}, effects=effects), model=model)).findings
+    (one,) = rank_findings(replace(make_result({"gx": [moved]}, effects=effects), model=model)).findings
     assert (one.old_frequency, one.size_ratio) == (20.0, pytest.approx(1.0))
 
 
-def test_the_shares_of_findings_and_remainders_make_one():
-    line = of("sinusoidal", 60.0, frequency=17.3)
-    r = made({"gx": [line], "gy": []}, {"gx": [left("spectrum", 30.0)], "gy": [left("distribution", 10.0)]})
+def test_shares_of_findings_and_remaining_gaps_sum_to_one():
+    line = make_step("sinusoidal", 60.0, frequency=17.3)
+    r = make_result(
+        {"gx": [line], "gy": []},
+        {"gx": [make_remaining("spectrum", 30.0)], "gy": [make_remaining("distribution", 10.0)]},
+    )
     ranking = rank_findings(r)
     assert ranking.whole_nats == 100.0
     assert [one.share for one in ranking.findings] == [0.6]
@@ -117,14 +127,14 @@ def test_the_shares_of_findings_and_remainders_make_one():
     assert ranking.explained_share == pytest.approx(0.6)
 
 
-def test_the_dependence_of_two_axes_on_each_other_counts_once():
-    leaks = {"gx": [left("other_axes", 30.0, "gy")], "gy": [left("other_axes", 40.0, "gx")]}
-    ranking = rank_findings(made({"gx": [], "gy": []}, leaks))
+def test_dependence_of_two_axes_on_each_other_counts_once():
+    leaks = {"gx": [make_remaining("other_axes", 30.0, "gy")], "gy": [make_remaining("other_axes", 40.0, "gx")]}
+    ranking = rank_findings(make_result({"gx": [], "gy": []}, leaks))
     assert [(one.axis, one.gap.gain_nats) for one in ranking.remainders] == [("gy", 40.0)]
-    same = {axis: [left("other_axes", 30.0, source)] for axis, source in (("gx", "gy"), ("gy", "gx"))}
-    assert len(rank_findings(made({"gx": [], "gy": []}, same)).remainders) == 1
+    same = {axis: [make_remaining("other_axes", 30.0, source)] for axis, source in (("gx", "gy"), ("gy", "gx"))}
+    assert len(rank_findings(make_result({"gx": [], "gy": []}, same)).remainders) == 1
 
 
-def test_a_recording_without_a_gap_is_explained():
-    ranking = rank_findings(made({"gx": []}))
+def test_recording_without_a_gap_is_explained():
+    ranking = rank_findings(make_result({"gx": []}))
     assert (ranking.whole_nats, ranking.findings, ranking.explained_share) == (0.0, (), 1.0)

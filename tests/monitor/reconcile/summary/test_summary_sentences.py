@@ -1,4 +1,4 @@
-"""The summary: at most five sentences, the faults first, and only the findings that matter."""
+"""Tests of the summary: at most five sentences, faults first, and only important findings."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ CONTINUE = "Continue with model.toml, which contains the findings, if the findin
         )),
     ],
 )  # fmt: skip
-def test_the_summary_is_plain(made: Reconciliation, said: tuple[str, ...]) -> None:
+def test_summary_has_the_expected_text(made: Reconciliation, said: tuple[str, ...]) -> None:
     assert summarize(made) == said
 
 
@@ -55,7 +55,7 @@ def fault(kind: str, *axes: str) -> RecordingFinding:
         ("missing_rows", "connection"),
     ],
 )
-def test_the_faults_of_the_recording_come_first_and_are_to_be_fixed_first(kind: str, advice: str) -> None:
+def test_faults_of_the_recording_are_stated_first(kind: str, advice: str) -> None:
     r = replace(samples.partly_explained(), recording_findings=(fault(kind, "gz", "gx"), fault(kind, "gy")))
     said = summarize(r)
     assert len(said) == 5
@@ -70,7 +70,7 @@ def with_remaining(*gains: tuple[str, float]) -> Reconciliation:
     return replace(r, axes={**r.axes, "gz": replace(r.axes["gz"], remaining=remaining)})
 
 
-def test_a_small_rest_is_said_to_be_small() -> None:
+def test_small_remaining_gap_is_stated_as_small() -> None:
     said = summarize(with_remaining(("spectrum", 2.0)))
     assert "The remaining difference on gz is significant, but only 0.2 % of the whole." in said
 
@@ -94,10 +94,10 @@ def test_vibration_and_disturbances_have_their_own_advice() -> None:
          "scale factor of 1.25 on gx, gy and gz"),
     ],
 )  # fmt: skip
-def test_a_finding_is_a_phrase_with_its_place(changed: dict[str, object], said: str) -> None:
+def test_phrase_of_a_finding_contains_its_place(changed: dict[str, object], said: str) -> None:
     line: RankedGapCause = rank_findings(samples.explained()).findings[0]
     assert describe_finding(replace(line, **changed)) == said  # type: ignore[arg-type]
 
 
-def test_phrases_belong_to_effects() -> None:
+def test_every_phrase_belongs_to_an_effect() -> None:
     assert set(EFFECT_PHRASES) <= set(EFFECTS)
