@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from monitor.daemon.outputs.ros2_output import Ros2Output
     from monitor.publishing.rerun.queued_view import RerunView
 
-MAX_IDLE_S: Final = 0.1
+MAX_IDLE_S: Final = 0.2
 """Longest sleep of the main loop if no samples arrive."""
 ROUND_PAUSE_S: Final = 0.02
 """Shortest interval between the starts of two rounds if no device publishes every block."""

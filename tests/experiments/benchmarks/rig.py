@@ -153,6 +153,7 @@ def open_session(port: int) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/timeout_ms", "30000")  # the daemon may not listen yet
     config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{port}"]')
     with zenoh.open(config) as session:
         yield session
