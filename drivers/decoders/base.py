@@ -324,7 +324,10 @@ class FrameBuffer:
         adjacent: list[bool] = []
         at = 0
         while True:
-            start, length = self._examine_candidate(buffer, at)
+            # Usually, the next frame follows without a gap.
+            start, length = at, self._match(buffer, at) if buffer.startswith(self.sync, at) else NEED_MORE
+            if length <= 0:
+                start, length = self._examine_candidate(buffer, at)
             at = start + max(length, 0)
             if length == NEED_MORE:
                 break
@@ -397,6 +400,8 @@ class FrameBuffer:
     def _arrival_times(self, ends: list[int]) -> Ints:
         if not ends:
             return np.empty(0, np.int64)
+        if len(self._arrivals) == 1:
+            return np.full(len(ends), self._arrivals[0][1], np.int64)
         offsets, t_ns = np.array(self._arrivals, np.int64).T
         arrived: Ints = t_ns[np.searchsorted(offsets, np.array(ends) + self._buffer_offset)]
         return arrived

@@ -1,9 +1,9 @@
 """Link to local or networked serial ports, which are addressed by any URL that pyserial supports.
 
-A read waits for the first byte, then for the time ``read_timeout`` (10 ms by default) for more bytes, and returns all
-bytes that have arrived. Waiting for more bytes takes a tenth of the processor time that one read per frame would take.
-The wait delays bytes by at most ``read_timeout``. If a URL handler has no file descriptor, a read returns as soon as
-bytes arrive.
+A read waits for the first byte, then for the time ``read_timeout`` for more bytes, and returns all bytes that have
+arrived. Waiting for more bytes takes much less processor time than one read per frame. The wait delays bytes by at most
+``read_timeout``. If the configuration states no ``read_timeout``, the daemon sets it according to the interval at which
+results are published. If a URL handler has no file descriptor, a read returns as soon as bytes arrive.
 
 ``close`` closes the port only after a waiting read has ended. Otherwise, the system could assign the file descriptor to
 another file during the read. If the port cannot be opened, the text of ``LinkUnavailable`` states the reason and a
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = ""
 READ_BYTES: Final = 4096
-"""Maximum number of bytes per read, which is more than 10 ms of data at 3 Mbit/s.
-
-At higher rates, reads do not wait.
-"""
+"""Maximum number of bytes per call of the system. The buffer of a terminal in the Linux kernel has the same size."""
+MAX_WAITING_BYTES: Final = 16_384
+"""Number of bytes per read above which the next read does not wait. The kernel stores 64 KiB before bytes are lost."""
+DEFAULT_READ_TIMEOUT_S: Final = 0.01
 STOP_BITS: Final = (1.0, 1.5, 2.0)
 SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
 """URL schemes that pyserial supports without extensions."""
@@ -71,8 +71,10 @@ class Settings(LinkSettings):
     rtscts: bool = Field(False, description="hardware flow control")
     xonxoff: bool = Field(False, description="software flow control")
     exclusive: bool = Field(True, description="true: other programs cannot open the port")
-    read_timeout: Annotated[float, READ_TIMEOUT_S] = Field(
-        0.01, description="time in s that received bytes may wait for more bytes"
+    read_timeout: Annotated[float, READ_TIMEOUT_S] | None = Field(
+        None,
+        examples=[0.01],
+        description="time in s that received bytes may wait for more bytes; absent: interval of `publish`, 5 to 100 ms",
     )
 
 
@@ -86,8 +88,13 @@ class SerialLink(PolledLink):
         self._shown_port = mask_secrets(settings.port)
         super().__init__(f"{self._shown_port} at {settings.baudrate} baud")
         self._settings = settings
+        self._read_timeout_s = settings.read_timeout or DEFAULT_READ_TIMEOUT_S
         self._port: serial.SerialBase | None = None
         self._buffer_filling = False  # True if the last read returned so many bytes that the next read must not wait
+
+    def set_default_read_timeout(self, timeout_s: float) -> None:
+        """Set the time in s that received bytes may wait, unless the configuration states ``read_timeout``."""
+        self._read_timeout_s = self._settings.read_timeout or timeout_s
 
     def close(self) -> None:
         """Interrupt a waiting call of ``wait_for_chunks_or_timeout``, then close the port."""
@@ -115,7 +122,7 @@ class SerialLink(PolledLink):
                 stopbits=s.stopbits,
                 rtscts=s.rtscts,
                 xonxoff=s.xonxoff,
-                timeout=s.read_timeout,
+                timeout=self._read_timeout_s,
                 # URL handlers that cannot lock a port ignore this key.
                 **({"exclusive": True} if s.exclusive else {}),
             )
@@ -133,14 +140,15 @@ class SerialLink(PolledLink):
             if not _has_file_number(port):
                 data: bytes = port.read(READ_BYTES)
                 return data
-            until_s = time.monotonic() + self._settings.read_timeout
+            until_s = time.monotonic() + self._read_timeout_s
             data = port.read(1)
             if data:
                 if not self._buffer_filling:
                     self._closing.wait(max(0.0, until_s - time.monotonic()))
                 with contextlib.suppress(BlockingIOError):  # no more bytes have arrived
-                    data += os.read(port.fileno(), READ_BYTES)
-            self._buffer_filling = len(data) > READ_BYTES // 2
+                    while len(data) <= MAX_WAITING_BYTES and (more := os.read(port.fileno(), READ_BYTES)):
+                        data += more
+            self._buffer_filling = len(data) > MAX_WAITING_BYTES
         except OSError as error:
             self._close_source()
             raise LinkLost(

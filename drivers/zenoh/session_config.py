@@ -23,12 +23,14 @@ DEFAULT_CONFIGURATION: Final[Mapping[str, Any]] = {
     "listen/endpoints": [],
     "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
     "transport/link/rx/max_message_size": 64_000_000,
+    "transport/shared_memory/enabled": False,
 }
 """Default configuration of a zenoh session.
 
 With the defaults of zenoh, a session would search for other programs and listen on all network interfaces, and would
 accept messages of 1 GiB. A lost connection is retried at least once per second. A message longer than 64 MB is dropped,
-and the connection stays open. A message of 64 MB could contain an hour of samples at 1 kHz.
+and the connection stays open. A message of 64 MB could contain an hour of samples at 1 kHz. Shared memory is not used,
+because zenoh would wake two threads 30 times per second for it.
 """
 
 SECRET_FILES: Final = (

@@ -5,7 +5,7 @@ from SciPy is at most 1e-12.
 """
 
 from functools import lru_cache
-from math import exp, inf, lgamma, log, log1p, pi
+from math import exp, inf, lgamma, log, log1p, pi, sqrt
 from statistics import NormalDist
 from typing import Final
 
@@ -88,27 +88,13 @@ def chi2_quantile(edf: Floats, probability: float) -> Floats:
     >>> chi2_quantile(np.array([1.0, 10.0, 1e6]), 0.975).round(3).tolist()
     [5.024, 20.483, 1002773.701]
     """
-    found = np.full(edf.shape, np.nan)
     z = normal_quantile(probability)
-    large = edf >= MIN_EXPANDED_EDF
-    if large.any():
-        found[large] = 2.0 * _expanded(0.5 * edf[large], z)
-    few = (edf > 0.0) & (edf < MIN_ASYMPTOTIC_EDF)
-    if few.any():
-        a = 0.5 * edf[few]
-        start = np.where(large[few], 0.5 * found[few], _start(a, z, probability))
-        found[few] = 2.0 * _refined(a, start, probability)
-    return found
-
-
-def _expanded(a: Floats, z: float) -> Floats:
-    """Return the Cornish-Fisher expansion of the quantile of the gamma distribution with shape ``a``."""
-    epsilon = 1.0 / np.sqrt(a)
-    return np.asarray(a * (1.0 + epsilon * np.polynomial.polynomial.polyval(epsilon, _coefficients(z))))
+    flat = np.ascontiguousarray(edf, np.float64).ravel()
+    return _chi2_quantiles(flat, probability, z, _coefficients(z)).reshape(edf.shape)
 
 
 @lru_cache(maxsize=16)
-def _coefficients(z: float) -> tuple[float, ...]:
+def _coefficients(z: float) -> Floats:
     """Return the coefficients y_k(z) of the Cornish-Fisher expansion of a gamma quantile.
 
     With shape a, normal quantile z and ε = 1/√a, the expansion is x = a (1 + ε Σ y_k ε^k). For the normal density φ and
@@ -130,51 +116,72 @@ def _coefficients(z: float) -> tuple[float, ...]:
         first.append(y[k].deriv())
         second.append(first[k].deriv())
         squares.append(square + 2.0 * first[k])
-    return tuple(float(one(z)) for one in y)
+    return np.array([float(one(z)) for one in y])
 
 
-def _start(a: Floats, z: float, probability: float) -> Floats:
+@compiled
+def _chi2_quantiles(edf: Floats, probability: float, z: float, coefficients: Floats) -> Floats:
+    quantiles = np.empty(edf.size)
+    for i in range(edf.size):
+        a = 0.5 * edf[i]
+        if not a > 0.0:
+            quantiles[i] = np.nan
+        elif edf[i] < MIN_EXPANDED_EDF:
+            quantiles[i] = 2.0 * _refined(a, _start(a, z, probability), probability)
+        else:
+            x = _expanded(a, coefficients)
+            quantiles[i] = 2.0 * (_refined(a, x, probability) if edf[i] < MIN_ASYMPTOTIC_EDF else x)
+    return quantiles
+
+
+@compiled
+def _expanded(a: float, coefficients: Floats) -> float:
+    """Return the Cornish-Fisher expansion of the quantile of the gamma distribution with shape ``a``."""
+    epsilon = 1.0 / sqrt(a)
+    total = 0.0
+    for k in range(coefficients.size - 1, -1, -1):
+        total = coefficients[k] + total * epsilon
+    return a * (1.0 + epsilon * total)
+
+
+@compiled
+def _start(a: float, z: float, probability: float) -> float:
     """Return a start value for the gamma quantile: the power law near zero, or the formula of Wilson and Hilferty."""
-    logs = np.array([lgamma(one + 1.0) for one in a.tolist()])
-    with np.errstate(under="ignore"):
-        at_zero = np.exp((np.log(probability) + logs) / a)
-    cubed = a * np.maximum(1.0 - 1.0 / (9.0 * a) + z / (3.0 * np.sqrt(a)), 0.0) ** 3
-    return np.asarray(np.where((at_zero < 0.2 * (a + 1.0)) | (cubed <= 0.0), at_zero, cubed))
+    at_zero = exp((log(probability) + lgamma(a + 1.0)) / a)
+    root = max(1.0 - 1.0 / (9.0 * a) + z / (3.0 * sqrt(a)), 0.0)
+    return at_zero if at_zero < 0.2 * (a + 1.0) or root == 0.0 else a * root * root * root
 
 
-def _refined(a: Floats, x: Floats, probability: float) -> Floats:
+@compiled
+def _refined(a: float, x: float, probability: float) -> float:
     """Solve P(a, x) = probability for x by Halley's iteration in ln x.
 
     With the gamma density f, the derivatives of P with respect to ln x are x f(x) and (a − x) x f(x).
     """
-    logs = np.array([lgamma(one) for one in a.tolist()])
-    open_ = np.flatnonzero(x > 0.0)  # x is zero if the quantile underflows
+    if x == 0.0:  # the quantile underflows
+        return x
+    log_gamma = lgamma(a)
     for _ in range(MAX_ITERATIONS):
-        if not open_.size:
+        slope = exp(a * log(x) - x - log_gamma)
+        newton = (slope * _series(a, x) - probability) / slope
+        bend = min(max(0.5 * newton * (a - x), -0.5), 0.5)
+        step = min(max(newton / (1.0 - bend), -2.0), 2.0)
+        x *= exp(-step)
+        if abs(step) <= STEP_TOLERANCE:
             break
-        b, at = a[open_], x[open_]
-        slope = np.exp(b * np.log(at) - at - logs[open_])
-        newton = (slope * _series(b, at) - probability) / slope
-        bend = np.clip(0.5 * newton * (b - at), -0.5, 0.5)
-        step = np.clip(newton / (1.0 - bend), -2.0, 2.0)
-        x[open_] = at * np.exp(-step)
-        open_ = open_[np.abs(step) > STEP_TOLERANCE]
     return x
 
 
 @compiled
-def _series(a: Floats, x: Floats) -> Floats:
+def _series(a: float, x: float) -> float:
     """Return the power series Σ_n x^n / (a (a + 1) … (a + n)), which equals P(a, x) Γ(a) / (x^a e^−x)."""
-    out = np.empty(a.size)
-    for i in range(a.size):
-        term = 1.0 / a[i]
-        total, n = term, a[i]
-        while term > 1e-17 * total:
-            n += 1.0
-            term *= x[i] / n
-            total += term
-        out[i] = total
-    return out
+    total = term = 1.0 / a
+    n = a
+    while term > 1e-17 * total:
+        n += 1.0
+        term *= x / n
+        total += term
+    return total
 
 
 # --- F and Student

@@ -47,10 +47,10 @@ if TYPE_CHECKING:
     from monitor.daemon.outputs.ros2_output import Ros2Output
     from monitor.publishing.rerun.queued_view import RerunView
 
-MAX_IDLE_S: Final = 0.05
+MAX_IDLE_S: Final = 0.2
 """Longest sleep of the main loop if no samples arrive."""
 ROUND_PAUSE_S: Final = 0.02
-"""Pause between two rounds if no device publishes every block."""
+"""Shortest interval between the starts of two rounds if no device publishes every block."""
 STATUS_INTERVAL_S: Final = 1.0
 """Interval of the status messages."""
 STARTING_STATES: Final = ("not open yet", "starting")
@@ -173,7 +173,7 @@ class Service:
             self._wake.wait(MAX_IDLE_S)
             self._wake.clear()
             if not any(worker.device.publish_s == 0.0 for worker in self.workers):
-                self._stop.wait(ROUND_PAUSE_S)
+                self._stop.wait(max(0.0, now_s + ROUND_PAUSE_S - time.monotonic()))
 
     def _work_devices(self, now_s: float) -> None:
         for worker in self.workers:

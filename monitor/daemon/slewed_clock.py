@@ -66,11 +66,14 @@ class SlewedClock:
 
     def unix_offset_ns(self, monotonic_ns: int) -> int:
         """Return the offset from a monotonic time to the Unix time, in nanoseconds."""
-        return int(self.unix_offsets_ns(np.array([monotonic_ns], np.int64))[0])
+        return int(np.max(self.unix_offsets_ns(np.array([monotonic_ns], np.int64))))
 
-    def unix_offsets_ns(self, monotonic_ns: Ints) -> Ints:
-        """Return the offsets [n] from monotonic times to Unix times, in nanoseconds."""
+    def unix_offsets_ns(self, monotonic_ns: Ints) -> Ints | int:
+        """Return the offsets [n] from increasing monotonic times to Unix times in nanoseconds, or one common offset."""
         knots = self._knots
+        newest_begun_ns, newest_offset_ns, newest_correction_ns = knots[-1].tolist()
+        if MAX_SLEW_RATE * (int(monotonic_ns[0]) - newest_begun_ns) >= abs(newest_correction_ns) + 1:
+            return int(newest_offset_ns + newest_correction_ns)  # the correction ended before the first time
         begun_ns, offset_ns, correction_ns = knots[np.searchsorted(knots[1:, 0], monotonic_ns, side="right")].T
         most_ns = (MAX_SLEW_RATE * np.maximum(monotonic_ns - begun_ns, 0)).astype(np.int64)
         offsets: Ints = offset_ns + np.clip(correction_ns, -most_ns, most_ns)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from drivers.data_types import Chunk, Floats, SampleBlock
 from drivers.driver import Driver
-from drivers.links.base import Link
+from drivers.links.base import BatchingLink, Link
 from drivers.links.replay_link import ReplayLink
 from drivers.timing.sample_clock import SampleClock
 from monitor.common.device_health import Health
@@ -36,6 +36,12 @@ RING_SAMPLES_RANGE: Final = (65_536, 1_000_000)
 """Minimum and maximum capacity of the ring buffer in samples."""
 UNKNOWN_RATE_HZ: Final = 1000.0
 """Assumed sample rate for the capacity of the ring buffer if no rate is configured."""
+READ_TIMEOUT_RANGE_S: Final = (0.005, 0.1)
+"""Shortest and longest time for which received bytes wait for more bytes, by default the interval of publication.
+
+A read takes about as much processor time for one sample as for 50 samples. Each read wakes the main loop, which
+publishes at once, so that the wait does not delay the newest sample of a result.
+"""
 REPLAY_PAUSE_S: Final = 0.002
 """Interval at which the reader of a replayed recording checks a full queue."""
 MODEL_SELECTION_S: Final = 0.001
@@ -88,6 +94,9 @@ class DeviceWorker:
         low, high = RING_SAMPLES_RANGE
         self.ring = RingBuffer(int(min(max((device.rate_hz or UNKNOWN_RATE_HZ) * RING_S, low), high)))
         timed = _arrivals_are_timed(device, link)
+        if isinstance(link, BatchingLink):
+            shortest_s, longest_s = READ_TIMEOUT_RANGE_S
+            link.set_default_read_timeout(min(max(device.publish_s, shortest_s), longest_s))
         self.clock = SampleClock(device.decoder.timing, device.rate_hz, timed)
         keep = None if recorder is None else self._record_chunks
         self.driver = Driver(

@@ -5,7 +5,6 @@ overwritten samples. The field ``lost`` of the next block also includes the over
 """
 
 import threading
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -30,6 +29,7 @@ class RingBuffer:
         self._temperature_c = np.zeros(capacity)
         self._ticks = np.zeros(capacity, np.int64)
         self._lost = np.zeros(capacity, np.int64)  # number of missing samples just before each sample
+        self._columns = (self._t_ns, self._values, self._temperature_c, self._ticks, self._lost)
         self._read = self._written = 0  # samples read and written since the start
         self._lock = threading.Lock()
 
@@ -55,12 +55,23 @@ class RingBuffer:
             n = self._written - self._read
             if n == 0:
                 return []
-            at = np.arange(self._read, self._written) % self.capacity
+            parts = self._contiguous_rows(self._read, n)
             self._read = self._written
-            taken = make_block(self._t_ns[at], self._values[at], self._temperature_c[at], self._ticks[at])
-            lost = self._lost[at]
+            t_ns, values, temperature_c, ticks, lost = (
+                np.concatenate([column[rows] for rows in parts]) for column in self._columns
+            )
         edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), n]
-        return [replace(taken[a:b], lost=int(lost[a])) for a, b in pairwise(edges)]
+        return [
+            make_block(t_ns[a:b], values[a:b], temperature_c[a:b], ticks[a:b], int(lost[a])) for a, b in pairwise(edges)
+        ]
+
+    def _contiguous_rows(self, first: int, n: int) -> list[slice]:
+        """Return the rows of n samples as one range, or as two ranges if the samples reach the end of the buffer."""
+        start = first % self.capacity
+        end = start + n
+        if end <= self.capacity:
+            return [slice(start, end)]
+        return [slice(start, self.capacity), slice(0, end - self.capacity)]
 
     def _write(self, samples: SampleBlock) -> None:
         n = len(samples)
@@ -70,13 +81,16 @@ class RingBuffer:
             missing = overwritten + int(self._lost[gone].sum())
             self._read += overwritten
             self.overflowed += overwritten
-        at = np.arange(self._written, self._written + n) % self.capacity
-        self._t_ns[at] = samples.t_ns
-        self._values[at] = samples.values
-        self._temperature_c[at] = samples.temperature_c
-        self._ticks[at] = samples.ticks
-        self._lost[at] = 0
-        self._lost[at[0]] = samples.lost
+        done = 0
+        for rows in self._contiguous_rows(self._written, n):
+            part = slice(done, done + rows.stop - rows.start)
+            self._t_ns[rows] = samples.t_ns[part]
+            self._values[rows] = samples.values[part]
+            self._temperature_c[rows] = samples.temperature_c[part]
+            self._ticks[rows] = samples.ticks[part]
+            self._lost[rows] = 0
+            done = part.stop
+        self._lost[self._written % self.capacity] = samples.lost
         self._written += n
         if overwritten:
             self._lost[self._read % self.capacity] += missing

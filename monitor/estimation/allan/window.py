@@ -19,7 +19,7 @@ Rounding adds white phase noise of variance 2^-2s/12. For a window of one hour a
 per sample, the relative change of the Allan variance is 1e-10.
 """
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,6 @@ from monitor.estimation.allan.window_kernel import (
     LAST_MISSING,
     LINE,
     NEWEST,
-    RUN_SAMPLES,
     STAGE_SAMPLES,
     TOTAL,
     WIDTH,
@@ -41,12 +40,14 @@ from monitor.estimation.allan.window_kernel import (
     drift_slopes_by_axis_and_tau,
     keep_newest,
     view_window_arrays,
+    window_memory_size,
 )
 
 MIN_LENGTH: Final = 100
 """Minimum window length in samples."""
 MAX_LENGTH: Final = 10_000_000
 """Maximum window length in samples. Each sample needs up to 96 bytes of memory."""
+ONE_SAMPLE: Final = (1, AXES)
 SKIP_BLOCK_ROWS: Final = 4096
 """Maximum number of missing samples that are appended at a time."""
 FULL_SCALE: Final = (70.0,) * 3 + (400.0,) * 3 + (1.0,) * 2
@@ -136,17 +137,16 @@ class AllanWindow:
         self.spans = spans.astype(np.int64)
         self._taus = int(factors.size)
         self._scale = integer_phase_scale(int(factors.max()))
-        # All data is stored in three arrays, because each array that is passed to compiled code costs 50 ns.
-        taus, places = self._taus, length + 1 + RUN_SAMPLES
-        self._ints = _aligned(LANES + -(-2 * taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
-        self._floats = _aligned((2 + 2 * RUN_SAMPLES + 2 * taus + STAGE_SAMPLES) * LANES, np.float64)
-        self._missing = np.zeros(places * LANES, np.int32)
-        arrays = view_window_arrays(self._ints, self._floats, self._missing, taus)
+        taus = self._taus
+        self._memory = _aligned(window_memory_size(length, taus))
+        arrays = view_window_arrays(self._memory, taus)
         self._state, self._phase, self._scaling = arrays.state, arrays.phase, arrays.scaling
+        self._missing = arrays.missing
         arrays.factors[:], arrays.spans[:] = self.factors, self.spans
         self._terms = arrays.terms.reshape(taus, LANES)
         self._sums, self._rest = arrays.sums.reshape(taus, LANES), arrays.rest.reshape(taus, LANES)
         self._stage = arrays.stage[: STAGE_SAMPLES * AXES].reshape(STAGE_SAMPLES, AXES)
+        self._first_staged = self._stage[:1]  # creating this view takes 0.1 µs
         self.resets = -1  # number of times the window has been emptied
         self.discard_samples()
 
@@ -164,8 +164,8 @@ class AllanWindow:
         """Discard all samples in the window."""
         self.resets += 1
         self._terms[:] = 0
-        self._floats[:] = 0
-        self._scaling[:LANES] = self._scale
+        self._sums[:] = self._rest[:] = 0.0
+        self._scaling[:LANES], self._scaling[LANES:] = self._scale, 0.0
         self._state[[TOTAL, LAST_MISSING, WIDTH]] = (0, -(1 << 62), LANES)
 
     def append_samples(self, values: Floats) -> None:
@@ -183,15 +183,16 @@ class AllanWindow:
         """
         rows = np.asarray(values)
         shape = rows.shape
+        if shape == ONE_SAMPLE:
+            self._first_staged[...] = rows
+            append_staged_samples(self._memory, self._taus, 0, 1)
+            return
         if len(shape) != 2 or shape[1] != AXES:
             raise ValueError(f"samples of shape {shape}; expected is [n, {AXES}]")
-        n = shape[0]
-        if n > STAGE_SAMPLES:
-            for start in range(0, n, STAGE_SAMPLES):
-                self.append_samples(rows[start : start + STAGE_SAMPLES])
-            return
-        self._stage[:n] = rows
-        append_staged_samples(self._ints, self._floats, self._missing, self._taus, 0, n)
+        for start in range(0, shape[0], STAGE_SAMPLES):
+            part = rows[start : start + STAGE_SAMPLES]
+            self._stage[: len(part)] = part
+            append_staged_samples(self._memory, self._taus, 0, len(part))
 
     def copy_to_input_buffer(self, values: Floats) -> None:
         """Copy up to ``STAGE_SAMPLES`` samples [n, 6] to the input buffer of the compiled kernels."""
@@ -201,7 +202,7 @@ class AllanWindow:
 
     def kernel_buffers(self) -> WindowBuffers:
         """Return the arrays of the window in the form that the compiled kernels expect."""
-        return WindowBuffers(self._ints, self._floats, self._missing, self._taus, self.length)
+        return WindowBuffers(self._memory, self._taus, self.length)
 
     def append_missing_samples(self, n: int) -> None:
         """Append n missing samples. If n exceeds the window length, the window is emptied."""
@@ -224,7 +225,7 @@ class AllanWindow:
             Number of newest samples to keep.
         """
         if n < self.samples_in_window:
-            keep_newest(self._ints, self._floats, self._missing, self._taus, axis, n)
+            keep_newest(self._memory, self._taus, axis, n)
 
     def avar(self) -> Floats:
         """Return the Allan variance [m, 6] in squared units of the axis; NaN if too many samples are missing."""
@@ -255,7 +256,7 @@ class AllanWindow:
         """
         slope, slopes = np.empty(AXES), np.empty((self._taus, AXES))
         lengths = np.full(AXES, self.samples_in_window) if lengths is None else lengths
-        drift_slopes_by_axis_and_tau(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
+        drift_slopes_by_axis_and_tau(self._memory, self._taus, lengths, slope, slopes)
         return slope / self._scale[:AXES], slopes / self._scale[:AXES]
 
     def term_counts(self) -> Ints:
@@ -297,7 +298,8 @@ class AllanWindow:
         return phase, missing, (int(self._state[NEWEST]) - self.samples_in_window) % rows[0], 1.0 / self._scale[:AXES]
 
 
-def _aligned(size: int, dtype: type[np.generic]) -> NDArray[Any]:
-    space = np.zeros(size + LINE, dtype)
+def _aligned(size: int) -> Ints:
+    """Return zeros [size] that begin at the start of a cache line."""
+    space = np.zeros(size + LINE, np.int64)
     start = -(space.ctypes.data // space.itemsize) % LINE
     return space[start : start + size]

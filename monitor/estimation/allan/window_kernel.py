@@ -1,7 +1,7 @@
 """Compiled kernels of ``AllanWindow``, which store phase in a ring buffer and update the sums of squared differences.
 
-The arithmetic is described in the module ``window``. All data of a window is stored in the three arrays of
-``WindowBuffers``, because each array that Python passes to compiled code costs 50 ns.
+The arithmetic is described in the module ``window``. All data of a window is stored in one array, because each array
+that Python passes to compiled code costs 50 ns.
 """
 
 from typing import Final, NamedTuple
@@ -42,11 +42,9 @@ The resulting error is 1 % of the standard deviation of the sum.
 
 
 class WindowBuffers(NamedTuple):
-    """Memory of a sliding window in three arrays, which are passed to compiled code."""
+    """Memory of a sliding window, which is passed to compiled code."""
 
-    ints: Ints  # integer fields of ``WindowArrays``
-    floats: Floats  # floating-point fields of ``WindowArrays``
-    missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
+    memory: Ints  # all fields of ``WindowArrays``
     taus: int  # number of cluster sizes
     length: int  # number of samples in a full window
 
@@ -67,32 +65,42 @@ class WindowArrays(NamedTuple):
     missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
 
 
-def view_window_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int) -> WindowArrays:
-    """Return a view of each field that the arrays of a sliding window contain.
+def window_memory_size(length: int, taus: int) -> int:
+    """Return the number of 8-byte numbers that a window of ``length`` samples with ``taus`` cluster sizes needs."""
+    header = LANES + (2 * taus + LINE - 1) // LINE * LINE
+    samples = 2 + 2 * RUN_SAMPLES + 3 * taus + STAGE_SAMPLES
+    return header + samples * LANES + (length + 1 + RUN_SAMPLES) * (LANES + LANES // 2)
+
+
+def view_window_arrays(memory: Ints, taus: int) -> WindowArrays:
+    """Return a view of each field in the memory of a sliding window.
 
     Parameters
     ----------
-    ints, floats, missing, taus
+    memory, taus
         Fields of ``WindowBuffers``.
     """
     spans, terms = LANES + taus, LANES + (2 * taus + LINE - 1) // LINE * LINE
-    phase = terms + taus * LANES
-    scratch, sums = 2 * LANES, (2 + 2 * RUN_SAMPLES) * LANES
+    scaling = terms + taus * LANES
+    scratch = scaling + 2 * LANES
+    sums = scratch + 2 * RUN_SAMPLES * LANES
     rest, stage = sums + taus * LANES, sums + 2 * taus * LANES
+    phase = stage + STAGE_SAMPLES * LANES
+    missing = phase + (memory.size - phase) // 3 * 2  # a count of missing samples takes half the memory of a phase
+    floats = memory.view(np.float64)
     return WindowArrays(
-        ints[:LANES], ints[LANES:spans], ints[spans : spans + taus], ints[terms:phase], ints[phase:],
-        floats[:scratch], floats[scratch:sums], floats[sums:rest], floats[rest:stage], floats[stage:], missing,
+        memory[:LANES], memory[LANES:spans], memory[spans : spans + taus], memory[terms:scaling],
+        memory[phase:missing], floats[scaling:scratch], floats[scratch:sums], floats[sums:rest], floats[rest:stage],
+        floats[stage:phase], memory[missing:].view(np.int32),
     )  # fmt: skip
 
 
-compiled_view_window_arrays = compiled(view_window_arrays)
+compiled_view_window_arrays = inlined(view_window_arrays)
 """Version of ``view_window_arrays`` that compiled code can call."""
 
 
 @compiled
-def append_staged_samples(
-    ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int
-) -> None:
+def append_staged_samples(memory: Ints, taus: int, start: int, n: int) -> None:
     """Append n samples from the input buffer to the window, and update the sums of all cluster sizes.
 
     The phase of up to ``RUN_SAMPLES`` samples is stored before the sums of each τ are updated. In this order, the
@@ -100,7 +108,7 @@ def append_staged_samples(
 
     Parameters
     ----------
-    ints, floats, missing, taus
+    memory, taus
         Fields of ``WindowBuffers``.
     start : int
         Index of the first sample in the input buffer.
@@ -109,7 +117,7 @@ def append_staged_samples(
     """
     # All fields are unpacked at once, because each access to a field of a named tuple changes a reference count.
     state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = compiled_view_window_arrays(
-        ints, floats, missing, taus
+        memory, taus
     )
     places = phase.size // LANES
     length = places - 1 - RUN_SAMPLES
@@ -305,20 +313,20 @@ def _replace_terms(
 
 
 @compiled
-def keep_newest(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
+def keep_newest(memory: Ints, taus: int, axis: int, n: int) -> None:
     """Mark all but the newest n samples of one axis as missing, and recompute the sums from the newest n samples.
 
     Parameters
     ----------
-    ints, floats, missing, taus
+    memory, taus
         Fields of ``WindowBuffers``.
     axis : int
         Index of the axis.
     n : int
         Number of newest samples to keep.
     """
-    w = compiled_view_window_arrays(ints, floats, missing, taus)
-    state, places = w.state, w.phase.size // LANES
+    w = compiled_view_window_arrays(memory, taus)
+    state, missing, places = w.state, w.missing, w.phase.size // LANES
     # Give older phase points different counts of missing samples, so that older second differences count as incomplete.
     oldest = ring_row(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
@@ -396,14 +404,12 @@ def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: i
 
 
 @compiled
-def drift_slopes_by_axis_and_tau(
-    ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, lengths: Ints, slope: Floats, slopes: Floats
-) -> None:
+def drift_slopes_by_axis_and_tau(memory: Ints, taus: int, lengths: Ints, slope: Floats, slopes: Floats) -> None:
     """Compute the slope of the rate of each axis, and the slope at each averaging time.
 
     Parameters
     ----------
-    ints, floats, missing, taus
+    memory, taus
         Fields of ``WindowBuffers``.
     lengths : ndarray of int64, shape (6,)
         Number of newest samples that are used for each axis.
@@ -412,7 +418,7 @@ def drift_slopes_by_axis_and_tau(
     slopes : ndarray of float64, shape (m, 6)
         Output array for the result of ``mean_rate_slope`` for each τ and axis.
     """
-    w = compiled_view_window_arrays(ints, floats, missing, taus)
+    w = compiled_view_window_arrays(memory, taus)
     for axis in range(AXES):
         n, newest = lengths[axis], w.state[NEWEST]
         slope[axis] = integer_slope_from_thirds(w.phase, w.missing, newest, n, axis)

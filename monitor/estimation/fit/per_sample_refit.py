@@ -190,11 +190,11 @@ def _follow(
     If an axis must be fitted again, the function stops and copies the Allan variances of the axis to ``state.curves``.
     The function returns the index of the next sample and the bit set of the axes to fit.
     """
-    w = compiled_view_window_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
+    w = compiled_view_window_arrays(buffers.memory, buffers.taus)
     curves, output, maps, ages = state
-    ints, floats, missing, taus, window = buffers
+    memory, taus, window = buffers
     # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
-    counters, phase, scaling, terms, slope = w.state, w.phase, w.scaling, curves.terms, curves.slope
+    counters, phase, missing, scaling, terms, slope = w.state, w.phase, w.missing, w.scaling, curves.terms, curves.slope
     used, free, misfit, theta, status = maps.used, maps.free, output.misfit, output.theta, output.status
     right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
     unit, inverse = np.empty((AXES, m)), np.empty((AXES, m))
@@ -205,7 +205,7 @@ def _follow(
     scale = SumsToVariances(unit, inverse)
     for row in range(start, end):
         due = 0
-        append_staged_samples(ints, floats, missing, taus, row, 1)
+        append_staged_samples(memory, taus, row, 1)
         filled = min(counters[TOTAL], window)
         for axis in range(AXES):
             lengths[axis] = min(lengths[axis] + 1, filled)

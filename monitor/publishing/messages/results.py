@@ -33,6 +33,7 @@ MAX_TEXT_LENGTH: Final = 400
 """Largest length of received texts, which limits the memory use of the receiver."""
 MAX_OUTPUTS: Final = 16
 STATUSES: Final = {status.name.lower(): status for status in Status}
+STATUS_NAMES: Final = tuple(STATUSES)
 
 
 class TotalAndHadamardCurves(NamedTuple):
@@ -493,15 +494,11 @@ def coefficient_values(
         True if the data cannot distinguish K from R.
     """
     other = {"K": "R", "R": "K"} if k_r_ambiguous else {}
+    c = coefficients
+    columns = [array[:, axis].tolist() for array in (c.value, c.lo, c.hi, c.status)]
     return {
-        symbol: CoefficientValue(
-            float(coefficients.value[row, axis]),
-            float(coefficients.lo[row, axis]),
-            float(coefficients.hi[row, axis]),
-            Status(int(coefficients.status[row, axis])).name.lower(),
-            other.get(symbol, UNSET),
-        )
-        for row, symbol in enumerate(SYMBOLS)
+        symbol: CoefficientValue(value, lo, hi, STATUS_NAMES[status], other.get(symbol, UNSET))
+        for symbol, value, lo, hi, status in zip(SYMBOLS, *columns, strict=True)
     }
 
 

@@ -76,6 +76,7 @@ def test_continuous_data_are_read_without_waiting(
     waits: list[float] = []
     wait = link._closing.wait
     monkeypatch.setattr(link._closing, "wait", lambda timeout_s: waits.append(timeout_s) or wait(timeout_s))
+    monkeypatch.setattr(serial_link, "MAX_WAITING_BYTES", serial_link.READ_BYTES // 2)
     sent = os.urandom(20 * serial_link.READ_BYTES)
     parts = [sent[at : at + 500] for at in range(0, len(sent), 500)]
     writer = threading.Thread(target=lambda: [os.write(master, part) for part in parts], daemon=True)

@@ -68,7 +68,7 @@ class PublishedMessages:
 def run(devices: int, read_timeout_s: float, seconds: float, folder: Path) -> RunResult:
     """Run a daemon with several devices and return the result."""
     sensors = Sensors(folder, devices, RATE_HZ, WARM_UP_S + seconds)
-    daemon = Daemon(folder, devices, RATE_HZ, "10min", read_timeout=read_timeout_s)
+    daemon = Daemon(folder, devices, RATE_HZ, "10min", driver=f"read_timeout = {read_timeout_s}")
     published = PublishedMessages()
     try:
         with open_session(daemon.port) as session, session.declare_subscriber("imu/**", published.take):

@@ -1,21 +1,23 @@
 """Sensors in one process, the daemon in another process, and a subscriber in this process, for service benchmarks.
 
-``python -m tests.experiments.benchmarks.rig FOLDER DEVICES RATE SECONDS`` is the process of the sensors. It opens a
-pseudo-terminal FOLDER/tty<i> for each device, encodes all frames, and waits for a line on standard input. It then
-writes a frame to each device every 1/RATE s. The numbers and times of the frames are stored in FOLDER, with times in
-monotonic nanoseconds. If a pseudo-terminal is full, the process waits and counts the event. A real port would lose
+``python -m tests.experiments.benchmarks.rig FOLDER DEVICES RATE SECONDS DECODER`` is the process of the sensors. It
+opens a pseudo-terminal FOLDER/tty<i> for each device, encodes all frames, and waits for a line on standard input. It
+then writes a frame to each device every 1/RATE s. The numbers and times of the frames are stored in FOLDER, with times
+in monotonic nanoseconds. If a pseudo-terminal is full, the process waits and counts the event. A real port would lose
 bytes.
 """
 
 import contextlib
 import json
 import os
+import re
 import select
 import subprocess
 import sys
 import time
 import tty
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +26,6 @@ import psutil
 import zenoh
 
 from drivers.data_types import Ints, make_block
-from drivers.decoders.binary_frames import vectornav_binary
 from tests.support.ports import free_port
 from tests.support.waiting import wait_for
 
@@ -39,8 +40,8 @@ window = "{window}"
 [device.driver]
 link = "serial"
 port = "{folder}/tty{i}"
-read_timeout = {read_timeout}
-decoder = "vectornav_binary"
+decoder = "{decoder}"
+{driver}
 """
 REST: Final = """
 [zenoh]
@@ -55,7 +56,9 @@ level = "error"
 class Sensors:
     """Process of the simulated sensors."""
 
-    def __init__(self, folder: Path, devices: int, rate_hz: int, seconds: float) -> None:
+    def __init__(
+        self, folder: Path, devices: int, rate_hz: int, seconds: float, decoder: str = "vectornav_binary"
+    ) -> None:
         self.folder = folder
         command = [
             sys.executable,
@@ -65,6 +68,7 @@ class Sensors:
             str(devices),
             str(rate_hz),
             str(seconds),
+            decoder,
         ]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
@@ -97,13 +101,23 @@ class Daemon:
     """``imu-monitor run`` in a separate process."""
 
     def __init__(
-        self, folder: Path, devices: int, rate_hz: int, window: str, more: str = "", read_timeout: float = 0.01
+        self,
+        folder: Path,
+        devices: int,
+        rate_hz: int,
+        window: str,
+        more: str = "",
+        driver: str = "",
+        decoder: str = "vectornav_binary",
+        python: str = sys.executable,
     ) -> None:
         self.port = free_port()
         path = folder / "config.toml"
-        values = {"rate": rate_hz, "window": window, "folder": folder, "more": more, "read_timeout": read_timeout}
-        path.write_text("".join(DEVICE.format(i=i, **values) for i in range(devices)) + REST.format(port=self.port))
-        self._process = subprocess.Popen([sys.executable, "-c", DAEMON, "run", str(path)])
+        values = {"rate": rate_hz, "window": window, "more": more, "driver": driver, "decoder": decoder}
+        path.write_text(
+            "".join(DEVICE.format(i=i, folder=folder, **values) for i in range(devices)) + REST.format(port=self.port)
+        )
+        self._process = subprocess.Popen([python, "-P", "-c", DAEMON, "run", str(path)])
         self.process = psutil.Process(self._process.pid)
         wait_for(lambda: self._open_ports() >= devices, "the daemon to open its ports")
 
@@ -111,6 +125,11 @@ class Daemon:
         """Return the processor time so far in seconds."""
         t = self.process.cpu_times()
         return float(t.user + t.system)
+
+    def context_switches(self) -> int:
+        """Return how often a thread has waited so far."""
+        tasks = Path(f"/proc/{self.process.pid}/task").glob("*/status")
+        return sum(int(re.findall(r"voluntary_ctxt_switches:\s+(\d+)", task.read_text())[0]) for task in tasks)
 
     def close(self) -> None:
         """Stop the daemon (SIGTERM) and check its exit status."""
@@ -134,17 +153,19 @@ def open_session(port: int) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/timeout_ms", "30000")  # the daemon may not listen yet
     config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{port}"]')
     with zenoh.open(config) as session:
         yield session
 
 
-def encode_frames(rate_hz: int, seconds: float) -> list[bytes]:
-    """Return frames of a resting sensor with noise. TimeStartup increases by one period in each frame."""
+def encode_frames(rate_hz: int, seconds: float, name: str) -> list[bytes]:
+    """Return frames of a resting sensor with noise. The device time increases by one period in each frame."""
     n = round(rate_hz * seconds)
     values = 1e-3 * np.random.default_rng(1).standard_normal((n, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
-    at = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
-    decoder = vectornav_binary.VectornavBinaryDecoder(vectornav_binary.Settings())
+    module: Any = import_module(f"drivers.decoders.binary_frames.{name}")
+    decoder = module.build(module.Settings())
+    at = np.arange(n, dtype=np.int64) * round(1.0 / rate_hz / decoder.timing.tick_s)
     return [chunk.data for chunk in decoder.encode(make_block(at, values, np.full(n, np.nan), at + 1_000_000))]
 
 
@@ -190,7 +211,7 @@ def _write(master: int, data: bytes) -> int:
 def main() -> None:
     """Run the process of the sensors."""
     folder, devices, rate_hz, seconds = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
-    frames = encode_frames(rate_hz, seconds)
+    frames = encode_frames(rate_hz, seconds, sys.argv[5])
     masters = open_terminals(folder, devices)
     print("ready", flush=True)
     if sys.stdin.readline() != "go\n":

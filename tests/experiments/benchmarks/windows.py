@@ -207,7 +207,7 @@ def cost_table(rounds: int, seed: int) -> None:
 
 def memory_of(window: AllanWindow) -> int:
     """Return the memory of the arrays of a window in bytes."""
-    return window._ints.nbytes + window._floats.nbytes + window._missing.nbytes
+    return int(window._memory.nbytes)
 
 
 def make_append_loop(window: AllanWindow, values: Floats, size: int) -> Callable[[], None]:

@@ -313,10 +313,10 @@ def test_staged_samples_can_be_appended_singly():
         plain.append_samples(row[None])
     window._stage[:] = values
     for row in range(STAGE_SAMPLES):
-        append_staged_samples(window._ints, window._floats, window._missing, window._taus, row, 1)
+        append_staged_samples(window._memory, window._taus, row, 1)
     assert_same_state(window, plain)
     window._stage[:] = values[::-1]
-    append_staged_samples(window._ints, window._floats, window._missing, window._taus, 100, 300)
+    append_staged_samples(window._memory, window._taus, 100, 300)
     plain.append_samples(values[::-1][100:400])
     assert_same_state(window, plain)
 
