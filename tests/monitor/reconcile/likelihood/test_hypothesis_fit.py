@@ -24,7 +24,19 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     fit_with_fixed_noise,
     with_shape,
 )
-from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, K, N, axis, correlated, ringing, time_s, walk, white
+from tests.monitor.reconcile.axes import (
+    RATE_HZ,
+    WALK,
+    WHITE,
+    K,
+    N,
+    axis,
+    correlated,
+    draw_resonance,
+    time_s,
+    walk,
+    white,
+)
 
 n = 20_000
 MODEL = (WHITE, RateRandomWalk(K=3e-5))
@@ -91,7 +103,7 @@ def test_shape_maximizes_its_profile_likelihood():
 
 
 def test_resonance_near_half_the_sample_rate_is_not_its_alias():
-    y = white(n, np.random.default_rng(7)) + ringing(n, np.random.default_rng(6), 1e-3, 48.0, 1.0)
+    y = white(n, np.random.default_rng(7)) + draw_resonance(n, np.random.default_rng(6), 1e-3, 48.0, 1.0)
     start = Narrowband(sigma=1e-4, frequency=49.0, bandwidth=1.0)
     found = fit_shape_parameter(axis(y), (WHITE,), start, "frequency", 1.2)
     assert found.frequency == pytest.approx(48.0, abs=0.5)
