@@ -14,6 +14,7 @@ import structlog
 
 from drivers.links.replay_link import ReplayLink
 from drivers.recordings.segment_file import SegmentMetadata
+from monitor.common.library_pages import LLVM_LIBRARY, release_library_pages
 from monitor.daemon import config_changes
 from monitor.daemon.command_handler import CommandHandler
 from monitor.daemon.config_changes import ConfigChange
@@ -76,7 +77,7 @@ class Service(DaemonProcess):
         self._commands = CommandHandler(self.zenoh, reconciler or Reconciler())
 
     def _start_devices(self) -> None:
-        threading.Thread(target=self._ready.compile_kernels, args=(self._wake,), name="warm-up", daemon=True).start()
+        threading.Thread(target=self._compile_kernels, name="warm-up", daemon=True).start()
         for worker in self.workers:
             worker.start_reader_and_resume_recording()
         if self.recorder is not None:
@@ -113,6 +114,10 @@ class Service(DaemonProcess):
         """Return the state of each output and of the recording by name."""
         recording = {} if self.recorder is None else {"recording": self.recorder.state}
         return {**super().output_states(), **recording}
+
+    def _compile_kernels(self) -> None:
+        self._ready.compile_kernels(self._wake)
+        release_library_pages(LLVM_LIBRARY)
 
     def _rebuild_windows(self, workers: Sequence[DeviceWorker]) -> None:
         self._ready.all.wait()
