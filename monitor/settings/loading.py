@@ -71,7 +71,7 @@ class Config:
     metrics: MetricsAddress | None = None
     influx: InfluxTable | None = None  # None if nothing is sent
     ros2: Ros2Table | None = None  # None if nothing is published
-    workers: int | None = None  # number of worker processes; None if it depends on the sample rates
+    workers: int = 0  # number of worker processes; 0 if it depends on the sample rates
     path: Path | None = None  # of the file
     table: Mapping[str, Any] = dataclasses.field(
         default_factory=dict

@@ -389,9 +389,9 @@ class InfluxTable(SettingsModel):
 class ServiceTable(SettingsModel):
     """Table ``[service]``: settings of the processes of the daemon."""
 
-    workers: Annotated[int | None, KeywordOrType({"auto": None}, Annotated[int, number_ranges.WORKERS])] = Field(
-        None,
-        examples=[2],
+    workers: Annotated[int, KeywordOrType({"auto": 0}, Annotated[int, number_ranges.WORKERS])] = Field(
+        0,
+        examples=["auto"],
         description='processes that share the devices; 1: a single process, "auto": one for each 8000 samples/s',
     )
 

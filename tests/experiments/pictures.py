@@ -420,7 +420,7 @@ def save_notebook_pictures(name: str, folder: Path, path: Path) -> Path:
 
     from tests.support.notebooks import list_output_data, run_notebook
 
-    source = Path(__file__).parents[2] / "docs" / "notebooks" / f"{name}.ipynb"
+    source = Path(__file__).parents[2] / "docs" / "tutorials" / f"{name}.ipynb"
     with contextlib.chdir(folder):
         notebook, _ = run_notebook(source)
     encoded = [data["image/png"] for data in list_output_data(notebook) if "image/png" in data]

@@ -17,10 +17,8 @@ def count_workers(config: Config) -> int:
     """Return the number of processes among which the devices are spread; 1 means that there are no workers."""
     if not config.table:  # the workers read their devices from the table of the configuration file
         return 1
-    workers = config.workers
-    if workers is None:
-        rate_hz = sum(device.rate_hz or UNKNOWN_RATE_HZ for device in config.devices)
-        workers = min(math.ceil(rate_hz / PROCESS_RATE_HZ), os.cpu_count() or 1)
+    rate_hz = sum(device.rate_hz or UNKNOWN_RATE_HZ for device in config.devices)
+    workers = config.workers or min(math.ceil(rate_hz / PROCESS_RATE_HZ), os.cpu_count() or 1)
     return min(workers, len(config.devices))
 
 

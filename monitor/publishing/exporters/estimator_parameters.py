@@ -10,7 +10,7 @@ exported. The programs differ in file syntax and parameter names. They state the
 
 The last two forms hold for N and K alike. A program with discrete noise adds (dt σ)² to the variance of an angle
 or a velocity in each step. This variance must be N² dt, so that σ = N/√dt. For a bias, it must be K² dt, so that σ =
-K/√dt. ``docs/export.md`` names the documentation or source code on which each entry is based.
+K/√dt. ``docs/reference/export.md`` names the documentation or source code on which each entry is based.
 """
 
 import math

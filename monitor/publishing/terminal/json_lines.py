@@ -1,7 +1,7 @@
 """Command ``imu-monitor watch --json``, which prints each message of the daemons as one line of JSON.
 
-Each line is an object with the keys ``key`` (zenoh key), ``topic`` and ``message``. ``message`` is the payload as
-``docs/messages.md`` describes it. Messages with samples are msgpack on the wire. Each column becomes an array.
+Each line is an object with the keys ``key`` (zenoh key), ``topic`` and ``message``. ``message`` is the payload, see
+``docs/reference/messages.md``. Messages with samples are msgpack on the wire. Each column becomes an array.
 """
 
 import contextlib
