@@ -10,13 +10,15 @@ import socket
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from multiprocessing import connection as pipes
+from pathlib import Path
 from typing import Any, Final
 
 import structlog
 
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, describe_error
 from monitor.common.device_health import Health
 from monitor.common.program import PROGRAM
 from monitor.daemon import config_changes
@@ -26,7 +28,7 @@ from monitor.daemon.operations.coefficient_limits import read_model_in_force
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.outputs.output import Output
 from monitor.daemon.workers.device_spreading import spread_devices
-from monitor.daemon.workers.worker_service import COMMAND, RELOAD, STOP, Call
+from monitor.daemon.workers.worker_service import COMMAND, RELOAD, START, STOP, Call
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.publisher import Command
 from monitor.settings import loading
@@ -54,24 +56,22 @@ class _Worker:
         self.process: subprocess.Popen[bytes] | None = None
         self.pipe: pipes.Connection | None = None
 
-    def start(self, table: Mapping[str, Any], folder: Any) -> None:
-        """Start the process with the configuration of its devices."""
+    def start(self, table: Mapping[str, Any], folder: Path) -> None:
+        """Start the process with the configuration of its devices. Raise OSError if this is impossible."""
         ours, theirs = socket.socketpair()
-        with theirs:
+        with ours, theirs:
             descriptor = theirs.fileno()
             self.process = subprocess.Popen(  # a session of its own, because the terminal sends Ctrl-C to all processes
                 [*PROGRAM, "worker", str(descriptor)], pass_fds=[descriptor], start_new_session=True
             )
-        self.pipe, self.restart_s = pipes.Connection(ours.detach()), None
-        self.pipe.send((table, folder, os.getpid()))
+            self.pipe, self.restart_s = pipes.Connection(ours.detach()), None
+        self.call(START, table, folder, os.getpid())
 
-    def send(self, name: str, *arguments: Any) -> None:
-        """Send a call to the process, if it has not ended."""
+    def call(self, name: str, *arguments: Any) -> None:
+        """Send a call to the process. If the process has ended, ``receive`` will report the end."""
         if self.pipe is not None:
-            try:
+            with suppress(OSError):
                 self.pipe.send(Call(name, arguments))
-            except OSError:
-                _log.debug("worker", text=f"{self.name} has ended and does not receive {name}")
 
     def receive(self) -> list[Call]:
         """Return the calls that have arrived. Raise EOFError at the end of the process."""
@@ -143,21 +143,28 @@ class WorkerSupervisor(DaemonProcess):
             before, names = worker.devices, tuple(name for name, place in self._places.items() if place == number)
             worker.devices = names
             if worker.pipe is not None and names:
-                worker.send(RELOAD, *loading.select_devices(self.config, names))
+                worker.call(RELOAD, *loading.select_devices(self.config, names))
             elif worker.pipe is not None:
-                worker.send(STOP)
+                worker.call(STOP)
             elif set(names) != set(before):
-                worker.restart_s = time.monotonic()
+                worker.restart_s = time.monotonic() if names else None
 
     # --- one round
 
     def _work(self, now_s: float) -> None:
         for worker in self._workers:
-            if worker.restart_s is not None and now_s >= worker.restart_s and worker.devices:
-                worker.start(*loading.select_devices(self.config, worker.devices))
+            if worker.restart_s is not None and now_s >= worker.restart_s:
+                self._start(worker)
             self._receive(worker)
         while not self.zenoh.commands.empty():
             self._forward(self.zenoh.commands.get_nowait())
+
+    def _start(self, worker: _Worker) -> None:
+        try:
+            worker.start(*loading.select_devices(self.config, worker.devices))
+        except OSError as error:
+            _log.error("worker", text=f"{worker.name} cannot be started: {describe_error(error)}; trying again")
+            worker.restart_s = time.monotonic() + RESTART_PAUSE_S
 
     def _receive(self, worker: _Worker) -> None:
         try:
@@ -198,7 +205,7 @@ class WorkerSupervisor(DaemonProcess):
             return
         self._command_count += 1
         self._commands[self._command_count] = worker, command
-        worker.send(COMMAND, self._command_count, command.device, command.verb)
+        worker.call(COMMAND, self._command_count, command.device, command.verb)
 
     def _wait(self) -> None:
         running = [worker.pipe for worker in self._workers if worker.pipe is not None]
@@ -265,7 +272,7 @@ class WorkerSupervisor(DaemonProcess):
         self._stop.set()
         for worker in self._workers:
             worker.restart_s = None
-            worker.send(STOP)
+            worker.call(STOP)
         until_s = time.monotonic() + STOP_TIMEOUT_S
         while not self._has_ended() and time.monotonic() < until_s:
             for worker in self._workers:

@@ -5,6 +5,7 @@ to the main process, which publishes them. In the other direction, the pipe carr
 main process asks for it, and also when the main process ends.
 """
 
+import os
 import signal
 import threading
 from collections import deque
@@ -20,7 +21,7 @@ import structlog
 from drivers.data_types import Event, Ints, SampleBlock
 from drivers.errors import ConfigError
 from monitor.common.device_health import Health
-from monitor.daemon.config_changes import ConfigChange, compare_configurations
+from monitor.daemon.config_changes import compare_configurations
 from monitor.daemon.operations.log_level import set_log_level
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.outputs.output import Output
@@ -29,9 +30,12 @@ from monitor.publishing.zenoh.publisher import Command
 from monitor.settings import loading
 from monitor.settings.loading import Config, Device
 
+START: Final = "start"
 STOP: Final = "stop"
 RELOAD: Final = "reload"
 COMMAND: Final = "command"
+
+_log = structlog.get_logger("imu-monitor")
 
 
 class Call(NamedTuple):
@@ -128,7 +132,7 @@ class WorkerService(Service):
     def __init__(self, config: Config, output: PipeOutput, main_pid: int) -> None:
         super().__init__(config, [output], unit=_ProgressNotifier(output), owner_pid=main_pid)
         self._output = output
-        self._new_config = config
+        self._new_table: tuple[Any, ...] = ()  # arguments of the last call RELOAD
 
     def receive_calls(self, connection: Connection) -> None:
         """Execute the calls of the main process until it asks for the end or has ended."""
@@ -138,20 +142,23 @@ class WorkerService(Service):
         self.request_stop()
 
     def _execute(self, call: Call) -> None:
-        match call.name:
-            case "reload":
-                self._new_config = loading.load_selected_devices(*call.arguments)
-                self.request_reload()
-            case "command":
-                number, device, verb = call.arguments
-                reply, refuse = (partial(self._output.call, name, number) for name in ("reply_result", "reply_refusal"))
-                self.zenoh.commands.put(Command(device, verb, reply, refuse))
+        if call.name == RELOAD:
+            self._new_table = call.arguments
+            self.request_reload()
+        elif call.name == COMMAND:
+            number, device, verb = call.arguments
+            reply, refuse = (partial(self._output.call, name, number) for name in ("reply_result", "reply_refusal"))
+            self.zenoh.commands.put(Command(device, verb, reply, refuse))
 
-    def _find_changes(self) -> ConfigChange:
-        return compare_configurations(self.config, self._new_config, {one.name: one.model for one in self.workers})
+    def _reload(self) -> None:
+        try:
+            new, models = loading.load_selected_devices(*self._new_table), {one.name: one.model for one in self.workers}
+            self._apply(compare_configurations(self.config, new, models))
+        except ConfigError as error:  # the main process has not checked simulated sensors
+            _log.error("not reloaded, the running configuration stays in force", error=str(error))
 
 
-def run_worker(descriptor: int) -> None:
+def run_worker(descriptor: int) -> NoReturn:
     """Run a worker process until the main process asks for the end.
 
     Parameters
@@ -162,7 +169,7 @@ def run_worker(descriptor: int) -> None:
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):  # systemd sends SIGTERM to all processes of a unit
         signal.signal(number, signal.SIG_IGN)
     with Connection(descriptor) as connection:
-        table, folder, main_pid = connection.recv()
+        table, folder, main_pid = connection.recv().arguments
         output = PipeOutput(connection)
         _send_log_lines(output)
         try:
@@ -170,6 +177,7 @@ def run_worker(descriptor: int) -> None:
         except ConfigError as error:
             output.call("refuse", error.mistake_lines)
         output.finish_round()
+    os._exit(0)  # threads that identify drift models abort a process whose interpreter ends
 
 
 def _run_service(

@@ -7,8 +7,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from structlog.testing import capture_logs
 
 from drivers.errors import ConfigError
+from monitor.daemon.workers import supervisor
 from monitor.daemon.workers.supervisor import WorkerSupervisor
 from monitor.settings import loading
 from tests.support.ports import free_endpoint
@@ -29,13 +31,13 @@ def write(folder: Path, endpoint: str, devices: dict[str, str]) -> Path:
 
 @contextmanager
 def run_supervisor(path: Path, output: RecordingOutput) -> Iterator[WorkerSupervisor]:
-    supervisor = WorkerSupervisor(loading.load_config(path), 2, [output])
-    thread = threading.Thread(target=supervisor.run)
+    running = WorkerSupervisor(loading.load_config(path), 2, [output])
+    thread = threading.Thread(target=running.run)
     thread.start()
     try:
-        yield supervisor
+        yield running
     finally:
-        supervisor.request_stop()
+        running.request_stop()
         thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
@@ -44,15 +46,15 @@ def run_supervisor(path: Path, output: RecordingOutput) -> Iterator[WorkerSuperv
 def test_reload_and_commands_reach_the_worker_of_a_device(tmp_path: Path) -> None:
     endpoint, output = free_endpoint(), RecordingOutput()
     path = write(tmp_path, endpoint, {"kept": "", "removed": ""})
-    with run_supervisor(path, output) as supervisor, ExitStack() as stack:
+    with run_supervisor(path, output) as running, ExitStack() as stack:
         wait_for(lambda: len(output.estimates) == 2, "estimates of both devices")
-        wait_for(lambda: supervisor.output_states()["zenoh"] == "ok", "the session")
+        wait_for(lambda: running.output_states()["zenoh"] == "ok", "the session")
         session = stack.enter_context(open_session(connect=[endpoint]))
         write(tmp_path, endpoint, {"kept": LIMIT, "added": ""})
         before = output.healths["kept"]
-        supervisor.request_reload()
+        running.request_reload()
         wait_for(lambda: "added" in output.estimates, "an estimate of the added device")
-        wait_for(lambda: output.healths["added"].state == "running", "its status")
+        wait_for(lambda: "added" in output.healths, "its status")
         wait_for(lambda: output.healths["kept"].received > before.received, "more samples of the kept device")
         assert output.healths["kept"].uptime_s > before.uptime_s
         count = len(output.blocks["removed"])
@@ -67,7 +69,20 @@ def test_reload_and_commands_reach_the_worker_of_a_device(tmp_path: Path) -> Non
     assert ["unknown command" in reply["error"] for reply in replies["added"]] == [True]
     assert replies["removed"] == []
     assert {name: health.state for name, health in output.healths.items()}["kept"] == "running"
-    assert [worker.process.returncode for worker in supervisor._workers if worker.process is not None] == [0, 0]
+    assert [worker.process.returncode for worker in running._workers if worker.process is not None] == [0, 0]
+
+
+@pytest.mark.long
+def test_worker_that_cannot_be_started_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    output = RecordingOutput()
+    path = write(tmp_path, free_endpoint(), {"a": "", "b": ""})
+    with monkeypatch.context() as patch, capture_logs() as logs:
+        patch.setattr(supervisor, "PROGRAM", (str(tmp_path / "missing"),))
+        with run_supervisor(path, output):
+            wait_for(lambda: len(logs) >= 2, "the failures of both workers")
+            patch.undo()
+            wait_for(lambda: len(output.estimates) == 2, "estimates of both devices")
+    assert "worker 0 cannot be started: No such file or directory; trying again" in logs[0]["text"]
 
 
 @pytest.mark.long
@@ -77,6 +92,6 @@ def test_worker_refuses_a_configuration_that_became_invalid(tmp_path: Path) -> N
     more = f'driver = {{ link = "virtual", model = "{model}" }}'
     path = tmp_path / "config.toml"
     path.write_text("".join(f'[[device]]\nname = "{name}"\n{more}\n' for name in "ab") + '[viewer]\nmode = "none"\n')
-    supervisor = WorkerSupervisor(loading.load_config(path), 2)
+    refused = WorkerSupervisor(loading.load_config(path), 2)
     with pytest.raises(ConfigError, match=r"model\.toml"):
-        supervisor.run(PATIENCE_S)
+        refused.run(PATIENCE_S)
