@@ -23,7 +23,7 @@ from monitor.daemon.operations.log_level import set_log_level
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.outputs.history_output import HistoryOutput
 from monitor.daemon.outputs.output import Output
-from monitor.daemon.outputs.table_output import TableOutput
+from monitor.daemon.outputs.terminal_outputs import TableOutput
 from monitor.daemon.outputs.viewer_output import ViewerOutput
 from monitor.daemon.outputs.zenoh_output import ZenohOutput
 from monitor.history.bucketed_history import HistoryTable

@@ -392,7 +392,7 @@ class ServiceTable(SettingsModel):
     workers: Annotated[int, KeywordOrType({"auto": 0}, Annotated[int, number_ranges.WORKERS])] = Field(
         0,
         examples=["auto"],
-        description='processes that share the devices; 1: a single process, "auto": one for each 8000 samples/s',
+        description='processes that share the devices; 1: a single process, "auto": one for each 8 devices',
     )
 
 

@@ -35,7 +35,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.recordings import save_samples
-from monitor.commands.reconcile import ReconciliationRequest, reconcile_and_write_report
+from monitor.commands.reconcile import reconcile_and_write_report
 from monitor.common import shipped_config_paths
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
@@ -472,7 +472,7 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
         assert rate_hz is not None
         n = round(HOUR_S * rate_hz)
         save_samples(source, np.arange(n) / rate_hz, model.simulate(n, rate_hz, 1), None)
-    return reconcile_and_write_report(ReconciliationRequest(source, read_model(MODEL), folder / "result")).axes["gz"]
+    return reconcile_and_write_report(source, read_model(MODEL), folder / "result").axes["gz"]
 
 
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:

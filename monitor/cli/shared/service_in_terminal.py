@@ -58,8 +58,7 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
 
     from monitor.daemon.daemon_process import STATUS_INTERVAL_S, DaemonProcess
     from monitor.daemon.operations.systemd import SystemdNotifier
-    from monitor.daemon.outputs.log_output import EventAndStatusLogOutput
-    from monitor.daemon.outputs.table_output import TableOutput
+    from monitor.daemon.outputs.terminal_outputs import EventAndStatusLogOutput, TableOutput
     from monitor.daemon.service import Service
     from monitor.daemon.workers.device_spreading import count_workers
     from monitor.daemon.workers.supervisor import WorkerSupervisor

@@ -7,23 +7,22 @@ from typing import Final
 
 from monitor.settings.loading import Config, Device
 
-PROCESS_RATE_HZ: Final = 8000.0
-"""Total sample rate of the devices above which they are spread over several processes."""
-UNKNOWN_RATE_HZ: Final = 1000.0
-"""Assumed sample rate of a device without a configured rate."""
+DEVICES_PER_PROCESS: Final = 8
+"""Number of devices above which the devices are spread over several processes."""
 
 
 def count_workers(config: Config) -> int:
     """Return the number of processes among which the devices are spread; 1 means that there are no workers."""
     if not config.table:  # the workers read their devices from the table of the configuration file
         return 1
-    rate_hz = sum(device.rate_hz or UNKNOWN_RATE_HZ for device in config.devices)
-    workers = config.workers or min(math.ceil(rate_hz / PROCESS_RATE_HZ), os.cpu_count() or 1)
-    return min(workers, len(config.devices))
+    devices = len(config.devices)
+    return min(devices, config.workers or min(math.ceil(devices / DEVICES_PER_PROCESS), os.cpu_count() or 1))
 
 
 def spread_devices(devices: Sequence[Device], workers: int, before: Mapping[str, int]) -> dict[str, int]:
-    """Assign each device to a worker. A device stays at its worker, and the others go to the least loaded worker.
+    """Assign each device to a worker. A device stays at its worker, and the others go to the worker with the fewest.
+
+    The rate does not matter, because a device is read and its results are published at a rate of its own.
 
     Parameters
     ----------
@@ -39,9 +38,8 @@ def spread_devices(devices: Sequence[Device], workers: int, before: Mapping[str,
     dict of str to int
         Number of the worker of each device by its name.
     """
-    load_hz, places = [0.0] * workers, {}
-    for device in sorted(devices, key=lambda one: (one.name not in before, -(one.rate_hz or UNKNOWN_RATE_HZ))):
-        place = before.get(device.name, load_hz.index(min(load_hz)))
-        load_hz[place] += device.rate_hz or UNKNOWN_RATE_HZ
-        places[device.name] = place
+    places = {device.name: before[device.name] for device in devices if device.name in before}
+    for device in devices:
+        used = list(places.values())
+        places.setdefault(device.name, min(range(workers), key=used.count))
     return places

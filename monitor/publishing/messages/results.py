@@ -544,7 +544,7 @@ def deviations_with_interval_ends(
 
     Parameters
     ----------
-        curve
+    curve
         Allan, total or Hadamard variances of all axes.
     axis
         Column of the axis.

@@ -27,7 +27,7 @@ from tests.experiments.benchmarks.rig import NO_VIEWER, PATIENCE_S, Daemon, Sens
 from tests.support.waiting import wait_for
 
 WARM_UP_S: Final = 5.0
-SETTLE_S: Final = 2.0
+POLL_S: Final = 0.1
 SAMPLES: Final = re.compile(rb'"samples":(\d+)')
 STORAGE: Final = '[storage]\nfolder = "{folder}/store"\n'
 PARTS: Final[Mapping[str, tuple[str, str]]] = {
@@ -60,6 +60,10 @@ class PublishedMessages:
         elif key.endswith("/coefficients") and (found := SAMPLES.search(sample.payload.to_bytes())):
             self.results.append((int(found[1]), time.monotonic_ns()))
 
+    def count_samples(self) -> int:
+        """Return the number of samples that were received, bad or lost."""
+        return self.total("received") + self.total("bad") + self.total("lost")
+
     def total(self, what: str) -> int:
         """Return the sum of a count over the devices."""
         return sum(int(status[what]) for status in self.status.values())
@@ -82,7 +86,9 @@ def run(devices: int, part: str, folder: Path, options: argparse.Namespace) -> t
             sent = sensors.wait(seconds + PATIENCE_S)
             took_s = time.monotonic() - start_s
             cpu, messages, others = (daemon.cpu_s() - cpu_s) / took_s, published.messages - before, load.describe()
-            time.sleep(SETTLE_S)
+            until_s = time.monotonic() + PATIENCE_S
+            while published.count_samples() < devices * sent["each"] and time.monotonic() < until_s:
+                time.sleep(POLL_S)
             processes, memory_bytes = daemon.processes(), daemon.memory_bytes()
             threads, descriptors = (sum(map(count, processes)) for count in (_count_threads, _count_descriptors))
         written_ns = sensors.written_ns()

@@ -56,7 +56,7 @@ def measure(devices: int, part: str, rate_hz: int, folder: Path) -> Counter[str]
             wait_for(lambda: len(published.status) == devices, "the first status")
             sensors.start()
             sent = devices * int(sensors.wait(10.0 * WINDOW_S)["each"])
-            wait_for(lambda: published.total("received") + published.total("lost") == sent, "the last sample")
+            wait_for(lambda: published.count_samples() == sent, "the last sample")
             time.sleep(SETTLE_S)
             return measure_origins(daemon.process.pid)
     finally:

@@ -13,7 +13,7 @@ from drivers.data_types import AXES, EXTENDED_ID, Chunk, Floats, SampleBlock, ma
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recordings import load_samples, save_samples
 from drivers.recordings.reading_options import ReadingOptions
-from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
+from monitor.commands.recording_loading import DecoderChoice, LoadingOptions, load_recording
 from tests.contracts.decoder_examples import CAN_SIGNALS, DEGREE, STIM300, VECTORNAV, Example
 from tests.support.program import exit_status
 from tests.support.recordings import recordings
@@ -76,7 +76,7 @@ class TestCanLogs:
     @pytest.mark.parametrize("suffix", LOGS)
     def test_log_gives_the_samples_that_were_sent(self, tmp_path: Path, suffix: str) -> None:
         path = tmp_path / f"drive{suffix}"
-        found = load_recording(path, decoder=write_can_log(path))
+        found = load_recording(path, LoadingOptions(decoder=write_can_log(path)))
         assert found.axes == AXES
         assert_equal_values(found.values, VALUES[: len(found)])
         assert N - 1 <= len(found) <= N  # the frames after the last sample are missing
@@ -88,14 +88,14 @@ class TestCanLogs:
 
     def test_log_has_unix_times(self, tmp_path: Path) -> None:
         path = tmp_path / "drive.blf"
-        found = load_recording(path, decoder=write_can_log(path))
+        found = load_recording(path, LoadingOptions(decoder=write_can_log(path)))
         assert found.t_s is not None
         assert abs(found.t_s[0] - T0_NS * 1e-9) < 1e-2
 
     def test_missing_samples_leave_a_gap_and_a_note(self, tmp_path: Path) -> None:
         path = tmp_path / "drive.blf"
         gap = slice(2000, 3000)  # five seconds
-        found = load_recording(path, decoder=write_can_log(path, gap))
+        found = load_recording(path, LoadingOptions(decoder=write_can_log(path, gap)))
         assert found.notes == ("1,000 samples missing in 1 place.",)
         assert found.t_s is not None
         assert found.t_s[-1] - found.t_s[0] == pytest.approx((N - 1) / RATE_HZ, abs=0.02)
@@ -105,26 +105,26 @@ class TestCanLogs:
         choice = write_can_log(path)
         whole = path.read_bytes()
         path.write_bytes(whole[: len(whole) // 2])
-        found = load_recording(path, decoder=choice)
+        found = load_recording(path, LoadingOptions(decoder=choice))
         assert 0.45 * N < len(found) < 0.55 * N
         path.write_bytes(whole[: len(whole) // 2] + b"\n   1.0 1  50 Rx d 6 00 zz")
-        notes = load_recording(path, decoder=choice).notes
+        notes = load_recording(path, LoadingOptions(decoder=choice)).notes
         assert len(notes) == 1
         assert notes[0].startswith("The file is cut off or damaged at this point: ")
 
     def test_last_part_and_channel(self, tmp_path: Path) -> None:
         path = tmp_path / "drive.asc"
         choice = write_can_log(path)
-        assert len(load_recording(path, last_s=1.0, decoder=choice)) == RATE_HZ
+        assert len(load_recording(path, LoadingOptions(last_s=1.0, decoder=choice))) == RATE_HZ
         other = dataclasses.replace(choice, options={**choice.options, "channel": "7"})
         with pytest.raises(RecordingError, match=r"drive\.asc: the file contains no data$"):
-            load_recording(path, decoder=other)
+            load_recording(path, LoadingOptions(decoder=other))
 
 
 class TestCaptures:
     def test_device_counter_gives_the_times(self, tmp_path: Path) -> None:
         path = tmp_path / "capture.raw"
-        found = load_recording(path, decoder=write_capture(path, encode(VECTORNAV, tmp_path)))
+        found = load_recording(path, LoadingOptions(decoder=write_capture(path, encode(VECTORNAV, tmp_path))))
         assert found.t_s is not None
         np.testing.assert_allclose(found.t_s, np.arange(N) / RATE_HZ, atol=1e-6)
         np.testing.assert_array_equal(found.values, VALUES.astype(np.float32))
@@ -138,7 +138,7 @@ class TestCaptures:
         damaged[20] ^= 0xFF
         chunks[500] = dataclasses.replace(chunks[500], data=bytes(damaged))
         kept = [*chunks[:1000], *chunks[3000:3500], chunks[3499], *chunks[3500:]]  # ten seconds are missing
-        found = load_recording(path, decoder=write_capture(path, kept))
+        found = load_recording(path, LoadingOptions(decoder=write_capture(path, kept)))
         assert found.notes == (
             "2,001 samples missing in 2 places.",
             "1 frame rejected.",
@@ -155,8 +155,8 @@ class TestCaptures:
         write_capture(path, [*chunks[:1000], *chunks[1200:]])
         choice = DecoderChoice("text", {"columns": ["counter", "gx", "gy", "gz"], "counter_modulus": 256})
         with pytest.raises(ConfigError, match=r"capture\.raw: contains no times; give the sample rate with --rate HZ"):
-            load_recording(path, decoder=choice)
-        found = load_recording(path, RATE_HZ, decoder=choice)
+            load_recording(path, LoadingOptions(decoder=choice))
+        found = load_recording(path, LoadingOptions(RATE_HZ, decoder=choice))
         assert found.t_s is not None
         np.testing.assert_allclose(found.t_s, np.delete(np.arange(N), range(1000, 1200)) / RATE_HZ, atol=1e-6)
         assert found.notes == ("200 samples missing in 1 place.",)
@@ -166,7 +166,7 @@ class TestCaptures:
         """The sensor was started again, so that its time is smaller than before."""
         path = tmp_path / "capture.raw"
         chunks = encode(VECTORNAV, tmp_path)
-        found = load_recording(path, decoder=write_capture(path, [*chunks[1000:2000], *chunks[:1000]]))
+        found = load_recording(path, LoadingOptions(decoder=write_capture(path, [*chunks[1000:2000], *chunks[:1000]])))
         assert len(found) == 2000
         assert found.t_s is not None
         np.testing.assert_allclose(np.diff(found.t_s), 1.0 / RATE_HZ, atol=1e-4)
@@ -176,7 +176,7 @@ class TestCaptures:
     def test_clock_of_a_short_counter(self, tmp_path: Path) -> None:
         path = tmp_path / "capture.raw"
         write_capture(path, encode(STIM300, tmp_path, 2000.0))
-        found = load_recording(path, decoder=DecoderChoice("stim300"))
+        found = load_recording(path, LoadingOptions(decoder=DecoderChoice("stim300")))
         assert found.t_s is not None
         np.testing.assert_allclose(found.t_s, np.arange(N) / RATE_HZ, atol=1e-6)
 
@@ -184,7 +184,7 @@ class TestCaptures:
         path = tmp_path / "capture.txt"
         write_capture(path, encode(TEXT, tmp_path))
         choice = DecoderChoice("text", {"columns": ["gx", "gy", "gz"]})
-        found = load_recording(path, 50.0, decoder=choice)
+        found = load_recording(path, LoadingOptions(50.0, decoder=choice))
         assert found.t_s is not None
         np.testing.assert_allclose(found.t_s, np.arange(N) / 50.0, atol=1e-6)
         assert found.axes == ("gx", "gy", "gz")
@@ -193,7 +193,7 @@ class TestCaptures:
         path = tmp_path / "capture.txt"
         example = Example("vectornav_ascii", {"sentence": "VNYMR"})
         write_capture(path, encode(example, tmp_path))
-        found = load_recording(path, RATE_HZ, decoder=DecoderChoice("vectornav_ascii"))
+        found = load_recording(path, LoadingOptions(RATE_HZ, decoder=DecoderChoice("vectornav_ascii")))
         assert any("hides bias instability B and random walk K; select $VNIMU" in note for note in found.notes)
 
     def test_stated_byte_rate_gives_the_times(self, tmp_path: Path) -> None:
@@ -202,19 +202,19 @@ class TestCaptures:
         size = sum(len(chunk.data) for chunk in chunks)
         choice = write_capture(path, chunks)
         choice = DecoderChoice("text", {"columns": ["gx", "gy", "gz"], "bytes_per_second": size / N * RATE_HZ})
-        found = load_recording(path, decoder=choice)
+        found = load_recording(path, LoadingOptions(decoder=choice))
         assert found.t_s is not None
         assert found.t_s[-1] - found.t_s[0] == pytest.approx(N / RATE_HZ, rel=0.02)
 
     def test_wrong_rate_is_reported(self, tmp_path: Path) -> None:
         path = tmp_path / "capture.raw"
-        found = load_recording(path, 100.0, decoder=write_capture(path, encode(VECTORNAV, tmp_path)))
+        found = load_recording(path, LoadingOptions(100.0, decoder=write_capture(path, encode(VECTORNAV, tmp_path))))
         assert found.notes == ("The measured rate of 200 Hz differs from the stated rate.",)
 
 
 def refusal(path: Path, **keys: Any) -> str:
     with pytest.raises(ImuError) as error:
-        load_recording(path, **keys)
+        load_recording(path, LoadingOptions(**keys))
     line = str(error.value)
     assert line.startswith(f"{path}: ")
     return line.removeprefix(f"{path}: ")
@@ -325,7 +325,9 @@ class TestCommands:
 class TestRealRecordings:
     def test_captured_sentences_give_the_recorded_samples(self) -> None:
         folder = recordings() / "vn100-serial"
-        found = load_recording(folder / "vnymr-sentences.txt.gz", 40.0, decoder=DecoderChoice("vectornav_ascii"))
+        found = load_recording(
+            folder / "vnymr-sentences.txt.gz", LoadingOptions(40.0, decoder=DecoderChoice("vectornav_ascii"))
+        )
         expected = load_samples(folder / "static-12min.npz")
         np.testing.assert_allclose(found.values, expected.values, rtol=1e-6, atol=1e-9)
         assert found.t_s is not None
@@ -336,7 +338,7 @@ class TestRealRecordings:
         signals = {f"g{axis.lower()}": f"ImuData.AngularRate{axis}" for axis in "XYZ"}
         signals |= {f"a{axis.lower()}": f"ImuData.Acceleration{axis}" for axis in "XYZ"}
         choice = DecoderChoice("dbc", {"file": "canmod_gps", "signals": signals})
-        found = load_recording(folder / "drive-a-frames.csv.gz", decoder=choice)
+        found = load_recording(folder / "drive-a-frames.csv.gz", LoadingOptions(decoder=choice))
         expected = load_samples(folder / "drive-a.npz")
         assert len(found) == len(expected)
         half_a_bit = np.repeat([0.125 * DEGREE, 0.0625], 3)

@@ -55,22 +55,30 @@ class DecoderChoice:
     options: Mapping[str, Any] = field(default_factory=dict)  # keys of the decoder, and those in LINK_KEYS
 
 
+@dataclass(frozen=True, slots=True)
+class LoadingOptions:
+    """Options for reading or decoding a recording."""
+
+    rate_hz: float | None = None  # sample rate of a recording that has neither times nor a rate
+    last_s: float | None = None  # duration at the end of the recording to use; None = all
+    reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
+    decoder: DecoderChoice | None = None  # decoder of a CAN log, of captured bytes, or of raw data of the daemon
+
+
+DEFAULT_LOADING: Final = LoadingOptions()
+
+
 def load_recording(
-    path: Path,
-    rate_hz: float | None = None,
-    last_s: float | None = None,
-    reading: ReadingOptions = DEFAULT_OPTIONS,
-    decoder: DecoderChoice | None = None,
-    report_progress: ProgressCallback = ignore_progress,
+    path: Path, options: LoadingOptions = DEFAULT_LOADING, report_progress: ProgressCallback = ignore_progress
 ) -> Recording:
     """Read a recording, and decode it if it contains the wire format of a sensor.
 
     Parameters
     ----------
-    path, rate_hz, last_s, reading
-        See ``drivers.recordings.load_samples``.
-    decoder : DecoderChoice, optional
-        Decoder of a CAN log, of captured bytes, or of raw data of the daemon.
+    path : Path
+        File, or folder of segments.
+    options : LoadingOptions, optional
+        Options for reading and decoding.
     report_progress : callable, optional
         Function that receives the progress.
 
@@ -81,7 +89,7 @@ def load_recording(
     ConfigError
         If the decoder is missing or does not fit, an option is wrong, or the samples do not fit into memory.
     """
-    kind = None
+    kind, decoder = None, options.decoder
     with contextlib.suppress(ConfigError, OSError):  # load_samples describes an unknown or missing file
         kind = detect_file_kind(path) if path.exists() else None
     if decoder is None:
@@ -90,15 +98,15 @@ def load_recording(
             raise ConfigError(f"{path}: contains {CONTENTS[kind]}; name the decoder with --decoder: {', '.join(names)}")
         report_progress("reading", None)
         with listen_to_reading_progress(lambda share: report_progress("reading", share)):
-            return load_samples(path, rate_hz, last_s, reading)
+            return load_samples(path, options.rate_hz, options.last_s, options.reading)
     if kind == "recording":
         raise ConfigError(f"{path}: contains samples, which need no decoder; leave out --decoder")
-    if reading.topic is not None:
+    if options.reading.topic is not None:
         raise ConfigError(f"{path}: contains no topics; leave out --topic")
     report_progress("decoding", None)
     with listen_to_reading_progress(lambda share: report_progress("decoding", share)):
-        found = _decode_file(path, decoder, rate_hz)
-    return found if last_s is None else take_last(found, last_s)
+        found = _decode_file(path, decoder, options.rate_hz)
+    return found if options.last_s is None else take_last(found, options.last_s)
 
 
 def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Recording:

@@ -1,4 +1,4 @@
-"""Export of noise coefficients as the dictionary ``imu_err`` of gnss-ins-sim, in Python.
+"""Export of noise coefficients for simulators: gnss-ins-sim in Python, and MathWorks ``imuSensor`` in MATLAB.
 
 The class ``imu_model.IMU`` of gnss-ins-sim reads angle random walk in °/√h, bias stability of gyroscopes in °/h,
 velocity random walk in m/s/√h and bias stability of accelerometers in m/s². The simulator has no flicker noise. The
@@ -6,19 +6,25 @@ bias is a first-order Gauss-Markov process with a standard deviation (``b_stabil
 (``b_corr``), which are chosen as for the Kalman filter in ``monitor.publishing.exporters.kalman``. With an infinite
 correlation time, the simulator draws white noise instead, so that such a bias is exported with a stability of 0.
 
-If only an upper bound of a coefficient is known, the coefficient is set to 0, because the dictionary is meant for
+The property ``NoiseDensity`` of ``imuSensor`` is N of IEEE Std 952 if the noise type is ``single-sided``, because the
+standard deviation of a sample is then NoiseDensity·√rate. With the default noise type of MathWorks, the noise would be
+too small by a factor of √2. The property ``BiasInstability`` is the standard deviation of the white noise at the input
+of a filter. With the filter ``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995), the bias has the spectrum B²/(2πf) of
+IEEE Std 952. The default filter of MathWorks has one pole at 0.5 and does not generate flicker noise.
+
+If only an upper bound of a coefficient is known, the coefficient is set to 0, because the values are meant for
 simulation.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from drivers.errors import ConfigError
-from drivers.number_ranges import DURATION_S, HOUR_S
+from drivers.number_ranges import HOUR_S
 from monitor.common.unit_formatting import DEGREE, ROOT_HOUR, Kind, axes_of
 from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
     NoiseCoefficients,
+    ascii_unit,
     comment_on_omitted_terms,
     describe_coefficients,
     format_float,
@@ -47,17 +53,7 @@ def export_gnss_ins_sim(
         Factor that multiplies N and B.
     correlation_time_s
         Correlation time of the bias [s]. By default, the time is computed from N and K.
-
-    Raises
-    ------
-    ConfigError
-        If the correlation time is outside the supported range.
     """
-    if correlation_time_s is not None:
-        try:
-            DURATION_S.check(correlation_time_s)
-        except ConfigError as error:
-            raise ConfigError(f"correlation time: {error}") from None
     lines = [
         "# imu_err for imu_model.IMU(accuracy=imu_err) of gnss-ins-sim",
         *header_comments(noise, inflation, "#"),
@@ -98,3 +94,65 @@ def _markov_process(
 def _item(key: str, values: Sequence[float], unit: str) -> str:
     listed = ", ".join("np.inf" if value == float("inf") else format_float(value) for value in values)
     return f"    '{key}': np.array([{listed}]),  # {unit}"
+
+
+N_POLES: Final = 500
+"""Number of poles of the 1/f filter, the same as in the Allan variance example of MathWorks."""
+
+
+def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
+    """Export noise coefficients as a MATLAB script.
+
+    Parameters
+    ----------
+    noise
+        Noise coefficients of each axis, in SI units.
+    inflation
+        Factor that multiplies N, B and K.
+    """
+    lines = [
+        "% Noise of an IMU for imuSensor (Navigation Toolbox, or Sensor Fusion and Tracking Toolbox), R2023b or newer",
+        *header_comments(noise, inflation, "%"),
+        "% single-sided: white noise with sigma = NoiseDensity*sqrt(rate) per sample, N of IEEE Std 952",
+        f"% fractalcoef({N_POLES}): 1/f noise down to about rate/{N_POLES}; more poles extend the range",
+    ]
+    made = []
+    kinds: tuple[tuple[Kind, str, str], ...] = (
+        ("gyro", "gyroparams", "Gyroscope"),
+        ("accel", "accelparams", "Accelerometer"),
+    )
+    for kind, maker, name in kinds:
+        if not set(axes_of(kind)) & noise.axes.keys():
+            continue
+        unit = ascii_unit("B", kind)
+        made.append(f", '{name}', {kind}")
+        lines += [
+            "",
+            *(
+                f"% {axis}: {describe_coefficients(noise.axes[axis], 'NBK')}"
+                for axis in axes_of(kind)
+                if axis in noise.axes
+            ),
+            f"{kind} = {maker}( ...",
+            _property(noise, kind, "N", "NoiseDensity", f"({unit})/sqrt(Hz)", inflation),
+            _property(noise, kind, "B", "BiasInstability", unit, inflation),
+            _property(noise, kind, "K", "RandomWalk", f"({unit})*sqrt(Hz)", inflation),
+            "    'NoiseType', 'single-sided', ...",
+            f"    'BiasInstabilityCoefficients', fractalcoef({N_POLES}));",
+        ]
+    rate = "" if noise.sample_rate_hz is None else f", 'SampleRate', {noise.sample_rate_hz!r}"
+    lines += ["", f"imu = imuSensor('accel-gyro'{rate}{''.join(made)});"]
+    return join_lines([*lines, *comment_on_omitted_terms(noise, "NBK", "%")])
+
+
+def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit: str, inflation: float) -> str:
+    """Return a property with the values of three axes. Unknown coefficients are written as 0, with a comment."""
+    known, values, said = noise.coefficient_by_axis(kind, letter), [], ""
+    for axis in axes_of(kind):
+        term = known.get(axis)
+        values.append("0" if term is None or term.bound else format_float(term.value * inflation))
+        if term is None:
+            said += f"; {axis} unknown"
+        elif term.bound:
+            said += f"; {axis} only bounded, <= {term.value:.3g}"
+    return f"    '{name}', [{' '.join(values)}], ... % {letter}, {unit}{said}"

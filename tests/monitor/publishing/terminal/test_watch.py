@@ -20,7 +20,7 @@ from drivers.data_types import AXES, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.publishing.messages.results import EventMessage
-from monitor.publishing.terminal.json_lines import RESULT_TOPICS, SAMPLE_TOPICS, json_line
+from monitor.publishing.terminal.watch import RESULT_TOPICS, SAMPLE_TOPICS, json_line
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import ReceivedMessageOrLiveliness
 from monitor.settings.loading import ZenohTable
