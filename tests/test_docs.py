@@ -54,7 +54,11 @@ PAGES = sorted(
         *(ROOT / "docs").rglob("*.ipynb"),
     ]
 )
-COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+COMMANDS = {
+    name: command
+    for name, command in typer.main.get_command(app).commands.items()  # type: ignore[attr-defined]
+    if not command.hidden
+}
 ENDPOINT_IN_PAGES = "tcp/127.0.0.1:7450"
 
 

@@ -138,6 +138,8 @@ FRACTION: Final = NumberRange("", 0.0, 1.0)
 POSITIVE_SHARE: Final = NumberRange("", 1e-6, 1.0)
 PERCENT: Final = NumberRange("%", 1.0, 100.0)
 SEED: Final = NumberRange("", 0, (1 << 63) - 1)
+WORKERS: Final = NumberRange("", 1, 64)
+"""Number of worker processes."""
 SAMPLE_COUNT: Final = NumberRange("samples", 1, 10_000_000_000)
 """Number of samples of a simulated recording."""
 COUNTER_MODULUS: Final = NumberRange("counts", 2, 1 << 62)

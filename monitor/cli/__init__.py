@@ -33,6 +33,7 @@ from monitor.cli import (
     view,
     warm_up,
     watch,
+    worker,
 )
 from monitor.cli.shared.errors import DEBUG, INTERRUPTED, error_message_and_exit_status
 
@@ -90,6 +91,7 @@ for _command, _example in (
     (export.export, "export result.json --format kalibr --out imu.yaml"),
 ):
     app.command(epilog=f"Example: imu-monitor {_example}")(_command)
+app.command(hidden=True)(worker.worker)
 _thermal = typer.Typer(
     help="Bias against temperature: fit a model to a recording, and predict another recording.", rich_markup_mode=None
 )

@@ -3,6 +3,8 @@
 The lock is ``flock`` on a lock file in the folder, so the operating system releases the lock at the end of the process.
 The lock file contains the process id and the host name of the lock holder. Readers need no lock.
 
+Several processes of one daemon share the lock: each of them holds a shared lock, and the file names the daemon.
+
 A process loses the lock if the folder or the lock file is deleted or replaced. Child processes do not inherit the lock.
 """
 
@@ -37,14 +39,17 @@ class FolderLock:
         Folder to lock. ``ensure_held`` creates the folder if necessary.
     name : str
         Name of the lock file in the folder.
+    owner_pid : int, optional
+        Process id of the daemon that owns the lock. By default, that of this process.
     """
 
-    def __init__(self, folder: Path, name: str) -> None:
+    def __init__(self, folder: Path, name: str, owner_pid: int | None = None) -> None:
         self.folder = folder
         self.path = folder / name
         self.warning = ""
         """Warning if the file system does not support locks, otherwise an empty string."""
         self._descriptor: int | None = None
+        self._owner_pid = owner_pid
 
     def ensure_held(self) -> str:
         """Acquire the lock without waiting, or check that this process still holds the lock.
@@ -69,7 +74,6 @@ class FolderLock:
         try:
             free = self._lock(descriptor)
             if free and self._in_place(descriptor):
-                _write_holder(descriptor)
                 self._descriptor = descriptor
                 return ""
             return f"{self.folder}: in use by {_holder(descriptor)}"
@@ -98,14 +102,21 @@ class FolderLock:
     def _lock(self, descriptor: int) -> bool:
         """Try to lock the lock file. Return True on success, or if the file system does not support locks."""
         self.warning = ""
+        owner = _format_holder(self._owner_pid or os.getpid())
         for wait_s in (RETRY_S, 0.0):
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _write_holder(descriptor, owner)
+                if self._owner_pid is not None:
+                    fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
+                if self._owner_pid is not None and _shares_lock(descriptor, owner):
+                    return True
                 time.sleep(wait_s)
             except OSError as error:
                 if error.errno not in LOCKS_UNSUPPORTED_ERRNOS:
                     raise
+                _write_holder(descriptor, owner)
                 self.warning = (
                     f"{self.folder}: this file system has no locks ({error.strerror}); make sure that no other "
                     f"imu-monitor uses the folder"
@@ -136,7 +147,7 @@ def describe_lock_holder(folder: Path, name: str) -> str:
     except OSError:
         return ""
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return _holder(descriptor)
     except OSError:
@@ -166,11 +177,27 @@ def _open_lock_file(path: Path) -> int:
     return descriptor
 
 
-def _write_holder(descriptor: int) -> None:
+def _shares_lock(descriptor: int, owner: bytes) -> bool:
+    """Return True if another process of the same daemon holds the lock, which is then shared."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    if os.pread(descriptor, HOLDER_BYTES, 0) == owner:
+        return True
+    fcntl.flock(descriptor, fcntl.LOCK_UN)
+    return False
+
+
+def _format_holder(pid: int) -> bytes:
+    return f"{pid} {socket.gethostname()}\n".encode(errors="replace")
+
+
+def _write_holder(descriptor: int, owner: bytes) -> None:
     # on a full disk, the lock works without the name of the lock holder
     with contextlib.suppress(OSError):
         os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode(errors="replace"), 0)
+        os.pwrite(descriptor, owner, 0)
 
 
 def _holder(descriptor: int) -> str:

@@ -48,12 +48,27 @@ class ConfigChange:
 
 
 def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) -> ConfigChange:
-    """Compare the configuration file with the running configuration.
+    """Compare the configuration file with the running configuration, as ``compare_configurations``.
+
+    Raises
+    ------
+    ConfigError
+        If the file contains an error, or if the running configuration was not read from a file.
+    """
+    if running.path is None:
+        raise ConfigError("the running configuration was not read from a file; there is no file to read again")
+    return compare_configurations(running, loading.load_config(running.path), models)
+
+
+def compare_configurations(running: Config, new: Config, models: Mapping[str, NoiseModel | None]) -> ConfigChange:
+    """Compare a new configuration with the running configuration.
 
     Parameters
     ----------
     running : Config
         Running configuration.
+    new : Config
+        New configuration.
     models : mapping of str to NoiseModel or None
         Noise model that each running device uses.
 
@@ -65,11 +80,8 @@ def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) 
     Raises
     ------
     ConfigError
-        If the file contains an error, or if the running configuration was not read from a file.
+        If a noise model of the new configuration is invalid.
     """
-    if running.path is None:
-        raise ConfigError("the running configuration was not read from a file; there is no file to read again")
-    new = loading.load_config(running.path)
     old_tables, new_tables = _by_name(running.table), _by_name(new.table)
     added, limited = [], []
     for device in new.devices:

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -71,6 +71,7 @@ class Config:
     metrics: MetricsAddress | None = None
     influx: InfluxTable | None = None  # None if nothing is sent
     ros2: Ros2Table | None = None  # None if nothing is published
+    workers: int = 0  # number of worker processes; 0 if it depends on the sample rates
     path: Path | None = None  # of the file
     table: Mapping[str, Any] = dataclasses.field(
         default_factory=dict
@@ -154,12 +155,58 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
     return ConfigReading(dataclasses.replace(config, path=path, table=table, warnings=lines), [], models)
 
 
+def select_devices(config: Config, names: Collection[str]) -> tuple[dict[str, Any], Path]:
+    """Return the table and the folder of a configuration of some devices, whose results are only recorded.
+
+    Parameters
+    ----------
+    config : Config
+        Configuration that was read from a file.
+    names : collection of str
+        Names of the devices.
+    """
+    table, off = config.table, {"mode": "none"}
+    part = {"device": [one for one in table["device"] if one["name"] in names], "zenoh": off, "viewer": off}
+    part |= {"log": table.get("log", {}), "storage": {**table.get("storage", {}), "history": False}}
+    return part, (config.path or Path()).resolve().parent
+
+
+def load_selected_devices(table: Mapping[str, Any], folder: Path) -> Config:
+    """Load the configuration that ``select_devices`` has returned.
+
+    Parameters
+    ----------
+    table : mapping of str to Any
+        Content of the configuration.
+    folder : Path
+        Folder to which relative paths refer.
+
+    Raises
+    ------
+    ConfigError
+        If the configuration is no longer valid, for example because a file has been deleted.
+    """
+    checked = check_table(ConfigFile, table, folder)
+    if checked.problems or checked.value is None:
+        raise ConfigError(*(_format_problem(problem, table) for problem in checked.problems))
+    return dataclasses.replace(_configuration(checked.value), table=table)
+
+
 def _configuration(file: ConfigFile) -> Config:
     storage = None if file.storage.folder == Path() else file.storage
     influx = None if file.influx.url is None else file.influx
     ros2 = None if file.ros2.domain is None else file.ros2
     return Config(
-        file.devices, file.zenoh, file.viewer, file.log, storage, file.hooks, file.metrics.listen, influx, ros2
+        file.devices,
+        file.zenoh,
+        file.viewer,
+        file.log,
+        storage,
+        file.hooks,
+        file.metrics.listen,
+        influx,
+        ros2,
+        file.service.workers,
     )
 
 

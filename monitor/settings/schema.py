@@ -395,6 +395,16 @@ class InfluxTable(SettingsModel):
             yield Conflict("token_file", "there is no server to send the token to; add url", ("url",))
 
 
+class ServiceTable(SettingsModel):
+    """Table ``[service]``: settings of the processes of the daemon."""
+
+    workers: Annotated[int, KeywordOrType({"auto": 0}, Annotated[int, number_ranges.WORKERS])] = Field(
+        0,
+        examples=["auto"],
+        description='processes that share the devices; 1: a single process, "auto": one for each 8 devices',
+    )
+
+
 class LogTable(SettingsModel):
     """Table ``[log]``: settings of the log messages."""
 
@@ -414,6 +424,7 @@ class ConfigFile(SettingsModel):
     influx: InfluxTable = Field(InfluxTable(), description="numbers for InfluxDB")
     ros2: Ros2Table = Field(Ros2Table(), description="diagnostics and samples for ROS 2")
     log: LogTable = Field(LogTable(), description="messages of the service")
+    service: ServiceTable = Field(ServiceTable(), description="processes of the service")
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield the conflicts between tables of a configuration file."""

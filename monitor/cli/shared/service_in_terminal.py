@@ -56,9 +56,12 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     import structlog
     from rich.console import Console
 
+    from monitor.daemon.daemon_process import STATUS_INTERVAL_S, DaemonProcess
     from monitor.daemon.operations.systemd import SystemdNotifier
     from monitor.daemon.outputs.terminal_outputs import EventAndStatusLogOutput, TableOutput
-    from monitor.daemon.service import STATUS_INTERVAL_S, Service
+    from monitor.daemon.service import Service
+    from monitor.daemon.workers.device_spreading import count_workers
+    from monitor.daemon.workers.supervisor import WorkerSupervisor
     from monitor.publishing.remote_device_states import RemoteDeviceRegistry
     from monitor.publishing.terminal.live_device_table import LiveTable
     from monitor.publishing.terminal.queued_writer import QueuedWriter
@@ -84,7 +87,12 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
                 if terminal
                 else [TableOutput(board), EventAndStatusLogOutput()]
             )
-            service = Service(config, outputs, unit=unit, writers=writers)
+            workers = count_workers(config)
+            service: DaemonProcess = (
+                Service(config, outputs, unit=unit, writers=writers)
+                if workers == 1
+                else WorkerSupervisor(config, workers, outputs, unit, writers)
+            )
 
             def stop() -> None:
                 asked.set()

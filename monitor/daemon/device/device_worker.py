@@ -30,9 +30,9 @@ from monitor.settings.loading import Device, VirtualTable
 if TYPE_CHECKING:
     from monitor.simulator import SimulatedDevice
 
-RING_S: Final = 10.0
-"""Capacity of the ring buffer in seconds, limited to RING_SAMPLES_RANGE."""
-RING_SAMPLES_RANGE: Final = (65_536, 1_000_000)
+RING_S: Final = 65.536
+"""Capacity of the ring buffer in seconds, limited to RING_SAMPLES_RANGE. Samples wait while kernels are compiled."""
+RING_SAMPLES_RANGE: Final = (4096, 1_000_000)
 """Minimum and maximum capacity of the ring buffer in samples."""
 UNKNOWN_RATE_HZ: Final = 1000.0
 """Assumed sample rate for the capacity of the ring buffer if no rate is configured."""

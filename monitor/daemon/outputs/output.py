@@ -4,6 +4,7 @@ from typing import Any
 
 from drivers.data_types import Event, Ints, SampleBlock
 from monitor.common.device_health import Health
+from monitor.settings.loading import Device
 
 
 class Output:
@@ -42,6 +43,15 @@ class Output:
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Publish the status of the device once a second; ``unix_s`` is None if the present time is unknown."""
+
+    def set_alive(self, device: str, samples_arrive: bool) -> None:
+        """Publish that samples of a device arrive, or that no more samples arrive."""
+
+    def finish_round(self) -> None:
+        """Send the results of one round of the main loop, if they have been collected."""
+
+    def add_device(self, device: Device) -> None:
+        """Add a device that was added to the configuration."""
 
     def remove_device(self, device: str) -> None:
         """Remove the data of a device that was removed from the configuration."""

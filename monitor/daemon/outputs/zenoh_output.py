@@ -12,6 +12,7 @@ from monitor.common.device_health import Health
 from monitor.daemon.outputs.output import Output
 from monitor.publishing.result_kinds import kind_of
 from monitor.publishing.zenoh.publisher import ZenohPublisher
+from monitor.settings.loading import Device
 
 
 class ZenohOutput(Output):
@@ -42,6 +43,18 @@ class ZenohOutput(Output):
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Publish the status as a JSON message."""
         self._publish_messages(device, unix_s, health.received, health)
+
+    def set_alive(self, device: str, samples_arrive: bool) -> None:
+        """Declare or remove the liveliness token of a device."""
+        self._zenoh.set_alive(device, samples_arrive)
+
+    def add_device(self, device: Device) -> None:
+        """Declare the zenoh keys of a device."""
+        self._zenoh.add_device(device.name)
+
+    def remove_device(self, device: str) -> None:
+        """Remove the zenoh keys of a device."""
+        self._zenoh.remove_device(device)
 
     def _publish_messages(self, device: str, unix_s: float | None, received: int, result: Any) -> None:
         for message in kind_of(result).messages:

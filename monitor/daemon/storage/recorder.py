@@ -59,10 +59,16 @@ class Recorder:
         Metadata of the recordings to write.
     opening : callable, optional
         Function that opens a segment.
+    owner_pid : int, optional
+        Process id of the daemon, whose processes record into one folder. By default, that of this process.
     """
 
     def __init__(
-        self, storage: Storage, origins: Sequence[SegmentMetadata], opening: Opening = SegmentFileWriter
+        self,
+        storage: Storage,
+        origins: Sequence[SegmentMetadata],
+        opening: Opening = SegmentFileWriter,
+        owner_pid: int | None = None,
     ) -> None:
         self._storage = storage
         self._opening = opening
@@ -77,7 +83,7 @@ class Recorder:
         self._packing: Iterator[None] | None = None
         self._finished: deque[Path] = deque()  # segments to compress
         self._disk_full = ""  # message if the disk is too full
-        self._folder_lock = FolderLock(storage.folder, RECORDING_LOCK)
+        self._folder_lock = FolderLock(storage.folder, RECORDING_LOCK, owner_pid)
         self._lock_failure = ""  # message if the lock on the folder is not held
         self._lock_failed_s = 0.0  # monotonic time of the last attempt to take the lock
         self._other_process = False  # True if another process holds the lock on the folder

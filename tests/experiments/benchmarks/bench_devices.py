@@ -1,74 +1,82 @@
-"""Lost samples, processor time and memory of a daemon with many IMUs.
+"""Lost samples, processor time, memory and latency of a daemon with many IMUs.
 
-    python -m tests.experiments.benchmarks.bench_devices [--devices 1 4 16 16:0.05] [--seconds 30]
+    python -m tests.experiments.benchmarks.bench_devices [--devices 1 4 16 64] [--rate 1000] [--seconds 30]
+        [--parts default viewer ...] [--read-timeout 0.01] [--workers auto] [--window 10min] [--burst 1]
 
-Another process writes VectorNav binary frames at 1 kHz to one pseudo-terminal for each device. The daemon reads them
-with its serial link and default settings, except for a window of ten minutes. (A window stores 64 bytes per sample, so
-an hour of 16 devices at 1 kHz needs 3.7 GB.) This process subscribes to all messages of the daemon. The processor time
-is measured from 5 s after the first sample to the last sample. Every sample must be received, bad or lost.
+Another process writes VectorNav binary frames to one pseudo-terminal for each device. The daemon reads them with its
+serial link and default settings, except for the length of the window. This process subscribes to all messages of the
+daemon. The processor time of all processes of the daemon is measured from 5 s after the first sample to the last
+sample. The latency is the time from the write of the newest frame of a result until this process receives the
+coefficients. Shared memory pages count once (PSS). Every sample must be received, bad or lost.
 """
 
 import argparse
 import json
+import re
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
+import numpy as np
 import zenoh
 
 from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
-from tests.experiments.benchmarks.rig import PATIENCE_S, Daemon, Sensors, open_session
+from tests.experiments.benchmarks.rig import NO_VIEWER, PATIENCE_S, Daemon, Sensors, open_session
 from tests.support.waiting import wait_for
 
-RATE_HZ: Final = 1000
 WARM_UP_S: Final = 5.0
-SETTLE_S: Final = 2.0
-READ_TIMEOUT_S: Final = 0.01
-"""Default of the serial link: longest time that a byte waits for further bytes."""
-
-
-@dataclass(frozen=True, slots=True)
-class RunResult:
-    """Result of one run."""
-
-    sent: int
-    received: int
-    bad: int
-    lost: int
-    overflowed: int
-    full: int
-    cpu: float  # as a share of one core
-    memory: int  # bytes
-    messages: int
-    latency_p99_s: float  # from arrival to publication, largest value of all devices in the last second
-    others: str
+POLL_S: Final = 0.1
+SAMPLES: Final = re.compile(rb'"samples":(\d+)')
+STORAGE: Final = '[storage]\nfolder = "{folder}/store"\n'
+PARTS: Final[Mapping[str, tuple[str, str]]] = {
+    "default": ("", NO_VIEWER),
+    "with recording and history": ("", NO_VIEWER + STORAGE),
+    "with viewer": ("", '[viewer]\nmode = "{folder}/view.rrd"\n'),
+    "without compensation": ("compensate = false", NO_VIEWER),
+    "without thermal models": ('thermal_interval = "off"', NO_VIEWER),
+    "without change detection": ("alarms_per_day = 0.0", NO_VIEWER),
+    "publish at 1 Hz": ('publish = "1 Hz"\nrefit = "1 Hz"', NO_VIEWER),
+}
+"""Keys of each device and tables of the configuration, by the part of the daemon that is switched on or off."""
 
 
 class PublishedMessages:
-    """Number of published messages, and the newest status of each device."""
+    """Published messages: their number, the newest status of each device, and the times of the coefficients."""
 
     def __init__(self) -> None:
         self.messages = 0
         self.status: dict[str, dict[str, Any]] = {}
+        self.results: list[tuple[int, int]] = []  # number of samples, and time in ns
 
     def take(self, sample: zenoh.Sample) -> None:
-        """Count a message and store a status. zenoh calls this method."""
+        """Count a message and store its content. zenoh calls this method."""
         self.messages += 1
-        if str(sample.key_expr).endswith("/status"):
+        key = str(sample.key_expr)
+        if key.endswith("/status"):
             payload = json.loads(sample.payload.to_bytes())
             self.status[payload["device"]] = payload
+        elif key.endswith("/coefficients") and (found := SAMPLES.search(sample.payload.to_bytes())):
+            self.results.append((int(found[1]), time.monotonic_ns()))
+
+    def count_samples(self) -> int:
+        """Return the number of samples that were received, bad or lost."""
+        return self.total("received") + self.total("bad") + self.total("lost")
 
     def total(self, what: str) -> int:
         """Return the sum of a count over the devices."""
         return sum(int(status[what]) for status in self.status.values())
 
 
-def run(devices: int, read_timeout_s: float, seconds: float, folder: Path) -> RunResult:
-    """Run a daemon with several devices and return the result."""
-    sensors = Sensors(folder, devices, RATE_HZ, WARM_UP_S + seconds)
-    daemon = Daemon(folder, devices, RATE_HZ, "10min", driver=f"read_timeout = {read_timeout_s}")
+def run(devices: int, part: str, folder: Path, options: argparse.Namespace) -> tuple[list[str], str]:
+    """Run a daemon with several devices, and return the cells of a table and a note."""
+    rate_hz, seconds = options.rate, options.seconds
+    more, tables = (text.replace("{folder}", str(folder)) for text in PARTS[part])
+    tables += f"[service]\nworkers = {options.workers if options.workers != 'auto' else chr(34) + 'auto' + chr(34)}\n"
+    sensors = Sensors(folder, devices, rate_hz, WARM_UP_S + seconds, burst=options.burst)
+    driver = "" if options.read_timeout is None else f"read_timeout = {options.read_timeout}"
+    daemon = Daemon(folder, devices, rate_hz, options.window, more, driver=driver, tables=tables)
     published = PublishedMessages()
     try:
         with open_session(daemon.port) as session, session.declare_subscriber("imu/**", published.take):
@@ -77,74 +85,63 @@ def run(devices: int, read_timeout_s: float, seconds: float, folder: Path) -> Ru
             time.sleep(WARM_UP_S)
             load, start_s, cpu_s, before = Load(), time.monotonic(), daemon.cpu_s(), published.messages
             sent = sensors.wait(seconds + PATIENCE_S)
-            cpu = (daemon.cpu_s() - cpu_s) / (time.monotonic() - start_s)
-            others, messages = load.describe(), published.messages - before
-            p99_s = max(status["latency"]["p99"] or 0.0 for status in published.status.values())
-            time.sleep(SETTLE_S)
-            memory = daemon.process.memory_info().rss
-            return RunResult(
-                sent=devices * sent["each"],
-                received=published.total("received"),
-                bad=published.total("bad"),
-                lost=published.total("lost"),
-                overflowed=published.total("overflowed"),
-                full=sent["full"],
-                cpu=cpu,
-                memory=memory,
-                messages=messages,
-                latency_p99_s=p99_s,
-                others=others,
-            )
+            took_s = time.monotonic() - start_s
+            cpu, messages, others = (daemon.cpu_s() - cpu_s) / took_s, published.messages - before, load.describe()
+            until_s = time.monotonic() + PATIENCE_S
+            while published.count_samples() < devices * sent["each"] and time.monotonic() < until_s:
+                time.sleep(POLL_S)
+            processes, memory_bytes = daemon.processes(), daemon.memory_bytes()
+            threads, descriptors = (sum(map(count, processes)) for count in (_count_threads, _count_descriptors))
+        written_ns = sensors.written_ns()
     finally:
         daemon.close()
         sensors.close()
+    late_ms = [(at_ns - written_ns[n - 1]) / 1e6 for n, at_ns in published.results if n > WARM_UP_S * rate_hz]
+    counts = [published.total(name) for name in ("received", "bad", "lost", "overflowed")]
+    balance, all_sent = sum(counts[:3]), devices * sent["each"]
+    cells = [f"{count:,}" for count in (all_sent, *counts, sent["full"])]
+    cells += [f"{100 * cpu:.0f}", f"{memory_bytes / 1e6:.0f}", f"{messages / took_s:.0f}"]
+    cells += [f"{np.quantile(late_ms, q):.0f}" for q in (0.5, 0.99)]
+    cells += [f"{len(processes)}", f"{threads}", f"{descriptors}"]
+    sign = "=" if balance == all_sent else "≠"
+    late = f"sensors at most {1e3 * sent['latest']:.0f} ms late"
+    return cells, f"{devices} {part}: received + bad + lost = {balance:,} {sign} {all_sent:,} sent; {others}; {late}"
+
+
+def _count_threads(process: Any) -> int:
+    return int(process.num_threads())
+
+
+def _count_descriptors(process: Any) -> int:
+    return int(process.num_fds())
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--devices", nargs="+", default=["1", "4", "16", "16:0.05"], metavar="N[:READ_TIMEOUT]")
+    parser.add_argument("--devices", nargs="+", type=int, default=[1, 4, 16, 64])
+    parser.add_argument("--parts", nargs="+", default=["default"], choices=PARTS)
+    parser.add_argument("--rate", type=int, default=1000, metavar="HZ")
     parser.add_argument("--seconds", type=float, default=30.0)
-    arguments = parser.parse_args()
+    parser.add_argument("--read-timeout", type=float, metavar="S")
+    parser.add_argument("--workers", default="auto")
+    parser.add_argument("--window", default="10min")
+    parser.add_argument("--burst", type=int, default=1, metavar="FRAMES")
+    options = parser.parse_args()
     console.print(describe_machine())
     table = create_table(
-        f"devices at {RATE_HZ} Hz on one service, {arguments.seconds:g} s after {WARM_UP_S:g} s",
-        "devices",
-        "read_timeout",
-        "sent",
-        "received",
-        "bad",
-        "lost",
-        "over-flowed",
-        "port full",
-        "% of a core",
-        "MB",
-        "mes-sages/s",
-        "p99 of status",
-    )
+        f"devices at {options.rate} Hz, workers: {options.workers}, {options.seconds:g} s after {WARM_UP_S:g} s",
+        "devices", "sent", "received", "bad", "lost", "over-flowed", "port full", "% of a core", "MB", "mes-sages/s",
+        "p50 ms", "p99 ms", "pro-cesses", "threads", "descrip-tors",
+    )  # fmt: skip
     notes = []
-    for word in arguments.devices:
-        devices, read_timeout_s = int(word.partition(":")[0]), float(word.partition(":")[2] or READ_TIMEOUT_S)
-        with TemporaryDirectory() as folder:
-            result = run(devices, read_timeout_s, arguments.seconds, Path(folder))
-        counts = [
-            f"{count:,}"
-            for count in (result.sent, result.received, result.bad, result.lost, result.overflowed, result.full)
-        ]
-        table.add_row(
-            f"{devices}",
-            f"{1e3 * read_timeout_s:g} ms",
-            *counts,
-            f"{100 * result.cpu:.0f}",
-            f"{result.memory / 1e6:.0f}",
-            f"{result.messages / arguments.seconds:.0f}",
-            f"{result.latency_p99_s * 1e3:.1f} ms",
-        )
-        balance = result.received + result.bad + result.lost
-        sign = "=" if balance == result.sent else "≠"
-        notes.append(
-            f"{word} devices: received + bad + lost = {balance:,} {sign} {result.sent:,} sent; {result.others}"
-        )
+    for devices in options.devices:
+        for part in options.parts:
+            with TemporaryDirectory() as folder:
+                cells, note = run(devices, part, Path(folder), options)
+            table.add_row(f"{devices} {part}", *cells)
+            notes.append(note)
+            print(devices, part, *cells, note, sep=" | ", flush=True)
     console.print(table)
     for note in notes:
         console.print(note)

@@ -1,9 +1,11 @@
 """Sensors in one process, the daemon in another process, and a subscriber in this process, for service benchmarks.
 
-``python -m tests.experiments.benchmarks.rig FOLDER DEVICES RATE SECONDS DECODER`` is the process of the sensors. It
-opens a pseudo-terminal FOLDER/tty<i> for each device, encodes all frames, and waits for a line on standard input. It
-then writes a frame to each device every 1/RATE s. The numbers and times of the frames are stored in FOLDER, with times
-in monotonic nanoseconds. If a pseudo-terminal is full, the process waits and counts the event. A real port would lose
+``python -m tests.experiments.benchmarks.rig FOLDER DEVICES RATE SECONDS DECODER BURST SPEED`` is the process of the
+sensors. It opens a pseudo-terminal FOLDER/tty<i> for each device, encodes all frames, and waits for a line on standard
+input. It then writes a burst of BURST frames to each device every BURST/RATE/SPEED s. A USB adapter sends such bursts
+as well. A SPEED above 1 fills long windows quickly. The numbers and times of the frames are stored in FOLDER, with
+times in monotonic nanoseconds. If a pseudo-terminal is full, the process waits and counts the event. A real port would
+lose
 bytes.
 """
 
@@ -46,10 +48,12 @@ decoder = "{decoder}"
 REST: Final = """
 [zenoh]
 listen = ["tcp/127.0.0.1:{port}"]
-[viewer]
-mode = "none"
 [log]
 level = "error"
+"""
+NO_VIEWER: Final = """
+[viewer]
+mode = "none"
 """
 
 
@@ -57,7 +61,14 @@ class Sensors:
     """Process of the simulated sensors."""
 
     def __init__(
-        self, folder: Path, devices: int, rate_hz: int, seconds: float, decoder: str = "vectornav_binary"
+        self,
+        folder: Path,
+        devices: int,
+        rate_hz: int,
+        seconds: float,
+        decoder: str = "vectornav_binary",
+        burst: int = 1,
+        speed: float = 1.0,
     ) -> None:
         self.folder = folder
         command = [
@@ -69,6 +80,8 @@ class Sensors:
             str(rate_hz),
             str(seconds),
             decoder,
+            str(burst),
+            str(speed),
         ]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
@@ -110,21 +123,32 @@ class Daemon:
         driver: str = "",
         decoder: str = "vectornav_binary",
         python: str = sys.executable,
+        tables: str = NO_VIEWER,
     ) -> None:
         self.port = free_port()
         path = folder / "config.toml"
         values = {"rate": rate_hz, "window": window, "more": more, "driver": driver, "decoder": decoder}
         path.write_text(
-            "".join(DEVICE.format(i=i, folder=folder, **values) for i in range(devices)) + REST.format(port=self.port)
+            "".join(DEVICE.format(i=i, folder=folder, **values) for i in range(devices))
+            + REST.format(port=self.port)
+            + tables
         )
         self._process = subprocess.Popen([python, "-P", "-c", DAEMON, "run", str(path)])
         self.process = psutil.Process(self._process.pid)
         wait_for(lambda: self._open_ports() >= devices, "the daemon to open its ports")
 
+    def processes(self) -> list[psutil.Process]:
+        """Return the main process and its worker processes."""
+        return [self.process, *self.process.children(recursive=True)]
+
     def cpu_s(self) -> float:
-        """Return the processor time so far in seconds."""
-        t = self.process.cpu_times()
-        return float(t.user + t.system)
+        """Return the processor time of all processes so far in seconds."""
+        times = [process.cpu_times() for process in self.processes()]
+        return float(sum(t.user + t.system for t in times))
+
+    def memory_bytes(self) -> int:
+        """Return the memory of all processes in bytes, in which shared pages count once."""
+        return sum(process.memory_full_info().pss for process in self.processes())
 
     def context_switches(self) -> int:
         """Return how often a thread has waited so far."""
@@ -141,9 +165,10 @@ class Daemon:
         if self._process.poll() is not None:
             raise SystemExit(f"the daemon ended with status {self._process.returncode}")
         found = 0
-        for number in os.listdir(f"/proc/{self.process.pid}/fd"):
-            with contextlib.suppress(FileNotFoundError):
-                found += os.readlink(f"/proc/{self.process.pid}/fd/{number}").startswith("/dev/pts/")
+        for process in self.processes():
+            for number in os.listdir(f"/proc/{process.pid}/fd"):
+                with contextlib.suppress(FileNotFoundError):
+                    found += os.readlink(f"/proc/{process.pid}/fd/{number}").startswith("/dev/pts/")
         return found
 
 
@@ -182,17 +207,18 @@ def open_terminals(folder: Path, devices: int) -> list[int]:
     return masters
 
 
-def write_all(masters: list[int], frames: list[bytes], rate_hz: int) -> tuple[Ints, int]:
-    """Write each frame to each device at its time. Return the write times and how often a terminal was full."""
+def write_all(masters: list[int], frames: list[bytes], rate_hz: float, burst: int = 1) -> tuple[Ints, int]:
+    """Write bursts of frames to each device. Return the time of each frame and how often a terminal was full."""
     written_ns, full = np.zeros(len(frames), np.int64), 0
     begun_ns = time.monotonic_ns()
-    for i, frame in enumerate(frames):
-        early_ns = begun_ns + i * 1_000_000_000 // rate_hz - time.monotonic_ns()
+    for i in range(0, len(frames), burst):
+        data = b"".join(frames[i : i + burst])
+        early_ns = begun_ns + round((i + burst - 1) * 1e9 / rate_hz) - time.monotonic_ns()
         if early_ns > 0:
             time.sleep(early_ns / 1e9)
         for master in masters:
-            full += _write(master, frame)
-        written_ns[i] = time.monotonic_ns()
+            full += _write(master, data)
+        written_ns[i : i + burst] = time.monotonic_ns()
     return written_ns, full
 
 
@@ -212,13 +238,15 @@ def main() -> None:
     """Run the process of the sensors."""
     folder, devices, rate_hz, seconds = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
     frames = encode_frames(rate_hz, seconds, sys.argv[5])
+    burst, speed = int(sys.argv[6]), float(sys.argv[7])
     masters = open_terminals(folder, devices)
     print("ready", flush=True)
     if sys.stdin.readline() != "go\n":
         return
-    written_ns, full = write_all(masters, frames, rate_hz)
+    written_ns, full = write_all(masters, frames, speed * rate_hz, burst)
     np.save(folder / "written.npy", written_ns)
-    late_s = float(np.max((written_ns - written_ns[0]) / 1e9 - np.arange(len(frames)) / rate_hz))
+    due_s = np.arange(len(frames)) / (speed * rate_hz)
+    late_s = float(np.max((written_ns - written_ns[0]) / 1e9 - due_s))
     result = {"each": len(frames), "full": full, "seconds": (written_ns[-1] - written_ns[0]) / 1e9, "latest": late_s}
     (folder / "sent.part").write_text(json.dumps(result))
     (folder / "sent.part").rename(folder / "sent.json")

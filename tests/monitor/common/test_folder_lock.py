@@ -44,6 +44,26 @@ def test_locks_of_different_names_are_independent(tmp_path: Path) -> None:
     second.release()
 
 
+def test_processes_of_one_daemon_share_the_lock(tmp_path: Path) -> None:
+    first, second, foreign = (FolderLock(tmp_path, "a.lock", owner_pid=pid) for pid in (11, 11, 12))
+    alone = FolderLock(tmp_path, "a.lock")
+    in_use = f"{tmp_path}: in use by process 11"
+    assert (first.ensure_held(), second.ensure_held()) == ("", "")
+    assert (foreign.ensure_held(), alone.ensure_held()) == (in_use, in_use)
+    first.release()
+    assert (foreign.ensure_held(), alone.ensure_held()) == (in_use, in_use)
+    assert describe_lock_holder(tmp_path, "a.lock") == "process 11"
+    assert first.ensure_held() == ""
+    first.release()
+    second.release()
+    assert foreign.ensure_held() == ""
+    assert first.ensure_held() == f"{tmp_path}: in use by process 12"
+    foreign.release()
+    assert alone.ensure_held() == ""
+    assert first.ensure_held() == f"{tmp_path}: in use by process {os.getpid()}"
+    alone.release()
+
+
 def test_lock_of_a_killed_process_is_free_although_its_child_lives(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", HOLDER_PROGRAM, str(tmp_path), "a.lock"],

@@ -1,0 +1,1 @@
+"""Worker processes among which the daemon spreads its devices, and their supervisor."""
