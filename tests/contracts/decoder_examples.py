@@ -87,6 +87,7 @@ LISTED_EXAMPLES = (
     Example("aceinna_dmu", {"packet": "S0"}, 1260 * DEGREE / 2**16, 20 * G / 2**16, 200 / 2**16, checksum=True),
     Example("aceinna_dmu", {"packet": "z1"}, DEGREE * 2.0**-17, 8 * FLOAT32_STEP, None, checksum=True),
     Example("aceinna_dmu", {"packet": "s1", "accel_unit": "g"}, DEGREE * 2.0**-17, G * FLOAT32_STEP, 1e-5, True),
+    Example("bno055", {}, DEGREE / 16, 0.01, 1.0),
     Example("bno08x_rvc", {}, None, 1e-3 * G, None, checksum=True),
     TEXT,
     Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),

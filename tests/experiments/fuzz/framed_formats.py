@@ -53,6 +53,29 @@ def _aceinna_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
             yield (*(DEGREE * x for x in floats[3:]), *(unit * x for x in floats[:3]))
 
 
+# --- BNO055
+
+
+def _bno055_wrap(data: bytes, settings: Settings) -> bytes:
+    """Build error answers, an answer with any measurements, or both."""
+    errors = bytes([0xEE, 1 + data[0] % 12]) * (data[0] // 16) if data and data[0] > 0x80 else b""
+    registers = bytearray(data[1:61].ljust(60, b"\0"))
+    registers[:4], registers[7] = b"\xa0\xfb\x32\x0f", 0
+    return errors if data[:1] > b"\xf0" else errors + b"\xbb\x3c" + registers
+
+
+def _bno055_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
+    for at in find_offsets(stream, b"\xbb\x3c\xa0\xfb\x32\x0f"):
+        registers = stream[at + 2 : at + 62]
+        if len(registers) < 60 or registers[7] or registers[0x39] == 1:
+            continue
+        accel, gyro = struct.unpack_from("<3h", registers, 8), struct.unpack_from("<3h", registers, 20)
+        rate = 1 / 900 if registers[0x3B] & 2 else DEGREE / 16
+        force = G / 1000 if registers[0x3B] & 1 else 0.01
+        if any(accel + gyro):
+            yield (*(rate * x for x in gyro), *(force * x for x in accel))
+
+
 # --- BNO08x RVC
 
 
@@ -212,6 +235,7 @@ def _ublox_measurements(stream: bytes, is_meas: bool) -> Iterator[tuple[int, int
 
 FRAMED_FORMATS: Final = {
     "aceinna_dmu": Format(_aceinna_wrap, _aceinna_readings),
+    "bno055": Format(_bno055_wrap, _bno055_readings),
     "bno08x_rvc": Format(_rvc_wrap, _rvc_readings),
     "inertial_labs": Format(_inertial_labs_wrap, _inertial_labs_readings),
     "novatel_rawimusx": Format(_novatel_wrap, _novatel_readings),
