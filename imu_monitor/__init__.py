@@ -1,7 +1,7 @@
 """Python interface of imu-monitor, and the entry point of the command ``imu-monitor``.
 
-The names in ``__all__`` are the public interface (docs/python-api.md). They are imported at their first use, so that
-``import imu_monitor`` and the start of the command stay fast.
+The names in ``__all__`` are the public interface (docs/reference/python-api.md). They are imported at their first
+use, so that ``import imu_monitor`` and the start of the command stay fast.
 
 ``monitor`` and ``drivers`` are common names. Another package or module of such a name on ``PYTHONPATH`` (every ROS
 shell sets it), in the current folder or imported by a ``sitecustomize`` would be found first. This package has a name

@@ -55,10 +55,7 @@ class Analysis(AllanEstimate):
         save_plot_or_report(self._results, Path(path), title or Path(path).stem)
 
     def _message(self) -> AnalysisMessage:
-        found = self._results
-        return AnalysisMessage.from_analysis(
-            found.analysis, found.total, found.hadamard, found.dynamic, found.without_temperature
-        )
+        return self._results.to_message()
 
     def _total_and_hadamard(self) -> tuple[TotalVarianceCurve | None, HadamardCurve | None]:
         return self._results.total, self._results.hadamard

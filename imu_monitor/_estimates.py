@@ -203,8 +203,8 @@ class AllanEstimate(Mapping[str, AxisEstimate]):
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary of plain Python objects.
 
-        The keys are those of ``imu-monitor analyze --json`` (docs/analyze-format.md). A number that is not finite is
-        None.
+        The keys are those of ``imu-monitor analyze --json`` (docs/reference/analyze-format.md). A number that is not
+        finite is None.
         """
         result: dict[str, Any] = msgspec.json.decode(self._message().encode())
         return result

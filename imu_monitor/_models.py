@@ -153,7 +153,7 @@ def export_parameters(
     source : AllanEstimate, NoiseModel, str or path-like
         Result of ``analyze``, noise model, name of a shipped model, or path of a model file.
     format : str
-        Program that reads the parameters, such as "kalibr", "openvins", "px4_ekf2" or "gtsam" (docs/export.md).
+        Program that reads the parameters, such as "kalibr", "openvins", "px4_ekf2" (docs/reference/export.md).
     inflation : float
         Factor on N, B and K, at least 1.
     dt_s : float, optional

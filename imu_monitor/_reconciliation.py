@@ -68,7 +68,7 @@ class Reconciliation:
         return tuple(map(name_arguments, self._result.notes))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of ``report.json`` as a dictionary of plain Python objects (docs/reconcile.md)."""
+        """Return the content of ``report.json`` as plain Python objects (docs/explanation/reconcile.md)."""
         from monitor.reconcile.json_report import encode_report
 
         result: dict[str, Any] = msgspec.json.decode(encode_report(self._result))

@@ -163,8 +163,8 @@ def read_recording(
     Parameters
     ----------
     path : str or path-like
-        File or folder (docs/recording-formats.md). The columns of tables are ``t`` in s, ``gx gy gz`` in rad/s, ``ax ay
-        az`` in m/s² and ``temperature`` in °C.
+        File or folder (docs/reference/recording-formats.md). The columns of tables are ``t`` in s,
+        ``gx gy gz`` in rad/s, ``ax ay az`` in m/s² and ``temperature`` in °C.
     rate_hz : float, optional
         Sample rate in Hz, for a file without the column ``t``.
     last_s : float, optional

@@ -1,3 +1,3 @@
-"""Effects of a noise model, with their parameters in SI units (docs/effects.md)."""
+"""Effects of a noise model, with their parameters in SI units (docs/reference/effects.md)."""
 
 from monitor.noise.effects import *  # noqa: F403 - every effect is public

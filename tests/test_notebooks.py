@@ -10,7 +10,7 @@ import yaml
 import imu_monitor
 from tests.support.notebooks import list_output_data, run_notebook
 
-FOLDER = Path(__file__).parents[1] / "docs" / "notebooks"
+FOLDER = Path(__file__).parents[1] / "docs" / "tutorials"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 TRUE_NOISE = imu_monitor.load_model("consumer-mems").to_dict()
 

@@ -25,7 +25,7 @@ from monitor.noise.effects import EFFECTS
 from tests.experiments.attacks.test_environments import create_foreign_packages
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "python-api.md"
+PAGE = ROOT / "docs" / "reference" / "python-api.md"
 RATE_HZ = 100.0
 NOISE_MODEL_METHODS = {"avar", "from_toml", "to_dict", "to_toml", "two_sided_psd"}
 """Public methods of ``NoiseModel``. Its other methods serve the commands."""

@@ -43,7 +43,7 @@ GATHER_S: Final = 0.01
 """Time in s that a scan may wait for more scans in a buffer of at least BUFFER_SCANS scans."""
 ENABLED_CHANNELS: Final = re.compile(r"in_(anglvel|accel)_[xyz]|in_temp0?|in_timestamp")
 """Regular expression that matches the channels that the link enables."""
-PERMISSION_ADVICE: Final = "a udev rule has to give the group of the user access, see docs/connecting-sensors.md"
+PERMISSION_ADVICE: Final = "a udev rule has to give the group of the user access, see docs/how-to/connecting-sensors.md"
 
 
 def _check_device(device: str) -> None:

@@ -2,8 +2,8 @@
 
 An incorrect sample rate shifts the Allan deviation along τ and scales the noise coefficients. If the difference is
 within the tolerance of an oscillator, the measured rate is used. If the difference is larger, its cause is unknown, and
-results that depend on the sample rate must not be published (docs/decisions/rate-is-a-label.md,
-docs/decisions/contradicted-rate.md).
+results that depend on the sample rate must not be published (docs/explanation/decisions/rate-is-a-label.md,
+docs/explanation/decisions/contradicted-rate.md).
 """
 
 from typing import Final

@@ -1,7 +1,7 @@
 """Conversion between ``SampleBlock`` and the msgpack map that is published under ``<prefix>/<device>/samples``.
 
-``docs/samples-format.md`` documents the format. The daemon and the replay of a recording write these messages, and the
-decoder ``samples`` reads them.
+``docs/reference/samples-format.md`` documents the format. The daemon and the replay of a recording write these
+messages, and the decoder ``samples`` reads them.
 
 If the samples are evenly spaced to within half a microsecond, ``t0`` and ``t`` are the Unix times of the first and the
 newest sample in seconds, and ``rate`` is the sample rate in Hz. Otherwise, ``t`` contains the Unix time of each sample

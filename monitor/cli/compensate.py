@@ -10,7 +10,7 @@ from drivers.file_access import real_path
 from monitor.cli.shared import options, output, service_in_terminal
 
 
-@options.with_reading_options
+@options.with_loading_options
 def compensate(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Recording without drift: .npz, .csv, .parquet, ….")],
@@ -24,12 +24,8 @@ def compensate(
         str | None,
         typer.Option(metavar="P,Q", help="Order of the ARMA model of the drift, up to 2,1; by default by a criterion."),
     ] = None,
-    rate: options.Rate = None,
-    last: options.Last = None,
-    reading: options.Reading = None,
-    decoder: options.DecoderName = None,
-    option: options.DecoderOptions = None,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    loading: options.Loading = None,
+    json: options.JsonFile = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
     ] = None,
@@ -42,21 +38,15 @@ def compensate(
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--out", out)
-    output.check_output_file("--json", json)
     for name, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
         if place is not None and real_path(place) == real_path(out):
             raise ConfigError(f"{name}: {place} is also the output file of --out; choose another name")
     service_in_terminal.exit_on_sigterm()
-    last_s = options.parse_duration("--last", last)
     arma_order = options.parse_arma_order(order)
-    wanted = compensating.CompensationRequest(
-        recording, out, method, rate, arma_order, last_s, reading, options.parse_decoder(decoder, option)
-    )
     with output.show_progress_bar() as tell:
         output.compile_analysis_kernels(tell)
-        result = compensating.run_compensation(wanted, tell)
-    if json is not None:
-        output.write_file_or_stdout("--json", json, text.encode_compensation(result) + b"\n")
+        result = compensating.run_compensation(recording, out, method, arma_order, loading, tell)
+    output.write_json(json, lambda: text.encode_compensation(result))
     if plot is not None:
         from monitor.publishing.plots.compensate_plot import save_compensation_plot
 

@@ -8,7 +8,7 @@ import typer
 from monitor.cli.shared import options, output, service_in_terminal
 
 
-@options.with_reading_options
+@options.with_loading_options
 def convert(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
     out: Annotated[
@@ -18,21 +18,14 @@ def convert(
             help="Recording to write: .csv, .csv.gz, .npz, .parquet, .arrow, .mcap, ….",
         ),
     ],
-    rate: options.Rate = None,
-    last: options.Last = None,
-    reading: options.Reading = None,
-    decoder: options.DecoderName = None,
-    option: options.DecoderOptions = None,
+    loading: options.Loading = None,
 ) -> None:
     """Write a recording in another format, without changing times or values."""
     from monitor.commands import convert as conversion
 
-    last_s = options.parse_duration("--last", last)
     service_in_terminal.exit_on_sigterm()
-    choice = options.parse_decoder(decoder, option)
-    request = conversion.ConversionRequest(recording, out, rate, last_s, reading, choice)
     with output.show_progress_bar() as tell:
-        result = conversion.run_conversion(request, tell)
+        result = conversion.run_conversion(recording, out, loading, tell)
     temperature = ", temperature" if conversion.has_temperature(result) else ""
     typer.echo(f"{out}: {len(result)} samples of {' '.join(result.axes)}{temperature}")
     for note in result.notes:

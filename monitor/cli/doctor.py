@@ -5,7 +5,7 @@ from typing import Annotated, Final
 
 import typer
 
-from monitor.cli.shared import output
+from monitor.cli.shared import options, output
 from monitor.cli.shared.errors import FAILED
 
 SCHEMA: Final = "imu-monitor/doctor/1"
@@ -17,22 +17,19 @@ def doctor(
         Path | None,
         typer.Argument(metavar="[CONFIG.toml]", help="Configuration file; by default only the machine is checked."),
     ] = None,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Findings as JSON; - = standard output.")] = None,
+    json: options.JsonFile = None,
 ) -> None:
     """Check this machine and a configuration for unattended operation. No device is opened."""
     import msgspec
 
-    from monitor.commands import doctor as checks
+    from monitor.commands.doctor import examine_machine
+    from monitor.commands.doctor.finding import worst_mark
 
-    output.check_output_file("--json", json)
-    findings = checks.examine_machine(config)
-    if json is not None:
-        output.write_file_or_stdout(
-            "--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n"
-        )
+    findings = examine_machine(config)
+    output.write_json(json, lambda: msgspec.json.encode({"schema": SCHEMA, "findings": findings}))
     if json != Path("-"):
         _print(findings)
-    if checks.worst_mark(findings) == "wrong":
+    if worst_mark(findings) == "wrong":
         raise typer.Exit(FAILED)
 
 

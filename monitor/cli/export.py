@@ -66,7 +66,7 @@ def export(
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> "NoiseCoefficients":
     """Return the coefficients that a running daemon currently publishes."""
     from monitor.publishing import exporters
-    from monitor.publishing.zenoh.coefficients_client import receive_coefficients
+    from monitor.publishing.zenoh.clients import receive_coefficients
 
     found = receive_coefficients(endpoint, name, prefix, file)
     device = options.select_device(name, list(found), mask_secrets(endpoint or str(file)), "result")

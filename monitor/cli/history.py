@@ -41,7 +41,7 @@ def history(
     ] = None,
     step: Annotated[str | None, typer.Option(metavar="S", help="Minimum time per row: 15min, 1h, 1d.")] = None,
     axis: Annotated[str | None, typer.Option(metavar="AXIS", help="Print one axis over time: gz.")] = None,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    json: options.JsonFile = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="All numbers as a table: .csv, .parquet, .npz, .arrow.")
     ] = None,
@@ -65,7 +65,6 @@ def history(
         raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')
     unit_system = options.parse_units(units)
     output.check_output_file("--plot", plot, ".png")
-    output.check_output_file("--json", json)
     output.check_output_file("--out", out)
     if out is not None:
         find_writer(out, any_columns=True)
@@ -97,10 +96,9 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
     from monitor.publishing.messages.history import HistoryMessage
     from monitor.publishing.reports import history_file
 
-    if json is not None:
-        newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
-        message = HistoryMessage.build_reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
-        output.write_file_or_stdout("--json", json, message.encode() + b"\n")
+    newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
+    samples = int(past.counts[:, 0].sum())
+    output.write_json(json, lambda: HistoryMessage.build_reply(past, asked, newest_s, samples).encode())
     if out is not None:
         history_file.save_history(past, out)
 
@@ -124,7 +122,7 @@ def _from_file(source: Path | None, name: str | None) -> Get:
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
-    from monitor.publishing.zenoh.history_client import query_histories
+    from monitor.publishing.zenoh.clients import query_histories
 
     def query_daemon(query: "HistoryQuery") -> "HistoryTable":
         found = {

@@ -11,7 +11,7 @@ from drivers.extras import require_extra
 from monitor.cli.shared import options, output, service_in_terminal
 
 
-@options.with_reading_options
+@options.with_loading_options
 def reconcile(
     recordings: Annotated[
         list[Path],
@@ -28,12 +28,8 @@ def reconcile(
         ),
     ] = None,
     seed: options.ReportSeed = 1,
-    rate: options.Rate = None,
-    last: options.Last = None,
-    reading: options.Reading = None,
-    decoder: options.DecoderName = None,
-    option: options.DecoderOptions = None,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    loading: options.Loading = None,
+    json: options.JsonFile = None,
     details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
 ) -> None:
     """Compare recordings with a noise model, and find the effects that are missing from the model."""
@@ -46,9 +42,6 @@ def reconcile(
     from monitor.reconcile import json_report
     from monitor.reconcile.several_recordings import comparison_json
 
-    last_s = options.parse_duration("--last", last)
-    choice = options.parse_decoder(decoder, option)
-    output.check_output_file("--json", json)
     tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
     service_in_terminal.exit_on_sigterm()
@@ -56,24 +49,16 @@ def reconcile(
         with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
             if several:
-                every = reconciling.RecordingsComparisonRequest(
-                    tuple(recordings), tested, out, seed, rate, last_s, reading, choice
-                )
-                runs = reconciling.compare_recordings(every, tell)
+                runs = reconciling.compare_recordings(recordings, tested, out, seed, loading, tell)
                 data, show = comparison_json.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
                 one = reconciling.reconcile_and_write_report(
-                    reconciling.ReconciliationRequest(
-                        recordings[0], tested, out, seed, rate, last_s=last_s, reading=reading, decoder=choice
-                    ),
-                    tell,
+                    recordings[0], tested, out, seed, loading, report_progress=tell
                 )
                 data, show = json_report.encode_report(one), partial(text.print_reconciliation, one, details=details)
     except NotReady:
-        if json is not None:
-            output.write_file_or_stdout("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
+        output.write_json(json, (out / reconciling.REPORT).read_bytes)
         raise
-    if json is not None:
-        output.write_file_or_stdout("--json", json, data + b"\n")
+    output.write_json(json, lambda: data)
     if json != Path("-"):
         show(Console())

@@ -1,5 +1,6 @@
 """Command ``simulate``: simulates a noise model and writes the samples to a recording."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ from drivers.file_access import real_path
 from monitor.cli.shared import options, output, service_in_terminal
 
 
-@options.with_reading_options
+@partial(options.with_loading_options, rate_and_last=False)
 def simulate(
     model: Annotated[str, typer.Argument(metavar="MODEL.toml|NAME", help="Model file, or name of a shipped model.")],
     seconds: Annotated[str, typer.Option(metavar="S", help="Length in seconds; also 30min, 1h, 2d.")],
@@ -22,35 +23,28 @@ def simulate(
     temperature_from: Annotated[
         Path | None, typer.Option(metavar="RECORDING", help="Use the temperature of this recording.")
     ] = None,
-    reading: options.Reading = None,
-    decoder: options.DecoderName = None,
-    option: options.DecoderOptions = None,
+    loading: options.Loading = None,
     truth: Annotated[
         bool,
         typer.Option(
             "--truth", help="Also write FILE.truth.json with the model and the random values drawn from the seed."
         ),
     ] = False,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    json: options.JsonFile = None,
 ) -> None:
     """Simulate a noise model and write the samples to a recording."""
     from monitor.commands import simulate as simulation
     from monitor.noise.model_loading import load_model
 
     length_s = options.parse_duration("--seconds", seconds)
-    output.check_output_file("--json", json)
     for name, path in (("--json", json), ("--temperature-from", temperature_from)):
         if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{name}: {path} is also the output file of --out; choose another name")
     noise = load_model(model, Path.cwd())
-    choice = options.parse_decoder(decoder, option)
-    request = simulation.SimulationRequest(
-        noise, out, length_s, seed, rate, temperature_from, truth, model, reading, choice
-    )
+    request = simulation.SimulationRequest(noise, out, length_s, seed, rate, temperature_from, truth, model, loading)
     service_in_terminal.exit_on_sigterm()
     with output.show_progress_bar() as tell:
         result = simulation.run_simulation(request, tell)
-    if json is not None:
-        output.write_file_or_stdout("--json", json, result.encode_recording_summary_as_json() + b"\n")
+    output.write_json(json, result.encode_recording_summary_as_json)
     if json != Path("-"):
         typer.echo(result.describe_in_one_line())

@@ -9,11 +9,10 @@ from drivers.errors import NotReady
 from monitor.cli.shared import options, output
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
-JsonPath = Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")]
 PlotPath = Annotated[Path | None, typer.Option(metavar="FILE.png", help="Means and model as a picture.")]
 
 
-@options.with_reading_options
+@options.with_loading_options
 def thermal_fit(
     recording: RecordingPath,
     out: Annotated[Path | None, typer.Option(metavar="MODEL.json", help="Where to write the model.")] = None,
@@ -23,12 +22,8 @@ def thermal_fit(
             metavar="S", help="Averaging interval; also 10min, 1h. By default about 72 intervals per recording."
         ),
     ] = None,
-    rate: options.Rate = None,
-    last: options.Last = None,
-    reading: options.Reading = None,
-    decoder: options.DecoderName = None,
-    option: options.DecoderOptions = None,
-    json: JsonPath = None,
+    loading: options.Loading = None,
+    json: options.JsonFile = None,
     plot: PlotPath = None,
 ) -> None:
     """Fit the bias of each axis as a function of the temperature and its history."""
@@ -38,14 +33,11 @@ def thermal_fit(
     from monitor.publishing.terminal import thermal_output as text
 
     output.check_output_file("--plot", plot, ".png")
-    output.check_output_file("--json", json)
     output.check_output_file("--out", out)
-    interval_s, last_s = options.parse_duration("--interval", interval), options.parse_duration("--last", last)
-    choice = options.parse_decoder(decoder, option)
+    interval_s = options.parse_duration("--interval", interval)
     with output.show_progress_bar() as tell:
-        study = thermal.fit_thermal_models(recording, interval_s, rate, last_s, reading, choice, tell)
-    if json is not None:
-        output.write_file_or_stdout("--json", json, text.encode_thermal_fit(study) + b"\n")
+        study = thermal.fit_thermal_models(recording, interval_s, loading, tell)
+    output.write_json(json, lambda: text.encode_thermal_fit(study))
     if not study.fits:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in study.refused.items()))
     if out is not None:
@@ -58,16 +50,12 @@ def thermal_fit(
         text.print_thermal_fit(study, Console())
 
 
-@options.with_reading_options
+@options.with_loading_options
 def thermal_predict(
     recording: RecordingPath,
     model: Annotated[Path, typer.Option(metavar="MODEL.json", help="Model file that thermal fit has written.")],
-    rate: options.Rate = None,
-    last: options.Last = None,
-    reading: options.Reading = None,
-    decoder: options.DecoderName = None,
-    option: options.DecoderOptions = None,
-    json: JsonPath = None,
+    loading: options.Loading = None,
+    json: options.JsonFile = None,
     plot: PlotPath = None,
 ) -> None:
     """Predict the bias of another recording with a model, and print the errors of the prediction."""
@@ -77,13 +65,10 @@ def thermal_predict(
     from monitor.publishing.terminal import thermal_output as text
 
     output.check_output_file("--plot", plot, ".png")
-    output.check_output_file("--json", json)
-    models, last_s = thermal.read_model_file(model), options.parse_duration("--last", last)
-    choice = options.parse_decoder(decoder, option)
+    models = thermal.read_model_file(model)
     with output.show_progress_bar() as tell:
-        outlook = thermal.predict_bias_of_recording(recording, models, rate, last_s, reading, choice, tell)
-    if json is not None:
-        output.write_file_or_stdout("--json", json, text.encode_thermal_prediction(outlook) + b"\n")
+        outlook = thermal.predict_bias_of_recording(recording, models, loading, tell)
+    output.write_json(json, lambda: text.encode_thermal_prediction(outlook))
     if not outlook.judged:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in outlook.refused.items()))
     if plot is not None:

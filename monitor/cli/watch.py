@@ -22,7 +22,7 @@ def watch(
     stop = threading.Event()
     service_in_terminal.install_signal_handlers(stop.set)
     if json:
-        from monitor.publishing.terminal.json_lines import print_messages_as_json
+        from monitor.publishing.terminal.watch import print_messages_as_json
 
         print_messages_as_json(keyexpr, connect or (), stop, sys.stdout, sys.stderr, seconds, zenoh)
         return

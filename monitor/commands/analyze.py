@@ -18,9 +18,7 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import AVERAGING_TIME_S
 from drivers.recordings import Recording, iter_blocks
-from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
     TemperatureRemovalComparison,
@@ -33,6 +31,7 @@ from monitor.estimation.allan.hadamard import HadamardCurve, compute_hadamard_cu
 from monitor.estimation.allan.total import TotalVarianceCurve, compute_total_curve
 from monitor.estimation.analysis import RecordingAnalysis, analyze, detect_disturbances
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
+from monitor.publishing.messages.analysis_json import AnalysisMessage
 from monitor.publishing.plots.allan_figure import additional_deviations
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from monitor.publishing.terminal.thermal_output import notes_on_temperature_dependence
@@ -58,21 +57,6 @@ class TooFewSamples(NotReady):
 
 
 @dataclass(frozen=True, slots=True)
-class AnalysisRequest:
-    """Recording to analyse and results to compute."""
-
-    recording: Path
-    rate_hz: float | None = None
-    tau: TauGrid = "octave"
-    window_s: float | None = None  # window length for dynamic Allan deviations; None = not computed
-    exclude_motion: bool = False  # True to exclude samples during motion
-    total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
-    last_s: float | None = None  # duration at the end of the recording to use; None = all
-    reading: ReadingOptions = DEFAULT_OPTIONS  # reading, columns and units to read
-    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
-
-
-@dataclass(frozen=True, slots=True)
 class AnalysisResults:
     """Results of an analysis."""
 
@@ -85,42 +69,11 @@ class AnalysisResults:
         None  # coefficients without temperature effect; None if no axis has any
     )
 
-
-def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = ignore_progress) -> AnalysisResults:
-    """Read and analyze a recording.
-
-    Parameters
-    ----------
-    request : AnalysisRequest
-        Recording to analyse and results to compute.
-    report_progress : callable, optional
-        Function that receives the progress.
-
-    Raises
-    ------
-    RecordingError, ConfigError
-        If the recording cannot be read or is too short for a requested averaging time or window, or if there is not
-        enough memory.
-    TooFewSamples
-        If the recording has too few samples for any result.
-    """
-    try:
-        recording = load_recording(
-            request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
+    def to_message(self) -> AnalysisMessage:
+        """Return the results as the message that ``analyze --json`` writes."""
+        return AnalysisMessage.from_analysis(
+            self.analysis, self.total, self.hadamard, self.dynamic, self.without_temperature
         )
-        return analyze_recording(
-            recording,
-            request.tau,
-            request.window_s,
-            request.exclude_motion,
-            request.total_and_hadamard,
-            report_progress,
-        )
-    except MemoryError as error:
-        raise ConfigError(
-            f"{request.recording}: the analysis needs more memory than is free; use only the end with --last, or "
-            "split the recording"
-        ) from error
 
 
 def check_averaging_times(tau: TauGrid) -> None:
@@ -158,8 +111,14 @@ def analyze_recording(
     ----------
     recording : Recording
         Samples to analyse.
-    tau, window_s, exclude_motion, total_and_hadamard
-        See ``AnalysisRequest``.
+    tau : TauGrid
+        Name of a grid of averaging times, or averaging times in seconds.
+    window_s : float, optional
+        Length of the window [s] for dynamic Allan deviations, which are not computed without a length.
+    exclude_motion : bool
+        True to exclude samples during motion.
+    total_and_hadamard : bool
+        True to compute total and Hadamard deviations.
     report_progress : callable, optional
         Function that receives the progress.
 

@@ -5,7 +5,6 @@ estimated drift noise. All methods are evaluated on the same samples, which were
 first third of the samples at rest is excluded from the evaluation, because some methods use it for learning.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -16,10 +15,9 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, NotReady
 from drivers.module_lookup import format_suggestion
 from drivers.recordings import iter_blocks
-from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import open_recording_writer
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
+from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
 from monitor.drift.compensation.compensation_result import AxisCompensation, DriftCompensationResult
 from monitor.drift.compensation.compensation_score import score_at_rest
@@ -35,29 +33,26 @@ LEARNING_SHARE: Final = 1.0 / 3.0
 BLOCK_ROWS: Final = 1 << 16
 
 
-@dataclass(frozen=True, slots=True)
-class CompensationRequest:
-    """Recording to compensate and method to use."""
-
-    recording: Path
-    out: Path
-    method: str = "adaptive"
-    rate_hz: float | None = None
-    order: Order | None = None  # order of the ARMA drift model; None = selected by a criterion
-    last_s: float | None = None  # duration at the end of the recording to use; None = all
-    reading: ReadingOptions = DEFAULT_OPTIONS  # reading, columns and units to read
-    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
-
-
 def run_compensation(
-    request: CompensationRequest, report_progress: ProgressCallback = ignore_progress
+    recording: Path,
+    out: Path,
+    method: str = "adaptive",
+    order: Order | None = None,
+    loading: LoadingOptions = DEFAULT_LOADING,
+    report_progress: ProgressCallback = ignore_progress,
 ) -> DriftCompensationResult:
     """Remove the gyro drift from a recording and write the compensated recording.
 
     Parameters
     ----------
-    request : CompensationRequest
-        Recording to compensate and method to use.
+    recording, out : Path
+        Recording to compensate, and file to write.
+    method : str
+        One of METHODS.
+    order : Order, optional
+        Order of the ARMA drift model. By default, a criterion selects the order.
+    loading : LoadingOptions, optional
+        Options for reading the recording.
     report_progress : callable, optional
         Function that receives the progress.
 
@@ -73,40 +68,40 @@ def run_compensation(
     NotReady
         If the sensor was never at rest for long enough. In this case, no file is written.
     """
-    if request.method not in METHODS:
-        raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
-    found = load_recording(
-        request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
-    )
+    if method not in METHODS:
+        raise ConfigError(f'--method: unknown method "{method}"{format_suggestion(method, METHODS)}')
+    found = load_recording(recording, loading, report_progress)
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
-        raise ConfigError(f"{request.recording}: there is no gyro axis; columns gx, gy, gz in rad/s are needed")
+        raise ConfigError(f"{recording}: there is no gyro axis; columns gx, gy, gz in rad/s are needed")
     values, temperature_c, rate_hz, notes = place_samples_and_temperature_on_grid(
         list(iter_blocks(found)), found.rate_hz
     )
-    orders = ORDERS if request.order is None else (request.order,)
-    live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
-    out = _run(live, values, report_progress)
+    orders = ORDERS if order is None else (order,)
+    live = Compensator(rate_hz, adapts=method != "fixed", orders=orders)
+    compensated = _run(live, values, report_progress)
     intervals = tuple(live.take_finished_intervals())
     rest = _at_rest(intervals, len(values), live.interval_samples)
     learned, judged = _split_learning(rest)
     if not judged.any():
         raise NotReady(
-            f"{request.recording}: never at rest for {MIN_CONFIRMED_INTERVALS * live.interval_s:g} s, "
+            f"{recording}: never at rest for {MIN_CONFIRMED_INTERVALS * live.interval_s:g} s, "
             "so the drift cannot be learned"
         )
-    if request.method in REFERENCE_METHODS:
-        out = _compensate_offline(request.method, values, learned, axes, report_progress)
+    if method in REFERENCE_METHODS:
+        compensated = _compensate_offline(method, values, learned, axes, report_progress)
     report_progress("evaluating", None)
     judged_axes: dict[str, AxisCompensation] = {
-        str(axis): _evaluate_axis(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
+        str(axis): _evaluate_axis(AXES.index(axis), values, compensated, learned, judged, live, intervals)
+        for axis in axes
     }
-    start_s = 0.0 if (t_s := found.t_s) is None else float(t_s[0])
-    _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, report_progress)
+    start_s = 0.0 if (stored_s := found.t_s) is None else float(stored_s[0])
+    t_s = start_s + np.arange(len(values)) / rate_hz
+    _write(out, found.axes, t_s, compensated, temperature_c, report_progress)
     return DriftCompensationResult(
-        recording=request.recording.name,
-        out=request.out,
-        method=request.method,
+        recording=recording.name,
+        out=out,
+        method=method,
         rate_hz=rate_hz,
         samples=len(values),
         interval_s=live.interval_s,

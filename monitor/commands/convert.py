@@ -1,6 +1,6 @@
 """Command ``convert``: reads a recording in any format and writes the samples in another format."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -12,27 +12,19 @@ from drivers.file_access import real_path
 from drivers.recordings import Recording, open_recording_writer
 from drivers.recordings.file_formats.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
 from drivers.recordings.formats import find_writer
-from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.topics import JOIN
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
+from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 
 BLOCK_ROWS: Final = 1 << 16
 
 
-@dataclass(frozen=True, slots=True)
-class ConversionRequest:
-    """Recording to read and file to write."""
-
-    recording: Path
-    out: Path
-    rate_hz: float | None = None
-    last_s: float | None = None  # duration at the end of the recording to use; None = all
-    reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
-    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
-
-
-def run_conversion(request: ConversionRequest, report_progress: ProgressCallback = ignore_progress) -> Recording:
+def run_conversion(
+    path: Path,
+    out: Path,
+    loading: LoadingOptions = DEFAULT_LOADING,
+    report_progress: ProgressCallback = ignore_progress,
+) -> Recording:
     """Read a recording, write its samples, and return the recording.
 
     Times and values are written without rounding, except that MCAP stores times in whole nanoseconds. If the recording
@@ -40,8 +32,10 @@ def run_conversion(request: ConversionRequest, report_progress: ProgressCallback
 
     Parameters
     ----------
-    request : ConversionRequest
-        Recording to read and file to write.
+    path, out : Path
+        Recording to read, and file to write.
+    loading : LoadingOptions, optional
+        Options for reading the recording.
     report_progress : callable, optional
         Function that receives the progress.
 
@@ -50,15 +44,13 @@ def run_conversion(request: ConversionRequest, report_progress: ProgressCallback
     ConfigError, RecordingError
         If the recording cannot be read, or if the file cannot be written.
     """
-    find_writer(request.out)
-    if real_path(request.recording) == real_path(request.out):
-        raise ConfigError(f"{request.out}: is the recording itself; choose another name")
-    found = load_recording(
-        request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
-    )
+    find_writer(out)
+    if real_path(path) == real_path(out):
+        raise ConfigError(f"{out}: is the recording itself; choose another name")
+    found = load_recording(path, loading, report_progress)
     axes = [axis for axis in found.axes if not np.isnan(found.values[:, AXES.index(axis)]).all()] or found.axes
     in_ns = found.times is not None and found.times.dtype == np.int64
-    with open_recording_writer(request.out, axes, has_temperature(found), times_in_ns=in_ns) as append_samples:
+    with open_recording_writer(out, axes, has_temperature(found), times_in_ns=in_ns) as append_samples:
         for start in range(0, len(found), BLOCK_ROWS):
             report_progress("writing", start / len(found))
             part = slice(start, min(start + BLOCK_ROWS, len(found)))
@@ -69,7 +61,7 @@ def run_conversion(request: ConversionRequest, report_progress: ProgressCallback
                 times = np.arange(part.start, part.stop) / found.rate_hz
             append_samples(times, found.values[part], found.temperature_c[part])
         report_progress("finishing the file", None)  # some formats are compressed only at the end
-    if has_temperature(found) and request.out.suffix.lower() == ".mcap":
+    if has_temperature(found) and out.suffix.lower() == ".mcap":
         topic = JOIN.join((IMU_TOPIC, TEMPERATURE_TOPIC))
         note = f"The temperature has a topic of its own; read both with --topic {topic}."
         return replace(found, notes=(*found.notes, note))

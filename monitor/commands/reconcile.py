@@ -8,7 +8,7 @@ each recording is written to a subfolder.
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -20,10 +20,9 @@ from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.file_access import real_path
 from drivers.recordings import FORMATS, iter_blocks
 from drivers.recordings import Recording as Samples
-from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
+from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.json_report import SCHEMA, encode_report
@@ -36,44 +35,31 @@ from monitor.reconcile.several_recordings.comparison import NamedResult, Recordi
 REPORT: Final = "report.json"
 
 
-@dataclass(frozen=True, slots=True)
-class ReconciliationRequest:
-    """Recording, noise model and options of the command ``reconcile``."""
-
-    recording: Path
-    model: NoiseModel | None  # with None, the five noise terms are fitted to the recording
-    out: Path
-    seed: int = 1
-    rate_hz: float | None = None
-    notes: tuple[str, ...] = ()  # additional notes for the report
-    last_s: float | None = None  # length of the end of the recording that is used; None for all
-    reading: ReadingOptions = DEFAULT_OPTIONS  # reading, columns and units to read
-    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes
-
-
-@dataclass(frozen=True, slots=True)
-class RecordingsComparisonRequest:
-    """Several recordings of one sensor, the noise model, and the options of the command ``reconcile``."""
-
-    recordings: tuple[Path, ...]
-    model: NoiseModel | None  # None fits the five noise terms to the first recording
-    out: Path
-    seed: int = 1
-    rate_hz: float | None = None
-    last_s: float | None = None  # length of the end of each recording that is used; None for all
-    reading: ReadingOptions = DEFAULT_OPTIONS  # reading, columns and units to read
-    decoder: DecoderChoice | None = None  # decoder of CAN logs or of captured bytes
-
-
 def reconcile_and_write_report(
-    request: ReconciliationRequest, report_progress: ProgressCallback = ignore_progress
+    recording: Path,
+    model: NoiseModel | None,
+    out: Path,
+    seed: int = 1,
+    loading: LoadingOptions = DEFAULT_LOADING,
+    notes: Sequence[str] = (),
+    report_progress: ProgressCallback = ignore_progress,
 ) -> Reconciliation:
     """Compare a recording with a noise model and write the report.
 
     Parameters
     ----------
-    request : ReconciliationRequest
-        Recording, noise model and options.
+    recording : Path
+        Recording to read.
+    model : NoiseModel or None
+        Noise model to test. None fits the five noise terms to the recording.
+    out : Path
+        Folder for the report.
+    seed : int, optional
+        Seed of the random numbers.
+    loading : LoadingOptions, optional
+        Options for reading the recording.
+    notes : sequence of str, optional
+        Additional notes for the report.
     report_progress : callable, optional
         Progress callback.
 
@@ -84,17 +70,15 @@ def reconcile_and_write_report(
     NotReady
         If the data do not support an answer.
     """
-    found = load_recording(
-        request.recording, request.rate_hz, request.last_s, request.reading, request.decoder, report_progress
-    )
-    create_report_folder(request.out)
+    found = load_recording(recording, loading, report_progress)
+    create_report_folder(out)
     try:
-        result = reconcile_recording(found, request.model, request.seed, request.notes, report_progress)
+        result = reconcile_recording(found, model, seed, notes, report_progress)
     except NotReady as error:
-        _write(request.out / REPORT, _encode_failure(str(error), len(found)))
+        _write(out / REPORT, _encode_failure(str(error), len(found)))
         raise
     report_progress("writing", None)
-    write_report(result, request.out, request.recording.name)
+    write_report(result, out, recording.name)
     return result
 
 
@@ -132,14 +116,27 @@ def reconcile_recording(
 
 
 def compare_recordings(
-    request: RecordingsComparisonRequest, report_progress: ProgressCallback = ignore_progress
+    recordings: Sequence[Path],
+    model: NoiseModel | None,
+    out: Path,
+    seed: int = 1,
+    loading: LoadingOptions = DEFAULT_LOADING,
+    report_progress: ProgressCallback = ignore_progress,
 ) -> RecordingsComparison:
     """Compare several recordings with a noise model and with each other, and write the reports.
 
     Parameters
     ----------
-    request : RecordingsComparisonRequest
-        Recordings, noise model and options.
+    recordings : sequence of Path
+        Recordings of one sensor.
+    model : NoiseModel or None
+        Noise model to test. None fits the five noise terms to the first recording.
+    out : Path
+        Folder for the reports.
+    seed : int, optional
+        Seed of the random numbers.
+    loading : LoadingOptions, optional
+        Options for reading the recordings.
     report_progress : callable, optional
         Progress callback.
 
@@ -150,28 +147,18 @@ def compare_recordings(
     NotReady
         If fewer than two recordings can be evaluated.
     """
-    named = unique_recording_names(request.recordings)
-    _check_recordings(named, request.out)
-    create_report_folder(request.out)
-    model, runs, silent = request.model, list[NamedResult](), dict[str, str]()
+    named = unique_recording_names(recordings)
+    _check_recordings(named, out)
+    create_report_folder(out)
+    runs, silent = list[NamedResult](), dict[str, str]()
     fitted_to = next(iter(named)) if model is None else None
     for at, (name, path) in enumerate(named.items(), start=1):
         notes = (
             (f"The model under test consists of the five noise terms of {fitted_to}.",) if fitted_to and at > 1 else ()
         )
-        one = ReconciliationRequest(
-            path,
-            model,
-            request.out / name,
-            request.seed,
-            request.rate_hz,
-            notes,
-            request.last_s,
-            request.reading,
-            request.decoder,
-        )
+        tell = _tell_for(report_progress, f"{name}, {at} of {len(named)}")
         try:
-            result = reconcile_and_write_report(one, _tell_for(report_progress, f"{name}, {at} of {len(named)}"))
+            result = reconcile_and_write_report(path, model, out / name, seed, loading, notes, tell)
         except NotReady as error:
             silent[name] = str(error)
             if model is None:
@@ -182,20 +169,20 @@ def compare_recordings(
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
         why = f"at least two recordings are needed for a comparison, but only {len(runs)} can be evaluated: {why}"
-        _write(request.out / REPORT, _encode_failure(why, 0, comparison_json.SCHEMA))
+        _write(out / REPORT, _encode_failure(why, 0, comparison_json.SCHEMA))
         raise NotReady(why)
     report_progress("writing", None)
     comparison = compare_results(runs, fitted_to, silent)
-    _write_comparison(comparison, request.out)
+    _write_comparison(comparison, out)
     return comparison
 
 
 def _write_comparison(result: RecordingsComparison, folder: Path) -> None:
-    from monitor.publishing.reports.comparison_page import render_page
+    from monitor.publishing.reports.reconcile_page import render_comparison_page
 
     _write(folder / REPORT, comparison_json.encode_comparison(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
-    _write(folder / "report.html", render_page(result).encode())
+    _write(folder / "report.html", render_comparison_page(result).encode())
 
 
 def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:

@@ -5,7 +5,7 @@ recording contains only the axes of the noise model. The truth file contains the
 values such as the times of events.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -17,10 +17,9 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import SAMPLE_COUNT
 from drivers.recordings import Recording, open_recording_writer
-from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
+from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.noise.model import NoiseModel
 from monitor.noise.simulation import ModelStream, SimulatedSamples
 
@@ -41,8 +40,7 @@ class SimulationRequest:
     temperature_from: Path | None = None  # recording from which the temperature is taken
     truth: bool = False  # True to write a file with the drawn random values
     name: str = "the model"  # name of the model in messages
-    reading: ReadingOptions = DEFAULT_OPTIONS  # topic, columns and units to read
-    decoder: DecoderChoice | None = None  # decoder of a CAN log or of captured bytes with the temperature
+    loading: LoadingOptions = DEFAULT_LOADING  # options for reading the recording with the temperature
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,11 +230,11 @@ def _temperature(
 def _load_recording(request: SimulationRequest, path: Path, report_progress: ProgressCallback) -> Recording:
     """Load the recording of the temperature. The requested sample rate is used if the recording has none."""
     try:
-        return load_recording(path, None, None, request.reading, request.decoder, report_progress)
+        return load_recording(path, request.loading, report_progress)
     except ConfigError:
         if request.rate_hz is None:
             raise
-        return load_recording(path, request.rate_hz, None, request.reading, request.decoder, report_progress)
+        return load_recording(path, replace(request.loading, rate_hz=request.rate_hz), report_progress)
 
 
 def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> bytes:

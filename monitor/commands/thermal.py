@@ -16,9 +16,8 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks
-from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
+from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel
@@ -61,10 +60,7 @@ class _ModelFile(msgspec.Struct):
 def fit_thermal_models(
     recording: Path,
     interval_s: float | None = None,
-    rate_hz: float | None = None,
-    last_s: float | None = None,
-    reading: ReadingOptions = DEFAULT_OPTIONS,
-    decoder: DecoderChoice | None = None,
+    loading: LoadingOptions = DEFAULT_LOADING,
     report_progress: ProgressCallback = ignore_progress,
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
@@ -75,14 +71,8 @@ def fit_thermal_models(
         Recording with temperature.
     interval_s : float, optional
         Length of an interval in seconds. By default, the interval is about 1/72 of the recording.
-    rate_hz : float, optional
-        Sample rate, if the recording has none.
-    last_s : float, optional
-        Length in seconds of the end of the recording that is used. By default the whole recording is used.
-    reading : ReadingOptions, optional
-        Topic, columns and units to read.
-    decoder : DecoderChoice, optional
-        Decoder of a CAN log or of captured bytes.
+    loading : LoadingOptions, optional
+        Options for reading the recording.
     report_progress : callable, optional
         Progress callback.
 
@@ -91,7 +81,7 @@ def fit_thermal_models(
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s, reading, decoder, report_progress)
+    means, notes = _read_interval_means(recording, interval_s, loading, report_progress)
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -105,10 +95,7 @@ def fit_thermal_models(
 def predict_bias_of_recording(
     recording: Path,
     models: Mapping[str, ThermalModel],
-    rate_hz: float | None = None,
-    last_s: float | None = None,
-    reading: ReadingOptions = DEFAULT_OPTIONS,
-    decoder: DecoderChoice | None = None,
+    loading: LoadingOptions = DEFAULT_LOADING,
     report_progress: ProgressCallback = ignore_progress,
 ) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models that were fitted to an earlier recording.
@@ -119,14 +106,8 @@ def predict_bias_of_recording(
         Recording with temperature.
     models : mapping of str to ThermalModel
         Thermal model of each axis.
-    rate_hz : float, optional
-        Sample rate, if the recording has none.
-    last_s : float, optional
-        Length in seconds of the end of the recording that is used. By default the whole recording is used.
-    reading : ReadingOptions, optional
-        Topic, columns and units to read.
-    decoder : DecoderChoice, optional
-        Decoder of a CAN log or of captured bytes.
+    loading : LoadingOptions, optional
+        Options for reading the recording.
     report_progress : callable, optional
         Progress callback.
 
@@ -136,7 +117,7 @@ def predict_bias_of_recording(
         If the recording cannot be read, or if it has no temperature.
     """
     interval = next(iter(models.values())).interval_s
-    means, notes = _read_interval_means(recording, interval, rate_hz, last_s, reading, decoder, report_progress)
+    means, notes = _read_interval_means(recording, interval, loading, report_progress)
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
@@ -238,16 +219,10 @@ def _model(path: Path, axis: str, row: _AxisModelRecord, interval_s: float) -> T
 
 
 def _read_interval_means(
-    recording: Path,
-    interval_s: float | None,
-    rate_hz: float | None,
-    last_s: float | None,
-    reading: ReadingOptions,
-    decoder: DecoderChoice | None,
-    report_progress: ProgressCallback,
+    recording: Path, interval_s: float | None, loading: LoadingOptions, report_progress: ProgressCallback
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
     """Return the interval means of each recorded axis, and notes about the recording."""
-    found = load_recording(recording, rate_hz, last_s, reading, decoder, report_progress)
+    found = load_recording(recording, loading, report_progress)
     values, temperature_c, rate, notes = place_samples_and_temperature_on_grid(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")

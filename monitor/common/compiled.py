@@ -6,7 +6,7 @@ A cached kernel becomes invalid if the source file of the kernel or any imported
 
 By default, Numba generates machine code for every function that a kernel calls, even if Python never calls the
 function. ``Kernel`` keeps such functions as intermediate code, which shortens the first start by more than a quarter
-(``docs/benchmarks-service.md``).
+(``docs/measurements/benchmarks-service.md``).
 
 Kernels copy array fields of a NamedTuple to local variables before a loop, because Numba counts a reference at each
 access to a field.

@@ -31,7 +31,7 @@ from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.outputs.history_output import HistoryOutput
 from monitor.daemon.outputs.output import Output
-from monitor.daemon.outputs.table_output import TableOutput
+from monitor.daemon.outputs.terminal_outputs import TableOutput
 from monitor.daemon.outputs.viewer_output import ViewerOutput
 from monitor.daemon.outputs.zenoh_output import ZenohOutput
 from monitor.daemon.storage.recorder import Recorder, segment_metadata

@@ -41,7 +41,7 @@ class HistoryTable:
     step_s: int  # width of the time buckets, unless the stored rows are wider
     start_s: Ints  # [p] Unix time of the start of each time bucket
     width_s: Ints  # [p]
-    names: tuple[str, ...]  # [k] column names, see ``estimate_to_columns``
+    names: tuple[str, ...]  # [k] column names, see ``minute_aggregation``
     n: Ints  # [p, k] number of values
     low: Singles  # [p, k] minimum, SI units; NaN if there is no value
     high: Singles

@@ -1,6 +1,6 @@
 """History rows, which contain statistics of the results of a device over a period (time bucket).
 
-A history row has columns such as ``gz.N``, ``gz.sigma.0.1`` and ``temperature`` (see ``estimate_to_columns``). For each
+A history row has columns such as ``gz.N``, ``gz.sigma.0.1`` and ``temperature`` (see ``minute_aggregation``). For each
 column, the row contains the number of values, the minimum, the maximum and the last value. Merging rows preserves the
 minimum and maximum exactly, because values are rounded to float32 before they are compared. The numbers of received,
 lost, bad and overflowed samples are added when rows are merged.

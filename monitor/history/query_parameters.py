@@ -14,7 +14,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
-from monitor.history.estimate_to_columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
+from monitor.history.minute_aggregation import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
 from monitor.history.time_ranges import TimeRange, parse_duration_s, parse_zenoh_range
 
 COEFFICIENTS: Final = "coefficients"

@@ -5,6 +5,7 @@ Optional keys are printed as comments with example values.
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, get_args, get_origin
 
@@ -36,7 +37,6 @@ def format_defaults() -> str:
     """Format a configuration file with the keys of all tables, links and decoders."""
     links = [name for name in driver_settings.list_link_names() if name != FIRST_LINK]
     decoders = [name for name in module_lookup.list_modules(drivers.decoders) if name != FIRST_DECODER]
-    top = {key: find_settings_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
     blocks = [
         INTRODUCTION,
         _table(Device, "device", omit=("driver", "axes", "limit")),
@@ -51,9 +51,21 @@ def format_defaults() -> str:
         *(_commented(format_decoder_defaults(name)) for name in decoders),
         _commented(_table(Limit, "device.limit", "any number of tables")),
         _commented(_table(Hook, "hook", "any number of tables")),
-        *(_table(model, key) for key, model in top.items() if model is not None and key not in LIST_TABLES),
+        *(_table(model, key) for key, model in _top_tables().items()),
     ]
     return "\n\n".join(block.strip("\n") for block in blocks) + "\n"
+
+
+def _top_tables() -> dict[str, type[SettingsModel]]:
+    """Return the tables of the file that exist once."""
+    models = {key: find_settings_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
+    return {key: model for key, model in models.items() if model is not None and key not in LIST_TABLES}
+
+
+def list_tables() -> list[tuple[str, type[SettingsModel]]]:
+    """Return the headers and the models of all tables except those of the links and decoders."""
+    once = [(f"[{key}]", model) for key, model in _top_tables().items()]
+    return [("[[device]]", Device), ("[[device.limit]]", Limit), ("[[hook]]", Hook), *once]
 
 
 def format_link_defaults(name: str) -> str:
@@ -93,17 +105,36 @@ def format_decoder_defaults(name: str) -> str:
     return _table(settings, DECODER_TABLE, f'decoder = "{name}"{lacking}')
 
 
+@dataclass(frozen=True, slots=True)
+class KeyDescription:
+    """Name, example value and meaning of a configuration key."""
+
+    name: str
+    value: object
+    """Default value in the notation of the file. Example for a key without a default."""
+    has_default: bool
+    required: bool
+    description: str
+    """Meaning with the possible values or the range in parentheses."""
+
+
+def describe_keys(model: type[SettingsModel]) -> Iterator[KeyDescription]:
+    """Yield the keys of a configuration table in their order."""
+    for key, info in fields_by_key(model).items():
+        value = info.examples[0] if info.examples else info.default
+        optional = info.default in (None, "", (), frozenset(), Path()) or info.default == {}
+        required = info.is_required()
+        yield KeyDescription(key, value, not (optional or required), required, f"{info.description}{_values(info)}")
+
+
 def _table(model: type[SettingsModel], name: str, about: str = "", omit: tuple[str, ...] = ()) -> str:
     """Format the header and the keys of a configuration table, with optional keys in comments."""
     header = f"[[{name}]]" if name in LIST_TABLES else f"[{name}]"
     lines = [f"{header:<{COMMENT_COLUMN - 1}} # {about}" if about else header]
-    for key, info in fields_by_key(model).items():
-        if key not in omit:
-            default = "no default; " if info.is_required() else ""
-            value = info.examples[0] if info.examples else info.default
-            line = _line(key, value, f"{default}{info.description}{_values(info)}")
-            optional = info.default in (None, "", (), frozenset(), Path()) or info.default == {}
-            lines.append(_commented(line) if optional else line)
+    for key in describe_keys(model):
+        if key.name not in omit:
+            line = _line(key.name, key.value, f"{'no default; ' if key.required else ''}{key.description}")
+            lines.append(line if key.required or key.has_default else _commented(line))
     return "\n".join((*lines, ""))
 
 

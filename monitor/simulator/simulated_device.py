@@ -18,7 +18,7 @@ from drivers.errors import LinkUnavailable
 from monitor.settings.loading import VirtualTable
 from monitor.simulator.encoding_sensor import SimulatedSensor
 from monitor.simulator.faults import DrawnFaults, FaultCounts, Faults
-from monitor.simulator.port import create_port
+from monitor.simulator.ports import create_port
 
 BURST_S: Final = 0.01
 """Time between bursts of samples in s, chosen to resemble a USB adapter."""

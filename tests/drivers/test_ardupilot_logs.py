@@ -12,7 +12,8 @@ from drivers.errors import ConfigError, ImuError
 from drivers.links import replay_link
 from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
 from drivers.recordings.file_formats import ardupilot_log_format
-from monitor.commands.analyze import AnalysisRequest, run_analysis
+from monitor.commands.analyze import analyze_recording
+from monitor.commands.recording_loading import load_recording
 from tests.support.dataflash import Messages, dataflash_bytes, imu, raw_sensor, table_of, write_dataflash
 from tests.support.recordings import recordings
 
@@ -74,7 +75,7 @@ class TestSamples:
         assert found.values.tobytes() == same.values.tobytes()
         assert found.temperature_c.tobytes() == same.temperature_c.tobytes()
         assert (found.axes, found.notes) == (AXES, ())
-        of_log, of_npz = (run_analysis(AnalysisRequest(one)).analysis for one in (path, tmp_path / "same.npz"))
+        of_log, of_npz = (analyze_recording(load_recording(one)).analysis for one in (path, tmp_path / "same.npz"))
         for field in ("value", "lo", "hi"):
             ours, theirs = (getattr(one.estimate.coefficients, field) for one in (of_log, of_npz))
             np.testing.assert_array_equal(ours, theirs)

@@ -12,7 +12,8 @@ import pyulog
 from drivers.data_types import AXES
 from drivers.errors import ImuError
 from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
-from monitor.commands.analyze import AnalysisRequest, run_analysis
+from monitor.commands.analyze import analyze_recording
+from monitor.commands.recording_loading import load_recording
 from tests.support.recordings import recordings
 from tests.support.ulog import (
     UlogTopic,
@@ -80,7 +81,7 @@ class TestSamples:
         assert found.t_ns.tolist() == same.t_ns.tolist() == (1000 * t_us).tolist()
         assert found.values.tobytes() == same.values.tobytes()
         assert (found.axes, found.notes) == (AXES, ())
-        of_log, of_npz = (run_analysis(AnalysisRequest(one)).analysis for one in (path, tmp_path / "same.npz"))
+        of_log, of_npz = (analyze_recording(load_recording(one)).analysis for one in (path, tmp_path / "same.npz"))
         for field in ("value", "lo", "hi"):
             ours, theirs = (getattr(one.estimate.coefficients, field) for one in (of_log, of_npz))
             np.testing.assert_array_equal(ours, theirs)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.recordings import load_samples, reading_progress, save_samples
-from monitor.commands.wire_format_decoding import DecoderChoice, load_recording
+from monitor.commands.recording_loading import DecoderChoice, LoadingOptions, load_recording
 from tests.support import dataflash, ros_bags, ulog
 
 N = 20_000
@@ -49,7 +49,9 @@ def test_commands_receive_the_share(tmp_path: Path, suffix: str) -> None:
     else:
         (tmp_path / "x.txt").write_text("".join(f"{x:.6f} {y:.6f}\n" for x, y in VALUES[:, :2]))
         choice = DecoderChoice("text", {"columns": ["gx", "gy"], "gyro_unit": "rad/s"})
-        load_recording(tmp_path / "x.txt", 100.0, decoder=choice, report_progress=lambda *step: steps.append(step))
+        load_recording(
+            tmp_path / "x.txt", LoadingOptions(100.0, decoder=choice), report_progress=lambda *step: steps.append(step)
+        )
     word = "reading" if suffix == ".csv" else "decoding"
     assert {step for step, _ in steps} == {word}
     assert steps[0] == (word, None)

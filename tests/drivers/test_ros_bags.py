@@ -17,7 +17,8 @@ from drivers.errors import ConfigError, ImuError, LinkEnded, LinkUnavailable, Re
 from drivers.links import replay_link
 from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
 from drivers.recordings.file_formats import ros_bag_format, ros_bag_readers
-from monitor.commands.analyze import AnalysisRequest, run_analysis
+from monitor.commands.analyze import analyze_recording
+from monitor.commands.recording_loading import load_recording
 from tests.support.program import exit_status
 from tests.support.ros_bags import KINDS, imu_topic, storage_file, temperature_topic, text_topic, write_bag
 
@@ -82,7 +83,7 @@ class TestSamples:
         assert found.t_ns.tolist() == same.t_ns.tolist() == t_ns.tolist()
         assert found.values.tobytes() == same.values.tobytes()
         assert (found.axes, found.notes) == (AXES, ())
-        of_bag, of_npz = (run_analysis(AnalysisRequest(one)).analysis for one in (bag, tmp_path / "same.npz"))
+        of_bag, of_npz = (analyze_recording(load_recording(one)).analysis for one in (bag, tmp_path / "same.npz"))
         assert of_bag.estimate.rate_hz == of_npz.estimate.rate_hz
         for field in ("value", "lo", "hi"):
             ours, theirs = (getattr(one.estimate.coefficients, field) for one in (of_bag, of_npz))

@@ -35,7 +35,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.recordings import save_samples
-from monitor.commands.reconcile import ReconciliationRequest, reconcile_and_write_report
+from monitor.commands.reconcile import reconcile_and_write_report
 from monitor.common import shipped_config_paths
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
@@ -420,7 +420,7 @@ def save_notebook_pictures(name: str, folder: Path, path: Path) -> Path:
 
     from tests.support.notebooks import list_output_data, run_notebook
 
-    source = Path(__file__).parents[2] / "docs" / "notebooks" / f"{name}.ipynb"
+    source = Path(__file__).parents[2] / "docs" / "tutorials" / f"{name}.ipynb"
     with contextlib.chdir(folder):
         notebook, _ = run_notebook(source)
     encoded = [data["image/png"] for data in list_output_data(notebook) if "image/png" in data]
@@ -472,7 +472,7 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
         assert rate_hz is not None
         n = round(HOUR_S * rate_hz)
         save_samples(source, np.arange(n) / rate_hz, model.simulate(n, rate_hz, 1), None)
-    return reconcile_and_write_report(ReconciliationRequest(source, read_model(MODEL), folder / "result")).axes["gz"]
+    return reconcile_and_write_report(source, read_model(MODEL), folder / "result").axes["gz"]
 
 
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:

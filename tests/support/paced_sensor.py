@@ -12,8 +12,7 @@ from typing import Final
 
 from drivers.driver import Driver
 from monitor.simulator import SimulatedDevice
-from monitor.simulator.pty_port import PtyPort
-from monitor.simulator.zenoh_port import ZenohPort
+from monitor.simulator.ports import PtyPort, ZenohPort
 
 AHEAD: Final = 32
 """Samples that the sensor may be ahead of its reader. A pseudo-terminal holds them in every wire format."""

@@ -8,7 +8,7 @@ import zenoh
 from drivers.data_types import concatenate_blocks
 from drivers.recordings import load_samples, save_samples
 from drivers.zenoh.sample_message import DecodedSampleMessage, decode_samples
-from monitor.commands.compensate import CompensationRequest, run_compensation
+from monitor.commands.compensate import run_compensation
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 from tests.support.zenoh_sessions import open_session, patient_file
@@ -58,7 +58,7 @@ def test_live_compensation_equals_offline_compensation(tmp_path: Path) -> None:
 
         wait_for(last_batch_arrived, "the last batch over zenoh")
     rates = concatenate_blocks(output.compensated_blocks["bench-1"])
-    run_compensation(CompensationRequest(recording, tmp_path / "out.npz"))
+    run_compensation(recording, tmp_path / "out.npz")
     offline = load_samples(tmp_path / "out.npz")
     np.testing.assert_allclose(rates.values, offline.values, rtol=0.0, atol=1e-12)
     assert np.sqrt(np.mean((rates.values[turning, 1] - truth) ** 2)) < 1.05 * SIGMA

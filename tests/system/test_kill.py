@@ -1,8 +1,8 @@
 """Test of a daemon that is killed at random moments while it records a sensor at 1 kHz.
 
-According to docs/recording.md, a crash loses at most half a second of samples and the samples in transit. The test
-compares the number of samples that the sensor has sent with the batches and rows on the disk. A loaded machine delays
-single batches and kills, so the test compares medians with a factor of four.
+According to docs/how-to/recording.md, a crash loses at most half a second of samples and the samples in transit. The
+test compares the number of samples that the sensor has sent with the batches and rows on the disk. A loaded machine
+delays single batches and kills, so the test compares medians with a factor of four.
 """
 
 import re
@@ -17,7 +17,7 @@ from tests.experiments.benchmarks.kill import RATE, Bench, Kill
 pytest.importorskip("pyarrow", reason="recording needs the extra arrow")
 
 MAX_BATCH_INTERVAL_S = 0.5
-"""Time between two batches according to docs/recording.md. It is not imported, because the test checks the program."""
+"""Time between two batches according to docs/how-to/recording.md. It is not imported, as it is tested."""
 LOAD_FACTOR = 4.0
 KILLS = 5
 """Number of kills of daemons that have recorded for at least two seconds."""

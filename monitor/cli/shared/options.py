@@ -21,9 +21,10 @@ from drivers.number_ranges import (
     NumberRange,
 )
 from monitor.cli.shared.errors import name_option_in_config_errors
+from monitor.cli.shared.output import check_output_file
 
 if TYPE_CHECKING:
-    from monitor.commands.wire_format_decoding import DecoderChoice
+    from monitor.commands.recording_loading import DecoderChoice, LoadingOptions
     from monitor.common.unit_formatting import UnitSystem
     from monitor.drift.compensation.arma import Order
     from monitor.estimation.allan.batch import TauGrid
@@ -48,6 +49,19 @@ def make_range_callback(allowed_range: NumberRange) -> Callable[[typer.CallbackP
     return check_option_value
 
 
+def _check_json_file(path: Path | None) -> Path | None:
+    check_output_file("--json", path)
+    return path
+
+
+def _text_option(metavar: str, help_text: str) -> Any:
+    return Annotated[str | None, typer.Option(metavar=metavar, help=help_text)]
+
+
+JsonFile = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Result as JSON; - = standard output.", callback=_check_json_file),
+]
 Viewer = Annotated[
     str | None, typer.Option(metavar="auto|native|web|none|FILE.rrd", help="Where to show the live view.")
 ]
@@ -61,14 +75,6 @@ ZenohFile = Annotated[
 ]
 Prefix = Annotated[str, typer.Option(metavar="KEY", help="Prefix of the keys of the daemon.")]
 DeviceName = Annotated[str | None, typer.Option(metavar="NAME", help="Device; needed if there are several.")]
-Rate = Annotated[
-    float | None,
-    typer.Option(
-        metavar="HZ",
-        help="Sample rate for a recording that has neither times nor a rate.",
-        callback=make_range_callback(RATE_HZ),
-    ),
-]
 ModelRate = Annotated[
     float | None,
     typer.Option(
@@ -109,9 +115,6 @@ CorrelationTime = Annotated[
         callback=make_range_callback(DURATION_S),
     ),
 ]
-Last = Annotated[
-    str | None, typer.Option(metavar="S", help="Use only the last S seconds of the recording; also 1h, 1d.")
-]
 
 Units = Annotated[
     str,
@@ -121,49 +124,70 @@ Units = Annotated[
     ),
 ]
 
+LENGTH_OPTIONS = {
+    "rate": Annotated[
+        float | None,
+        typer.Option(
+            metavar="HZ",
+            help="Sample rate for a recording that has neither times nor a rate.",
+            callback=make_range_callback(RATE_HZ),
+        ),
+    ],
+    "last": _text_option("S", "Use only the last S seconds of the recording; also 1h, 1d."),
+}
+"""Options for the rate and the length of a recording."""
 READING_OPTIONS = {
-    "topic": typer.Option(
-        metavar="NAME",
-        help="Topic of a ROS bag or of an autopilot's log; by default its only IMU. A+B joins gyroscope and "
-        "accelerometer.",
+    "topic": _text_option(
+        "NAME",
+        "Topic of a ROS bag or of an autopilot's log; by default its only IMU. A+B joins gyroscope and accelerometer.",
     ),
-    "columns": typer.Option(
-        metavar="Q=COLUMN,…",
-        help="Columns of a table by name or number, e.g. gx=omega_x,t=1; by default recognized by name.",
+    "columns": _text_option(
+        "Q=COLUMN,…", "Columns of a table by name or number, e.g. gx=omega_x,t=1; by default recognized by name."
     ),
-    "gyro_unit": typer.Option(metavar="UNIT", help="Unit of gx, gy, gz in the file: deg/s, deg/s/131, mrad/s, …"),
-    "accel_unit": typer.Option(metavar="UNIT", help="Unit of ax, ay, az in the file: g, mg, g/16384, …"),
-    "temperature_unit": typer.Option(metavar="UNIT", help="Unit of the temperature in the file: °C, K or °F."),
-    "time_unit": typer.Option(metavar="UNIT", help="Unit of the times in the file: s, ms, us or ns."),
+    "gyro_unit": _text_option("UNIT", "Unit of gx, gy, gz in the file: deg/s, deg/s/131, mrad/s, …"),
+    "accel_unit": _text_option("UNIT", "Unit of ax, ay, az in the file: g, mg, g/16384, …"),
+    "temperature_unit": _text_option("UNIT", "Unit of the temperature in the file: °C, K or °F."),
+    "time_unit": _text_option("UNIT", "Unit of the times in the file: s, ms, us or ns."),
 }
 """Options that determine how a recording is read, by the field of ``ReadingOptions``."""
-Reading = Any
-"""Annotation of the argument that ``with_reading_options`` replaces by READING_OPTIONS."""
+DECODER_OPTIONS = {
+    "decoder": _text_option("NAME", "Decoder of a CAN log or of captured bytes: dbc, vectornav_binary, …."),
+    "option": Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUE", help="Key of the decoder, e.g. file=imu.dbc, signals.gz=Rates.Z; repeatable."
+        ),
+    ],
+}
+"""Options for a recording that contains the wire format of a sensor."""
+Loading = Any
+"""Annotation of the argument that ``with_loading_options`` replaces by the options of a recording."""
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
-def with_reading_options(command: Command) -> Command:
-    """Replace the argument ``reading`` of a command by the options READING_OPTIONS.
+def with_loading_options(command: Command, *, rate_and_last: bool = True) -> Command:
+    """Replace the argument ``loading`` of a command by the options that determine how a recording is read.
 
-    The command receives ``ReadingOptions`` as its argument ``reading``.
+    Parameters
+    ----------
+    command : callable
+        Command that receives ``LoadingOptions`` as its argument ``loading``.
+    rate_and_last : bool
+        True to include the options ``--rate`` and ``--last``.
     """
+    added = {**(LENGTH_OPTIONS if rate_and_last else {}), **READING_OPTIONS, **DECODER_OPTIONS}
 
     @functools.wraps(command)
     def parse_options_and_run(**arguments: Any) -> None:
-        from drivers.recordings.reading_options import create_reading_options, parse_column_mapping
-
-        given = {name: arguments.pop(name) for name in READING_OPTIONS}
-        if given["columns"] is not None:
-            with name_option_in_config_errors("--columns"):
-                given["columns"] = parse_column_mapping(given["columns"])
-        command(**arguments, reading=create_reading_options(given))
+        given = {name: arguments.pop(name) for name in added}
+        command(**arguments, loading=_parse_loading_options(given))
 
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(command).parameters.values():
-        if parameter.name == "reading":
+        if parameter.name == "loading":
             parameters += (
-                inspect.Parameter(name, parameter.kind, default=None, annotation=Annotated[str | None, option])
-                for name, option in READING_OPTIONS.items()
+                inspect.Parameter(name, parameter.kind, default=None, annotation=annotation)
+                for name, annotation in added.items()
             )
         else:
             parameters.append(parameter)
@@ -172,18 +196,20 @@ def with_reading_options(command: Command) -> Command:
     return cast("Command", parse_options_and_run)
 
 
-DecoderName = Annotated[
-    str | None,
-    typer.Option(
-        "--decoder", metavar="NAME", help="Decoder of a CAN log or of captured bytes: dbc, vectornav_binary, …."
-    ),
-]
-DecoderOptions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--option", metavar="KEY=VALUE", help="Key of the decoder, e.g. file=imu.dbc, signals.gz=Rates.Z; repeatable."
-    ),
-]
+def _parse_loading_options(given: dict[str, Any]) -> "LoadingOptions":
+    from drivers.recordings.reading_options import create_reading_options, parse_column_mapping
+    from monitor.commands.recording_loading import LoadingOptions
+
+    reading = {name: given[name] for name in READING_OPTIONS}
+    if reading["columns"] is not None:
+        with name_option_in_config_errors("--columns"):
+            reading["columns"] = parse_column_mapping(reading["columns"])
+    return LoadingOptions(
+        given.get("rate"),
+        parse_duration("--last", given.get("last")),
+        create_reading_options(reading),
+        parse_decoder(given["decoder"], given["option"]),
+    )
 
 
 def parse_decoder(name: str | None, options: list[str] | None) -> "DecoderChoice | None":
@@ -206,7 +232,7 @@ def parse_decoder(name: str | None, options: list[str] | None) -> "DecoderChoice
     ConfigError
         If there are options without a decoder, or if an option is not a key with a value.
     """
-    from monitor.commands.wire_format_decoding import DecoderChoice
+    from monitor.commands.recording_loading import DecoderChoice
 
     if name is None:
         if options:

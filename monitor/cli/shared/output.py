@@ -2,7 +2,7 @@
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from drivers.errors import ConfigError
@@ -32,6 +32,25 @@ def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
         raise ConfigError(f"{option}: {path}: a name ending in {' or '.join(suffixes)} is needed")
     if path != Path("-") and not path.parent.is_dir():
         raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
+
+
+def write_json(path: Path | None, encode: Callable[[], bytes]) -> None:
+    """Write the value of the option ``--json``, if the option was given.
+
+    Parameters
+    ----------
+    path : Path or None
+        File to write, or ``-`` for standard output.
+    encode : callable
+        Function that returns the JSON text.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be written.
+    """
+    if path is not None:
+        write_file_or_stdout("--json", path, encode() + b"\n")
 
 
 def write_file_or_stdout(option: str, path: Path, data: bytes) -> None:

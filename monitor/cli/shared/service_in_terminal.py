@@ -57,8 +57,7 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     from rich.console import Console
 
     from monitor.daemon.operations.systemd import SystemdNotifier
-    from monitor.daemon.outputs.log_output import EventAndStatusLogOutput
-    from monitor.daemon.outputs.table_output import TableOutput
+    from monitor.daemon.outputs.terminal_outputs import EventAndStatusLogOutput, TableOutput
     from monitor.daemon.service import STATUS_INTERVAL_S, Service
     from monitor.publishing.remote_device_states import RemoteDeviceRegistry
     from monitor.publishing.terminal.live_device_table import LiveTable

@@ -8,9 +8,10 @@ For each kind of event and each device, a hook runs at most BURST times in a row
 faulty cable that reports losses every second therefore starts only a few programs.
 """
 
+import contextlib
 import os
 import queue
-import selectors
+import select
 import signal
 import subprocess
 import threading
@@ -39,6 +40,8 @@ OUTPUT_BYTES: Final = 4096
 """Maximum number of bytes that are kept from the output of a command."""
 MAX_LINE_CHARS: Final = 200
 """Maximum length of an output line in a message, in characters."""
+MAX_LAST_READS: Final = 16
+"""Maximum number of reads of the output after a command has ended."""
 POLL_S: Final = 0.05
 """Interval between two checks of whether a command has ended."""
 CLOSE_TIMEOUT_S: Final = 2.0
@@ -178,98 +181,47 @@ def _run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: C
         )
     except (OSError, ValueError) as error:
         return f"cannot be started: {getattr(error, 'strerror', None) or error}"
-    try:
-        with _Pipes(process, payload) as pipes:
-            return _wait_for_end(process, pipes, hook.timeout_s, ending)
-    except OSError as error:  # no file descriptors are left
-        return f"killed: {error.strerror or error}"
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)  # the process id is still valid, because the process is not reaped
-            process.wait()
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with process.stdout as output:
+        try:
+            with contextlib.suppress(BrokenPipeError), process.stdin:  # the command may close its standard input
+                process.stdin.write(payload)  # does not block, because a pipe buffers more bytes
+            return _wait_for_end(process, output.fileno(), hook.timeout_s, ending)
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)  # the process id is valid, because the process is not reaped
+                process.wait()
 
 
-def _wait_for_end(
-    process: "subprocess.Popen[bytes]", pipes: "_Pipes", timeout_s: float, ending: Callable[[], bool]
-) -> str:
+def _wait_for_end(process: "subprocess.Popen[bytes]", output: int, timeout_s: float, ending: Callable[[], bool]) -> str:
     """Wait for the end of a command or kill the command; return "" or a description of the error."""
-    until_s = time.monotonic() + timeout_s
+    os.set_blocking(output, False)
+    readable = select.poll()
+    readable.register(output, select.POLLIN)
+    until_s, tail = time.monotonic() + timeout_s, b""
     while process.poll() is None:
-        pipes.exchange_stdin_and_stdout()
         if ending():
             return "killed because the service ended"
         if time.monotonic() > until_s:
             return f"killed after {timeout_s:g} s"
+        if readable.poll(1000.0 * POLL_S):
+            data = _read(output)
+            tail = (tail + data)[-OUTPUT_BYTES:]
+            if not data:  # the command has closed its output
+                time.sleep(POLL_S)
     if process.returncode == 0:
         return ""
-    pipes.read_remaining_output()
+    for _ in range(MAX_LAST_READS):
+        tail = (tail + _read(output))[-OUTPUT_BYTES:]
     how = f"signal {-process.returncode}" if process.returncode < 0 else f"exit status {process.returncode}"
-    return f"{how}{pipes.last_output_line_text()}"
+    lines = tail.decode("utf-8", "replace").strip().splitlines()
+    last = "".join(letter if letter.isprintable() else "�" for letter in lines[-1]) if lines else ""
+    return f"{how}: {last[-MAX_LINE_CHARS:]}" if last else how
 
 
-class _Pipes:
-    """Non-blocking pipes to the standard input and output of a command."""
-
-    def __init__(self, process: "subprocess.Popen[bytes]", payload: bytes) -> None:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        self._in, self._out = process.stdin, process.stdout
-        self._left = memoryview(payload)
-        self._tail = bytearray()
-        self._selector = selectors.DefaultSelector()
-        for pipe, events in ((self._in, selectors.EVENT_WRITE), (self._out, selectors.EVENT_READ)):
-            os.set_blocking(pipe.fileno(), False)
-            self._selector.register(pipe, events)
-
-    def __enter__(self) -> "_Pipes":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._selector.close()
-        for pipe in (self._in, self._out):
-            pipe.close()
-
-    def exchange_stdin_and_stdout(self) -> None:
-        """Write to the standard input and read from the standard output for up to POLL_S."""
-        for key, _ in self._selector.select(POLL_S):
-            if key.fileobj is self._in:
-                self._write()
-            else:
-                self._read()
-
-    def read_remaining_output(self) -> None:
-        """Read the remaining output of a finished command."""
-        for _ in range(16):
-            if self._out.closed or not self._read():
-                return
-
-    def last_output_line_text(self) -> str:
-        """Return ``: `` followed by the last output line, or "" if there is no output.
-
-        Unprintable characters are replaced.
-        """
-        lines = self._tail.decode("utf-8", "replace").strip().splitlines()
-        if not lines:
-            return ""
-        return f": {''.join(letter if letter.isprintable() else '�' for letter in lines[-1])[-MAX_LINE_CHARS:]}"
-
-    def _write(self) -> None:
-        try:
-            self._left = self._left[os.write(self._in.fileno(), self._left) :]
-        except BlockingIOError:
-            return
-        except BrokenPipeError:  # the command has closed its standard input
-            self._left = self._left[:0]
-        if not self._left:
-            self._selector.unregister(self._in)
-            self._in.close()
-
-    def _read(self) -> bool:
-        try:
-            data = os.read(self._out.fileno(), OUTPUT_BYTES)
-        except BlockingIOError:
-            return False
-        self._tail = (self._tail + data)[-OUTPUT_BYTES:]
-        if not data and self._out in self._selector.get_map():
-            self._selector.unregister(self._out)
-        return bool(data)
+def _read(output: int) -> bytes:
+    try:
+        return os.read(output, OUTPUT_BYTES)
+    except BlockingIOError:
+        return b""

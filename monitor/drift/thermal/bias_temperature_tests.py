@@ -5,7 +5,7 @@ least-squares regression. The noise model is the sum of white noise and a random
 two parameters of the noise model are unknown, so the F test is repeated for each pair of parameters on a grid. A pair
 is plausible if its restricted log-likelihood (Harville, J. Am. Stat. Assoc. 72, 1977) is within MAX_LIKELIHOOD_LOSS of
 the maximum. The largest p-value among all plausible pairs is used. Measured false positive rates are listed in
-docs/thermal-measurements.md.
+docs/measurements/thermal-models.md.
 
 Hysteresis is described by three kinds of regressors:
 

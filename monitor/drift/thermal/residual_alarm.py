@@ -2,7 +2,7 @@
 
 If the model is correct, the bias lies above the 95 % prediction interval in 2.5 % of the intervals, and below it in
 another 2.5 %. A change is suspected if, in MIN_OUTSIDE of the last WINDOW_INTERVALS intervals, the bias lies outside
-the prediction interval on the same side. The measured false alarm rate is given in docs/thermal-measurements.md.
+the prediction interval on the same side. The measured false alarm rate is given in docs/measurements/thermal-models.md.
 """
 
 from collections import deque

@@ -65,7 +65,7 @@ def newest_samples_per_displayed_tau(factors: Ints, rate_hz: float, window_sampl
 
     The duration of the samples is 16 τ, but at least 10 s and at most the whole window. A change of the white noise is
     therefore visible within a minute for τ up to 3 s. The displayed values are not used for fits, because a fit to them
-    would find spurious noise terms (``docs/windows.md``).
+    would find spurious noise terms (``docs/explanation/windows.md``).
 
     Parameters
     ----------

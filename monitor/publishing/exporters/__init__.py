@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 from drivers.errors import ConfigError
-from drivers.number_ranges import COEFFICIENT, INFLATION
+from drivers.number_ranges import COEFFICIENT, DURATION_S, INFLATION
 from monitor.publishing.exporters.estimator_parameters import PARAMETER_FILES
 from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
@@ -22,10 +22,9 @@ from monitor.publishing.exporters.export_input import (
     from_model,
     missing_coefficient_error,
 )
-from monitor.publishing.exporters.gnss_ins_sim import export_gnss_ins_sim
-from monitor.publishing.exporters.gyroparams import export_gyroparams
 from monitor.publishing.exporters.imu_utils import export_imu_utils
 from monitor.publishing.exporters.kalman import export_kalman_process_noise
+from monitor.publishing.exporters.simulator_parameters import export_gnss_ins_sim, export_gyroparams
 
 __all__ = ["FORMATS", "AxisCoefficientOrBound", "NoiseCoefficients", "export", "from_analysis_json", "from_model"]
 
@@ -76,10 +75,13 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
         formats = [one for one, exporter in FORMATS.items() if name in exporter.options]
         if format_name not in formats:
             raise ConfigError(f"{name}: is an option of {', '.join(formats)}, not of {format_name}")
-    try:
-        INFLATION.check(inflation)
-    except ConfigError as error:
-        raise ConfigError(f"inflation: {error}") from None
+    checked = (("inflation", INFLATION, inflation), ("correlation time", DURATION_S, given.get("correlation_time_s")))
+    for name, allowed_range, value in checked:
+        try:
+            if value is not None:
+                allowed_range.check(value)
+        except ConfigError as error:
+            raise ConfigError(f"{name}: {error}") from None
     if not noise.axes:
         raise missing_coefficient_error(noise, "nothing to export: no axis has any of Q, N, B, K, R")
     for axis, terms in noise.axes.items():

@@ -10,7 +10,7 @@ exported. The programs differ in file syntax and parameter names. They state the
 
 The last two forms hold for N and K alike. A program with discrete noise adds (dt σ)² to the variance of an angle
 or a velocity in each step. This variance must be N² dt, so that σ = N/√dt. For a bias, it must be K² dt, so that σ =
-K/√dt. ``docs/export.md`` names the documentation or source code on which each entry is based.
+K/√dt. ``docs/reference/export.md`` names the documentation or source code on which each entry is based.
 """
 
 import math
@@ -19,11 +19,11 @@ from enum import Enum
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.number_ranges import DURATION_S
 from monitor.common.unit_formatting import Kind
 from monitor.publishing.exporters.export_input import (
     NoiseCoefficients,
     ascii_unit,
+    choose_time_step_s,
     comment_on_omitted_terms,
     find_worst_axis,
     format_float,
@@ -149,7 +149,7 @@ class ParameterFile:
         NotReady
             If the recording is too short to determine a required coefficient.
         """
-        step_s = self._time_step_s(noise.sample_rate_hz, dt_s)
+        step_s = self._time_step_s(noise, dt_s)
         filled = {"rate": repr(noise.sample_rate_hz), "rostopic": rostopic}
         lines = [
             *self.first_lines,
@@ -180,20 +180,15 @@ class ParameterFile:
             lines.append("# outside the documented range, {:g} to {:g}".format(*one.documented_range))
         return [*lines, self.line.format(name=one.name, value=format_float(value))]
 
-    def _time_step_s(self, rate_hz: float | None, dt_s: float | None) -> float:
+    def _time_step_s(self, noise: NoiseCoefficients, dt_s: float | None) -> float:
         """Return the time step of the target program. Continuous-time values do not depend on the time step."""
+        rate_hz = noise.sample_rate_hz
         if rate_hz is None and any("{rate}" in text for text in self.before):
             raise ConfigError(f"{self.name} needs an update_rate, and the model has no sample_rate")
-        sample_period_s = None if rate_hz is None else 1.0 / rate_hz
-        step_s = next((one for one in (dt_s, self.default_dt_s, sample_period_s) if one is not None), None)
-        if step_s is None and not self.form.discrete:
+        dt_s = self.default_dt_s if dt_s is None else dt_s
+        if dt_s is None and rate_hz is None and not self.form.discrete:
             return 1.0
-        if step_s is None or not DURATION_S.supports(step_s):
-            raise ConfigError(
-                f"{self.name} needs a time step of {DURATION_S.format_range()}: the model's sample_rate, or one that "
-                "is given"
-            )
-        return step_s
+        return choose_time_step_s(noise, dt_s, self.name)
 
 
 def _noise_and_bias(gyro_n: str, accel_n: str, gyro_k: str, accel_k: str) -> tuple[Parameter, ...]:

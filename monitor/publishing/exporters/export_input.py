@@ -13,7 +13,7 @@ import msgspec
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError, NotReady
-from drivers.number_ranges import RATE_HZ
+from drivers.number_ranges import DURATION_S, RATE_HZ
 from monitor.common.unit_formatting import KINDS, Kind, axes_of
 from monitor.noise.effect import Source, gyro_and_accel_units
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
@@ -37,7 +37,7 @@ def ascii_unit(letter: str, kind: Kind) -> str:
 
     Parameters
     ----------
-        letter
+    letter
         Symbol of the coefficient: Q, N, B, K or R.
     kind
         Kind of sensor: gyro or accel.
@@ -99,7 +99,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
 
     Parameters
     ----------
-        model
+    model
         Noise model with the effects of each axis.
     source
         Source of the coefficients, for the header of the file.
@@ -159,7 +159,7 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
 
     Parameters
     ----------
-        json_text
+    json_text
         Output of ``imu-monitor analyze --json``, or message ``imu/<device>/coefficients``.
     source
         Source of the coefficients, for the header of the file.
@@ -215,6 +215,32 @@ def missing_coefficient_error(noise: NoiseCoefficients, message: str) -> ImuErro
         Text of the exception.
     """
     return NotReady(f"{message}: a longer recording is needed") if noise.measured else ConfigError(message)
+
+
+def choose_time_step_s(noise: NoiseCoefficients, dt_s: float | None, format_name: str) -> float:
+    """Return the time step of the target program [s].
+
+    Parameters
+    ----------
+    noise
+        Noise coefficients, whose sample period is the default.
+    dt_s
+        Time step that the user has given, or None.
+    format_name
+        Name of the export format, for error messages.
+
+    Raises
+    ------
+    ConfigError
+        If the time step is unknown or outside the supported range.
+    """
+    step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
+    if step_s is None or not DURATION_S.supports(step_s):
+        raise ConfigError(
+            f"{format_name} needs a time step of {DURATION_S.format_range()}: the model's sample_rate, or one that is "
+            "given"
+        )
+    return step_s
 
 
 def find_worst_axis(

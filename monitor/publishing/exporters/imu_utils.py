@@ -13,12 +13,11 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from drivers.errors import ConfigError
-from drivers.number_ranges import DURATION_S
 from monitor.common.unit_formatting import Kind
 from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
     NoiseCoefficients,
+    choose_time_step_s,
     comment_on_omitted_terms,
     describe_coefficients,
     format_float,
@@ -52,11 +51,7 @@ def export_imu_utils(noise: NoiseCoefficients, inflation: float = 1.0, dt_s: flo
     NotReady
         If the recording is too short to determine N, or both B and K.
     """
-    step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
-    if step_s is None or not DURATION_S.supports(step_s):
-        raise ConfigError(
-            f"imu_utils needs a time step of {DURATION_S.format_range()}: the model's sample_rate, or one that is given"
-        )
+    step_s = choose_time_step_s(noise, dt_s, "imu_utils")
     lines = [
         "%YAML:1.0",
         "---",

@@ -25,14 +25,13 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
-from drivers.errors import ConfigError
-from drivers.number_ranges import DURATION_S
 from monitor.common.unit_formatting import sensor_kind
 from monitor.noise.effects import BiasInstability
 from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
     NoiseCoefficients,
     ascii_unit,
+    choose_time_step_s,
     comment_on_omitted_terms,
     describe_coefficients,
     format_float,
@@ -76,18 +75,9 @@ def export_kalman_process_noise(
     Raises
     ------
     ConfigError
-        If the time step is unknown, or if the time step or the correlation time is outside the supported range.
+        If the time step is unknown or outside the supported range.
     """
-    step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
-    if step_s is None or not DURATION_S.supports(step_s):
-        raise ConfigError(
-            f"kalman needs a time step of {DURATION_S.format_range()}: the model's sample_rate, or one that is given"
-        )
-    if correlation_time_s is not None:
-        try:
-            DURATION_S.check(correlation_time_s)
-        except ConfigError as error:
-            raise ConfigError(f"correlation time: {error}") from None
+    step_s = choose_time_step_s(noise, dt_s, "kalman")
     lines = [
         *HEADER_COMMENT,
         *header_comments(noise, inflation, "#"),

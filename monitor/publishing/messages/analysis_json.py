@@ -178,7 +178,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
         ----------
         result
             Analysis of the recording.
-                total
+        total
             Total variance, or None to omit total deviations.
         hadamard
             Hadamard variance, or None to omit Hadamard deviations.

@@ -17,8 +17,8 @@ from drivers.data_types import AXES, Floats, Ints
 from monitor.common import topics
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.history.bucketed_history import MAX_EVENTS, ColumnStatistics, HistoryTable
-from monitor.history.estimate_to_columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
 from monitor.history.history_row import COUNTS, STATES
+from monitor.history.minute_aggregation import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
 from monitor.history.query_parameters import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange

@@ -99,7 +99,7 @@ def attributes_with_field_names(struct_type: type[msgspec.Struct], source: objec
 
     Parameters
     ----------
-        struct_type
+    struct_type
         Class of the msgspec struct.
     source
         Object with the attributes.

@@ -48,23 +48,31 @@ class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
     """Allan, total or Hadamard deviations of one axis with 95 % intervals."""
 
     deviation: Floats
+    """Deviations [rad/s, m/s²], one for each averaging time."""
     lo: Floats
+    """Lower ends of the 95 % intervals."""
     hi: Floats
+    """Upper ends of the 95 % intervals."""
 
 
 class AllanAxis(DeviationCurve, frozen=True):
-    """Allan deviations of one axis. The field ``recent`` uses only the last max(10 s, 16 τ) of samples."""
+    """Allan deviations of one axis."""
 
     recent: DeviationCurve | UnsetType = UNSET
+    """Deviations of the last max(10 s, 16 τ) of the samples."""
 
 
 class CoefficientValue(msgspec.Struct, frozen=True):
     """Noise coefficient of one axis with 95 % interval and status."""
 
     value: float | None = None
+    """Coefficient in SI units. ``null`` if it is not estimated."""
     lo: float | None = None
+    """Lower end of the 95 % interval."""
     hi: float | None = None
+    """Upper end of the 95 % interval, or an upper bound."""
     status: str = ""
+    """``estimated``, ``upper_bound`` or ``unestimated``."""
     other: str | UnsetType | None = msgspec.field(name="or", default=UNSET)
     """Other coefficient, K or R, that explains the data equally well. Unset if the data distinguish K from R."""
 
@@ -78,6 +86,7 @@ class SlidingWindowMessage(
     """Base class of messages with results that are computed from the sliding window."""
 
     rate_hz: float | None = None
+    """Sample rate from which the averaging times are computed [Hz]."""
     window_s: float | None = None
     """Length of the sliding window [s]."""
     filled_s: float | None = None
@@ -89,6 +98,7 @@ class AllanMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.A
 
     topic = topics.ALLAN
     tau_s: Floats
+    """Averaging times [s]."""
     axes: dict[str, AllanAxis]
 
     @classmethod
@@ -183,6 +193,7 @@ class TauRange(msgspec.Struct, frozen=True):
     """First and last averaging time of a range [s]."""
 
     tau: tuple[float, float]
+    """First and last averaging time of the difference [s]."""
 
 
 class AxisModelComparisonValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
@@ -191,13 +202,20 @@ class AxisModelComparisonValues(msgspec.Struct, frozen=True, eq=False, kw_only=T
     agrees: bool | None = None
     """True if the axis agrees with the noise model, based on a test with hysteresis. None before the first decision."""
     gap: float
+    """Largest difference between measurement and model in standard deviations."""
     where: TauRange
     ratio: float | None = None
+    """Measured deviation divided by that of the model, where the difference is largest."""
     null95: float | None = None
+    """Limit that the gap of this axis exceeds in 5 % of windows if the model is true."""
     threshold: float | None = None
+    """Limit that the gap of any axis exceeds in 1 % of windows if the model is true."""
     measured: Floats | None = None
+    """Measured Allan deviations, one for each averaging time."""
     model: Floats | None = None
+    """Allan deviations of the model."""
     z: Floats | None = None
+    """Differences in standard deviations."""
 
 
 class ModelGapMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema_name()):
@@ -205,6 +223,7 @@ class ModelGapMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topic
 
     topic = topics.GAP
     tau_s: Floats | None = None
+    """Averaging times [s]."""
     axes: dict[str, AxisModelComparisonValues]
 
     @classmethod
@@ -221,17 +240,22 @@ class ModelGapMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topic
 
 
 class AxisBiasPrediction(msgspec.Struct, frozen=True):
-    """Measured and predicted mean bias of one axis in an interval. ``text`` states why a prediction is missing."""
+    """Measured and predicted mean bias of one axis in an interval."""
 
     bias: float | None
+    """Mean bias in the interval [rad/s, m/s²]."""
     error: float | None
+    """Standard error of the mean bias."""
     multi_step: PredictionInterval | None
     """Bias predicted from the temperature alone."""
     one_step: PredictionInterval | None
     """Bias predicted from the temperature and the mean bias of the preceding interval."""
     model: str | None
+    """Form of the thermal model."""
     slope: float | None
+    """Slope of the model at the temperature of the interval, per °C."""
     text: str
+    """Reason why a prediction is missing."""
 
 
 class ThermalPredictionMessage(
@@ -245,7 +269,9 @@ class ThermalPredictionMessage(
 
     topic = topics.THERMAL
     interval_s: float
+    """Length of the interval [s]."""
     temperature_c: float | None
+    """Mean temperature in the interval [°C]."""
     axes: dict[str, AxisBiasPrediction]
 
     @classmethod
@@ -263,6 +289,7 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
     """Total or Hadamard deviations of all measured axes at the same averaging times."""
 
     tau: Floats
+    """Averaging times [s]."""
     axes: dict[str, DeviationCurve]
 
     @classmethod
@@ -292,13 +319,17 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_n
 
     topic = topics.EVENT
     kind: str
+    """Kind of the event."""
     axis: str | None = None
+    """Axis that the event concerns."""
     what: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
     """Values of the affected coefficients, such as the values before and after a change."""
     since: float | None = None
     """Unix time at which the condition that the event reports began [s]."""
     sigma: float | None = None
+    """Size of the change in standard errors."""
     text: str
+    """Sentence for the user."""
 
     @classmethod
     def _convert(cls, t: float | None, result: Event) -> dict[str, Any]:
@@ -334,10 +365,12 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_n
 
 
 class LatencyPercentiles(msgspec.Struct, frozen=True):
-    """Percentiles of the time from the receipt of a sample to its publication [s]."""
+    """Percentiles of the latency."""
 
     p50: float | None = None
+    """Median time from the receipt of a sample to its publication, over the last second [s]."""
     p99: float | None = None
+    """99 % quantile of this time [s]."""
 
 
 class StatusMessage(
@@ -351,21 +384,36 @@ class StatusMessage(
 
     topic = topics.STATUS
     state: str
+    """``running``, ``waiting``, ``lost`` or ``ended``."""
     rate_hz: float | None = None
+    """Measured sample rate [Hz]. ``null`` until it is known."""
     received: Count
+    """Number of received samples."""
     lost: Count
+    """Number of samples that are missing on the wire, or whose frame came too late."""
     bad: Count
+    """Number of samples that are rejected because of a failed check or an impossible value."""
     overflowed: Count = 0
+    """Number of samples that were overwritten before the service took them."""
     latency: LatencyPercentiles = LatencyPercentiles()
     memory_bytes: Count = 0
+    """Memory of the whole process [bytes]."""
     outputs: dict[str, str] = msgspec.field(default_factory=dict)
+    """State of each output: ``ok`` or a description of the problem."""
     uptime_s: float = 0.0
+    """Time since the start of the device [s]."""
     repeated: Count = 0
+    """Number of samples that were received twice and discarded."""
     late: Count = 0
+    """Number of samples that were discarded because they already counted as missing."""
     moving: bool = False
+    """True while the device is in motion."""
     moved: Count = 0
+    """Number of samples during motion."""
     crossed: tuple[str, ...] = ()
+    """Limits that are crossed now, for example ``gz N``."""
     text: str = ""
+    """Problem of the device, or an empty text."""
 
     @classmethod
     def _convert(cls, _t: float | None, result: Health) -> dict[str, Any]:
@@ -403,6 +451,7 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema_nam
 
     topic = topics.RESET
     text: str
+    """Sentence for the user."""
 
     @classmethod
     def _convert(cls, _t: float | None, result: str) -> dict[str, Any]:
@@ -495,7 +544,7 @@ def deviations_with_interval_ends(
 
     Parameters
     ----------
-        curve
+    curve
         Allan, total or Hadamard variances of all axes.
     axis
         Column of the axis.

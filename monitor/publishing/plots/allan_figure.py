@@ -81,7 +81,7 @@ def additional_deviations(
 
     Parameters
     ----------
-        total
+    total
         Total variance, or None to draw no total deviation.
     hadamard
         Hadamard variance, or None to draw no Hadamard deviation.
@@ -97,7 +97,7 @@ def additional_deviations(
 
 
 @dataclass(frozen=True, slots=True)
-class _Ring:
+class CoefficientRing:
     """Ring at the averaging time at which a coefficient is read from the Allan plot."""
 
     letter: str
@@ -130,9 +130,9 @@ def draw_allan_panel(
         Units of the plot.
     """
     factor = units.deviation(kind).factor
-    tau_s, minimum_tau_s = estimate.curve.tau_s, _tau_of_minimum_s(estimate, kind)
+    tau_s, minimum_tau_s = estimate.curve.tau_s, tau_of_minimum_s(estimate, kind)
     shown: list[Floats] = []
-    rings: list[_Ring] = []
+    rings: list[CoefficientRing] = []
     drawn: set[str] = set()
     for number, axis in enumerate(axes_of(kind)):
         i = AXES.index(axis)
@@ -154,7 +154,7 @@ def draw_allan_panel(
             if points.any():
                 shown.append(_draw_other(panel, other, points, number, i, factor, longest_allan_tau_s, style_name))
                 drawn.add(other.name)
-        rings += _rings(estimate, i, factor, minimum_tau_s, float(measured.min()))
+        rings += coefficient_rings(estimate, i, factor, minimum_tau_s, float(measured.min()))
     _set_limits(panel, shown, rings)
     _draw_terms(panel, rings)
     _draw_labels(panel, kind, others, drawn, units)
@@ -176,7 +176,7 @@ def _draw_other(
     return np.asarray(y[line])
 
 
-def _tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
+def tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
     """Return the averaging time [s] with the lowest mean Allan deviation, at which B is read."""
     avar = estimate.curve.avar[:, [AXES.index(axis) for axis in axes_of(kind)]]
     good = np.isfinite(avar) & (avar > 0)
@@ -187,7 +187,24 @@ def _tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
     return float(estimate.curve.tau_s[common][np.argmin(level)])
 
 
-def _rings(estimate: Estimate, i: int, factor: float, minimum_tau_s: float, lowest: float) -> list[_Ring]:
+def coefficient_rings(
+    estimate: Estimate, i: int, factor: float, minimum_tau_s: float, lowest: float
+) -> list[CoefficientRing]:
+    """Return the rings of all estimated coefficients of one axis.
+
+    Parameters
+    ----------
+    estimate
+        Estimate with the coefficients.
+    i
+        Column index of the axis.
+    factor
+        Factor from the SI unit of the axis to the unit of the plot.
+    minimum_tau_s
+        Averaging time [s] at which B is read.
+    lowest
+        Smallest Allan deviation of the axis, in the unit of the plot.
+    """
     known, rings = estimate.coefficients, []
     for row, (letter, source) in enumerate(zip(SYMBOLS, UNIT_SOURCES, strict=True)):
         if known.status[row, i] != Status.ESTIMATED:
@@ -195,11 +212,11 @@ def _rings(estimate: Estimate, i: int, factor: float, minimum_tau_s: float, lowe
         tau_s = READING_TAU_S.get(letter, minimum_tau_s)
         line = known.value[row, i] * factor * np.sqrt(source.avar(np.array([tau_s, *LINE_TAU_S]), TAU0_S))
         if line[0] > lowest / MAX_DEPTH_RATIO:
-            rings.append(_Ring(letter, tau_s, float(line[0]), i % 3, line[1:]))
+            rings.append(CoefficientRing(letter, tau_s, float(line[0]), i % 3, line[1:]))
     return rings
 
 
-def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) -> None:
+def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[CoefficientRing]) -> None:
     panel.set(xscale="log", yscale="log")
     values = np.concatenate([*shown, [ring.sigma for ring in rings]]) if shown else np.array([1.0])
     values = values[np.isfinite(values) & (values > 0)]
@@ -209,7 +226,7 @@ def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) 
     panel.set_xlim(min([left, *(t / MARGIN_FACTOR for t in taus)]), max([right, *(t * MARGIN_FACTOR for t in taus)]))
 
 
-def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
+def _draw_terms(panel: "Axes", rings: Sequence[CoefficientRing]) -> None:
     for ring in rings:
         colour, size = COLOURS[ring.number], RING_SIZES[ring.number]
         panel.plot(LINE_TAU_S, ring.line, color=colour, linewidth=0.7, alpha=TERM_LINE_ALPHA, zorder=1, scalex=False)
@@ -230,10 +247,10 @@ def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
         )
 
 
-def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
+def _group_rings(panel: "Axes", rings: Sequence[CoefficientRing]) -> list[list[CoefficientRing]]:
     """Group rings of the same coefficient whose labels would overlap, so that each group has one label."""
     bottom, top = np.log(panel.get_ylim())
-    groups: list[list[_Ring]] = []
+    groups: list[list[CoefficientRing]] = []
     for ring in sorted(rings, key=lambda one: (one.letter, one.sigma)):
         previous = groups[-1][-1] if groups else None
         distance = np.inf if previous is None else np.log(ring.sigma / previous.sigma) / (top - bottom)

@@ -1,6 +1,6 @@
 """Colours of the x, y and z axes in all plots, which colour-blind people can distinguish.
 
-The colours are similar to vermilion, bluish green and sky blue of the Okabe-Ito palette, and also differ in lightness.
+The colours are vermilion, bluish green and sky blue of the Okabe-Ito palette. They also differ in lightness.
 The gyroscope and the accelerometer of an axis have the same colour, because they never appear in the same plot.
 """
 
@@ -9,18 +9,19 @@ from typing import Final
 Colour = tuple[int, int, int]
 
 AXIS_COLOURS: Final[dict[str, Colour]] = {
-    "gx": (240, 98, 77),
-    "gy": (45, 190, 130),
-    "gz": (84, 160, 255),
-    "ax": (240, 98, 77),
-    "ay": (45, 190, 130),
-    "az": (84, 160, 255),
+    "gx": (213, 94, 0),
+    "gy": (0, 158, 115),
+    "gz": (86, 180, 233),
+    "ax": (213, 94, 0),
+    "ay": (0, 158, 115),
+    "az": (86, 180, 233),
 }
 BACKGROUND: Final[Colour] = (13, 16, 17)
 FRAME: Final[Colour] = (92, 98, 104)
 MAJOR: Final[Colour] = (48, 53, 57)
 MINOR: Final[Colour] = (23, 27, 29)
 TEXT: Final[Colour] = (236, 239, 242)  # legible on label boxes in the dark and in the light theme of the viewer
+KEY: Final[Colour] = (150, 160, 170)  # signs in the key of a plot
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 
@@ -30,7 +31,7 @@ def blend_colours(colour: Colour, colour_share: float, background: Colour = BACK
     Parameters
     ----------
     colour
-                Colour of the area as red, green and blue, 0 to 255.
+        Colour of the area as red, green and blue, 0 to 255.
     colour_share
         Opacity of the area, 0 to 1.
     background

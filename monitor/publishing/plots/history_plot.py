@@ -66,7 +66,7 @@ def save_history_plot(
     path
         File to write. The suffix selects the format.
     axes
-                Names of the axes to draw.
+        Names of the axes to draw.
     units
         Units of the coefficients.
 

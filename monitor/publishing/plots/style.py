@@ -111,7 +111,7 @@ def create_figure(width: float, height: float, layout: Literal["constrained"] | 
     Parameters
     ----------
     width, height
-                Width and height of the figure [inches].
+        Width and height of the figure [inches].
     layout
         By default, matplotlib arranges the panels so that labels do not overlap. With None, panels keep their
         positions.
@@ -150,7 +150,7 @@ def to_svg_element(figure: "Figure", description: str) -> str:
     figure
         Figure to convert.
     description
-                Text alternative for people who cannot see the figure.
+        Text alternative for people who cannot see the figure.
     """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
@@ -217,7 +217,7 @@ def draw_band(panel: "Axes", x: Floats, lo: Floats, hi: Floats, colour: str, **o
 
     Parameters
     ----------
-        panel
+    panel
         Axes object of matplotlib.
     x, lo, hi
         Horizontal positions, and lower and upper ends of the intervals, shape [n].
@@ -234,7 +234,7 @@ def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
 
     Parameters
     ----------
-        panel
+    panel
         Axes object of matplotlib.
     columns
         Number of columns of the legend.

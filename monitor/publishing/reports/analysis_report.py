@@ -43,7 +43,7 @@ def write_html_report(plot_data: AnalysisPlotData, path: Path, title: str = "") 
     plot_data
         Analysis of the recording.
     path
-                HTML file to write.
+        HTML file to write.
     title
         Title of the HTML page.
 

@@ -30,7 +30,7 @@ def save_history(past: HistoryTable, path: Path) -> None:
     past
         Stored history of the device.
     path
-                File to write, with a suffix such as .csv or .parquet.
+        File to write, with a suffix such as .csv or .parquet.
 
     Raises
     ------

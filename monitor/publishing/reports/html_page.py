@@ -14,7 +14,7 @@ def render_template(name: str, **values: Any) -> str:
     Parameters
     ----------
     name
-                File name of the Jinja2 template.
+        File name of the Jinja2 template.
     values
         Values and functions that the template uses.
 

@@ -16,6 +16,7 @@ from drivers.data_types import Floats
 WIDTH: Final = 16.0
 HEIGHT: Final = 11.5
 MIN_DECADES: Final = 2.0
+RING_RADIUS: Final = 0.28
 FILL_STEPS: Final = 96  # number of vertical lines that fill a confidence band
 
 
@@ -36,7 +37,7 @@ class ChartDecadeRange:
         tau
             Averaging times [s], shape [n].
         sigma
-                        Allan deviations in the unit of the plot, shape [n].
+            Allan deviations in the unit of the plot, shape [n].
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             log_tau, log_sigma = np.log10(tau), np.log10(np.where(sigma > 0, sigma, np.nan))
@@ -58,7 +59,7 @@ def decade_range(values: Iterable[Floats], min_decades: int = int(MIN_DECADES)) 
     values
         Arrays of numbers.
     min_decades
-                Smallest number of decades of the range.
+        Smallest number of decades of the range.
     """
     good = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
     if good.size == 0:
@@ -129,6 +130,12 @@ def interval_strokes(low: Floats, high: Floats) -> Floats:
     strokes = np.stack([low[good], high[good]], axis=1)
     strokes[:, :, 1] = clip_to_box(strokes[:, :, 1])
     return strokes
+
+
+def ring_outline(x: float, y: float) -> Floats:
+    """Return a closed line around a chart position, shape [n, 2]."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)
+    return np.column_stack([x + RING_RADIUS * np.cos(angle), y + RING_RADIUS * np.sin(angle)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ axis therefore also contains the Allan deviations in SI units. Importing this mo
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
@@ -16,6 +16,7 @@ from monitor.common.unit_formatting import DEVIATION_UNITS, KINDS, Kind, axes_of
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours
+from monitor.publishing.plots.allan_figure import coefficient_rings, tau_of_minimum_s
 from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.rerun.allan_chart_geometry import (
     FILL_STEPS,
@@ -28,7 +29,16 @@ from monitor.publishing.rerun.allan_chart_geometry import (
     decade_range,
     finite_sections,
     interval_strokes,
+    ring_outline,
 )
+
+KEY: Final = ("measured", "fit", "95 %", "model", "N, B, K")
+KEY_SPACING: Final = 3.4
+KEY_TEXT: Final = 1.6
+KEY_BELOW: Final = 2.0
+"""Distance of the key below the plot [chart units]."""
+RING_LETTERS: Final = "NBK"
+LETTER_OFFSET: Final = (0.6, -0.35)
 
 Log = Callable[..., Any]
 """Function that logs components under the path of a Rerun entity."""
@@ -56,7 +66,7 @@ class AllanPlotPair:
         Parameters
         ----------
         estimate
-                        Estimate with the measured and fitted Allan deviations.
+            Estimate with the measured and fitted Allan deviations.
         gap
             Comparison with the noise model, which is drawn as dashed lines. None if the device has no model.
         """
@@ -75,11 +85,12 @@ class AllanPlotPair:
                 self._draw_grid(kind, scale, [one.axis for one in curves])
             for curve in curves:
                 self._draw_curve(scale, curve)
+            self._draw_rings(kind, scale, estimate)
 
     def _draw_grid(self, kind: Kind, scale: ChartDecadeRange, axes: Sequence[str]) -> None:
         path = f"{self._path}/{kind}"
         titles = [
-            (WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"),
+            (WIDTH / 2, HEIGHT + 0.95, "averaging time τ, s"),
             (1.2, -0.85, f"σ(τ), {DEVIATION_UNITS[kind].name}"),
         ]
         log_grid(self._log, path, scale, f"{path}/ticks", titles)
@@ -89,6 +100,42 @@ class AllanPlotPair:
             self._log, f"{path}/legend/strokes", strokes, [axis_colours.AXIS_COLOURS[axis] for axis in axes], 2.0, 30.0
         )
         self._log(f"{path}/legend", label_points([(x, -0.85, axis) for axis, x in ends]))
+        self._draw_key(f"{path}/key")
+
+    def _draw_key(self, path: str) -> None:
+        """Draw the meaning of points, lines, bands, dashes and rings below the plot."""
+        y = HEIGHT + KEY_BELOW
+        at = np.column_stack([np.arange(len(KEY)) * KEY_SPACING, np.zeros(len(KEY))])
+        sign = np.array([[0.0, y], [0.8, y]])
+        grey = axis_colours.KEY
+        log_lines(self._log, f"{path}/fit", [sign + at[1]], [grey], 1.25, 10.0)
+        log_lines(self._log, f"{path}/band", [sign + at[2]], [axis_colours.blend_colours(grey, 0.4)], 5.0, 10.0)
+        log_lines(self._log, f"{path}/model", dash_line(sign + at[3]), [axis_colours.TEXT], 0.75, 10.0)
+        log_lines(self._log, f"{path}/ring", [ring_outline(at[4, 0] + 0.4, y)], [grey], 0.9, 10.0)
+        self._log(path, rr.Points2D([(0.4, y)], colors=[grey], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
+        self._log(
+            f"{path}/text", label_points([(x + KEY_TEXT, y - 0.4, text) for (x, _), text in zip(at, KEY, strict=True)])
+        )
+
+    def _draw_rings(self, kind: Kind, scale: ChartDecadeRange, estimate: Estimate) -> None:
+        """Draw a ring at the averaging time at which N, B or K is read, and a letter at the rings of all axes."""
+        factor, minimum_tau_s = DEVIATION_UNITS[kind].factor, tau_of_minimum_s(estimate, kind)
+        letters: dict[str, list[Floats]] = {}
+        for axis in axes_of(kind):
+            i = AXES.index(axis)
+            rings = coefficient_rings(estimate, i, factor, minimum_tau_s, 0.0)
+            at = {
+                one.letter: scale.to_chart_positions(np.array([one.tau_s]), np.array([one.sigma]))[0]
+                for one in rings
+                if one.letter in RING_LETTERS
+            }
+            inside = {letter: xy for letter, xy in at.items() if 0.0 <= xy[0] <= WIDTH and 0.0 <= xy[1] <= HEIGHT}
+            outlines = [ring_outline(*xy) for xy in inside.values()]
+            log_lines(self._log, f"{self._path}/{axis}/rings", outlines, [axis_colours.AXIS_COLOURS[axis]], 0.9, 25.0)
+            for letter, xy in inside.items():
+                letters.setdefault(letter, []).append(xy)
+        labels = [(*(np.mean(xy, axis=0) + LETTER_OFFSET), letter) for letter, xy in letters.items()]
+        self._log(f"{self._path}/{kind}/letters", label_points(labels))
 
     def _draw_curve(self, scale: ChartDecadeRange, curve: "_Curve") -> None:
         path, colour = f"{self._path}/{curve.axis}", axis_colours.AXIS_COLOURS[curve.axis]
@@ -188,7 +235,7 @@ def log_lines(
     line_colours
         One colour for each line, or one for all lines.
     radius
-                Half of the line width, in points of the screen.
+        Half of the line width, in points of the screen.
     order
         Drawing order. Lines with higher values are in front.
     """

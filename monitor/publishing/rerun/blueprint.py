@@ -51,7 +51,7 @@ def blueprint(devices: Sequence[ViewerDeviceDescription], fleet: bool = False) -
     devices
         Devices to show.
     fleet
-                True if the overview is a table that also lists devices that are not shown in detail.
+        True if the overview is a table that also lists devices that are not shown in detail.
     """
     pages, names = [_device(one) for one in devices], [one.name for one in devices]
     if fleet:
@@ -138,7 +138,7 @@ def _heat_map(device: str, axis: str) -> rrb.View:
 def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
     paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
     name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {DEVIATION_UNITS[kind].name}"
-    return drawing_view(f"/{device}/allan", name, paths, (-1.6, WIDTH + 0.6), (-1.3, HEIGHT + 1.7))
+    return drawing_view(f"/{device}/allan", name, paths, (-1.6, WIDTH + 0.6), (-1.3, HEIGHT + 2.5))
 
 
 def _coefficient(device: str, kind: Kind, symbol: str) -> rrb.View:

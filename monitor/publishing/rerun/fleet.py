@@ -55,7 +55,7 @@ class FleetView:
     Parameters
     ----------
     subscriber
-                Subscriber that receives the messages of all devices.
+        Subscriber that receives the messages of all devices.
     viewer
         Viewer in which the results are drawn.
     detail

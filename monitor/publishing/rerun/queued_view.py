@@ -55,7 +55,7 @@ class RerunView:
     devices
         Devices to show in detail.
     history_source
-                Function that returns the stored history of a device. The thread of the viewer calls this function.
+        Function that returns the stored history of a device. The thread of the viewer calls this function.
     fleet
         True if the device table also contains devices that are not shown in detail.
     """

@@ -38,7 +38,7 @@ def time_series_view(
     legend
         True to show a legend.
     styles
-                Line styles for this view only, by path of the entity.
+        Line styles for this view only, by path of the entity.
     """
     return rrb.TimeSeriesView(
         origin=origin,

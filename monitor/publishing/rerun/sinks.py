@@ -209,7 +209,7 @@ def find_free_port(first_port: int, skipped_port: int | None = None) -> int:
     first_port
         First port to try.
     skipped_port
-                Port that is not used even if it is free.
+        Port that is not used even if it is free.
 
     Raises
     ------
@@ -243,7 +243,7 @@ def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callab
     recording_id
         Identifier of the recording in Rerun.
     should_stop
-                Function that returns True if the caller no longer waits for the viewer.
+        Function that returns True if the caller no longer waits for the viewer.
 
     Raises
     ------

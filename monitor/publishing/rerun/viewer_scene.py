@@ -75,7 +75,7 @@ class AllDevicesScene:
         device
             Name of the device.
         panel
-                        Name of the panel class.
+            Name of the panel class.
         results
             One or more results with their Unix times [s], in order of time.
         """

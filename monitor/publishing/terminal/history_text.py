@@ -57,7 +57,7 @@ def print_history_summary(
     past
         Stored history of the device.
     axes
-                Names of the axes to print.
+        Names of the axes to print.
     symbols
         Symbols of the coefficients to print.
     console

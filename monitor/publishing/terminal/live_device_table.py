@@ -82,7 +82,7 @@ class LiveTable:
     Parameters
     ----------
     console : Console
-                Console with the width, height and colours of the terminal.
+        Console with the width, height and colours of the terminal.
     states : RemoteDeviceRegistry or None
         State of all devices. If None, only log lines are written.
     units : UnitSystem, optional
@@ -106,7 +106,7 @@ class LiveTable:
         log_lines : sequence of str
             Lines of the log, with colours as ANSI codes.
         is_last : bool
-                        True to print the final table and make the cursor visible again.
+            True to print the final table and make the cursor visible again.
         """
         with self._console.capture() as captured:
             if self.states is not None and self._live is None and self._console.is_terminal and not is_last:
@@ -140,7 +140,7 @@ def device_overview(states: RemoteDeviceRegistry, now_s: float, units: UnitSyste
     states
         State of all devices.
     now_s
-                Current time [s] on the clock of ``states``.
+        Current time [s] on the clock of ``states``.
     units
         Units of the coefficients.
     """

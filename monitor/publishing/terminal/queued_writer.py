@@ -43,12 +43,12 @@ class QueuedWriter:
     Parameters
     ----------
     stream : TextIO or None
-                Stream that receives the text, or None to discard the text. A stream without a descriptor may block the
-                caller.
+        Stream that receives the text, or None to discard the text. A stream without a descriptor may block the
+        caller.
     place : str
         Name of the stream in messages, such as "standard error".
     render : callable, optional
-                Function that the thread calls to convert queued lines to text. By default, lines are joined.
+        Function that the thread calls to convert queued lines to text. By default, lines are joined.
     period_s : float, optional
         Interval [s] at which ``render`` is called even if no lines are queued. By default, lines are required.
     limit : int
@@ -281,7 +281,7 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
     Parameters
     ----------
     descriptor : int or None
-                File descriptor to test. None counts as writable.
+        File descriptor to test. None counts as writable.
     timeout_s : float
         Longest time to wait until a write does not block [s].
     """

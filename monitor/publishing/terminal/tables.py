@@ -20,7 +20,7 @@ def plain_table(*headers: str, wrapped_headers: Sequence[str] = (), gap: int = 2
     gap
         Number of blanks between columns.
     show_header
-                False to omit the header line.
+        False to omit the header line.
     """
     table = Table(box=None, padding=(0, gap, 0, 0), pad_edge=False, header_style="bold", show_header=show_header)
     for head in headers:

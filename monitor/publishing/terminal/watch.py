@@ -1,19 +1,36 @@
-"""Command ``imu-monitor watch``, which shows a live table of all devices whose results daemons publish over zenoh."""
+"""Command ``imu-monitor watch``, which shows a live table of devices, or prints the messages of daemons as JSON.
+
+With ``--json``, each line is an object with the keys ``key`` (zenoh key), ``topic`` and ``message``. ``message`` is the
+payload as ``docs/reference/messages.md`` describes it. Messages with samples are msgpack on the wire. Each column
+becomes an array.
+"""
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, TextIO, cast
+from typing import Any, Final, TextIO, cast
 
+import msgspec
 from rich.console import Console
 
+from drivers.data_types import AXES, ns_to_seconds
+from drivers.errors import DecodeError
+from drivers.zenoh.sample_message import TEMPERATURE, decode_samples
+from monitor.common import topics
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
-from monitor.publishing.remote_device_states import RemoteDeviceRegistry
+from monitor.publishing.messages.message import MAX_PAYLOAD_BYTES, encode_json
+from monitor.publishing.remote_device_states import RemoteDeviceRegistry, split_device_and_topic
 from monitor.publishing.terminal.live_device_table import LiveTable, device_overview
-from monitor.publishing.terminal.queued_writer import QueuedWriter
-from monitor.publishing.zenoh.subscriber import KEYEXPR, ZenohSubscriber
+from monitor.publishing.terminal.queued_writer import QueuedWriter, reader_is_gone
+from monitor.publishing.zenoh.subscriber import (
+    BACKLOG_BYTES,
+    KEYEXPR,
+    ReceivedMessageOrLiveliness,
+    ZenohSubscriber,
+)
 
 REFRESH_PERIOD_S: Final = 0.5
 PLAIN_PERIOD_S: Final = 1.0
@@ -39,7 +56,7 @@ def watch(
     Parameters
     ----------
     keyexpr
-                Pattern of zenoh keys (key expression) that selects the devices.
+        Pattern of zenoh keys (key expression) that selects the devices.
     connect
         Endpoints of daemons or routers.
     stop
@@ -126,3 +143,128 @@ def connection_problem(subscriber: ZenohSubscriber, any_message: bool) -> str:
     if subscriber.all_connected_duration_s > SILENCE_NOTE_S and not any_message:
         return "connected, but no messages: no daemon is there, or access control refuses them"
     return ""
+
+
+RESULT_TOPICS: Final = tuple(one for one in topics.TOPICS if one.encoding == topics.JSON and one.when != "query")
+SAMPLE_TOPICS: Final = tuple(one for one in topics.TOPICS if one.encoding == topics.MSGPACK)
+"""Topics that contain most of the data. They are printed only if the key expression names them."""
+WAIT_S: Final = 0.25
+"""Longest time [s] until the function notices that it must stop, or that nobody reads its output."""
+
+
+def print_messages_as_json(
+    keyexpr: str,
+    connect: Sequence[str],
+    stop: threading.Event,
+    stream: TextIO,
+    errors: TextIO,
+    duration_s: float | None = None,
+    file: Path | None = None,
+) -> None:
+    """Print each message as one line of JSON, until ``stop`` is set or the reader closes the pipe.
+
+    A separate thread writes the lines. If the reader is too slow, the oldest lines are dropped and counted.
+
+    Parameters
+    ----------
+    keyexpr
+        Pattern of zenoh keys (key expression) that selects devices or topics.
+    connect
+        Endpoints of daemons or routers.
+    stop
+        Event that ends the function when it is set.
+    stream
+        Stream that receives the lines.
+    errors
+        Stream that receives notes about the connection and about lost messages.
+    duration_s
+        Time [s] after which the function ends. By default, there is no limit.
+    file
+        zenoh configuration file.
+
+    Raises
+    ------
+    ConfigError
+        If zenoh rejects the key expression, an endpoint or the configuration file.
+    OSError
+        If the stream cannot be written, for example because the disk is full.
+    """
+    name = keyexpr.rpartition("/")[2]
+    received = (*RESULT_TOPICS, *(topic for topic in SAMPLE_TOPICS if topic.name == name))
+    end_s = math.inf if duration_s is None else time.monotonic() + duration_s
+    problem, messages, malformed = "", 0, 0
+    with (
+        contextlib.closing(ZenohSubscriber(keyexpr, connect, file, received=received)) as subscriber,
+        contextlib.suppress(BrokenPipeError, KeyboardInterrupt),
+        QueuedWriter(stream, STDOUT, limit=BACKLOG_BYTES) as writer,
+    ):
+        subscriber.start()
+        while not (stop.is_set() or time.monotonic() > end_s or reader_is_gone(stream)):
+            if (error := writer.error) is not None:
+                raise error
+            for message in subscriber.take(WAIT_S):
+                messages += 1
+                line = json_line(message)
+                malformed += not line
+                writer.put(line)
+            before, problem = problem, connection_problem(subscriber, messages > 0)
+            if problem != before:
+                _report(errors, problem or "connected")
+    dropped = subscriber.dropped + writer.dropped_lines
+    if dropped and not reader_is_gone(stream):
+        _report(errors, f"{dropped:,} messages dropped: this computer or the reader of {STDOUT} is too slow")
+    if malformed:
+        _report(errors, f"{malformed:,} malformed messages left out")
+
+
+def _report(errors: TextIO, text: str) -> None:
+    with contextlib.suppress(OSError, ValueError):  # the stream is closed, or the disk is full
+        print(f"imu-monitor: {text}", file=errors, flush=True)
+
+
+def json_line(received: ReceivedMessageOrLiveliness) -> str:
+    """Return a message as one line of JSON, or an empty string if the message is malformed.
+
+    >>> json_line(ReceivedMessageOrLiveliness("imu/bench-1/alive", None))
+    '{"key":"imu/bench-1/alive","topic":"alive","message":{"device":"bench-1","alive":true}}\\n'
+
+    Parameters
+    ----------
+    received
+        Message of a device, or notice about a liveliness token.
+    """
+    split = split_device_and_topic(received.key)
+    if split is None:
+        return ""
+    device, topic = split
+    try:
+        message = _decode(received, device, topic)
+        line = encode_json({"key": received.key, "topic": topic.name, "message": message})
+    except (ValueError, RecursionError, DecodeError):  # msgspec reports decoding errors as ValueError
+        return ""
+    return line.decode() + "\n"
+
+
+def _decode(received: ReceivedMessageOrLiveliness, device: str, topic: topics.Topic) -> dict[str, Any]:
+    """Return the payload of a message. Raise an exception if the payload is malformed."""
+    if received.payload is None:
+        return {"device": device.rpartition("/")[2], "alive": received.token_exists}
+    if topic in SAMPLE_TOPICS:
+        return _decode_sample_columns(received.payload, topic)
+    if len(received.payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(f"the payload has {len(received.payload)} bytes; at most {MAX_PAYLOAD_BYTES} are read")
+    return msgspec.json.decode(received.payload, type=dict[str, Any])
+
+
+def _decode_sample_columns(payload: bytes, topic: topics.Topic) -> dict[str, Any]:
+    found = decode_samples(payload)
+    block = found.block
+    columns = {axis: block.values[:, i] for i, axis in enumerate(AXES)} | {TEMPERATURE: block.temperature_c}
+    return {
+        "schema": topic.schema_name(),
+        "device": found.device,
+        "samples": found.total_samples,
+        "lost": block.lost,
+        "t": ns_to_seconds(block.t_ns),
+        **columns,
+    }

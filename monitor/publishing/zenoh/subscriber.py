@@ -66,7 +66,7 @@ class ZenohSubscriber:
 
     Parameters
     ----------
-        keyexpr
+    keyexpr
         Pattern of zenoh keys (key expression) that selects devices or topics, such as ``imu/**`` or ``*/*/status``.
     connect
         Endpoints of daemons or routers. By default, the endpoints in ``file`` or the default endpoint.

@@ -21,7 +21,7 @@ from tests.support.ports import free_endpoint
 from tests.support.zenoh_sessions import open_router
 
 START_NS = 1_763_700_000_123_456_789
-PAGE = Path(__file__).parents[3] / "docs" / "samples-format.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "samples-format.md"
 
 
 def make_samples(n: int, jitter_ns: int = 0) -> SampleBlock:

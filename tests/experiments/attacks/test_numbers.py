@@ -26,7 +26,8 @@ from drivers.number_ranges import NumberRange
 from drivers.recordings import load_samples
 from drivers.settings_model import KeywordOrType, SettingsModel, fields_by_key
 from monitor import cli
-from monitor.commands.analyze import AnalysisRequest, run_analysis
+from monitor.commands.analyze import analyze_recording
+from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.common import shipped_config_paths
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
@@ -414,14 +415,14 @@ def draw_columns(n: int = 400) -> dict[str, Any]:
 def test_stated_rate_of_a_recording(fs: Any, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     np.savez(path, fs=fs, **draw_columns())
-    is_answered(AnalysisRequest(path, total_and_hadamard=True))
+    is_answered(path, total_and_hadamard=True)
 
 
 @pytest.mark.parametrize("step_s", [1e-300, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 15.0, 900.0, 1e4, 1e7])
 def test_time_stamps_of_a_recording(step_s: float, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     np.savez(path, t=np.arange(400) * step_s, **draw_columns())
-    answered = is_answered(AnalysisRequest(path, total_and_hadamard=True))
+    answered = is_answered(path, total_and_hadamard=True)
     assert answered == (1e-6 <= step_s <= 900.0), step_s
 
 
@@ -441,8 +442,8 @@ def try_outlier(t0: float, row: int, outlier: float, tmp_path: Path) -> None:
     path, t = tmp_path / "r.npz", t0 + np.arange(400) / 100.0
     t[row] = outlier
     np.savez(path, t=t, **draw_columns())
-    is_answered(AnalysisRequest(path))
-    is_answered(AnalysisRequest(path, last_s=2.0))
+    is_answered(path)
+    is_answered(path, LoadingOptions(last_s=2.0))
 
 
 @pytest.mark.parametrize("value", [np.longdouble("1e4000"), np.longdouble("-1e4000"), np.longdouble("nan")])
@@ -454,7 +455,7 @@ def test_column_of_long_doubles(value: Any, tmp_path: Path) -> None:
     found = load_samples(path)
     assert np.isnan(found.values[7, 0])
     assert np.isfinite(found.values[8, 0])
-    assert is_answered(AnalysisRequest(path))
+    assert is_answered(path)
 
 
 @pytest.mark.parametrize("value", [1e30, 1e155, 1e300, 1e-300, 5e-324, -1e307])
@@ -464,7 +465,7 @@ def test_absurd_samples(value: float, tmp_path: Path) -> None:
     data["gx"][100:110] = value
     data["gz"] = data["gz"] * value
     np.savez(path, fs=100.0, **data)
-    is_answered(AnalysisRequest(path, total_and_hadamard=True))
+    is_answered(path, total_and_hadamard=True)
 
 
 @pytest.mark.parametrize("last_s", [1e-6, 1e-3, 1e9])
@@ -479,14 +480,14 @@ def test_every_supported_rate_is_answered(rate_hz: float, tmp_path: Path) -> Non
     """The rates are both ends of the range and that of a vibration sensor. Another test covers slow sensors."""
     path = tmp_path / "r.npz"
     np.savez(path, t=np.arange(2000) / rate_hz, **draw_columns(2000))
-    found = run_analysis(AnalysisRequest(path, total_and_hadamard=True, window_s=500.0 / rate_hz))
+    found = analyze_recording(load_recording(path), total_and_hadamard=True, window_s=500.0 / rate_hz)
     assert found.analysis.estimate.rate_hz == pytest.approx(rate_hz, rel=1e-3)
 
 
-def is_answered(request: AnalysisRequest) -> bool:
+def is_answered(path: Path, loading: LoadingOptions = DEFAULT_LOADING, **keys: Any) -> bool:
     """Return True if the analysis succeeds. Warnings are errors in tests."""
     try:
-        run_analysis(request)
+        analyze_recording(load_recording(path, loading), **keys)
     except ImuError:
         return False
     return True

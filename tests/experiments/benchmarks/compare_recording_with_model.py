@@ -20,6 +20,7 @@ from scipy.signal import welch
 
 from drivers.data_types import AXES, Floats
 from monitor.commands import analyze, simulate
+from monitor.commands.recording_loading import load_recording
 from monitor.common.unit_formatting import (
     COEFFICIENT_UNITS,
     DEGREE,
@@ -81,7 +82,7 @@ class AnalysedSeries:
 
 def analyse_both(recording: Path, model: str, seed: int) -> tuple[AnalysedSeries, AnalysedSeries]:
     """Analyse the recording and a simulation with the same duration."""
-    recorded = analyze.run_analysis(analyze.AnalysisRequest(recording)).analysis
+    recorded = analyze.analyze_recording(load_recording(recording)).analysis
     estimate = recorded.estimate
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "simulated.npz"
@@ -89,7 +90,7 @@ def analyse_both(recording: Path, model: str, seed: int) -> tuple[AnalysedSeries
         simulate.run_simulation(
             simulate.SimulationRequest(load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model)
         )
-        simulated = analyze.run_analysis(analyze.AnalysisRequest(out)).analysis
+        simulated = analyze.analyze_recording(load_recording(out)).analysis
     return AnalysedSeries("recorded", recorded), AnalysedSeries("simulated", simulated)
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.data_types import AXES, Floats, make_block
 from drivers.recordings import load_samples
-from monitor.commands.compensate import METHODS, CompensationRequest, run_compensation
+from monitor.commands.compensate import METHODS, run_compensation
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import fit_arma, stationary_covariance
@@ -164,7 +164,7 @@ def _compute_errors(recording: Path, method: str) -> Floats:
 def _compensate_recording(recording: Path, method: str) -> list[AxisCompensation]:
     """Return the result of each axis, without the compensated recording."""
     with tempfile.TemporaryDirectory() as folder:
-        return list(run_compensation(CompensationRequest(recording, Path(folder) / "out.npz", method)).axes.values())
+        return list(run_compensation(recording, Path(folder) / "out.npz", method).axes.values())
 
 
 def _format_errors(rows: Floats) -> list[str]:

@@ -3,7 +3,7 @@
     python -m tests.experiments.benchmarks.coverage --json coverage.jsonl                # all cells, 20 minutes
     python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 120  # fewer
 
-With ``--records 0 --page docs/statistics-measurements.md``, the program only writes the tables into the page.
+With ``--records 0 --page docs/measurements/statistics.md``, the program only writes the tables into the page.
 
 A cell is a noise and a length of record at 100 Hz. The tables contain these numbers for each cell, in percent with the
 95 % interval of Wilson:

@@ -3,7 +3,7 @@
     python -m tests.experiments.benchmarks.efficiency --json efficiency.jsonl  # all cells, 300 records each
     python -m tests.experiments.benchmarks.efficiency --json efficiency.jsonl --records 1200    # add more
 
-With ``--records 0 --page docs/statistics-measurements.md``, the program only writes the tables into the page.
+With ``--records 0 --page docs/measurements/statistics.md``, the program only writes the tables into the page.
 
 A cell is a noise and a length of record at 100 Hz. For each cell, estimator and term, the table contains the rms of the
 relative error of the coefficient over its Cramér–Rao limit, with the 95 % interval of this ratio from the scatter of

@@ -21,9 +21,13 @@ import numpy as np
 from monitor.estimation.estimate import Estimate
 from monitor.history import bucketed_history as past
 from monitor.history.bucketed_history import HistoryTable
-from monitor.history.estimate_to_columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, EstimateToColumnsConverter
 from monitor.history.history_row import HistoryRow, pack_count_min_max_last
-from monitor.history.minute_aggregation import MinuteAggregator
+from monitor.history.minute_aggregation import (
+    HEALTH_COLUMNS,
+    TEMPERATURE_COLUMNS,
+    EstimateToColumnsConverter,
+    MinuteAggregator,
+)
 from monitor.history.query_parameters import PARTS, HistoryQuery
 from monitor.history.sqlite_store import HistoryFileWriter, open_history
 from monitor.history.stored_events import StoredEvent

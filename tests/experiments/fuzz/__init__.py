@@ -1,4 +1,6 @@
-"""Fuzz every reader of external bytes or text: ``python -m tests.experiments.fuzz``. See ``docs/fuzzing.md``.
+"""Fuzz every reader of external bytes or text: ``python -m tests.experiments.fuzz``.
+
+See ``docs/measurements/fuzzing.md``.
 
 A target is a function of bytes in ``tests/experiments/fuzz/targets``, marked with ``@target``. It passes the bytes to
 one reader and raises an exception if the reader violates a condition. Examples are an exception that the docstring of

@@ -921,7 +921,7 @@ def test_present_result_of_a_daemon_is_exported(run_program: RunProgram, monkeyp
         only, named = run_program(*arguments), run_program(*arguments, "--device", "bench-1")
         publisher.put(topics.COEFFICIENTS, "bench-2", message)
         several = run_program(*arguments)
-        monkeypatch.setattr("monitor.publishing.zenoh.coefficients_client.PATIENCE_S", 1.0)
+        monkeypatch.setattr("monitor.publishing.zenoh.clients.PATIENCE_S", 1.0)
         absent = run_program(*arguments, "--device", "bench-3")
     finally:
         publisher.close()
@@ -1558,7 +1558,7 @@ def test_unexpected_error_is_reported_in_one_line(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("monitor.commands.analyze.run_analysis", fail)
+    monkeypatch.setattr("monitor.commands.recording_loading.load_recording", fail)
     run = run_program("analyze", "a.csv")
     assert line in run.require_one_error_line()
     assert len(run.err) < 1000

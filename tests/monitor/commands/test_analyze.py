@@ -9,7 +9,8 @@ import pytest
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import save_samples
 from monitor.commands import analyze, thermal
-from monitor.commands.analyze import AnalysisRequest, TooFewSamples, run_analysis
+from monitor.commands.analyze import TooFewSamples, analyze_recording
+from monitor.commands.recording_loading import load_recording
 from monitor.common.unit_formatting import MILLI_G
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing import exporters
@@ -35,7 +36,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def test_optional_results_are_computed_only_on_request(recording: Path) -> None:
-    results = run_analysis(AnalysisRequest(recording))
+    results = analyze_recording(load_recording(recording))
     assert results.total is results.hadamard is results.dynamic is results.without_temperature is None
     assert results.lacking == ""
     [change] = results.analysis.changes  # always detected because the notes mention it
@@ -45,9 +46,11 @@ def test_optional_results_are_computed_only_on_request(recording: Path) -> None:
 @pytest.mark.long
 def test_requested_results_are_all_computed(recording: Path) -> None:
     progress: list[tuple[str, float | None]] = []
-    results = run_analysis(
-        AnalysisRequest(recording, window_s=30.0, total_and_hadamard=True),
-        lambda what, share: progress.append((what, share)),
+    results = analyze_recording(
+        load_recording(recording),
+        window_s=30.0,
+        total_and_hadamard=True,
+        report_progress=lambda what, share: progress.append((what, share)),
     )
     assert results.total is not None
     assert results.hadamard is not None
@@ -72,7 +75,7 @@ def test_temperature_dependent_drift_is_reported(tmp_path: Path) -> None:
     values = 1e-4 * rng.standard_normal((t.size, 6))
     values[:, 2] += 3e-5 * (temperature_c - 25.0)
     save_samples(tmp_path / "warm.npz", t, values, temperature_c)
-    results = run_analysis(AnalysisRequest(tmp_path / "warm.npz"))
+    results = analyze_recording(load_recording(tmp_path / "warm.npz"))
     (note,) = (note for note in results.analysis.notes if "follows its temperature" in note)
     assert note.startswith("gz follows its temperature")
     written = json.loads(
@@ -111,7 +114,7 @@ def test_temperature_dependent_axes_are_named_whatever_the_status_of_k(tmp_path:
         )
     path = tmp_path / "chamber.npz"
     save_samples(path, np.arange(n) / rate_hz, values, temperature_c)
-    results = run_analysis(AnalysisRequest(path))
+    results = analyze_recording(load_recording(path))
     assert results.analysis.axes_of_temperature == ("gy", "gz", "az")
     named = [note.split()[0] for note in results.analysis.notes if "follows its temperature" in note]
     assert named == ["gy", "gz", "az"]
@@ -147,16 +150,16 @@ def test_temperature_dependent_axes_are_named_whatever_the_status_of_k(tmp_path:
 @pytest.mark.long
 def test_listed_tau_are_used_for_every_curve_that_supports_them(recording: Path) -> None:
     listed = (0.1, 0.2, 0.5, 1.0, 2.0, 100.0)
-    results = run_analysis(AnalysisRequest(recording, tau=listed, total_and_hadamard=True))
+    results = analyze_recording(load_recording(recording), tau=listed, total_and_hadamard=True)
     assert results.total is not None
     assert results.hadamard is not None
     assert results.total.tau_s.tolist() == list(listed)
     assert results.hadamard.tau_s.tolist() == list(listed[:-1])
-    assert run_analysis(AnalysisRequest(recording, tau=(100.0,), total_and_hadamard=True)).hadamard is None
+    assert analyze_recording(load_recording(recording), tau=(100.0,), total_and_hadamard=True).hadamard is None
 
 
 def test_window_longer_than_the_recording_omits_only_dynamic_curves(recording: Path) -> None:
-    results = run_analysis(AnalysisRequest(recording, window_s=1000.0))
+    results = analyze_recording(load_recording(recording), window_s=1000.0)
     assert results.dynamic is None
     assert results.lacking == "no dynamic curves: 240 s are recorded, less than the window of 1000 s"
     assert results.analysis.notes[-1] == results.lacking
@@ -165,15 +168,15 @@ def test_window_longer_than_the_recording_omits_only_dynamic_curves(recording: P
 def test_too_short_recording_reports_its_number_of_samples(tmp_path: Path) -> None:
     save_samples(tmp_path / "x.npz", np.arange(20) / RATE_HZ, np.zeros((20, 6)))
     with pytest.raises(TooFewSamples, match="20 samples; at least 50") as raised:
-        run_analysis(AnalysisRequest(tmp_path / "x.npz"))
+        analyze_recording(load_recording(tmp_path / "x.npz"))
     assert raised.value.samples == 20
 
 
 def test_invalid_requests_raise_an_error(tmp_path: Path, recording: Path) -> None:
     with pytest.raises(RecordingError):
-        run_analysis(AnalysisRequest(tmp_path / "nowhere.csv"))
+        analyze_recording(load_recording(tmp_path / "nowhere.csv"))
     with pytest.raises(ConfigError, match="window of 0"):
-        run_analysis(AnalysisRequest(recording, window_s=0.1))
+        analyze_recording(load_recording(recording), window_s=0.1)
 
 
 @pytest.mark.long
@@ -181,7 +184,7 @@ def test_invalid_requests_raise_an_error(tmp_path: Path, recording: Path) -> Non
 def test_plot_marks_the_changes(recording: Path, name: str, start: bytes) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
-    results = run_analysis(AnalysisRequest(recording, window_s=30.0, total_and_hadamard=True))
+    results = analyze_recording(load_recording(recording), window_s=30.0, total_and_hadamard=True)
     path = recording.with_name(name)
     analyze.save_plot_or_report(results, path, "bench")
     assert path.read_bytes().startswith(start)
@@ -189,12 +192,3 @@ def test_plot_marks_the_changes(recording: Path, name: str, start: bytes) -> Non
         page = path.read_text("utf-8")
         assert "gx angle random walk rose by" in page
         assert ">change</text>" in page  # the mark in the drawing
-
-
-def test_too_large_analysis_is_a_config_error(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_args: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(analyze, "analyze", fail)
-    with pytest.raises(ConfigError, match=r"x\.npz: the analysis needs more memory than is free; use only the end"):
-        run_analysis(AnalysisRequest(recording))

@@ -15,8 +15,8 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import WRITABLE, load_samples, save_samples
 from drivers.recordings.reading_options import ReadingOptions
-from monitor.commands.convert import BLOCK_ROWS, ConversionRequest, run_conversion
-from monitor.commands.wire_format_decoding import DecoderChoice
+from monitor.commands.convert import BLOCK_ROWS, run_conversion
+from monitor.commands.recording_loading import DecoderChoice, LoadingOptions
 from tests.support import dataflash, ros_bags, ulog
 from tests.support.program import exit_status
 
@@ -108,7 +108,7 @@ def assert_equal_recordings(found: Any, expected: Any, mcap: bool) -> None:
 @pytest.mark.parametrize("source", SOURCES)
 def test_every_format_is_converted_without_loss(tmp_path: Path, source: str, target: str) -> None:
     path, out = SOURCES[source](tmp_path, source), tmp_path / f"out{target}"
-    expected = run_conversion(ConversionRequest(path, out))
+    expected = run_conversion(path, out)
     assert_equal_recordings(load_samples(out), expected, target == ".mcap")
     assert len(expected) == N
     if source not in IN_SECONDS:
@@ -127,7 +127,7 @@ def test_mcap_returns_every_row(tmp_path: Path, start_s: float) -> None:
     t_s[20_000:] -= 30.0
     t_s[BLOCK_ROWS - 1] = t_s[BLOCK_ROWS]
     save_samples(tmp_path / "in.npz", t_s, values, temperature_c)
-    run_conversion(ConversionRequest(tmp_path / "in.npz", tmp_path / "out.mcap"))
+    run_conversion(tmp_path / "in.npz", tmp_path / "out.mcap")
     found = load_samples(tmp_path / "out.mcap")
     np.testing.assert_array_equal(found.values, values)
     assert np.abs(found.t_s - t_s).max() <= (1e-9 if start_s == 0.0 else 0.0)
@@ -137,7 +137,7 @@ def test_mcap_returns_every_row(tmp_path: Path, start_s: float) -> None:
 def test_another_program_reads_stamps_to_the_nanosecond(tmp_path: Path) -> None:
     t_s, values, temperature_c = make_samples(start_s=12.0)
     save_samples(tmp_path / "in.npz", t_s, values, temperature_c)
-    run_conversion(ConversionRequest(tmp_path / "in.npz", tmp_path / "out.mcap"))
+    run_conversion(tmp_path / "in.npz", tmp_path / "out.mcap")
     found: dict[str, list[Any]] = {"/imu/data": [], "/imu/temperature": []}
     with AnyReader([tmp_path / "out.mcap"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         for connection, _, data in reader.messages():
@@ -155,9 +155,9 @@ def test_another_program_reads_stamps_to_the_nanosecond(tmp_path: Path) -> None:
 
 def test_temperature_of_mcap_is_joined_by_topic(tmp_path: Path) -> None:
     save_samples(tmp_path / "in.npz", *make_samples())
-    expected = run_conversion(ConversionRequest(tmp_path / "in.npz", tmp_path / "a.mcap"))
+    expected = run_conversion(tmp_path / "in.npz", tmp_path / "a.mcap")
     both = ReadingOptions(topic="/imu/data+/imu/temperature")
-    found = run_conversion(ConversionRequest(tmp_path / "a.mcap", tmp_path / "b.csv", reading=both))
+    found = run_conversion(tmp_path / "a.mcap", tmp_path / "b.csv", loading=LoadingOptions(reading=both))
     np.testing.assert_array_equal(found.temperature_c, expected.temperature_c)
     assert_equal_recordings(load_samples(tmp_path / "b.csv"), found, mcap=False)
 
@@ -167,7 +167,7 @@ def test_axes_and_temperature_without_values_are_left_out(tmp_path: Path) -> Non
     values[:, [0, 1, 3, 4, 5]] = np.nan
     save_samples(tmp_path / "in.csv", t_s, values, np.full(N, np.nan), ["gx", "gz"])
     for suffix in WRITABLE:
-        run_conversion(ConversionRequest(tmp_path / "in.csv", tmp_path / f"out{suffix}"))
+        run_conversion(tmp_path / "in.csv", tmp_path / f"out{suffix}")
         assert load_samples(tmp_path / f"out{suffix}").axes == ("gz",)
 
 
@@ -176,7 +176,7 @@ def test_a_stamp_survives_every_format_in_turn(tmp_path: Path) -> None:
     path = write_table_in_ns(tmp_path, ".csv")
     save_samples(path, t_ns, np.ones((3, 6)))
     for i, suffix in enumerate((*WRITABLE, *reversed(WRITABLE))):
-        run_conversion(ConversionRequest(path, tmp_path / f"{i}{suffix}"))
+        run_conversion(path, tmp_path / f"{i}{suffix}")
         path = tmp_path / f"{i}{suffix}"
         assert load_samples(path).times.tolist() == t_ns.tolist()
 
@@ -184,7 +184,7 @@ def test_a_stamp_survives_every_format_in_turn(tmp_path: Path) -> None:
 def test_decoded_samples_keep_their_nanoseconds(tmp_path: Path) -> None:
     (tmp_path / "in.txt").write_text("".join(f"{i},{i},{i}\n" for i in range(7)))
     choice = DecoderChoice("text", {"columns": ["gx", "gy", "gz"]})
-    run_conversion(ConversionRequest(tmp_path / "in.txt", tmp_path / "out.csv", rate_hz=3.0, decoder=choice))
+    run_conversion(tmp_path / "in.txt", tmp_path / "out.csv", loading=LoadingOptions(rate_hz=3.0, decoder=choice))
     times = load_samples(tmp_path / "out.csv").times
     assert times is not None
     assert times.tolist() == [round(i * 1e9 / 3.0) for i in range(6)]  # the first line may be incomplete
@@ -193,7 +193,7 @@ def test_decoded_samples_keep_their_nanoseconds(tmp_path: Path) -> None:
 def test_rate_replaces_missing_times(tmp_path: Path) -> None:
     np.savez(tmp_path / "in.npz", gx=np.arange(5.0), fs=8.0)
     for request, rate_hz in ((None, 8.0), (4.0, 4.0)):
-        run_conversion(ConversionRequest(tmp_path / "in.npz", tmp_path / "out.csv", rate_hz=request))
+        run_conversion(tmp_path / "in.npz", tmp_path / "out.csv", loading=LoadingOptions(rate_hz=request))
         assert load_samples(tmp_path / "out.csv").t_s.tolist() == [i / rate_hz for i in range(5)]
 
 
@@ -202,17 +202,17 @@ def test_progress_of_writing_and_last_part(tmp_path: Path) -> None:
     t_s, values, temperature_c = make_samples(n)
     save_samples(tmp_path / "in.npz", t_s, values, temperature_c)
     steps: list[tuple[str, float | None]] = []
-    run_conversion(ConversionRequest(tmp_path / "in.npz", tmp_path / "out.arrow"), lambda *step: steps.append(step))
+    run_conversion(tmp_path / "in.npz", tmp_path / "out.arrow", report_progress=lambda *step: steps.append(step))
     shares = [("writing", share) for share in (0.0, 1 / 3, 2 / 3)]
     assert steps == [("reading", None), *shares, ("finishing the file", None)]
-    assert len(run_conversion(ConversionRequest(tmp_path / "in.npz", tmp_path / "out.arrow", last_s=1.0))) < 210
+    assert len(run_conversion(tmp_path / "in.npz", tmp_path / "out.arrow", loading=LoadingOptions(last_s=1.0))) < 210
 
 
 @pytest.mark.parametrize("t_s", [-1.0, 2.0**31])
 def test_times_beyond_the_range_of_ros_are_refused(tmp_path: Path, t_s: float) -> None:
     save_samples(tmp_path / "in.csv", np.array([0.0, t_s]), np.ones((2, 6)))
     with pytest.raises(RecordingError, match=r"out\.mcap: t = .* s cannot be stored in a ROS 2 message"):
-        run_conversion(ConversionRequest(tmp_path / "in.csv", tmp_path / "out.mcap"))
+        run_conversion(tmp_path / "in.csv", tmp_path / "out.mcap")
     assert os.listdir(tmp_path) == ["in.csv"]
 
 
@@ -221,7 +221,7 @@ def test_recording_is_not_overwritten_by_itself(tmp_path: Path) -> None:
     before = (tmp_path / "in.csv").read_bytes()
     (tmp_path / "link.csv").symlink_to(tmp_path / "in.csv")
     with pytest.raises(ConfigError, match="is the recording itself; choose another name"):
-        run_conversion(ConversionRequest(tmp_path / "in.csv", tmp_path / "link.csv"))
+        run_conversion(tmp_path / "in.csv", tmp_path / "link.csv")
     assert (tmp_path / "in.csv").read_bytes() == before
 
 

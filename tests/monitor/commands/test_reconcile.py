@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import ConfigError, NotReady, RecordingError
 from monitor.cli import main
 from monitor.commands import reconcile, simulate
-from monitor.commands.reconcile import RecordingsComparisonRequest, compare_recordings, unique_recording_names
+from monitor.commands.reconcile import compare_recordings, unique_recording_names
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, BiasStep, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import Reconciliation
@@ -122,7 +122,7 @@ def test_without_a_model_the_terms_of_the_first_recording_are_used(tmp_path: Pat
     )
     progress = []
     found = compare_recordings(
-        RecordingsComparisonRequest(paths, None, tmp_path / "out"), lambda what, _share: progress.append(what)
+        paths, None, tmp_path / "out", report_progress=lambda what, _share: progress.append(what)
     )
     assert found.fitted_to == "a"
     first, second = (run.result for run in found.runs)
@@ -142,7 +142,7 @@ def test_unusable_recording_is_left_out_and_named(tmp_path: Path, monkeypatch: p
         simulate_recording(tmp_path / f"{name}.csv", KNOWN_MODEL, k, s)
         for k, (name, s) in enumerate((("a", 60), ("b", 60), ("short", 2)))
     ]
-    found = compare_recordings(RecordingsComparisonRequest(tuple(paths), KNOWN_MODEL, tmp_path / "out"))
+    found = compare_recordings(tuple(paths), KNOWN_MODEL, tmp_path / "out")
     assert [run.name for run in found.runs] == ["a", "b"]
     assert "200 samples" in found.without_result["short"]
     last = read_report(tmp_path / "out")["recordings"][-1]
@@ -181,13 +181,11 @@ def test_invalid_request_is_refused_before_any_work(tmp_path: Path, monkeypatch:
     (tmp_path / "b").mkdir()
     a, b = tmp_path / "a.csv", tmp_path / "b"
     with pytest.raises(ConfigError, match=r"a\.csv: is given twice"):
-        compare_recordings(
-            RecordingsComparisonRequest((a, tmp_path / "b" / ".." / "a.csv"), KNOWN_MODEL, tmp_path / "out")
-        )
+        compare_recordings((a, tmp_path / "b" / ".." / "a.csv"), KNOWN_MODEL, tmp_path / "out")
     with pytest.raises(RecordingError, match=r"c\.csv: cannot be read"):
-        compare_recordings(RecordingsComparisonRequest((a, tmp_path / "c.csv"), KNOWN_MODEL, tmp_path / "out"))
+        compare_recordings((a, tmp_path / "c.csv"), KNOWN_MODEL, tmp_path / "out")
     with pytest.raises(ConfigError, match=r"--out: .*b is a recording"):
-        compare_recordings(RecordingsComparisonRequest((a, b), KNOWN_MODEL, tmp_path))
+        compare_recordings((a, b), KNOWN_MODEL, tmp_path)
     assert not (tmp_path / "out").exists()
 
 
@@ -207,8 +205,8 @@ def test_comparison_without_usable_recordings_is_refused(tmp_path: Path) -> None
         simulate_recording(tmp_path / "t.csv", KNOWN_MODEL, 1, 2.0),
     )
     with pytest.raises(NotReady, match=r"0 can be evaluated: s: the recording has 200 samples"):
-        compare_recordings(RecordingsComparisonRequest(paths, None, tmp_path / "out"))
+        compare_recordings(paths, None, tmp_path / "out")
     with pytest.raises(
         NotReady, match=r"0 can be evaluated: s: the recording has 200 samples.*; t: the recording has 200 samples"
     ):
-        compare_recordings(RecordingsComparisonRequest(paths, KNOWN_MODEL, tmp_path / "out"))
+        compare_recordings(paths, KNOWN_MODEL, tmp_path / "out")

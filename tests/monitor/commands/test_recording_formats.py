@@ -19,7 +19,8 @@ from drivers.recordings.reading_options import ReadingOptions, create_reading_op
 from drivers.units import DEGREE, G0
 from monitor.cli import app
 from monitor.cli.shared.options import READING_OPTIONS
-from monitor.commands.analyze import AnalysisRequest, run_analysis
+from monitor.commands.analyze import analyze_recording
+from monitor.commands.recording_loading import LoadingOptions, load_recording
 from monitor.estimation.estimate import Estimate
 from tests.drivers.test_csv_tables import ASL_HEADER, lines
 from tests.drivers.test_sensor_csv_files import phyphox, sensor_logger, write
@@ -138,7 +139,7 @@ FORMATS: dict[str, tuple[Write, dict[str, Any]]] = {
 
 
 def estimate_of(path: Path, options: ReadingOptions) -> Estimate:
-    return run_analysis(AnalysisRequest(path, reading=options)).analysis.estimate
+    return analyze_recording(load_recording(path, LoadingOptions(reading=options))).analysis.estimate
 
 
 @pytest.fixture(scope="module")

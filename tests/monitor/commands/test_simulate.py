@@ -13,8 +13,8 @@ from drivers.errors import ConfigError
 from drivers.recordings import load_samples, save_samples
 from drivers.recordings.formats import WRITABLE_TABLES
 from monitor.commands import analyze
+from monitor.commands.recording_loading import DecoderChoice, LoadingOptions, load_recording
 from monitor.commands.simulate import CHUNK_ROWS, SimulationRequest, run_simulation
-from monitor.commands.wire_format_decoding import DecoderChoice
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 
@@ -66,7 +66,7 @@ def test_five_terms_are_recovered_from_every_format(output_path: Path) -> None:
         False,
         None,
     )
-    found = analyze.run_analysis(analyze.AnalysisRequest(output_path)).analysis.estimate.coefficients
+    found = analyze.analyze_recording(load_recording(output_path)).analysis.estimate.coefficients
     assert found.value.shape == (5, 6)
     assert found.status[1, 2] == Status.ESTIMATED
     for row, letter in enumerate(SYMBOLS):
@@ -114,10 +114,17 @@ def test_temperature_is_taken_from_captured_bytes(tmp_path: Path) -> None:
     (tmp_path / "oven.txt").write_text("".join(f"0.0 {20.0 + 0.1 * i:.1f}\n" for i in range(300)))
     run_simulation(
         SimulationRequest(
-            TEMPERATURE_MODEL, tmp_path / "x.npz", 4.0, rate_hz=50.0, seed=1, temperature_from=tmp_path / "oven.txt",
-            decoder=DecoderChoice("text", {"columns": ["gx", "temperature"], "gyro_unit": "rad/s"}),
+            TEMPERATURE_MODEL,
+            tmp_path / "x.npz",
+            4.0,
+            rate_hz=50.0,
+            seed=1,
+            temperature_from=tmp_path / "oven.txt",
+            loading=LoadingOptions(
+                decoder=DecoderChoice("text", {"columns": ["gx", "temperature"], "gyro_unit": "rad/s"})
+            ),
         )
-    )  # fmt: skip
+    )
     assert load_samples(tmp_path / "x.npz").temperature_c == pytest.approx(
         20.1 + 0.1 * np.arange(200),
         abs=1e-6,  # a capture may begin within a line, so that its first line is left out

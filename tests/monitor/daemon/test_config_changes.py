@@ -19,7 +19,7 @@ from drivers.data_types import Event
 from drivers.errors import ConfigError
 from monitor.daemon import config_changes
 from monitor.daemon.outputs.output import Output
-from monitor.daemon.outputs.table_output import TableOutput
+from monitor.daemon.outputs.terminal_outputs import TableOutput
 from monitor.daemon.service import Service
 from monitor.noise.model_loading import read_model
 from monitor.publishing.remote_device_states import RemoteDeviceRegistry

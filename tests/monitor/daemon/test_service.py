@@ -17,7 +17,7 @@ from drivers.recordings import save_samples
 from monitor.common.device_health import Health
 from monitor.daemon.kernels import kernel_compilation, kernel_groups
 from monitor.daemon.outputs.output import Output
-from monitor.daemon.outputs.table_output import TableOutput
+from monitor.daemon.outputs.terminal_outputs import TableOutput
 from monitor.daemon.service import Service
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate

@@ -1,4 +1,4 @@
-"""Tests that docs/effects.md agrees with the code: names, order, descriptions, parameters and units."""
+"""Tests that docs/reference/effects.md agrees with the code: names, order, descriptions, parameters and units."""
 
 import re
 from dataclasses import fields
@@ -12,7 +12,7 @@ from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER
 from monitor.noise.temperature import Temperature
 from tests.contracts.effect_examples import AXIS, make_model
 
-PAGE = Path(__file__).parents[3] / "docs" / "effects.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "effects.md"
 SECTIONS = dict(
     re.findall(r"^## `\[?(\w+)\]?`(?: →)?\n(.*?)(?=^## |\Z)", PAGE.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
 )

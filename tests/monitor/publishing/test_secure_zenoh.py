@@ -22,7 +22,7 @@ from drivers.zenoh.session_config import build_session_config
 from monitor.common import topics
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.publishing.messages.results import StatusMessage
-from monitor.publishing.zenoh.history_client import query_histories
+from monitor.publishing.zenoh.clients import query_histories
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading

@@ -14,10 +14,8 @@ from drivers.timing.sample_clock import SampleClock
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.settings.loading import FaultsTable, VirtualTable
 from monitor.simulator import SimulatedDevice
-from monitor.simulator.can_port import CanPort
 from monitor.simulator.faults import FaultKind, Faults
-from monitor.simulator.pty_port import PtyPort
-from monitor.simulator.zenoh_port import ZenohPort
+from monitor.simulator.ports import CanPort, PtyPort, ZenohPort
 from tests.contracts.decoder_examples import EXAMPLES, Example
 from tests.support.paced_sensor import follow_reader, is_open
 from tests.support.waiting import PATIENCE_S, wait_for

@@ -3,20 +3,18 @@
 ``monitor.publishing.result_kinds`` lists the kinds of results. Importing this package imports Rerun.
 """
 
-from monitor.publishing.rerun.panels.device_health_panels import AllDevicesTablePanel, HealthPanel
-from monitor.publishing.rerun.panels.drift_panel import DriftPanel
-from monitor.publishing.rerun.panels.events_panel import EventsPanel
-from monitor.publishing.rerun.panels.measured_and_compensated_sample_panels import (
-    CompensatedPanel,
-    SamplesAndTemperaturePanel,
-)
+from monitor.publishing.rerun.panels.bias_panels import DriftPanel, ThermalPredictionPanel
 from monitor.publishing.rerun.panels.noise_panels import (
     AllanAndCoefficientPanel,
     CoefficientsPanel,
     ModelDifferencePanel,
 )
 from monitor.publishing.rerun.panels.panel import Panel
-from monitor.publishing.rerun.panels.thermal_panel import ThermalPredictionPanel
+from monitor.publishing.rerun.panels.sample_panels import (
+    CompensatedPanel,
+    SamplesAndTemperaturePanel,
+)
+from monitor.publishing.rerun.panels.status_panels import AllDevicesTablePanel, EventsPanel, HealthPanel
 
 __all__ = [
     "AllDevicesTablePanel",

@@ -21,7 +21,7 @@ from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.style import omit_wide_intervals
 from monitor.publishing.rerun import allan_drawing, dynamic_heat_map
-from monitor.publishing.rerun.bounded_allan_history import AllanHistory
+from monitor.publishing.rerun.dynamic_heat_map import AllanHistory
 from monitor.publishing.rerun.panels import history_points
 from monitor.publishing.rerun.panels.panel import Panel
 from monitor.publishing.rerun.panels.panel_text import noise_text
@@ -115,13 +115,13 @@ class CoefficientsPanel(Panel):
         Parameters
         ----------
         symbol
-                        Symbol of the coefficient: Q, N, B, K or R.
+            Symbol of the coefficient: Q, N, B, K or R.
         axis
             Name of the axis.
         unix_s
             Unix times [s], shape [n].
         values
-                        Values, shape [n], or values with the ends of their intervals, shape [n, 3], in SI units.
+            Values, shape [n], or values with the ends of their intervals, shape [n, 3], in SI units.
         name
             Suffix of the path of the entity.
         """

@@ -6,25 +6,17 @@ Importing this module imports Rerun.
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from drivers.data_types import Floats
-from monitor.common.unit_formatting import (
-    SAMPLE_UNITS,
-    sensor_kind,
-)
 from monitor.history.bucketed_history import HistoryTable
-from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.axis_colours import Colour
-from monitor.publishing.rerun.panels.decimation import decimate_extremes
 from monitor.publishing.rerun.shared_views import markdown_document
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.viewer_scene import AllDevicesScene
-    from monitor.publishing.result_kinds import CompensatedRateBatch, SampleBatch
 
 
 class Panel:
@@ -33,7 +25,7 @@ class Panel:
     Parameters
     ----------
     scene
-                Scene that contains the panel.
+        Scene that contains the panel.
     device
         Name of the device.
     """
@@ -74,22 +66,6 @@ class Panel:
         self.scene.log(
             self.entity_path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True
         )
-
-    def _style_samples(self, name: str, axes: Sequence[str]) -> None:
-        for axis in axes:
-            line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", axis_colours.AXIS_COLOURS[axis], 1.0)
-            self._style_lines(f"{name}/{axis}", [line])
-
-    def _log_samples(
-        self, name: str, axes: Sequence[str], results: "Sequence[SampleBatch | CompensatedRateBatch]"
-    ) -> Floats:
-        """Log decimated samples, and return the times of all samples."""
-        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
-        for i, axis in enumerate(axes):
-            t, y = decimate_extremes(times, values[:, i])
-            factor = SAMPLE_UNITS[sensor_kind(axis)].factor
-            self.scene.log_scalars(self.entity_path(f"{name}/{axis}"), t, y * factor)
-        return times
 
     def _log_text(self, name: str, unix_s: float, text: str) -> None:
         self.scene.set_log_time(unix_s)

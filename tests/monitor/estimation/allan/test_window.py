@@ -579,7 +579,7 @@ def test_slope_of_a_restarted_axis_uses_its_own_samples():
 
 @pytest.mark.long
 def test_ten_million_samples_with_gaps_and_a_transient_leave_no_error():
-    """The benchmark runs 10⁹ samples; see docs/benchmarks.md."""
+    """The benchmark runs 10⁹ samples; see docs/measurements/benchmarks.md."""
     assert long_run.run(10, lambda line: None) < 1e-9
 
 

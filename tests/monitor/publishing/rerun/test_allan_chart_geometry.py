@@ -14,7 +14,7 @@ from monitor.publishing.rerun.allan_chart_geometry import (
     finite_sections,
     interval_strokes,
 )
-from monitor.publishing.rerun.panels.decimation import ROWS_PER_FLUSH, ROWS_PER_S, average_buckets, decimate_extremes
+from monitor.publishing.rerun.panels.sample_panels import ROWS_PER_FLUSH, ROWS_PER_S, average_buckets, decimate_extremes
 
 
 def test_decade_limits_are_the_corners_of_the_chart():
