@@ -7,8 +7,10 @@ results are published. If a URL handler has no file descriptor, a read returns a
 
 ``close`` closes the port only after a waiting read has ended. Otherwise, the system could assign the file descriptor to
 another file during the read. If the port cannot be opened, the text of ``LinkUnavailable`` states the reason and a
-remedy. ``LinkLost`` is raised if the device is unplugged or the connection is closed. The link never writes to the
-device.
+remedy. ``LinkLost`` is raised if the device is unplugged or the connection is closed.
+
+The link writes to the device only if the key ``first_request`` or ``request`` is set
+(``drivers.links.periodic_request``).
 """
 
 import contextlib
@@ -23,8 +25,9 @@ from pydantic import Field
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
+from drivers.links.periodic_request import PeriodicRequest, parse_request
 from drivers.validation.module_lookup import format_choices_by_similarity
-from drivers.validation.number_ranges import BIT_RATE, READ_TIMEOUT_S
+from drivers.validation.number_ranges import BIT_RATE, READ_TIMEOUT_S, REQUEST_RATE_HZ
 from drivers.validation.settings_model import checked_by
 from drivers.zenoh.credential_masking import mask_secrets
 
@@ -76,6 +79,14 @@ class Settings(LinkSettings):
         examples=[0.01],
         description="time in s that received bytes may wait for more bytes; absent: interval of `publish`, 5 to 100 ms",
     )
+    first_request: Annotated[str, checked_by(parse_request)] = Field(
+        "", description="bytes in hexadecimal that are written once after the port has been opened; empty: none"
+    )
+    request: Annotated[str, checked_by(parse_request)] = Field(
+        "",
+        description="bytes in hexadecimal that are written repeatedly, for a sensor that only answers; empty: none",
+    )
+    request_rate: Annotated[float, REQUEST_RATE_HZ] = Field(100.0, description="number of requests per second")
 
 
 class SerialLink(PolledLink):
@@ -90,6 +101,7 @@ class SerialLink(PolledLink):
         self._settings = settings
         self._read_timeout_s = settings.read_timeout or DEFAULT_READ_TIMEOUT_S
         self._port: serial.SerialBase | None = None
+        self._requests: PeriodicRequest | None = None
         self._buffer_filling = False  # True if the last read returned so many bytes that the next read must not wait
 
     def set_default_read_timeout(self, timeout_s: float) -> None:
@@ -126,8 +138,13 @@ class SerialLink(PolledLink):
                 # URL handlers that cannot lock a port ignore this key.
                 **({"exclusive": True} if s.exclusive else {}),
             )
+            if s.first_request:
+                self._port.write(parse_request(s.first_request))
         except (OSError, ValueError, NotImplementedError) as error:
+            self._close_source()
             raise LinkUnavailable(mask_secrets(_why_not_open(s.port, error))) from error
+        if s.request:
+            self._requests = PeriodicRequest(self._port, parse_request(s.request), s.request_rate)
 
     def _poll_source(self, deadline: float) -> list[Chunk]:
         data = self._read_available()
@@ -159,6 +176,9 @@ class SerialLink(PolledLink):
 
     def _close_source(self) -> None:
         port, self._port = self._port, None
+        requests, self._requests = self._requests, None
+        if requests is not None:
+            requests.stop()
         if port is not None:
             port.close()
 

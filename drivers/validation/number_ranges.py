@@ -124,6 +124,8 @@ TICK_S: Final = NumberRange("s", 1e-12, DAY_S)
 # --- transmission
 
 BIT_RATE: Final = NumberRange("bit/s", 1, 1_000_000_000)
+REQUEST_RATE_HZ: Final = NumberRange("Hz", 1e-3, 1e4)
+"""Rate of requests to a sensor that sends data only as an answer."""
 BYTE_RATE: Final = NumberRange("byte/s", 1.0, 1e9)
 PORT: Final = NumberRange("", 0, 65_535)
 """TCP or UDP port."""

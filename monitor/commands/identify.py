@@ -17,7 +17,10 @@ BAUD_RATES: Final = (115200, 460800, 921600, 230400, 9600, 57600, 38400, 19200, 
 """Baud rates of IMUs in bit/s, the most common first."""
 MAX_BYTES: Final = 16384
 """Number of bytes that are examined, which is 0.2 s at the highest baud rate."""
-NO_BYTES_ADVICE: Final = "check the power, the wiring of TX and RX, and whether the sensor sends without a request"
+NO_BYTES_ADVICE: Final = (
+    "check the power and the wiring of TX and RX; a sensor that only answers requests, such as a BNO055, "
+    "cannot be identified"
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from drivers.decoders.binary_frames import (
     aceinna_dmu,
     bno08x_rvc,
     inertial_labs,
+    inertial_sense,
     novatel_rawimusx,
     stim300,
     ublox_esf,
@@ -253,7 +254,7 @@ def damage_stream(frames, broken, absent):
 
 @pytest.mark.parametrize(
     "module",
-    [vectornav_binary, stim300, aceinna_dmu, bno08x_rvc, inertial_labs, novatel_rawimusx, ublox_esf],
+    [vectornav_binary, stim300, aceinna_dmu, bno08x_rvc, inertial_labs, inertial_sense, novatel_rawimusx, ublox_esf],
     ids=lambda module: module.__name__.rpartition(".")[2],
 )
 @pytest.mark.parametrize("pieces", [1, 7, 1000])

@@ -277,7 +277,7 @@ class WorkerSupervisor(DaemonProcess):
         while not self._has_ended() and time.monotonic() < until_s:
             for worker in self._workers:
                 self._receive(worker)
-            self._wait()
+            self._wait(time.monotonic())
         for worker in self._workers:
             if worker.pipe is not None and worker.process is not None:
                 _log.warning("worker", text=f"{worker.name} did not end in {STOP_TIMEOUT_S:g} s and is killed")

@@ -3,7 +3,9 @@
 import contextlib
 import errno
 import os
+import select
 import socket
+import termios
 import threading
 import tty
 from collections.abc import Iterator
@@ -14,10 +16,10 @@ import pytest
 import serial
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
-from drivers.links import serial_link
+from drivers.links import periodic_request, serial_link
 from drivers.links.base import Link
 from tests.support.settings import read_settings
-from tests.support.waiting import FOREVER_S, wait_for
+from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 
 def build(**keys: Any) -> Link:
@@ -211,6 +213,11 @@ def test_error_lists_the_available_ports(monkeypatch: pytest.MonkeyPatch, tmp_pa
         {"port": "x", "stopbits": 3.0},
         {"port": "x", "read_timeout": 0.0},
         {"port": "x", "read_timeout": 5.0},
+        {"port": "x", "request": "AA 01 0"},
+        {"port": "x", "first_request": "0xAA"},
+        {"port": "x", "request": "00" * 257},
+        {"port": "x", "request": "AA", "request_rate": 0.0},
+        {"port": "x", "request": "AA", "request_rate": 1e5},
     ],
 )
 def test_wrong_settings_are_refused(keys: dict[str, Any]) -> None:
@@ -228,3 +235,100 @@ def test_unplugging_ends_a_waiting_read(pseudo_terminal: tuple[int, str]) -> Non
         link.wait_for_chunks_or_timeout(FOREVER_S)
     with pytest.raises(LinkLost):
         link.wait_for_chunks_or_timeout(0.1)
+
+
+def read_requests(master: int, n: int) -> bytes:
+    """Return the first ``n`` bytes that the link has written."""
+    got = b""
+    while len(got) < n:
+        assert select.select([master], [], [], PATIENCE_S)[0], f"{n} bytes, {len(got)} written"
+        got += os.read(master, n - len(got))
+    return got
+
+
+def test_link_without_a_request_never_writes(pseudo_terminal: tuple[int, str]) -> None:
+    master, port = pseudo_terminal
+    link = build(port=port, request_rate=1000.0)
+    link.open()
+    os.write(master, b"data")
+    assert read_bytes(link, 4) == b"data"
+    link.close()
+    assert select.select([master], [], [], 0.05)[0] == []
+
+
+def test_request_is_repeated_with_and_without_answers(pseudo_terminal: tuple[int, str]) -> None:
+    master, port = pseudo_terminal
+    link = build(port=port, request="aa 01", request_rate=500.0)
+    for _ in range(2):  # the link can be opened again
+        link.open()
+        assert read_requests(master, 20) == b"\xaa\x01" * 10
+        os.write(master, b"answer")
+        assert read_bytes(link, 6) == b"answer"
+        assert read_requests(master, 20) == b"\xaa\x01" * 10
+        link.close()
+        termios.tcflush(master, termios.TCIOFLUSH)
+    assert select.select([master], [], [], 0.05)[0] == []
+
+
+def test_requests_have_the_configured_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time stands still while the thread writes. It advances only by the waiting times."""
+    now_s, written_s = [100.0], []
+    monkeypatch.setattr(periodic_request.time, "monotonic", lambda: now_s[0])
+
+    class Stopping:
+        def wait(self, timeout_s: float) -> bool:
+            now_s[0] += timeout_s
+            return len(written_s) == 4
+
+    class Port:
+        def write(self, data: bytes) -> None:
+            written_s.append(now_s[0])
+            now_s[0] += 5.0 if len(written_s) == 2 else 0.05
+
+    requests = object.__new__(periodic_request.PeriodicRequest)
+    requests._port, requests._request, requests._period_s, requests._stopping = Port(), b"?", 0.25, Stopping()
+    requests._write_requests()
+    # after a write of 5 s, the missed requests are not made up for
+    assert written_s == pytest.approx([100.25, 100.5, 105.5, 105.75])
+
+
+def test_first_request_is_written_once_per_opening(pseudo_terminal: tuple[int, str]) -> None:
+    master, port = pseudo_terminal
+    link = build(port=port, first_request="00 FF", request="01", request_rate=500.0)
+    for _ in range(2):
+        link.open()
+        assert read_requests(master, 12) == b"\x00\xff" + b"\x01" * 10
+        link.close()
+        termios.tcflush(master, termios.TCIOFLUSH)
+
+
+def test_device_that_reads_no_requests_does_not_block_the_link(pseudo_terminal: tuple[int, str]) -> None:
+    """The requests fill the buffer of the pseudo-terminal, so the last write waits until the link is closed."""
+    master, port = pseudo_terminal
+    link = build(port=port, request="00" * 256, request_rate=10_000.0)
+    link.open()
+    assert isinstance(link, serial_link.SerialLink)
+    wait_for(lambda: link._port is not None and link._port.out_waiting == 0 and not writable(link._port.fileno()))
+    thread = link._requests._thread if link._requests else None
+    os.write(master, b"data")
+    assert read_bytes(link, 4) == b"data"
+    link.close()
+    assert thread is not None
+    assert not thread.is_alive()
+
+
+def writable(file_number: int) -> bool:
+    return bool(select.select([], [file_number], [], 0.0)[1])
+
+
+def test_unplugging_ends_the_requests(pseudo_terminal: tuple[int, str]) -> None:
+    master, port = pseudo_terminal
+    link = build(port=port, request="AA", request_rate=1000.0)
+    link.open()
+    assert isinstance(link, serial_link.SerialLink)
+    assert link._requests is not None
+    thread = link._requests._thread
+    os.close(master)
+    with pytest.raises(LinkLost, match="gone"):
+        read_bytes(link, 1)
+    assert not thread.is_alive()

@@ -53,6 +53,29 @@ def _aceinna_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
             yield (*(DEGREE * x for x in floats[3:]), *(unit * x for x in floats[:3]))
 
 
+# --- BNO055
+
+
+def _bno055_wrap(data: bytes, settings: Settings) -> bytes:
+    """Build error answers, an answer with any measurements, or both."""
+    errors = bytes([0xEE, 1 + data[0] % 12]) * (data[0] // 16) if data and data[0] > 0x80 else b""
+    registers = bytearray(data[1:61].ljust(60, b"\0"))
+    registers[:4], registers[7] = b"\xa0\xfb\x32\x0f", 0
+    return errors if data[:1] > b"\xf0" else errors + b"\xbb\x3c" + registers
+
+
+def _bno055_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
+    for at in find_offsets(stream, b"\xbb\x3c\xa0\xfb\x32\x0f"):
+        registers = stream[at + 2 : at + 62]
+        if len(registers) < 60 or registers[7] or registers[0x39] == 1:
+            continue
+        accel, gyro = struct.unpack_from("<3h", registers, 8), struct.unpack_from("<3h", registers, 20)
+        rate = 1 / 900 if registers[0x3B] & 2 else DEGREE / 16
+        force = G / 1000 if registers[0x3B] & 1 else 0.01
+        if any(accel + gyro):
+            yield (*(rate * x for x in gyro), *(force * x for x in accel))
+
+
 # --- BNO08x RVC
 
 
@@ -91,6 +114,42 @@ def _inertial_labs_readings(stream: bytes, settings: Settings) -> Iterator[Readi
         numbers = struct.unpack_from("<6i", frame, 6 + start)
         if not int.from_bytes(frame[6 + status_at : 8 + status_at], "little") & 0x1C2C:
             yield (*(DEGREE * x / 1e5 for x in numbers[:3]), *(G * x / 1e6 for x in numbers[3:]))
+
+
+# --- Inertial Sense
+
+INERTIAL_SENSE_SETS: Final = {"pimu": (3, 40, 16), "imu": (58, 36, 12), "imu_raw": (97, 36, 12)}
+"""Number of each data set, size of its payload, and offset of the rates."""
+
+
+def _inertial_sense_wrap(data: bytes, settings: Settings) -> bytes:
+    """Build a packet with any values and often a valid time and duration, or another packet."""
+    number, size, start = INERTIAL_SENSE_SETS[settings.get("data_set", "pimu")]
+    head, payload = data[:1], data[1 : 1 + size].ljust(size, b"\0")
+    if head < b"\xc0":
+        payload = (
+            struct.pack("<d", payload[0] * 100.0) + (b"\0\0\x80\x3b" if start == 16 else b"") + payload[start - 4 :]
+        )
+    flags = 4
+    if head > b"\xe0":
+        flags, number, payload = data[0] & 0x2F, data[0] % 100, data[1:]
+    body = b"\xef\x49" + bytes([flags, number]) + len(payload).to_bytes(2, "little") + payload
+    return body + _ublox_check(body)
+
+
+def _inertial_sense_readings(stream: bytes, settings: Settings) -> Iterator[Reading]:
+    number, size, start = INERTIAL_SENSE_SETS[settings.get("data_set", "pimu")]
+    for at in find_offsets(stream, b"\xef\x49\4" + bytes([number, size, 0])):
+        packet = stream[at : at + size + 8]
+        if len(packet) < size + 8 or _ublox_check(packet[:-2]) != packet[-2:]:
+            continue
+        seconds, duration = struct.unpack_from("<df", packet, 6)
+        status, *numbers = struct.unpack_from("<I6f", packet, 2 + start)
+        scale = duration if start == 16 else 1.0
+        is_saturated = status & 63 if status & 0x3F0000 else status >> 30
+        is_valid = 0.0 <= seconds < 2**48 / 1e6 and 0.0 < scale < float("inf")
+        if is_valid and not is_saturated and has_finite_values(numbers):
+            yield tuple(x / scale for x in numbers)
 
 
 # --- NovAtel
@@ -212,8 +271,10 @@ def _ublox_measurements(stream: bytes, is_meas: bool) -> Iterator[tuple[int, int
 
 FRAMED_FORMATS: Final = {
     "aceinna_dmu": Format(_aceinna_wrap, _aceinna_readings),
+    "bno055": Format(_bno055_wrap, _bno055_readings),
     "bno08x_rvc": Format(_rvc_wrap, _rvc_readings),
     "inertial_labs": Format(_inertial_labs_wrap, _inertial_labs_readings),
+    "inertial_sense": Format(_inertial_sense_wrap, _inertial_sense_readings),
     "novatel_rawimusx": Format(_novatel_wrap, _novatel_readings),
     "ublox_esf": Format(_ublox_wrap, _ublox_readings),
 }

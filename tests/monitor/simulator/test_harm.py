@@ -125,7 +125,8 @@ def count_needed_samples(kinds: np.ndarray, samples: int, fault: FaultKind) -> i
 
 
 WITH_COUNTER = (
-    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "mavlink", "microstrain_mip"),
+    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "inertial_sense", "mavlink"),
+    "microstrain_mip",
     *(
         "novatel_rawimusx",
         "sbg_ecom",
@@ -138,7 +139,8 @@ WITH_COUNTER = (
     *("ros2_imu", "samples"),
 )
 WITH_CHECKSUM = (
-    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "mavlink", "microstrain_mip"),
+    *("aceinna_dmu", "bno08x_rvc", "epson_uart-g366pdg0", "inertial_labs", "inertial_sense", "mavlink"),
+    "microstrain_mip",
     *(
         "novatel_rawimusx",
         "sbg_ecom",

@@ -203,6 +203,8 @@ WORDS: Final = {
     "silicon_sensing_dmu": (b"\x55\xaa", b"\x7f\xc0\0\0", b"\xff\x80\0\0"),
     "aceinna_dmu": (b"UUS0\x1e", b"UUS1\x18", b"UUz1\x28", b"UUs1\x34", b"\0\0\xc0\x7f"),
     "text": ("gx:", "az :", "nan", "-inf", "1e308", "1_0", "#", "$", "*", ",", ";", "\r\n", "4611686018427387904"),
+    "bno055": (b"\xbb\x3c\xa0\xfb\x32\x0f", b"\xee\7", b"\xee\1", b"\6\0\x80"),
+    "inertial_sense": (b"\xef\x49\4\3\x28\0", b"\xef\x49\4\x3a\x24\0", b"\0\0\x80\x3b", b"\0\0\xc0\x7f"),
     "inertial_labs": (b"\xaa\x55\1\x8f\x26\0", b"\xaa\x55\1\x81\x3a\0"),
     "novatel_rawimusx": (b"\xaa\x44\x13\x28\xb6\5", b"\xaa\x44\x12\x1c\xb5\5", b"\0\x20"),
     "ublox_esf": (b"\xb5b\x10\3", b"\xb5b\x10\2", b"\0\0\0\x0e", b"\0\0\0\x0c", b"$GNGGA,", b"*47\r\n"),
