@@ -85,7 +85,6 @@ class CsvSource:
     """A CSV file, or a CSV file in an archive."""
 
     path: Path  # file on disk, whose size determines the limits
-    size_bytes: int  # size of the stream
     label: str  # name of the source in messages
     sensor: str  # name of the sensor for columns that are only named x, y and z
     open_stream: Callable[[], AbstractContextManager[IO[bytes]]]
@@ -105,25 +104,25 @@ def read_csv(path: Path, options: ReadingOptions) -> table.Table:
 
 
 def _file_source(path: Path) -> CsvSource:
-    return CsvSource(path, path.stat().st_size, str(path), path.name.partition(".")[0], lambda: open_regular_file(path))
+    return CsvSource(path, str(path), path.name.partition(".")[0], lambda: open_regular_file(path))
 
 
 def read_csv_source(source: CsvSource, options: ReadingOptions) -> table.Table:
     """Read the columns of a CSV file on disk or in an archive. See ``read_csv``."""
+    lines = _count_rows(source)
     try:
-        return _read_columns(source, options, "i8")
+        return _read_columns(source, options, "i8", lines)
     except _FractionalTimeError:
-        return _read_columns(source, options, "f8")
+        return _read_columns(source, options, "f8", lines)
 
 
-def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str) -> table.Table:
+def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, lines: int) -> table.Table:
     """Read the columns of a CSV file. Raise _FractionalTimeError if a time does not have the type ``time_type``."""
     notes: list[str] = []
     bad = _BadLines()
     label = Path(source.label)
-    limit = memory_check.measure_read_limit(source.path)
     with source.open_stream() as file:
-        texts = _whole_lines(_check_unpacked_size(_decompressed(file, notes), limit), notes)
+        texts = _whole_lines(_decompressed(file, notes), notes)
         header = csv_header.find_header(source.path, label, texts, options)
         if header is None:
             what = notes[-1] if notes else "It has no line at all."
@@ -138,8 +137,7 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str) ->
         for part in _parse_pieces(label, header, texts, use, dtype, bad):
             parts.append(part)
             read += len(part)
-            limit.check_row_count(read)
-            report_read_share(file.tell(), source.size_bytes)
+            report_read_share(read, lines)
     rows = np.concatenate(parts) if parts else np.empty(0, dtype)
     if 2 * bad.count > len(rows):
         raise _too_many_bad_lines(label, bad, len(rows))
@@ -149,6 +147,20 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str) ->
         what = f". {notes[-1]}" if notes else ""
         raise RecordingError(f"{label}: has a header line but no complete line of samples after it{what}")
     return table.Table({name: rows[name] for name in layout.columns}, None, notes, layout.units)
+
+
+def _count_rows(source: CsvSource) -> int:
+    """Return the number of complete lines in a CSV file. Raise an error if the file exceeds a size limit."""
+    limit = memory_check.measure_read_limit(source.path)
+    lines = unpacked = 0
+    with source.open_stream() as file:
+        for text in _whole_lines(_decompressed(file, []), []):
+            lines += text.count(b"\n")
+            unpacked += len(text)
+            limit.check_row_count(lines)
+            if unpacked > limit.size_bytes:
+                limit.check_unpacked_size(unpacked)
+    return lines
 
 
 def read_csv_column_names(source: CsvSource, options: ReadingOptions) -> list[str]:
@@ -196,16 +208,6 @@ def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
         else:
             data = unzip.unconsumed_tail or file.read(GZIP_BYTES)
     notes.append("The gzip data end in the middle: the file is cut off and was read up to the cut.")
-
-
-def _check_unpacked_size(texts: Iterable[bytes], limit: memory_check.RecordingSizeLimits) -> Iterator[bytes]:
-    """Yield the pieces of text. Raise RecordingError if they exceed the size limit of the file."""
-    unpacked = 0
-    for text in texts:
-        unpacked += len(text)
-        if unpacked > limit.size_bytes:
-            limit.check_unpacked_size(unpacked)
-        yield text
 
 
 def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:

@@ -100,10 +100,7 @@ def _open_sources(path: Path) -> Iterator[dict[str, CsvSource]]:
     """Yield the CSV files of a folder or a zip archive by name, without the suffix."""
     if path.is_dir():
         files = sorted(one for one in path.iterdir() if one.suffix.lower() == ".csv")[:MAX_FILES]
-        yield {
-            one.stem: CsvSource(one, one.stat().st_size, str(one), one.stem, partial(open_regular_file, one))
-            for one in files
-        }
+        yield {one.stem: CsvSource(one, str(one), one.stem, partial(open_regular_file, one)) for one in files}
         return
     with IndexSizeLimitedFile(path) as file:
         try:
@@ -116,7 +113,7 @@ def _open_sources(path: Path) -> Iterator[dict[str, CsvSource]]:
             members = [one for one in archive.infolist() if one.filename.lower().endswith(".csv")][:MAX_FILES]
             yield {
                 (stem := Path(one.filename).stem): CsvSource(
-                    path, one.file_size, f"{path}: {one.filename}", stem, partial(_open_member, path, archive, one)
+                    path, f"{path}: {one.filename}", stem, partial(_open_member, path, archive, one)
                 )
                 for one in members
                 if one.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) and "meta/" not in one.filename
