@@ -74,7 +74,7 @@ def test_simulated_uart_reads_the_sent_bytes_at_the_right_baud_rate() -> None:
     assert read_at_wrong_baud_rate(data, 1.0)[:255] == data[:255]
 
 
-@pytest.mark.parametrize("captures", [20, pytest.param(100, marks=pytest.mark.long)])
+@pytest.mark.parametrize("captures", [20, pytest.param(1000, marks=pytest.mark.long)])
 def test_noise_is_not_identified(captures: int) -> None:
     rng = np.random.default_rng(captures)
     for i in range(captures):
