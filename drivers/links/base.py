@@ -132,7 +132,7 @@ class AddressFilteringLink(Protocol):
 
 @runtime_checkable
 class BatchingLink(Protocol):
-    """Interface of a link in which received bytes wait for more bytes, so that the driver reads less often."""
+    """Interface of a link that holds received bytes until more arrive, so that the driver reads less often."""
 
     def set_default_read_timeout(self, timeout_s: float) -> None:
         """Set the time in s that received bytes may wait, unless the configuration states ``read_timeout``."""

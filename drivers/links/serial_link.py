@@ -1,9 +1,9 @@
 """Link to local or networked serial ports, which are addressed by any URL that pyserial supports.
 
-A read waits for the first byte, then for the time ``read_timeout`` for more bytes, and returns all bytes that have
-arrived. Waiting for more bytes takes much less processor time than one read per frame. The wait delays bytes by at most
-``read_timeout``. If the configuration states no ``read_timeout``, the daemon sets it according to the interval at which
-results are published. If a URL handler has no file descriptor, a read returns as soon as bytes arrive.
+A read waits for the first byte, then up to ``read_timeout`` for more bytes, and returns all bytes received. Waiting for
+more bytes takes much less processor time than one read per frame. The wait delays bytes by at most ``read_timeout``. If
+the configuration states no ``read_timeout``, the daemon sets it according to the interval at which results are
+published. If a URL handler has no file descriptor, a read returns as soon as bytes arrive.
 
 ``close`` closes the port only after a waiting read has ended. Otherwise, the system could assign the file descriptor to
 another file during the read. If the port cannot be opened, the text of ``LinkUnavailable`` states the reason and a
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = ""
 READ_BYTES: Final = 4096
-"""Maximum number of bytes per call of the system. The buffer of a terminal in the Linux kernel has the same size."""
+"""Maximum number of bytes per system call. The buffer of a terminal in the Linux kernel has the same size."""
 MAX_WAITING_BYTES: Final = 16_384
 """Number of bytes per read above which the next read does not wait. The kernel stores 64 KiB before bytes are lost."""
 DEFAULT_READ_TIMEOUT_S: Final = 0.01

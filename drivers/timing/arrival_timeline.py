@@ -102,7 +102,7 @@ class ArrivalTimeline:
             self.line.add_point(self.index, arrived_s, self.nominal_hz)
         self.earliest_time.advance_clock(passed, arrived_s, self.undelayed_period_s())
         period_s = self.line.period_s() or 1.0 / NS_PER_S  # without a rate, only the order is known
-        # A sample cannot be taken after its arrival. The tolerance JUMP_S allows for the scatter of the arrivals.
+        # A sample cannot have been taken after it arrived. JUMP_S allows for the jitter of the arrival times.
         newest_s = min(self.line.time_at_index_s(self.index), arrived_s + JUMP_S)
         t_s = newest_s - (self.index - index) * period_s
         if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # the times must fit into int64 nanoseconds

@@ -21,7 +21,7 @@ from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
 from monitor.drift.compensation.compensation_score import AxisCompensation, DriftCompensationResult, score_at_rest
-from monitor.drift.compensation.compensator import Compensator, MeasuredAndPredictedDrift
+from monitor.drift.compensation.gyro_drift_compensator import Compensator, MeasuredAndPredictedDrift
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.compensation.sage_husa import MIN_CONFIRMED_INTERVALS, REJECTED, STEPPED, USED
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid

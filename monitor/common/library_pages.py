@@ -13,7 +13,7 @@ from typing import Final
 LLVM_LIBRARY: Final = "libllvmlite"
 SMAPS: Final = Path("/proc/self/smaps")
 MADV_DONTNEED: Final = 4
-"""Advice of madvise(2) that the pages are not needed; its number on Linux."""
+"""Linux value of the madvise(2) advice that the pages are not needed."""
 
 
 def release_library_pages(name: str) -> None:

@@ -48,7 +48,7 @@ class ConfigChange:
 
 
 def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) -> ConfigChange:
-    """Compare the configuration file with the running configuration, as ``compare_configurations``.
+    """Compare the configuration file with the running configuration, like ``compare_configurations``.
 
     Raises
     ------

@@ -464,7 +464,7 @@ def _parse_row(
 
 
 def _identifier(db: sqlite3.Connection, table: str, column: str, text: str) -> int:
-    """Return the identifier of a device or of a column layout, which is inserted if it is not stored yet."""
+    """Return the identifier of a device or column layout, inserting it if it is not stored yet."""
     db.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
     return int(db.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()[0])
 

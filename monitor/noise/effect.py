@@ -54,7 +54,8 @@ class NoiseSeries:
 
 @dataclass(slots=True)
 class RunningTransform:
-    """Transform of one axis during a simulation. A function with a memory must be a method, because it is copied."""
+    """Transform of one axis during a simulation. A function that keeps state must be a method, so that its state is
+    copied with it."""
 
     transform_in_place: Callable[[Floats], object]
     """Function that transforms the next samples [n] in place."""

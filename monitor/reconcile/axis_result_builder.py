@@ -9,7 +9,12 @@ from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import EFFECTS, BandwidthLimit, Outliers, PulseTrain, Sinusoidal, TemperatureBias
 from monitor.noise.effects.signal_chain.bandwidth_limit import FILTER_KINDS
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, compute_diagnostic_gaps
-from monitor.reconcile.effect_table import EFFECT_TABLE, MOST_DIRECT_DIAGNOSTIC, SERIES_SIZE_PARAMETERS, SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import (
+    EFFECT_PROPERTIES,
+    MOST_DIRECT_DIAGNOSTIC,
+    SERIES_SIZE_PARAMETERS,
+    SIZE_PARAMETERS,
+)
 from monitor.reconcile.likelihood.effect_roles import effect_size, linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, compute_shape_interval, compute_size_interval
 from monitor.reconcile.result import (
@@ -91,7 +96,7 @@ def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKin
     """Return the changes that the search kept: index of the search round, index of the effect, and kind of change."""
     hypothesis = search.hypothesis
     found: list[tuple[int, int, StepKind]] = []
-    left = list(range(hypothesis.given_count, len(hypothesis.effects)))
+    left = list(range(hypothesis.model_effect_count, len(hypothesis.effects)))
     resized = set(changed_sizes(hypothesis))
     for at, one in enumerate(search.rounds):
         last = one.hypothesis.effects[-1]
@@ -171,7 +176,9 @@ def _trials_not_added_too(hypothesis: Hypothesis, index: int, trials: tuple[Tria
 
     An effect that was added in another round is not an alternative, because it explains another difference.
     """
-    added = [effect for at, effect in enumerate(hypothesis.effects) if at >= hypothesis.given_count and at != index]
+    added = [
+        effect for at, effect in enumerate(hypothesis.effects) if at >= hypothesis.model_effect_count and at != index
+    ]
     alternatives = [one for one in trials[1:] if not any(_is_same_effect(one.effect, effect) for effect in added)]
     return (trials[0], *alternatives)
 
@@ -230,7 +237,7 @@ def _parameters_with_bounds(
         found[name] = _coefficient_bounds(hypothesis, index, name)
     if isinstance(effect, TemperatureBias):
         found["reference"] = ParameterInterval(effect.reference)
-    for shape in EFFECT_TABLE[effect.name].shapes if kind == "added" else ():
+    for shape in EFFECT_PROPERTIES[effect.name].shapes if kind == "added" else ():
         if getattr(effect, shape) is not None:
             found[shape] = compute_shape_interval(hypothesis.fit, index, shape)
     if isinstance(effect, PulseTrain):

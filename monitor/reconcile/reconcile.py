@@ -33,7 +33,7 @@ from monitor.reconcile.diagnostics.null_distribution import (
     estimate_null_distributions,
     run_diagnostics,
 )
-from monitor.reconcile.effect_table import PENALTY_NATS
+from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.effect_roles import is_stationary_gaussian, with_effect_size
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise

@@ -156,7 +156,7 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
 
 
 def select_devices(config: Config, names: Collection[str]) -> tuple[dict[str, Any], Path]:
-    """Return the table and the folder of a configuration of some devices, whose results are only recorded.
+    """Return the table and the folder of a configuration for some devices that only records their results.
 
     Parameters
     ----------

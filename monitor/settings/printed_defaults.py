@@ -57,7 +57,7 @@ def format_defaults() -> str:
 
 
 def _top_tables() -> dict[str, type[SettingsModel]]:
-    """Return the tables of the file that exist once."""
+    """Return the tables that can occur only once in the file."""
     models = {key: find_settings_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
     return {key: model for key, model in models.items() if model is not None and key not in LIST_TABLES}
 

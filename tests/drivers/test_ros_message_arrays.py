@@ -13,7 +13,7 @@ from drivers.recordings.file_formats.ros_message_arrays import (
     decode_messages,
     iter_message_blocks,
 )
-from drivers.recordings.topics import Topic
+from drivers.recordings.topic_selection import Topic
 from tests.support.ros_bags import imu_topic, temperature_topic
 
 T_NS = 1_763_700_000_123_456_789 + np.arange(6) * 5_000_001

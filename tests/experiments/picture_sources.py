@@ -47,7 +47,7 @@ def describe_allan_figure() -> object:
 
 
 def _describe_texts(figure: Any) -> list[str]:
-    """Return the texts of a figure without numbers, which depend on the data."""
+    """Return the texts of a figure, without the numbers, because those depend on the data."""
     from matplotlib.text import Text
 
     texts = {re.sub(r"[\d.,⁰¹²³⁴-⁹⁻−]+", "#", one.get_text()) for one in figure.findobj(Text)}

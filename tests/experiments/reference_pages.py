@@ -29,7 +29,7 @@ from monitor.settings.printed_defaults import FIRST_LINK, describe_keys, format_
 PAGES: Final = sorted((Path(__file__).resolve().parents[2] / "docs" / "reference").glob("*.md"))
 PART: Final = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 SHARED_BY: Final = 4
-"""Number of commands from which an option is described once for all of them."""
+"""Minimum number of commands sharing an option for the option to be described only once."""
 
 
 def format_commands() -> str:
@@ -193,7 +193,7 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
 
 
 def fill_page(text: str) -> str:
-    """Return the text of a page with new generated parts."""
+    """Return the text of a page with its generated parts regenerated."""
     return PART.sub(lambda part: f"{part[1]}\n{PARTS[part[2]]()}\n\n{part[3]}", text)
 
 

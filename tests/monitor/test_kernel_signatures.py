@@ -21,7 +21,7 @@ USE_ALL_KERNELS = """
     from drivers.data_types import make_block
     from monitor.daemon.kernels import kernel_groups
     from monitor.common.compiled import Kernel
-    from monitor.drift.compensation.compensator import Compensator
+    from monitor.drift.compensation.gyro_drift_compensator import Compensator
     from monitor.drift.thermal import thermal_response
     from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
     from monitor.estimation.estimator import Estimator

@@ -1,4 +1,5 @@
-"""Folder of the real recordings, simulated recordings, and loading of refused and damaged recordings."""
+"""Folder of the real recordings, functions that simulate recordings, and tests of loading rejected and damaged
+recordings."""
 
 import os
 import re

@@ -89,9 +89,9 @@ class RespondingSensor:
 
 
 def stamp_by_answer(link: Link, sensor: RespondingSensor) -> None:
-    """Give each chunk the time at which the last answer is due at the request rate.
+    """Set the time of each chunk to when its last answer is due according to the request rate.
 
-    The answers have no counter, so a pause of a loaded machine would count as lost samples.
+    The answers have no counter, so a pause on a heavily loaded machine would be counted as lost samples.
     """
     begun_ns = time.monotonic_ns()
     read = link.wait_for_chunks_or_timeout

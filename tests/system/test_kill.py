@@ -17,7 +17,8 @@ from tests.experiments.benchmarks.kill import RATE, Bench, Kill
 pytest.importorskip("pyarrow", reason="recording needs the extra arrow")
 
 MAX_BATCH_INTERVAL_S = 0.5
-"""Time between two batches according to docs/how-to/recording.md. It is not imported, as it is tested."""
+"""Time between two batches according to docs/how-to/recording.md. It is not imported, because it is the code under
+test."""
 LOAD_FACTOR = 4.0
 KILLS = 3
 """Number of kills of daemons that have recorded for at least two seconds."""

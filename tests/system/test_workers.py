@@ -45,7 +45,7 @@ driver = {{ link = "serial", port = "{port}", decoder = "vectornav_binary" }}
 
 
 class Sensors:
-    """Thread that writes the same frames to all terminals. A frame for a full terminal is dropped."""
+    """Thread that writes the same frames to all terminals. A frame is dropped if the terminal's buffer is full."""
 
     def __init__(self, terminals: list[PluggableTerminal]) -> None:
         self._masters = [terminal.master for terminal in terminals]
@@ -70,7 +70,7 @@ class Sensors:
 
 
 def read_sample_numbers(folder: Path) -> list[int]:
-    """Return the numbers of the recorded samples, of which the first frame of the sensor has number 0."""
+    """Return the numbers of the recorded samples, counted from 0 at the first frame of the sensor."""
     pieces = [piece for path in segment_file.list_segments(folder) for piece in segment_file.read_samples(path)]
     ticks = np.concatenate([piece.samples.ticks for piece in pieces])
     return [int(one) for one in (ticks - 1_000_000) // (1_000_000_000 // RATE_HZ)]

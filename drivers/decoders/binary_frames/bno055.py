@@ -21,9 +21,9 @@ The answers have no checksum. The identifiers, the page and the length serve as 
 so the decoder has no options. With sensor fusion, the rates and accelerations are corrected by the estimated offsets.
 After power-on, the sensor is in CONFIGMODE, and all measurements are 0. These answers make no samples.
 
-The sensor answers ``EE code`` if it cannot answer a read request or to acknowledge a write request. The codes 1 and 3
-acknowledge a write request. Each other code is a missing sample. The most frequent one is 7, BUS_OVER_RUN_ERROR, which
-the manufacturer recommends to answer by repeating the request. The answers are timed by their arrival.
+The sensor sends ``EE code`` when it cannot answer a read request, and also to acknowledge a write request. The codes 1
+and 3 acknowledge a write request. Each other code is a missing sample. The most frequent one is 7, BUS_OVER_RUN_ERROR,
+for which the manufacturer recommends repeating the request. The answers are timed by their arrival.
 """
 
 from dataclasses import replace
@@ -56,7 +56,7 @@ ERROR_CODES: Final = range(1, 11)
 WRITE_CODES: Final = (1, 3)
 """Codes that answer a write request."""
 MAX_ERROR_BYTES: Final = 20
-"""Length in bytes of consecutive error answers that are decoded without waiting for an answer with registers."""
+"""Maximum number of bytes of consecutive error answers to decode before waiting for an answer with registers."""
 SYSTEM_ERROR, FUSION_RUNNING, RUNNING = 1, 5, 6
 """Values of SYS_STATUS."""
 ACCEL_STEPS: Final = np.array([0.01, 1e-3 * G0])
@@ -82,7 +82,7 @@ class Bno055Decoder(base.FrameStreamDecoder):
 
     @property
     def bad(self) -> int:
-        """Number of rejected answers. Requests that were answered with an error are missing, not rejected."""
+        """Number of rejected answers. Requests answered with an error are counted as missing, not as rejected."""
         return super().bad - self._missed
 
     @property
@@ -98,7 +98,7 @@ class Bno055Decoder(base.FrameStreamDecoder):
 
     @property
     def on_board_filter_note(self) -> str:
-        """Note that sensor fusion has corrected the samples; "" if it does not run."""
+        """Note which says that sensor fusion has corrected the samples; "" if fusion is off."""
         return base.ON_BOARD_FILTER_NOTE if self._status == FUSION_RUNNING else ""
 
     def _decode(self, frames: base.RawFrames) -> list[SampleBlock]:
@@ -126,7 +126,7 @@ class Bno055Decoder(base.FrameStreamDecoder):
 def _read_measurements(registers: NDArray[np.void]) -> tuple[Floats, Floats]:
     """Return the values [n, 6] and the temperatures [n] in °C.
 
-    The values are NaN if the sensor does not measure, and infinite if the sensor reports an error.
+    The values are NaN if the sensor has no measurement, and infinite if it reports an error.
     """
     units = registers["units"]
     gyro = registers["gyro"] * GYRO_STEPS[units >> 1 & 1][:, None]

@@ -71,7 +71,7 @@ PAYLOAD_SIZES: Final = {number: layout.itemsize for number, layout in DATA_SETS.
 
 TICKS_PER_S: Final = 1_000_000
 TICKS: Final = 1 << 48
-"""Number of ticks after which the encoded time restarts, which is nine years."""
+"""Number of ticks after which the encoded time wraps around (nine years)."""
 SENSOR_BITS: Final = 0x3F << 16
 """Status bits of working sensors in version 2."""
 SATURATION_BITS: Final = 0x3F

@@ -26,7 +26,7 @@ from drivers.errors import RecordingError, convert_library_errors
 from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.topics import BLOCK_ROWS, JOIN, Topic, join_topics, select_topics
+from drivers.recordings.topic_selection import BLOCK_ROWS, JOIN, Topic, join_topics, select_topics
 
 MAGIC: Final = b"\xa3\x95\x80"
 """First bytes of a log: the start of a message, and the number of the message FMT."""

@@ -2,7 +2,7 @@
 
 phyphox and Sensor Logger write one file per sensor, such as ``Gyroscope.csv`` and ``Accelerometer.csv``. Each file has
 times of its own. Each file is treated as a topic, and the topics are joined like those of a log
-(``drivers.recordings.topics``).
+(``drivers.recordings.topic_selection``).
 
 The layouts are those of phyphox/phyphox-android (``DataExport.java``) and tszheichoi/awesome-sensor-logger
 (``UNITS.md``). ``Accelerometer.csv`` of Sensor Logger contains no gravity, so ``TotalAcceleration.csv`` is preferred.
@@ -28,7 +28,7 @@ from drivers.recordings.file_formats.csv_format import (
 from drivers.recordings.file_formats.zip_index import IndexSizeLimitedFile
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import convert_to_si, find_layout
-from drivers.recordings.topics import GYROS, JOIN, Topic, join_topics, select_topics
+from drivers.recordings.topic_selection import GYROS, JOIN, Topic, join_topics, select_topics
 
 GYROSCOPES: Final = ("Gyroscope", "GyroscopeUncalibrated")
 ACCELEROMETERS: Final = ("TotalAcceleration", "Accelerometer", "AccelerometerUncalibrated", "Linear Acceleration")

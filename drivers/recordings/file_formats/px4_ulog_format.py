@@ -24,7 +24,7 @@ from drivers.errors import RecordingError, convert_library_errors
 from drivers.host.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import open_file_and_report_position
-from drivers.recordings.topics import JOIN, Topic, join_topics, select_topics
+from drivers.recordings.topic_selection import JOIN, Topic, join_topics, select_topics
 
 _XYZ: Final = ("x", "y", "z")
 FIELDS: Final[Mapping[str, Mapping[str, str]]] = {

@@ -28,7 +28,7 @@ from drivers.recordings.file_formats.ros_message_arrays import (
     iter_message_blocks,
 )
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.topics import Topic, join_topics, select_topics
+from drivers.recordings.topic_selection import Topic, join_topics, select_topics
 
 METADATA: Final = "metadata.yaml"
 """File that identifies a folder as a ROS 2 bag."""

@@ -161,12 +161,13 @@ DECODER_OPTIONS = {
 }
 """Options for a recording that contains the wire format of a sensor."""
 Loading = Any
-"""Annotation of the argument that ``with_loading_options`` replaces by the options of a recording."""
+"""Annotation that marks the argument that ``with_loading_options`` replaces with the options for loading a
+recording."""
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
 def with_loading_options(command: Command, *, rate_and_last: bool = True) -> Command:
-    """Replace the argument ``loading`` of a command by the options that determine how a recording is read.
+    """Replace the ``loading`` argument of a command with the options that determine how a recording is read.
 
     Parameters
     ----------

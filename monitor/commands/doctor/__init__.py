@@ -11,7 +11,7 @@ from pathlib import Path
 from monitor.commands.check_configuration import check_configuration
 from monitor.commands.doctor.devices import check_device
 from monitor.commands.doctor.finding import Finding, check_permissions, well, wrong
-from monitor.commands.doctor.machine import (
+from monitor.commands.doctor.installation_and_clock import (
     check_clock,
     check_kernels,
     check_library_versions,
@@ -21,8 +21,8 @@ from monitor.commands.doctor.machine import (
 from monitor.commands.doctor.outputs import (
     check_influx,
     check_metrics,
-    check_reconcile,
-    check_ros2,
+    check_reconcile_packages,
+    check_ros2_routers,
     check_viewer,
     check_zenoh,
 )
@@ -62,8 +62,8 @@ def _check_configured(config: Config) -> Iterator[Finding]:
     yield from check_storage(config)
     yield from check_metrics(config)
     yield from check_influx(config)
-    yield from check_ros2(config)
-    yield from check_reconcile(config)
+    yield from check_ros2_routers(config)
+    yield from check_reconcile_packages(config)
     for hook in config.hooks:
         if hook.command:
             command = Path(hook.command[0])

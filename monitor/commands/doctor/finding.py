@@ -1,4 +1,4 @@
-"""Finding of the command ``doctor``, and checks that several parts share."""
+"""Finding reported by the ``doctor`` command, and checks used by several of its parts."""
 
 import os
 import stat

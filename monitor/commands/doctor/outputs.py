@@ -74,13 +74,13 @@ def check_influx(config: Config) -> Iterator[Finding]:
         yield doubt("influx", text, "use https")
 
 
-def check_ros2(config: Config) -> Iterator[Finding]:
-    """Check that the routers of the output to ROS 2 answer."""
+def check_ros2_routers(config: Config) -> Iterator[Finding]:
+    """Check that the routers used by the ROS 2 output respond."""
     for endpoint in config.ros2.connect if config.ros2 is not None else ():
         yield check_reachable("ros2", endpoint)
 
 
-def check_reconcile(config: Config) -> Iterator[Finding]:
+def check_reconcile_packages(config: Config) -> Iterator[Finding]:
     """If a folder for reports is configured, check that the packages for the command ``reconcile`` are installed."""
     missing = " and ".join(find_missing_packages("reconcile"))
     if missing and any(one.reconcile_folder for one in config.devices):

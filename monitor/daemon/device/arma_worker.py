@@ -8,7 +8,7 @@ import threading
 from drivers.data_types import Floats
 from drivers.errors import NotReady
 from monitor.drift.compensation.arma import ArmaModel, fit_arma
-from monitor.drift.compensation.compensator import Compensator
+from monitor.drift.compensation.gyro_drift_compensator import Compensator
 from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 
 

@@ -64,7 +64,7 @@ def _call_change_detection() -> None:
 
 def _call_compensation() -> None:
     from monitor.drift.compensation.arma import fit_arma
-    from monitor.drift.compensation.compensator import Compensator
+    from monitor.drift.compensation.gyro_drift_compensator import Compensator
 
     compensator = Compensator(100.0)
     compensator.compensate(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))

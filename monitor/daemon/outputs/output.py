@@ -45,7 +45,7 @@ class Output:
         """Publish the status of the device once a second; ``unix_s`` is None if the present time is unknown."""
 
     def set_alive(self, device: str, samples_arrive: bool) -> None:
-        """Publish that samples of a device arrive, or that no more samples arrive."""
+        """Publish a notification that samples of a device have started or stopped arriving."""
 
     def finish_round(self) -> None:
         """Send the results of one round of the main loop, if they have been collected."""

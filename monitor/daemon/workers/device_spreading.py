@@ -1,4 +1,4 @@
-"""Number of worker processes, and distribution of the devices to them."""
+"""Number of worker processes, and distribution of the devices among them."""
 
 import math
 import os
@@ -20,9 +20,10 @@ def count_workers(config: Config) -> int:
 
 
 def spread_devices(devices: Sequence[Device], workers: int, before: Mapping[str, int]) -> dict[str, int]:
-    """Assign each device to a worker. A device stays at its worker, and the others go to the worker with the fewest.
+    """Assign each device to a worker. A device stays with its worker; other devices go to the worker with the fewest
+    devices.
 
-    The rate does not matter, because a device is read and its results are published at a rate of its own.
+    The rate does not matter, because devices are read and results are published at rates independent of it.
 
     Parameters
     ----------
@@ -36,7 +37,7 @@ def spread_devices(devices: Sequence[Device], workers: int, before: Mapping[str,
     Returns
     -------
     dict of str to int
-        Number of the worker of each device by its name.
+        Worker number of each device, by the name of the device.
     """
     places = {device.name: before[device.name] for device in devices if device.name in before}
     for device in devices:

@@ -35,7 +35,7 @@ from monitor.settings import loading
 from monitor.settings.loading import Config
 
 RESTART_PAUSE_S: Final = 2.0
-"""Time before a worker is started again, in which the recording of the ended worker is complete."""
+"""Delay before a worker is restarted, long enough for the ended worker to finish its recording."""
 STOP_TIMEOUT_S: Final = 60.0
 """Longest wait for the end of all workers. A worker may compile kernels before it can process its last samples."""
 MAX_MESSAGES: Final = 10
@@ -45,7 +45,7 @@ _log = structlog.get_logger("imu-monitor")
 
 
 class _Worker:
-    """Worker process, which is started as long as it has devices."""
+    """Worker process, which is kept running as long as it has devices."""
 
     def __init__(self, number: int) -> None:
         self.name = f"worker {number}"
@@ -218,7 +218,7 @@ class WorkerSupervisor(DaemonProcess):
         return all(worker.pipe is None and worker.restart_s is None for worker in self._workers)
 
     def _handle_end(self, worker: _Worker) -> None:
-        """Start a worker again that has not ended in order."""
+        """Restart a worker that did not exit cleanly."""
         status = worker.reap()
         for number, (_, command) in [one for one in self._commands.items() if one[1][0] is worker]:
             del self._commands[number]

@@ -39,7 +39,7 @@ _log = structlog.get_logger("imu-monitor")
 
 
 class Call(NamedTuple):
-    """Call of a method of the other process."""
+    """A method call to the other process."""
 
     name: str
     arguments: tuple[Any, ...]
@@ -117,7 +117,7 @@ class _ProgressNotifier(SystemdNotifier):
 
 
 class WorkerService(Service):
-    """Service of some devices, whose results are sent to the main process.
+    """Handles a subset of the devices and sends their results to the main process.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class WorkerService(Service):
         self._new_table: tuple[Any, ...] = ()  # arguments of the last call RELOAD
 
     def receive_calls(self, connection: Connection) -> None:
-        """Execute the calls of the main process until it asks for the end or has ended."""
+        """Execute calls from the main process until it requests a stop or exits."""
         with suppress(EOFError, OSError):
             while (call := connection.recv()).name != STOP:
                 self._execute(call)
@@ -159,7 +159,7 @@ class WorkerService(Service):
 
 
 def run_worker(descriptor: int) -> NoReturn:
-    """Run a worker process until the main process asks for the end.
+    """Run a worker process until the main process asks it to stop.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.compensator import MeasuredAndPredictedDrift
+from monitor.drift.compensation.gyro_drift_compensator import MeasuredAndPredictedDrift
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 
 MINUTE_S: Final = 60.0

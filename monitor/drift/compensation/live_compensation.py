@@ -13,7 +13,7 @@ import numpy as np
 from drivers.data_types import AXES, Event, Floats, SampleBlock, make_block
 from monitor.common.unit_formatting import format_axis_value
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.compensator import GYROS, Compensator, MeasuredAndPredictedDrift
+from monitor.drift.compensation.gyro_drift_compensator import GYROS, Compensator, MeasuredAndPredictedDrift
 from monitor.drift.compensation.sage_husa import STEPPED, USED
 from monitor.estimation.detection.motion_and_change_monitor import MAX_RATE_CHANGE
 

@@ -70,8 +70,8 @@ def process_noise_intensity(memory_samples: int) -> float:
 def compute_gains_by_filter_age(memories: Ints) -> tuple[Floats, Ints]:
     """Return a table with the gains of all filters, and the index of the first row that belongs to each filter.
 
-    The table has the shape (rows, 2) and contains the gains of ω and its derivative. Each row of a filter corresponds
-    to an age of the filter in samples. The last row of each filter contains the steady-state gains.
+    The table has the shape (rows, 2) and contains the gains of ω and its derivative. Row i of a filter applies i
+    samples after the filter was started. The last row of each filter contains the steady-state gains.
     """
     tables = [
         _gains(process_noise_intensity(int(memory)), max(SETTLING_SAMPLES[0] * int(memory), SETTLING_SAMPLES[1]))

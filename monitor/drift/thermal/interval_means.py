@@ -108,7 +108,7 @@ class IntervalMean:
 
 
 class RunningIntervalMeans:
-    """Computes interval means from a stream of samples, which equal the results of ``compute_interval_means``.
+    """Computes interval means from a stream of samples, with the same results as ``compute_interval_means``.
 
     The results do not depend on how the stream is divided into blocks.
 

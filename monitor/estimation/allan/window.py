@@ -299,7 +299,7 @@ class AllanWindow:
 
 
 def _aligned(size: int) -> Ints:
-    """Return zeros [size] that begin at the start of a cache line."""
+    """Return an array of zeros [size] aligned to a cache line."""
     space = np.zeros(size + LINE, np.int64)
     start = -(space.ctypes.data // space.itemsize) % LINE
     return space[start : start + size]

@@ -197,7 +197,7 @@ def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Float
 
 
 def _excess_variance(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rate_hz: float) -> Floats:
-    """Return the additional variance of the Allan variance due to effects other than Q, N, B and K.
+    """Return the share of the Allan variance that comes from effects other than Q, N, B and K.
 
     The variance is that of a single second difference, in units with τ0 = 1. It is 4 ∫ (S² − S_standard²) G² dν, where
     S is the spectral density and G = 2 sin⁴(πνm)/(m sin πν)² (Parseval's theorem). A spectral line of mean square P

@@ -58,7 +58,7 @@ class AllanAxis(DeviationCurve, frozen=True):
     """Allan deviations of one axis."""
 
     recent: DeviationCurve | UnsetType = UNSET
-    """Deviations of the last max(10 s, 16 τ) of the samples."""
+    """Deviations over the last max(10 s, 16 τ) of samples."""
 
 
 class CoefficientValue(msgspec.Struct, frozen=True):
@@ -412,7 +412,7 @@ class StatusMessage(
     crossed: tuple[str, ...] = ()
     """Limits that are crossed now, for example ``gz N``."""
     text: str = ""
-    """Problem of the device, or an empty text."""
+    """Problem with the device, or an empty string."""
 
     @classmethod
     def _convert(cls, _t: float | None, result: Health) -> dict[str, Any]:

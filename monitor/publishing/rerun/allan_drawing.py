@@ -103,7 +103,7 @@ class AllanPlotPair:
         self._draw_key(f"{path}/key")
 
     def _draw_key(self, path: str) -> None:
-        """Draw the meaning of points, lines, bands, dashes and rings below the plot."""
+        """Draw a legend for points, lines, bands, dashes and rings below the plot."""
         y = HEIGHT + KEY_BELOW
         at = np.column_stack([np.arange(len(KEY)) * KEY_SPACING, np.zeros(len(KEY))])
         sign = np.array([[0.0, y], [0.8, y]])

@@ -28,7 +28,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.noise.spectrum import Spectrum, white_noise_spectrum
-from monitor.reconcile.effect_table import SERIES_SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.effect_roles import (
     MAX_REGRESSORS,
     build_unit_regressors,

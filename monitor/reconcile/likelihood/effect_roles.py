@@ -26,7 +26,7 @@ from monitor.noise.effects import (
     ScaleFactor,
     Sinusoidal,
 )
-from monitor.reconcile.effect_table import EFFECT_TABLE, NOISE_SIZE_PARAMETERS, SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import EFFECT_PROPERTIES, NOISE_SIZE_PARAMETERS, SIZE_PARAMETERS
 
 MAX_REGRESSORS: Final = 3
 """Largest number of regressors of an effect."""
@@ -38,7 +38,7 @@ GAUSSIAN_TRANSFORMS: Final = (BandwidthLimit, ConstantBias, Resolution, SampleRa
 
 def linear_coefficient_names(effect: Effect) -> tuple[str, ...]:
     """Return the names of the linear coefficients of a deterministic effect, beginning with the size."""
-    return tuple(name for name in EFFECT_TABLE[effect.name].sizes if getattr(effect, name) is not None)
+    return tuple(name for name in EFFECT_PROPERTIES[effect.name].sizes if getattr(effect, name) is not None)
 
 
 def regressor_count(effect: Effect) -> int:
@@ -130,7 +130,7 @@ def with_regression_coefficients(effect: Effect, coefficients: Floats) -> Effect
         return replace(
             effect, amplitude=hypot(*coefficients[:2]), phase=atan2(coefficients[1], coefficients[0]) % (2.0 * pi)
         )
-    if len(EFFECT_TABLE[effect.name].sizes) > 1:
+    if len(EFFECT_PROPERTIES[effect.name].sizes) > 1:
         changed: dict[str, Any] = dict(zip(linear_coefficient_names(effect), map(float, coefficients), strict=False))
         return replace(effect, **changed)  # type: ignore[type-var]
     return with_effect_size(effect, float(coefficients[0]))

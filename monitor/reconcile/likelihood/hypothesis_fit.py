@@ -14,7 +14,7 @@ import numpy as np
 from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
 from monitor.noise.effects import CommonVibration, ExponentiallyCorrelated, PulseTrain, VarianceModulation
-from monitor.reconcile.effect_table import SERIES_SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size, is_noise_effect
 from monitor.reconcile.likelihood.periodic_pulse_search import find_pulse_delay
@@ -46,14 +46,14 @@ class Hypothesis:
         return self.fit.axis
 
     @property
-    def given_count(self) -> int:
+    def model_effect_count(self) -> int:
         """Number of effects in the original noise model."""
         return len(self.model)
 
     @property
     def added(self) -> Effects:
         """Effects that were added to the noise model."""
-        return self.fit.effects[self.given_count :]
+        return self.fit.effects[self.model_effect_count :]
 
     @property
     def effects(self) -> Effects:
@@ -63,7 +63,7 @@ class Hypothesis:
     @property
     def resized_model_effect_count(self) -> int:
         """Number of noise effects of the model with a fitted size."""
-        return sum(at < self.given_count for at in self.fit.fitted_noise)
+        return sum(at < self.model_effect_count for at in self.fit.fitted_noise)
 
     @property
     def resize_penalty(self) -> float:

@@ -46,7 +46,7 @@ MIN_SQUARES_FOR_DECREASE: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class VarianceStep:
+class FittedVarianceStep:
     """Single step of the noise variance."""
 
     gain: float  # log-likelihood gain over a constant variance, nats
@@ -68,7 +68,7 @@ class PeriodicVariation:
 class VarianceChangeGains:
     """Log-likelihood gains of a step and of three other changes over a constant variance."""
 
-    step: VarianceStep
+    step: FittedVarianceStep
     trend_gain: float  # of ln σ² = a + b t + c t², nats
     periodic: PeriodicVariation
     slow_variation_gain: float  # of a slow random variation, nats
@@ -187,7 +187,7 @@ def find_spectrogram_change(residuals: Floats, tau0_s: float) -> SpectrogramChan
     )
 
 
-def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:
+def _best_step(squares: Floats, tau0_s: float) -> FittedVarianceStep:
     """Return the most likely step of the variance from the squares of the residuals.
 
     The step time is first searched at every ``STEP_SEARCH_STRIDE``-th sample, and then at all samples near the maximum.
@@ -212,7 +212,7 @@ def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:
     ratio = float(((sums[-1] / sums[at - 1] - 1.0) * at / after) ** 0.5)
     half = float(np.exp(Z95 * (0.5 / at + 0.5 / after) ** 0.5))
     ends = (at, min(int(k[lo]), at) - stride + 1, max(int(k[hi]), at) + stride - 1)
-    return VarianceStep(
+    return FittedVarianceStep(
         float(gains[best]),
         ValueWithInterval(*(one * tau0_s for one in ends)),
         ValueWithInterval(ratio, ratio / half, ratio * half),

@@ -401,7 +401,7 @@ def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
 def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: float) -> RepeatedSamples | None:
     """Return the repeated samples in values without a detected grid.
 
-    If samples at a distance of two are equal, the values lie on an unknown grid, and some repeats are due to chance.
+    If samples two positions apart are equal, the values lie on an unknown grid, and some repeats are due to chance.
     """
     mask = np.zeros(y.size, dtype=np.bool_)
     mask[1:] = pairs & (y[1:] == y[:-1])

@@ -69,8 +69,9 @@ def check_repeated_rows(
     """Report rows that repeat on all axes more often than by chance.
 
     Such rows occur throughout a recording that was resampled to a higher rate. Quantized values also repeat by chance,
-    but independently on each axis. The share of rows that repeat on all axes is therefore compared with the product of
-    the shares of single axes. The rows are kept, because the search for noise effects describes the repeats.
+    but independently on each axis. The proportion of rows in which all axes repeat is therefore compared with the
+    product of the proportions for the individual axes. The rows are kept, because the search for noise effects
+    describes the repeats.
 
     Parameters
     ----------

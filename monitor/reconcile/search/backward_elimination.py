@@ -31,7 +31,7 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull
-from monitor.reconcile.effect_table import EFFECT_TABLE, PENALTY_NATS, SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import EFFECT_PROPERTIES, PENALTY_NATS, SIZE_PARAMETERS
 from monitor.reconcile.likelihood.effect_roles import effect_size, with_effect_size
 from monitor.reconcile.likelihood.hypothesis_fit import (
     RESIZE_PENALTY_NATS,
@@ -160,7 +160,7 @@ def share_frequency_or_time(a: Effect, b: Effect) -> bool:
     """
     if type(a) is not type(b) and not (isinstance(a, PEAKS) and isinstance(b, PEAKS)):
         return False
-    row = EFFECT_TABLE[a.name]
+    row = EFFECT_PROPERTIES[a.name]
     first, second = getattr(a, row.identity, None), getattr(b, row.identity, None)
     if not isinstance(first, float) or not isinstance(second, float):
         return False
@@ -188,7 +188,7 @@ def _with_merged_peaks(hypothesis: Hypothesis) -> Hypothesis:
 def _merge_peaks(hypothesis: Hypothesis, low: Sinusoidal | Narrowband, high: Sinusoidal | Narrowband) -> Hypothesis:
     axis = hypothesis.axis
     rest = tuple(effect for effect in hypothesis.added if effect is not low and effect is not high)
-    other_effects = (*hypothesis.effects[: hypothesis.given_count], *rest)
+    other_effects = (*hypothesis.effects[: hypothesis.model_effect_count], *rest)
     middle = 0.5 * (low.frequency + high.frequency)
     width = max(high.frequency - low.frequency, *(getattr(one, "bandwidth", 0.0) for one in (low, high)))
     merged: Effect = Narrowband(sigma=axis.cosine_transform_rms, frequency=middle, bandwidth=width)

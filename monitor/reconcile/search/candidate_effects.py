@@ -40,7 +40,7 @@ from monitor.reconcile.diagnostics.whiteness_tests import (
     find_peak_gains_and_frequencies,
     fitted_variance_gain_nats,
 )
-from monitor.reconcile.effect_table import PENALTY_NATS
+from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.effect_roles import linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import find_maximum_by_golden_section, fit_shape_parameter

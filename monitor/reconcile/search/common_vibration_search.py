@@ -24,7 +24,7 @@ from monitor.common.distributions import HALF_CHI2_95
 from monitor.noise.effect import AxisLeak
 from monitor.noise.effects import CommonVibration, ExponentiallyCorrelated, Narrowband
 from monitor.reconcile.diagnostics.null_distribution import AxisNull
-from monitor.reconcile.effect_table import PENALTY_NATS
+from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.hypothesis_fit import (
     RESIZE_PENALTY_NATS,

@@ -27,7 +27,7 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
-from monitor.reconcile.effect_table import ONE_TIME_EFFECTS, SERIES_SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import ONE_TIME_EFFECTS, SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices

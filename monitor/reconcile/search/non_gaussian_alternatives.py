@@ -21,7 +21,7 @@ from monitor.noise.effects import (
     RandomTelegraph,
     RateRandomWalk,
 )
-from monitor.reconcile.effect_table import PENALTY_NATS
+from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size
 from monitor.reconcile.likelihood.event_process_likelihood import BackgroundNoise
@@ -166,9 +166,11 @@ def _with_original_walks(hypothesis: Hypothesis) -> tuple[Effects, frozenset[int
     Random walks of the noise model have the original size.
     """
     walks = frozenset(at for at, effect in enumerate(hypothesis.model) if isinstance(effect, WALK_EFFECTS))
-    known = [hypothesis.model[at] if at in walks else hypothesis.effects[at] for at in range(hypothesis.given_count)]
+    known = [
+        hypothesis.model[at] if at in walks else hypothesis.effects[at] for at in range(hypothesis.model_effect_count)
+    ]
     fixed_noise = frozenset(
-        at for at in range(hypothesis.given_count) if at in hypothesis.fit.fixed_noise or at in walks
+        at for at in range(hypothesis.model_effect_count) if at in hypothesis.fit.fixed_noise or at in walks
     )
     return (*known, *(one for one in hypothesis.added if not isinstance(one, WALK_EFFECTS))), fixed_noise
 
@@ -197,7 +199,7 @@ def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussian
     compared = compare_telegraph_with_correlated_noise(series, tau0_s, background, noise.sigma, noise.correlation_time)
     amplitude, dwell = (float(compared.parameters[name].value) for name in ("amplitude", "dwell_time"))
     effect = RandomTelegraph(amplitude=amplitude, dwell_time=dwell)
-    added = (*hypothesis.effects[hypothesis.given_count : index], *hypothesis.effects[index + 1 :], effect)
+    added = (*hypothesis.effects[hypothesis.model_effect_count : index], *hypothesis.effects[index + 1 :], effect)
     return NonGaussianAlternative(added, compared.gain, compared.parameters, compared.events)
 
 
@@ -208,11 +210,11 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
     """
     steps = sum(isinstance(effect, BiasStep) for effect in hypothesis.added)
     walks = [at for at, effect in enumerate(hypothesis.effects) if isinstance(effect, RateRandomWalk)]
-    if not steps and not any(at >= hypothesis.given_count or at in hypothesis.fit.fitted_noise for at in walks):
+    if not steps and not any(at >= hypothesis.model_effect_count or at in hypothesis.fit.fitted_noise for at in walks):
         return None
     effects, fixed_noise = _with_original_walks(hypothesis)
     without = hypothesis.axis.fit(effects, fixed_noise)
-    known = max((effect_size(effects[at]) for at in walks if at < hypothesis.given_count), default=0.0)
+    known = max((effect_size(effects[at]) for at in walks if at < hypothesis.model_effect_count), default=0.0)
     walk = hypothesis.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), fixed_noise)
     excess = effect_size(walk.effects[-1])
     background = build_background_noise(without.effects)
@@ -227,7 +229,7 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
         )
         gain = compared.gain + STEP_PENALTY_NATS * max(compared.single_steps - MAX_FREE_STEPS, 0)
     rate, height = (float(compared.parameters[name].value) for name in ("rate", "height"))
-    added = (*effects[hypothesis.given_count :], PoissonSteps(rate=rate, height=height))
+    added = (*effects[hypothesis.model_effect_count :], PoissonSteps(rate=rate, height=height))
     return NonGaussianAlternative(
         added, gain - POISSON_PENALTY_NATS, compared.parameters, compared.events, poisson_log_likelihood=whole
     )
@@ -240,13 +242,15 @@ def compare_poisson_with_added_noise(hypothesis: Hypothesis) -> NonGaussianAlter
     nor single steps. Return None if the hypothesis contains neither correlated noise nor a resized bias instability.
     """
     replaced = [effect for effect in hypothesis.added if isinstance(effect, (ExponentiallyCorrelated, *WALK_EFFECTS))]
-    resized = [at for at in hypothesis.fit.fitted_noise if at < hypothesis.given_count]
+    resized = [at for at in hypothesis.fit.fitted_noise if at < hypothesis.model_effect_count]
     slow = {at for at in resized if isinstance(hypothesis.effects[at], (BiasInstability, RateRandomWalk))}
     if not any(isinstance(effect, ExponentiallyCorrelated) for effect in replaced) and not any(
         isinstance(hypothesis.effects[at], BiasInstability) for at in slow
     ):
         return None
-    known = [hypothesis.model[at] if at in slow else hypothesis.effects[at] for at in range(hypothesis.given_count)]
+    known = [
+        hypothesis.model[at] if at in slow else hypothesis.effects[at] for at in range(hypothesis.model_effect_count)
+    ]
     others = [effect for effect in hypothesis.added if effect not in replaced]
     walk = RateRandomWalk(K=initial_effect_size(hypothesis.axis))
     fit = hypothesis.axis.fit((*known, *others, walk), hypothesis.fit.fixed_noise | slow)

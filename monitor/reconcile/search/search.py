@@ -26,7 +26,7 @@ from monitor.noise.effects import (
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
 from monitor.reconcile.diagnostics.plot_data import build_plot_data
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
-from monitor.reconcile.effect_table import MOST_DIRECT_DIAGNOSTIC, ONE_TIME_EFFECTS, PENALTY_NATS, SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import MOST_DIRECT_DIAGNOSTIC, ONE_TIME_EFFECTS, PENALTY_NATS, SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size, is_noise_effect
 from monitor.reconcile.likelihood.hypothesis_fit import (

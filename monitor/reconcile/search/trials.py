@@ -37,7 +37,7 @@ from monitor.noise.effects import (
 )
 from monitor.noise.effects.disturbances.heavy_tails import DEGREES_OF_FREEDOM
 from monitor.reconcile.diagnostics.whiteness_tests import STEP_MARGIN_FRACTION
-from monitor.reconcile.effect_table import PENALTY_NATS
+from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size, linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import (

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from math import hypot, sqrt
 from typing import Final, Literal
 
-from monitor.reconcile.effect_table import ONE_TIME_EFFECTS
+from monitor.reconcile.effect_properties import ONE_TIME_EFFECTS
 from monitor.reconcile.result import AddedOrResizedEffect, AxisResult, DiagnosticGap, Reconciliation
 
 Meaning = Literal["contradiction", "too_faint", "other_name", "unnamed", "may_differ"]

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from monitor.noise.effect import Effect
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.effect_table import EFFECT_TABLE
+from monitor.reconcile.effect_properties import EFFECT_PROPERTIES
 from monitor.reconcile.result import AddedOrResizedEffect, ParameterInterval
 
 INTERVAL_STRETCH: Final = 2.0
@@ -22,7 +22,7 @@ SAMPLE_RATE_EFFECT: Final = "sample_rate_error"
 
 def identifying_parameter_name(effect: str) -> str:
     """Return the name of the identifying parameter of an effect, or an empty string."""
-    return EFFECT_TABLE[effect].identity if effect in EFFECT_TABLE else ""
+    return EFFECT_PROPERTIES[effect].identity if effect in EFFECT_PROPERTIES else ""
 
 
 def find_identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseModel) -> ParameterInterval | None:
@@ -69,7 +69,7 @@ def distance_if_parameters_match(effect: str, a: ParameterInterval | None, b: Pa
         return 0.0
     if isinstance(a.value, str) or isinstance(b.value, str):
         return 0.0 if a.value == b.value else None
-    share = EFFECT_TABLE[effect].tolerance
+    share = EFFECT_PROPERTIES[effect].tolerance
     (lo, hi), (other_lo, other_hi) = _widened_interval(a, share), _widened_interval(b, share)
     return _relative_difference(a.value, b.value) if lo <= other_hi and other_lo <= hi else None
 

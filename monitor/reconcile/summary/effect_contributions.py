@@ -41,7 +41,7 @@ from monitor.noise.effects import (
 )
 from monitor.noise.spectrum import allan_variance_of_density
 from monitor.reconcile.diagnostics.whiteness_tests import fitted_variance_gain_nats
-from monitor.reconcile.effect_table import SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
@@ -80,7 +80,7 @@ def decompose_explained_gain(search: AxisSearchResult, fitted_first: bool) -> di
         True if the model was fitted to the same recording. Changed sizes then have no gain.
     """
     hypothesis = search.hypothesis
-    left = set(range(hypothesis.given_count, len(hypothesis.effects)))
+    left = set(range(hypothesis.model_effect_count, len(hypothesis.effects)))
     if not fitted_first:
         left.update(changed_sizes(hypothesis))
     gains: dict[int, float] = {}
@@ -111,7 +111,7 @@ def fit_without(hypothesis: Hypothesis, removed: Collection[int]) -> AxisFit:
     effects: list[Effect] = []
     fixed: set[int] = set()
     for at, effect in enumerate(hypothesis.effects):
-        if at in removed and at >= hypothesis.given_count:
+        if at in removed and at >= hypothesis.model_effect_count:
             continue
         if at in removed or at in hypothesis.fit.fixed_noise:
             fixed.add(len(effects))
@@ -122,7 +122,7 @@ def fit_without(hypothesis: Hypothesis, removed: Collection[int]) -> AxisFit:
 def _gains_outside_spectrum(search: AxisSearchResult) -> dict[int, float]:
     hypothesis = search.hypothesis
     found: dict[int, float] = {}
-    for at in range(hypothesis.given_count, len(hypothesis.effects)):
+    for at in range(hypothesis.model_effect_count, len(hypothesis.effects)):
         effect = hypothesis.effects[at]
         if isinstance(effect, (Resolution, Saturation, RandomSampleHold)):
             found[at] = value_artifact_gain(hypothesis.fit, type(effect))

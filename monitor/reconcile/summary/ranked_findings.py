@@ -18,7 +18,7 @@ from typing import Final
 from drivers.data_types import AXES
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
-from monitor.reconcile.effect_table import NOISE_SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import NOISE_SIZE_PARAMETERS
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AllanInfluence,

@@ -39,7 +39,7 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
     "without change detection": ("alarms_per_day = 0.0", NO_VIEWER),
     "publish at 1 Hz": ('publish = "1 Hz"\nrefit = "1 Hz"', NO_VIEWER),
 }
-"""Keys of each device and tables of the configuration, by the part of the daemon that is switched on or off."""
+"""Device keys and configuration tables, grouped by the part of the daemon that they switch on or off."""
 
 
 class PublishedMessages:

@@ -25,7 +25,7 @@ from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import fit_arma, stationary_covariance
 from monitor.drift.compensation.compensation_score import AxisCompensation
-from monitor.drift.compensation.compensator import Compensator
+from monitor.drift.compensation.gyro_drift_compensator import Compensator
 from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.thermal.interval_means import compute_interval_means

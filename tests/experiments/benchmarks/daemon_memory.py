@@ -3,8 +3,8 @@
     python -m tests.experiments.benchmarks.daemon_memory [--devices 1 3] [--rate 100] [--parts default ...]
 
 Another process writes the frames of one hour at many times the rate of the sensors, so the daemon withholds the
-coefficients, but it fills all windows. The kernel reports the resident pages by their origin (/proc/<pid>/smaps). The
-samples are counted with 64 bytes: time, six axes and temperature.
+coefficients, but it fills all windows. The kernel reports the resident pages by their origin (/proc/<pid>/smaps). Each
+sample is counted as 64 bytes: time, six axes and temperature.
 """
 
 import argparse

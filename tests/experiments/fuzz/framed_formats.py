@@ -123,7 +123,7 @@ INERTIAL_SENSE_SETS: Final = {"pimu": (3, 40, 16), "imu": (58, 36, 12), "imu_raw
 
 
 def _inertial_sense_wrap(data: bytes, settings: Settings) -> bytes:
-    """Build a packet with any values and often a valid time and duration, or another packet."""
+    """Build a packet with arbitrary values, often with a valid time and duration, or a packet of another type."""
     number, size, start = INERTIAL_SENSE_SETS[settings.get("data_set", "pimu")]
     head, payload = data[:1], data[1 : 1 + size].ljust(size, b"\0")
     if head < b"\xc0":

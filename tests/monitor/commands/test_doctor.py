@@ -19,7 +19,7 @@ from drivers.driver import AxisMap
 from drivers.host.extras import install_command
 from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter
-from monitor.commands.doctor import devices, examine_machine, machine, network
+from monitor.commands.doctor import devices, examine_machine, installation_and_clock, network
 from monitor.commands.doctor.finding import Finding, worst_mark
 from monitor.commands.doctor.storage import SAMPLE_BYTES, check_disk_space, recorded_bytes_per_day
 from monitor.common.compiled import kernel_cache_folder
@@ -370,9 +370,9 @@ def test_sample_size_estimate_agrees_with_a_packed_segment(tmp_path: Path) -> No
 
 
 def test_installed_libraries_satisfy_the_requirements() -> None:
-    found = machine.check_library_versions()
+    found = installation_and_clock.check_library_versions()
     assert [finding.mark for finding in found] == ["well"], found
-    required = {one.name: optional for one, optional in machine.library_requirements()}
+    required = {one.name: optional for one, optional in installation_and_clock.library_requirements()}
     assert required["numpy"] is False
     assert required["rerun-sdk"] is True
     assert "pytest" not in required
@@ -383,7 +383,9 @@ def test_kernel_cache_folder_is_none_only_if_nothing_is_writable(tmp_path: Path)
     assert kernel_cache_folder() is not None
     program = "from monitor.common.compiled import kernel_cache_folder; print(kernel_cache_folder())"
     copy = tmp_path / "copy"
-    shutil.copytree(Path(machine.__file__).parents[2], copy / "monitor", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        Path(installation_and_clock.__file__).parents[2], copy / "monitor", ignore=shutil.ignore_patterns("__pycache__")
+    )
     (copy / "monitor" / "common" / "__pycache__").touch()  # no folder can be created at this path
     (tmp_path / "file").touch()
     environment = {**os.environ, "PYTHONPATH": str(copy), "HOME": str(tmp_path / "file")}
@@ -402,7 +404,7 @@ def test_kernel_cache_folder_is_none_only_if_nothing_is_writable(tmp_path: Path)
 
 
 def test_clock_check_advises_only_if_not_synchronised() -> None:
-    found = machine.check_clock()
+    found = installation_and_clock.check_clock()
     assert found.mark in ("well", "doubt")
     assert bool(found.do) == ("not synchronised" in found.text)
 
@@ -418,9 +420,10 @@ def test_clock_check_advises_only_if_not_synchronised() -> None:
     ],
 )
 def test_systemd_unit_state_is_rated(properties: dict[str, str], mark: str) -> None:
-    assert [finding.mark for finding in machine.check_systemd_unit_state({"LoadState": "loaded", **properties})] == [
-        mark
-    ]
+    assert [
+        finding.mark
+        for finding in installation_and_clock.check_systemd_unit_state({"LoadState": "loaded", **properties})
+    ] == [mark]
 
 
 # --- the command

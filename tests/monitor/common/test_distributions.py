@@ -45,7 +45,7 @@ def test_student_quantile(probability: float) -> None:
 
 
 def test_incomplete_beta() -> None:
-    """Cover F tests of up to 1000 and 20 degrees of freedom; near 1, the test covers the complement."""
+    """Cover F tests with up to 1000 and 20 degrees of freedom; for probabilities near 1, test the complement."""
     x = np.concatenate([[0.0, 1.0], np.linspace(0.001, 0.999, 201), np.geomspace(1e-9, 1e-3, 61)])
     for a in (*(0.5 * np.arange(1, 20)), *(0.5 * np.arange(20, 160, 7)), 250.0, 500.0):
         for b in 0.5 * np.arange(1, 21):

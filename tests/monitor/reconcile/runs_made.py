@@ -1,4 +1,4 @@
-"""Reconciliations of one sensor without a search, with the line of ``samples`` on gz and other effects."""
+"""Reconciliations of one sensor without a search, with the spectral line from ``samples`` on gz plus other effects."""
 
 from collections.abc import Sequence
 from dataclasses import replace

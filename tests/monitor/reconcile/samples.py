@@ -86,7 +86,7 @@ def agrees(fitted_first: bool = False) -> Reconciliation:
 
 
 def explained() -> Reconciliation:
-    """Return a result with two steps on gz: a new line and another size of the white noise."""
+    """Return a result with two steps on gz: a new line and a changed white-noise level."""
     start = look("gz", n_true=MORE_N, line=True)
     with_line = look("gz", n_true=MORE_N, line=True, known_line=True)
     with_all = look("gz", n_model=MORE_N, n_true=MORE_N, line=True, known_line=True)

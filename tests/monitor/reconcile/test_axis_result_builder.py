@@ -195,7 +195,7 @@ def test_gaps_before_a_step_are_those_of_the_old_model_and_after_it_those_of_the
 
 
 def test_unreduced_gap_is_still_reported():
-    """A search whose final gap equals its first gap has a step and is partly explained."""
+    """A search with a step whose final gap equals its first gap counts as partly explained."""
     one = search_effect("line")
     again = replace(one, final=one.rounds[0].before)
     assert build_axis_result(again, STRICT, STRICT).verdict == "partly_explained"

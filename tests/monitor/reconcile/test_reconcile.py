@@ -1,4 +1,4 @@
-"""Tests of the complete reconciliation of ten minutes of three axes with no, one or several hidden effects."""
+"""Tests of a complete reconciliation of a ten-minute, three-axis recording with zero, one or several hidden effects."""
 
 import json
 from concurrent.futures import ThreadPoolExecutor
@@ -53,7 +53,7 @@ n = 60_000
 
 
 def make_changing_temperature(size):
-    """Return a temperature in °C that is no sine, so that no line can replace it, shape [size]."""
+    """Return a non-sinusoidal temperature in °C, which a spectral line cannot imitate, shape [size]."""
     t = np.arange(size) / size
     return 25.0 + 6.0 * np.abs(t - 0.35) + 2.0 * np.sin(2 * np.pi * 2.3 * t**2)
 

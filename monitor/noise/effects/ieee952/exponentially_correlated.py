@@ -36,7 +36,7 @@ class ExponentiallyCorrelated(Source):
         return gauss_markov_spectrum(self.sigma, 1.0 / self.correlation_time, tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
-        """Start a stationary series of the recursion x ← φx + σ√(1 − φ²) w with white noise w."""
+        """Initialize a stationary series given by the recursion x ← φx + σ√(1 − φ²) w with white noise w."""
         step = 1.0 / (self.correlation_time * rate_hz)
         phi, drive = float(np.exp(-step)), self.sigma * float(np.sqrt(-np.expm1(-2.0 * step)))
         state = self.sigma * float(rng.standard_normal())

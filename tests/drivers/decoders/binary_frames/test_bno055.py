@@ -1,7 +1,7 @@
 """Tests of the BNO055 decoder: registers and units of the data sheet, errors, modes and damaged answers.
 
 No public source contains an answer with the registers 0x00 to 0x3B. The answers are synthetic: they follow the register
-map of the data sheet, with its values of the identifiers and its default values of the registers.
+map of the data sheet, with its identifiers and default register values.
 """
 
 import struct

@@ -1,7 +1,8 @@
 """Tests of the decoder of Inertial Sense packets: checksum of published packets, layouts, status and other packets.
 
-The first three published packets are from the ISB page of the manual, the fourth is from a public script. No packet of
-a device with samples is public. The packets with samples are synthetic: they follow data_sets.h of the SDK.
+The first three published packets are from the ISB page of the manual, the fourth is from a public script. No packet
+with samples from a real device has been published. The packets with samples are synthetic: they follow data_sets.h of
+the SDK.
 """
 
 import struct

@@ -327,7 +327,7 @@ def _build_decoder(name: str) -> Decoder:
     return decoder
 
 
-def check_ros2(data: bytes) -> None:
+def check_ros2_routers(data: bytes) -> None:
     """Check that the values and the time of each sample are those of a CDR message."""
     reader = InputReader(data)
     rate = reader.choose(RATES_HZ)
@@ -505,7 +505,7 @@ for _name in ("iio", "ros2_imu", "samples"):
 NON_STREAM_TARGETS: Final = {
     "dbc": (check_dbc, _can_seeds),
     "iio": (check_iio, _iio_seeds),
-    "ros2_imu": (check_ros2, _ros2_seeds),
+    "ros2_imu": (check_ros2_routers, _ros2_seeds),
     "samples": (check_samples, _samples_seeds),
 }
 for _name in DECODER_NAMES:

@@ -34,7 +34,8 @@ def compare_with_cubic(seed, lag_h, noise):
     ("lag_h", "noise", "max_ratio"), [(1, 0.05, 0.65), (2, 0.05, 0.45), (4, 0.05, 0.3), (4, 0.02, 0.15)]
 )
 def test_delayed_temperature_effect_is_modelled(lag_h, noise, max_ratio):
-    """The paper reports 0.654 of a cubic's error; docs/measurements/thermal-models.md has the medians of 200 seeds."""
+    """The paper reports an error 0.654 times that of a cubic; docs/measurements/thermal-models.md lists the medians
+    over 200 seeds."""
     ratios, inside, found = zip(*(compare_with_cubic(seed, lag_h, noise) for seed in range(6)), strict=True)
     assert np.median(ratios) < max_ratio
     assert np.mean(inside) > 0.9

@@ -11,7 +11,7 @@ from tests.monitor.publishing.example_results import make_estimate
 
 
 def draw_example() -> dict[str, Any]:
-    """Return the Rerun components that the plots of an example log, by path."""
+    """Return the Rerun components logged by the plots of an example, by path."""
     logged: dict[str, Any] = {}
     AllanPlotPair(lambda path, *parts: logged.update({path: parts[0]}), "d").draw(make_estimate(), None)
     return logged

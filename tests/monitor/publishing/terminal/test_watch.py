@@ -188,7 +188,7 @@ def test_full_disk_is_an_error() -> None:
 
 @pytest.mark.skipif(shutil.which("jq") is None, reason="jq is not installed")
 def test_jq_filters_of_the_documentation() -> None:
-    """The filters of docs/reference/messages.md print the numbers of a message."""
+    """The filters in docs/reference/messages.md print the numeric values in a message."""
     text = (Path(__file__).parents[4] / "docs" / "reference" / "messages.md").read_text()
     filters = re.findall(r"watch --json '(\S+/(\w+))' \| jq (-r )?'([^']+)'", text)
     assert [topic for _, topic, _, _ in filters] == ["coefficients", "samples"]

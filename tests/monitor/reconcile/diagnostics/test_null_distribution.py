@@ -29,7 +29,7 @@ def upper_quartile(diagnostic):
 
 
 def draw_findings(count, rng, shift=0.0):
-    """Draw gains that exceed the upper quartile in a quarter of the recordings, by an exponential excess."""
+    """Draw gains of which a quarter exceed the upper quartile, with an exponentially distributed excess."""
     found = []
     for _ in range(count):
         excess = rng.exponential(size=len(DIAGNOSTICS)) - np.log(4.0) + shift

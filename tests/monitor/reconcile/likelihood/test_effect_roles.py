@@ -7,7 +7,7 @@ import pytest
 
 from monitor.noise.effect import AxisLeak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, Sinusoidal, TemperatureBias
-from monitor.reconcile.effect_table import NOISE_SIZE_PARAMETERS, SERIES_SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import NOISE_SIZE_PARAMETERS, SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.effect_roles import (
     build_unit_regressors,
     effect_size,

@@ -1,4 +1,5 @@
-"""Tests that outliers are distinguished from other heavy tails, and of their estimated scale and fraction."""
+"""Tests that outliers are distinguished from other heavy tails and that their scale and fraction are estimated
+correctly."""
 
 import numpy as np
 import pytest

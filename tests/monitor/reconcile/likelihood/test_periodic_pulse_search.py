@@ -45,7 +45,7 @@ def test_white_noise_stays_below_the_threshold():
     "shape", [SAW, SAW + 2.0 / np.pi * np.sin(2.0 * np.pi * T), make_pulses(1.0, 0.02) - make_pulses(1.0, 0.02, 0.5)]
 )
 def test_other_periodic_shapes_are_no_rectangle(shape):
-    """A sawtooth without its first spectral line is no rectangle either."""
+    """A sawtooth without its first spectral line is not a rectangular wave either."""
     assert not search_pulses(draw_noise(2) + 0.6 * shape)[1].is_rectangular
 
 

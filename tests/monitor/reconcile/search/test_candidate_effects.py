@@ -23,7 +23,7 @@ from monitor.noise.effects import (
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.spectrum import white_noise_spectrum
-from monitor.reconcile.effect_table import PENALTY_NATS
+from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.effect_roles import build_unit_regressors
 from monitor.reconcile.search import candidate_effects as propose
 from monitor.reconcile.search.candidate_effects import _line_frequency, find_broad_spectral_peaks
@@ -212,7 +212,7 @@ def test_other_axes_are_proposed_by_their_kind():
 
 
 def test_shapes_do_not_depend_on_the_initial_sizes():
-    """The sizes of candidates are fitted later, so the unit of the axis changes no shape."""
+    """The sizes of candidates are fitted later, so the unit of the axis does not affect their shapes."""
     y = draw_noise() + correlated(n, np.random.default_rng(8), 5e-4, 0.5)
     one = list_candidates(propose.propose_correlated_noise, axis(y))["exponentially_correlated"]
     scaled = (type(WHITE)(N=1e4 * N), type(WALK)(K=1e4 * WALK.K))

@@ -115,7 +115,8 @@ def test_effect_that_one_half_contradicts_is_not_kept(name):
 
 
 def test_strongest_line_of_noise_is_not_validated():
-    """The strongest line of pure noise gains about twelve nats, which is too little for a decision with halves."""
+    """The strongest line in pure noise gains about twelve nats, which is too little to decide by comparing the halves
+    of the recording."""
     one = axis(draw_noise(4))
     view = whiten(one, MODEL)
     gain, f_hz = find_peak_gains_and_frequencies(view.periodogram, one.rate_hz, 1)[0]

@@ -1,4 +1,4 @@
-"""Tests that of two effects with equal spectra, the simulated effect is named."""
+"""Tests that the simulated effect is identified when two effects have equal spectra."""
 
 import numpy as np
 import pytest

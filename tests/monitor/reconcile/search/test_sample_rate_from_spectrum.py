@@ -6,7 +6,7 @@ import pytest
 from monitor.noise.effect import AxisLeak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Narrowband, SampleRateError, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.effect_table import NOISE_SIZE_PARAMETERS, SERIES_SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import NOISE_SIZE_PARAMETERS, SERIES_SIZE_PARAMETERS
 from monitor.reconcile.search.sample_rate_from_spectrum import convert_effect_to_stated_time, detect_sample_rate_error
 from tests.contracts.effect_examples import make_effect
 from tests.monitor.reconcile.axes import GYRO_AXES, RATE_HZ, WALK, WHITE, axes, make_temperature, recording
@@ -123,7 +123,7 @@ def test_wrong_rate_with_white_noise_alone_changes_its_size():
 
 
 def test_unmoved_line_excludes_a_wrong_rate():
-    """One line has not moved, so the clock is right, although two other lines have moved by one ratio."""
+    """One line has not moved, so the clock is right, although two other lines have moved by the same ratio."""
     plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK)), RATE_HZ)
     third = Sinusoidal(amplitude=6e-5, frequency=23.9, phase=1.0)
     model = plain + NoiseModel({"gy": (LINE, OTHER, third)})

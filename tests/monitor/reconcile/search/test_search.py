@@ -59,7 +59,7 @@ def search_axis(y, model=MODEL, temperature_c=None) -> AxisSearchResult:
 
 def list_added(found):
     """Return the names of the added effects."""
-    return [effect.name for effect in found.hypothesis.effects[found.hypothesis.given_count :]]
+    return [effect.name for effect in found.hypothesis.effects[found.hypothesis.model_effect_count :]]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from monitor.reconcile.effect_table import ONE_TIME_EFFECTS
+from monitor.reconcile.effect_properties import ONE_TIME_EFFECTS
 from monitor.reconcile.result import AddedOrResizedEffect, DiagnosticGap, Location, ParameterInterval, Reconciliation
 from monitor.reconcile.several_recordings.absence import Absence, ClearestOccurrence, explain_absence
 from monitor.reconcile.several_recordings.comparison import NamedResult
@@ -21,7 +21,7 @@ def compute_absence(one: ClearestOccurrence, other: NamedResult) -> Absence:
 
 
 def make_result(score: DiagnosticGap, seconds: float = 600.0) -> Reconciliation:
-    """Return the result of an axis that agrees, with one diagnostic."""
+    """Return the result for an axis that agrees with the model and has one diagnostic."""
     agreeing = run("two", seconds=seconds).result
     gz = agreeing.axes["gz"]
     seen = replace(gz.end, gaps=(score,))
@@ -45,7 +45,8 @@ def test_short_recording_has_smaller_gaps(seconds: float, meaning: str) -> None:
 
 @pytest.mark.parametrize(("gap", "meaning"), [(4.5, "too_faint"), (6.5, "too_faint"), (7.5, "contradiction")])
 def test_scatter_of_the_gaps_is_considered(gap: float, meaning: str) -> None:
-    """The limit is the threshold of 4 plus two standard deviations of two gaps, which scatter by one each."""
+    """The limit is the threshold of 4 plus two standard deviations of the difference between two gaps, each with a
+    standard deviation of one."""
     assert compute_absence(make_shown(line(), gap), run("two")).meaning == meaning
 
 

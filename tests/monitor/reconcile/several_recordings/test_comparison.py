@@ -157,7 +157,7 @@ def test_curved_temperature_effect_is_pooled_at_one_reference() -> None:
 
 
 def test_retuned_term_is_a_contradiction_only_if_its_size_is_another() -> None:
-    """A change of 1 % with an interval of 2 % is insignificant, however large the closed gap is."""
+    """A change of 1 % with an interval of 2 % is insignificant, no matter how much of the gap it closes."""
     for size, half, meaning in ((1.01, 0.02, "too_faint"), (1.2, 0.02, "contradiction")):
         retuned = step("angle_random_walk", kind="retuned", N=around(size * samples.N, half * samples.N))
         seen = get_only_effect(compare_gz(run("a", retuned), run("b")).single)

@@ -1,4 +1,4 @@
-"""Tests of the matching of effects of several recordings by their places."""
+"""Tests that effects in several recordings are matched by location."""
 
 from dataclasses import fields
 
@@ -6,7 +6,7 @@ import pytest
 
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.effect_table import EFFECT_TABLE
+from monitor.reconcile.effect_properties import EFFECT_PROPERTIES
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.several_recordings.effect_matching import (
     distance_if_parameters_match,
@@ -27,7 +27,7 @@ LINES = NoiseModel(
 )
 
 
-@pytest.mark.parametrize("effect", [name for name, row in EFFECT_TABLE.items() if row.identity])
+@pytest.mark.parametrize("effect", [name for name, row in EFFECT_PROPERTIES.items() if row.identity])
 def test_place_is_a_parameter_of_its_effect(effect: str) -> None:
     assert identifying_parameter_name(effect) in {f.name for f in fields(EFFECTS[effect])}  # type: ignore[arg-type]
 

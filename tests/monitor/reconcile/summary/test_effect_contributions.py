@@ -1,4 +1,4 @@
-"""Tests of the parts of the gap, which are complete and never negative, also for quantized values."""
+"""Tests that the parts of the gap are complete and never negative, even for quantized values."""
 
 from functools import cache
 from math import sqrt

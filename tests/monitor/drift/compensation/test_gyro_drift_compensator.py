@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor.drift.compensation.arma import ArmaModel
-from monitor.drift.compensation.compensator import HISTORY_INTERVALS, MAX_PENDING_BLOCKS, Compensator
+from monitor.drift.compensation.gyro_drift_compensator import HISTORY_INTERVALS, MAX_PENDING_BLOCKS, Compensator
 from monitor.drift.compensation.sage_husa import NOT_AT_REST, REJECTED, STEPPED, USED
 
 RATE_HZ = 100.0

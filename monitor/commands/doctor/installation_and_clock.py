@@ -30,7 +30,7 @@ PACKAGES: Final = ("monitor", "drivers")
 
 
 UNCHECKED_EXTRAS: Final = ("test", "fuzz", "all")
-"""Extras for developers, and the extra that repeats all others."""
+"""Extras for developers, and the extra that includes all others."""
 
 
 def check_library_versions() -> list[Finding]:
