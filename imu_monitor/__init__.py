@@ -28,12 +28,12 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 if TYPE_CHECKING:
     from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
     from imu_monitor import effects
+    from imu_monitor._allan_window import AllanWindow
     from imu_monitor._analysis import Analysis, analyze
     from imu_monitor._estimates import AllanEstimate, AxisEstimate, Coefficient, Deviations, plot_allan
     from imu_monitor._models import export_parameters, list_models, load_model, simulate
     from imu_monitor._reconciliation import Reconciliation, reconcile
     from imu_monitor._recordings import Recording, read_recording
-    from imu_monitor._window import AllanWindow
     from monitor.noise.model import NoiseModel
 
     __version__: str
@@ -69,7 +69,7 @@ _MODULES: Final = {
     "imu_monitor._models": ("export_parameters", "list_models", "load_model", "simulate"),
     "imu_monitor._reconciliation": ("Reconciliation", "reconcile"),
     "imu_monitor._recordings": ("Recording", "read_recording"),
-    "imu_monitor._window": ("AllanWindow",),
+    "imu_monitor._allan_window": ("AllanWindow",),
     "monitor.noise.model": ("NoiseModel",),
 }
 """Modules that define the public names, which are imported at their first use."""

@@ -43,7 +43,7 @@ class SampleBlockContext:
 
 
 @dataclass(slots=True)
-class NoiseSeries:
+class RunningSource:
     """Time series of a source during a simulation."""
 
     add_next_samples: Callable[[Floats, SampleBlockContext], object]
@@ -144,7 +144,7 @@ class Source(Effect):
         """
 
     @abstractmethod
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a time series for a simulation.
 
         Parameters

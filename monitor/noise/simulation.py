@@ -24,8 +24,8 @@ from drivers.validation.module_lookup import format_suggestion
 from monitor.noise.effect import (
     AxisLeak,
     Effect,
-    NoiseSeries,
     RunningGain,
+    RunningSource,
     RunningTransform,
     SampleBlockContext,
     Source,
@@ -132,7 +132,7 @@ class ModelStream:
         self._count = 0  # number of samples that have been simulated so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
         self._truths: list[tuple[str, Effect, Callable[[], dict[str, Any]]]] = []
-        self._temperature: NoiseSeries | None = None
+        self._temperature: RunningSource | None = None
         if temperature_c is not None:
             self._temperature = recorded_temperature(temperature_c)
         elif temperature is not None:
@@ -254,8 +254,8 @@ class _AxisSimulator:
     """Simulates the effects on one axis."""
 
     def __init__(self) -> None:
-        self.white: list[NoiseSeries] = []
-        self.others: list[NoiseSeries] = []
+        self.white: list[RunningSource] = []
+        self.others: list[RunningSource] = []
         self.gains: list[RunningGain] = []  # gains of the white noise
         self.factors: list[Callable[[Floats], None]] = []  # functions that multiply the white noise
         self.leaks: list[AxisLeak] = []

@@ -12,7 +12,7 @@ import numpy as np
 from drivers.data_types import Floats
 from drivers.errors import ConfigError
 from drivers.validation.number_ranges import DURATION_S, TEMPERATURE_C
-from monitor.noise.effect import NoiseSeries, ParameterTable, SampleBlockContext, parameter_field
+from monitor.noise.effect import ParameterTable, RunningSource, SampleBlockContext, parameter_field
 from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated
 from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal
 
@@ -53,7 +53,7 @@ class Temperature(ParameterTable):
                 if getattr(self, given) is not None and getattr(self, needed) is None:
                     raise ConfigError(f"temperature: {given} needs a {needed}")
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a simulated time series of the temperature in °C.
 
         Parameters
@@ -63,7 +63,7 @@ class Temperature(ParameterTable):
         rng : numpy.random.Generator
             Random generator of the temperature noise.
         """
-        parts: list[NoiseSeries] = []
+        parts: list[RunningSource] = []
         if self.swing is not None and self.period is not None:
             swing = Sinusoidal(amplitude=self.swing, frequency=1.0 / self.period, phase=0.0)
             swing.check_rate(rate_hz)
@@ -77,10 +77,10 @@ class Temperature(ParameterTable):
             for part in parts:
                 part.add_next_samples(values, block)
 
-        return NoiseSeries(add_temperature_samples)
+        return RunningSource(add_temperature_samples)
 
 
-def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
+def recorded_temperature(temperature_c: Floats) -> RunningSource:
     """Return the temperature of a recording as a time series.
 
     Missing values are replaced by the preceding value. After the end of the recording, the last value is repeated.
@@ -106,4 +106,4 @@ def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
         index = np.arange(block.first, block.first + values.size)
         values += filled[np.minimum(index, filled.size - 1)]
 
-    return NoiseSeries(add_recorded_temperature)
+    return RunningSource(add_recorded_temperature)

@@ -3,15 +3,15 @@
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext
+from monitor.noise.effect import RunningSource, SampleBlockContext
 
 
-def draw_next_samples(series: NoiseSeries, n: int, first_index: int = 0) -> Floats:
+def draw_next_samples(series: RunningSource, n: int, first_index: int = 0) -> Floats:
     """Return the next samples of a time series.
 
     Parameters
     ----------
-    series : NoiseSeries
+    series : RunningSource
         Time series of a source.
     n : int
         Number of samples.

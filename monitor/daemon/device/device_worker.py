@@ -34,6 +34,8 @@ RING_S: Final = 65.536
 """Capacity of the ring buffer in seconds, limited to RING_SAMPLES_RANGE. Samples wait while kernels are compiled."""
 RING_SAMPLES_RANGE: Final = (4096, 1_000_000)
 """Minimum and maximum capacity of the ring buffer in samples."""
+MIN_REPLAY_RING_SAMPLES: Final = 65_536
+"""Minimum capacity for a replayed recording, whose blocks of up to 4096 samples wait for space in the ring buffer."""
 UNKNOWN_RATE_HZ: Final = 1000.0
 """Assumed sample rate for the capacity of the ring buffer if no rate is configured."""
 READ_TIMEOUT_RANGE_S: Final = (0.005, 0.1)
@@ -91,7 +93,9 @@ class DeviceWorker:
         self.device = device
         self.name = device.name
         self.model = read_model_in_force(device)
+        self._replayed = link.epoch == "unix"
         low, high = RING_SAMPLES_RANGE
+        low = MIN_REPLAY_RING_SAMPLES if self._replayed else low
         self.ring = RingBuffer(int(min(max((device.rate_hz or UNKNOWN_RATE_HZ) * RING_S, low), high)))
         timed = _arrivals_are_timed(device, link)
         if isinstance(link, BatchingLink):
@@ -105,7 +109,6 @@ class DeviceWorker:
         # otherwise, a short recording could end before the kernels of change detection are compiled
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         live = device.refit_s != 0.0 and timed and not isinstance(link, ReplayLink)
-        self._replayed = link.epoch == "unix"
         self.pipeline = DevicePipeline(device, self.model, ready, self._replayed, self.waits_for_all, live)
         limits = LimitMonitor(device.limits, self.model)
         self.publisher = ResultPublisher(device, self.driver, self.pipeline, limits, outputs)

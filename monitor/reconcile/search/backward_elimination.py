@@ -251,11 +251,11 @@ def _with_common_factor(
     if min(names) < 1 or sum(names) < 2 or any(_has_absent_term(one) for one in before):
         return dict(searches)
 
-    def fit_with_factor(log_factor: float) -> list[Hypothesis]:
+    def scale_noise_of_hypotheses(log_factor: float) -> list[Hypothesis]:
         return [_with_factor(one, float(np.exp(log_factor))) for one in before]
 
     def total(log_factor: float) -> float:
-        return sum(one.fit.log_likelihood for one in fit_with_factor(log_factor))
+        return sum(one.fit.log_likelihood for one in scale_noise_of_hypotheses(log_factor))
 
     start = max(np.linspace(-3.0, 3.0, 13).tolist(), key=total)
     best = find_maximum_by_golden_section(total, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS)
@@ -266,7 +266,7 @@ def _with_common_factor(
         name: _accept_if_diagnostics_agree(
             search, simpler, null[name], "the factor replaces sizes that concern the whole recording"
         )
-        for (name, search), simpler in zip(searches.items(), fit_with_factor(best), strict=True)
+        for (name, search), simpler in zip(searches.items(), scale_noise_of_hypotheses(best), strict=True)
     }
     return accepted if all(accepted[name] is not one for name, one in searches.items()) else dict(searches)
 

@@ -46,11 +46,15 @@ def test_optional_results_are_computed_only_on_request(recording: Path) -> None:
 @pytest.mark.long
 def test_requested_results_are_all_computed(recording: Path) -> None:
     progress: list[tuple[str, float | None]] = []
+
+    def report_progress(what: str, share: float | None) -> None:
+        progress.append((what, share))
+
     results = analyze_recording(
-        load_recording(recording),
+        load_recording(recording, report_progress=report_progress),
         window_s=30.0,
         total_and_hadamard=True,
-        report_progress=lambda what, share: progress.append((what, share)),
+        report_progress=report_progress,
     )
     assert results.total is not None
     assert results.hadamard is not None

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from monitor.noise.effect import NoiseSeries, Source, parameter_field
+from monitor.noise.effect import RunningSource, Source, parameter_field
 from monitor.noise.spectrum import Spectrum, zero_spectrum
 
 
@@ -25,6 +25,6 @@ class ConstantBias(Source):
         """Return a spectrum with a constant bias and no noise."""
         return replace(zero_spectrum(tau0_s), level=self.value)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a constant series."""
-        return NoiseSeries(lambda values, block: np.add(values, self.value, out=values))
+        return RunningSource(lambda values, block: np.add(values, self.value, out=values))

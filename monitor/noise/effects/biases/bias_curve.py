@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import ConfigError
-from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, RunningSource, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class BiasCurve(BiasWithoutSpectrum):
         if (self.logarithmic is None) != (self.time_constant is None):
             raise ConfigError(f"{self.name}: logarithmic and time_constant need each other")
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a drift at the next sample."""
         count = 0
 
@@ -44,4 +44,4 @@ class BiasCurve(BiasWithoutSpectrum):
                 values += self.logarithmic * np.log1p(t_s / self.time_constant)
             count += values.size
 
-        return NoiseSeries(add_drift)
+        return RunningSource(add_drift)

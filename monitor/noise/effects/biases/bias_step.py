@@ -8,7 +8,7 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.noise.effect import (
     BiasWithoutSpectrum,
-    NoiseSeries,
+    RunningSource,
     SampleBlockContext,
     first_sample_at_or_after,
     parameter_field,
@@ -28,11 +28,11 @@ class BiasStep(BiasWithoutSpectrum):
 
     description: ClassVar[str] = "The bias jumps once and keeps the new value, for example after a knock."
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series with a step. ``time`` is relative to the first sample of the stream."""
         first = first_sample_at_or_after(self.time, rate_hz)
 
         def add_bias_step(values: Floats, block: SampleBlockContext) -> None:
             values[max(0, first - block.first) :] += self.height
 
-        return NoiseSeries(add_bias_step)
+        return RunningSource(add_bias_step)

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, RunningSource, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +25,11 @@ class TemperatureBias(BiasWithoutSpectrum):
     description: ClassVar[str] = "The bias depends on the temperature of the sensor, without delay."
     uses_temperature: ClassVar[bool] = True
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series that depends on the temperature of each sample."""
 
         def add_temperature_bias(values: Floats, block: SampleBlockContext) -> None:
             warmer = block.temperature_c - self.reference
             values += (self.coefficient + ((self.quadratic or 0.0) + (self.cubic or 0.0) * warmer) * warmer) * warmer
 
-        return NoiseSeries(add_temperature_bias)
+        return RunningSource(add_temperature_bias)

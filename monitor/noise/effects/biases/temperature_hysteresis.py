@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, RunningSource, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class TemperatureHysteresis(BiasWithoutSpectrum):
     description: ClassVar[str] = "The bias differs between rising and falling temperature."
     uses_temperature: ClassVar[bool] = True
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series midway between the two branches."""
         state = 0.0
         last_c: float | None = None
@@ -42,7 +42,7 @@ class TemperatureHysteresis(BiasWithoutSpectrum):
             state = _add_hysteresis(values, block.temperature_c, before_c, state, self.height, 1.0 / self.reversal)
             last_c = float(block.temperature_c[-1])
 
-        return NoiseSeries(add_hysteresis)
+        return RunningSource(add_hysteresis)
 
 
 @compiled

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, RunningSource, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class TemperatureLag(BiasWithoutSpectrum):
     description: ClassVar[str] = "The bias follows the temperature of the sensor with a delay."
     uses_temperature: ClassVar[bool] = True
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series whose lagged temperature starts at the first temperature."""
         share = -expm1(-1.0 / (self.time_constant * rate_hz))
         lagged_c: float | None = None
@@ -40,7 +40,7 @@ class TemperatureLag(BiasWithoutSpectrum):
             inside = float(block.temperature_c[0]) if lagged_c is None else lagged_c
             lagged_c = _add_lagged_bias(values, block.temperature_c, inside, self.coefficient, self.reference, share)
 
-        return NoiseSeries(add_lagged_bias)
+        return RunningSource(add_lagged_bias)
 
 
 @compiled

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import BiasWithoutSpectrum, NoiseSeries, SampleBlockContext, parameter_field
+from monitor.noise.effect import BiasWithoutSpectrum, RunningSource, SampleBlockContext, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class TurnOnTransient(BiasWithoutSpectrum):
 
     description: ClassVar[str] = "After the sensor is switched on, the bias decays exponentially to its final value."
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a transient at the next sample."""
         step, count = 1.0 / (self.time_constant * rate_hz), 0
 
@@ -33,7 +33,7 @@ class TurnOnTransient(BiasWithoutSpectrum):
             _add_decay(values, count, self.amplitude, step)
             count += values.size
 
-        return NoiseSeries(add_decay)
+        return RunningSource(add_decay)
 
 
 @compiled

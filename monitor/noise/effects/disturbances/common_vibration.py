@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from monitor.noise.effect import NoiseSeries, Source, parameter_field
+from monitor.noise.effect import RunningSource, Source, parameter_field
 from monitor.noise.effects.disturbances.narrowband import start_resonance
 from monitor.noise.gauss_markov_avar_and_spectrum import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
@@ -43,6 +43,6 @@ class CommonVibration(Source):
         peaks = () if self.frequency is None else ((self.frequency, self.bandwidth),)
         return replace(gauss_markov_spectrum(self.gain, self._decay, tau0_s), peaks=peaks)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a stationary series."""
         return start_resonance(self.gain, self._decay / rate_hz, rng)

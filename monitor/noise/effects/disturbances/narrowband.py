@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.gauss_markov_avar_and_spectrum import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
@@ -43,12 +43,12 @@ class Narrowband(Source):
         peaks = ((self.frequency, self.bandwidth),)
         return replace(gauss_markov_spectrum(self.sigma, self._decay, tau0_s), peaks=peaks)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a stationary series."""
         return start_resonance(self.sigma, self._decay / rate_hz, rng)
 
 
-def start_resonance(sigma: float, step: complex, rng: np.random.Generator) -> NoiseSeries:
+def start_resonance(sigma: float, step: complex, rng: np.random.Generator) -> RunningSource:
     """Start a stationary series of the real part of the process z ← φz + w.
 
     Parameters
@@ -69,7 +69,7 @@ def start_resonance(sigma: float, step: complex, rng: np.random.Generator) -> No
         white = rng.standard_normal((values.size, 2))
         x, y = _add_resonance(values, white, float(phi.real), float(phi.imag), drive, x, y)
 
-    return NoiseSeries(add_resonance)
+    return RunningSource(add_resonance)
 
 
 @compiled

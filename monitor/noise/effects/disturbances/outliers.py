@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.random_events import RandomEvents
 from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 
@@ -30,7 +30,7 @@ class Outliers(Source):
         """Return the spectrum of white noise with the same mean square as the errors."""
         return white_noise_spectrum(self.fraction * self.scale**2, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series of outliers with geometrically distributed gaps."""
 
         def draw_gaps(n: int) -> Floats:
@@ -42,4 +42,4 @@ class Outliers(Source):
             when, errors = events.take_block_events(block.first, values.size)
             values[when] += errors
 
-        return NoiseSeries(add_errors, lambda: events.drawn_random_values("errors"))
+        return RunningSource(add_errors, lambda: events.drawn_random_values("errors"))

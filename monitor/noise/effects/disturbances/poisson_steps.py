@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.random_events import RandomEvents
 from monitor.noise.spectrum import Spectrum
@@ -38,7 +38,7 @@ class PoissonSteps(Source):
         """Return the spectrum of rate random walk with K² = λh²."""
         return RateRandomWalk(K=self.rate**0.5 * self.height).spectrum(tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series at zero."""
         gap, level = 1.0 / (self.rate / rate_hz) if self.rate > 0.0 else np.inf, 0.0
         events = RandomEvents(
@@ -53,4 +53,4 @@ class PoissonSteps(Source):
                 level += jump
                 values[begin:end] += level
 
-        return NoiseSeries(add_steps, lambda: events.drawn_random_values("heights"))
+        return RunningSource(add_steps, lambda: events.drawn_random_values("heights"))

@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum, allan_variance_of_density
 
 MAX_EXPONENT: Final = 2.9
@@ -51,7 +51,7 @@ class PowerLaw(Source):
 
         return Spectrum(density, lambda tau_s: allan_variance_of_density(density, tau_s, tau0_s, ()), tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a stationary series or, for exponents of at least 1, a series that starts at zero.
 
         The series is y = direct·w + walk·W + Σ weight·s, where w is white noise, W ← W + w, and s ← pole·s + w. For
@@ -76,7 +76,7 @@ class PowerLaw(Source):
             values += series
             values -= start
 
-        return NoiseSeries(add_fractional_noise)
+        return RunningSource(add_fractional_noise)
 
 
 def _fractional_filter(gain: float, d: float) -> tuple[Floats, Floats, float, float]:

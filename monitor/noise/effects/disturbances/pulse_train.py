@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Curve, Spectrum, nan_spectrum
 
 MAX_PERIOD_SAMPLES: Final = 1 << 20
@@ -64,7 +64,7 @@ class PulseTrain(Source):
         overlap = np.maximum(duty - shift, 0.0) + np.maximum(duty - 1.0 + shift, 0.0)
         return np.asarray(self.height**2 * (overlap - duty**2))
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series of pulses. The delay is relative to the first sample of the stream."""
         delay_s = float(rng.uniform(0.0, self.period)) if self.delay is None else self.delay
         period, width = self.period * rate_hz, self.width * rate_hz
@@ -74,7 +74,7 @@ class PulseTrain(Source):
             since = np.arange(block.first, block.first + values.size) - start
             values[np.mod(since, period) < width] += self.height
 
-        return NoiseSeries(add_pulses, lambda: {"delay": delay_s} if self.delay is None else {})
+        return RunningSource(add_pulses, lambda: {"delay": delay_s} if self.delay is None else {})
 
 
 def _spectral_lines(covariance: Floats, tau0_s: float) -> tuple[tuple[float, float], ...]:

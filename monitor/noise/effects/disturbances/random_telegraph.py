@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.gauss_markov_avar_and_spectrum import gauss_markov_spectrum
 from monitor.noise.random_events import RandomEvents
 from monitor.noise.spectrum import Spectrum
@@ -41,7 +41,7 @@ class RandomTelegraph(Source):
         """Return the spectrum of exponentially correlated noise with σ = a/2 and T_c = T/2."""
         return gauss_markov_spectrum(0.5 * self.amplitude, 2.0 / self.dwell_time, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series that begins at one of the two levels, chosen at random."""
         first_level = 0.5 * self.amplitude if rng.random() < 0.5 else -0.5 * self.amplitude
         flips = RandomEvents(lambda n: rng.exponential(self.dwell_time * rate_hz, n), np.zeros, rate_hz)
@@ -56,4 +56,4 @@ class RandomTelegraph(Source):
                 level = -level
             level = -level  # undo the level change at the end of the block
 
-        return NoiseSeries(add_levels, lambda: {"first_level": first_level, **flips.drawn_random_values()})
+        return RunningSource(add_levels, lambda: {"first_level": first_level, **flips.drawn_random_values()})

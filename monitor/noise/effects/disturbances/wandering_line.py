@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum, allan_variance_of_density
 
 FRACTION_TERMS: Final = 100
@@ -64,7 +64,7 @@ class WanderingLine(Source):
             density, lambda tau_s: allan_variance_of_density(density, tau_s, tau0_s, peaks), tau0_s, peaks=peaks
         )
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start an oscillation whose frequency is in its stationary state.
 
         The joint distribution of frequency and phase at the samples is exact. With x = τ0/T, the mean of the phase step
@@ -90,7 +90,7 @@ class WanderingLine(Source):
                 values, white, self.amplitude, decay, drive, cycles, phase, offset_hz
             )
 
-        return NoiseSeries(add_sinusoid, lambda: {"phase": start} if self.phase is None else {})
+        return RunningSource(add_sinusoid, lambda: {"phase": start} if self.phase is None else {})
 
 
 def line_shape(offset_hz: Floats, deviation_hz: float, time_s: float) -> Floats:

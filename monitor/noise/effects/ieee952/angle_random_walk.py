@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -26,7 +26,7 @@ class AngleRandomWalk(Source):
         """Return the spectrum N² and the Allan variance N²/τ."""
         return Spectrum(lambda f: np.full_like(f, self.N**2), lambda tau: self.N**2 / tau, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series of independent samples with the standard deviation N √rate."""
 
         def add_white_noise(values: Floats, block: SampleBlockContext) -> None:
@@ -34,4 +34,4 @@ class AngleRandomWalk(Source):
             white *= self.N * rate_hz**0.5
             values += white
 
-        return NoiseSeries(add_white_noise)
+        return RunningSource(add_white_noise)

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 # fmt: off
@@ -74,7 +74,7 @@ class BiasInstability(Source):
 
         return Spectrum(lambda f: self.B**2 / (2.0 * np.pi * f), avar, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a stationary series y = direct·w + Σ residue·s, with white noise w and s ← pole·s + w."""
         # The output density gain² / (RESPONSE_CONSTANT f) must equal B²/(2πf).
         gain = self.B * np.sqrt(RESPONSE_CONSTANT / (2.0 * np.pi))
@@ -85,7 +85,7 @@ class BiasInstability(Source):
         def add_flicker_noise(values: Floats, block: SampleBlockContext) -> None:
             _add_flicker_noise(values, rng.standard_normal(out=block.scratch), states, poles, residues, direct)
 
-        return NoiseSeries(add_flicker_noise)
+        return RunningSource(add_flicker_noise)
 
 
 def _sampled_allan_variance(m: Floats) -> Floats:

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.gauss_markov_avar_and_spectrum import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
@@ -35,7 +35,7 @@ class ExponentiallyCorrelated(Source):
         """Return the spectrum and the Allan variance in closed form."""
         return gauss_markov_spectrum(self.sigma, 1.0 / self.correlation_time, tau0_s)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Initialize a stationary series given by the recursion x ← φx + σ√(1 − φ²) w with white noise w."""
         step = 1.0 / (self.correlation_time * rate_hz)
         phi, drive = float(np.exp(-step)), self.sigma * float(np.sqrt(-np.expm1(-2.0 * step)))
@@ -45,7 +45,7 @@ class ExponentiallyCorrelated(Source):
             nonlocal state
             state = _add_gauss_markov(values, rng.standard_normal(out=block.scratch), phi, drive, state)
 
-        return NoiseSeries(add_correlated_noise)
+        return RunningSource(add_correlated_noise)
 
 
 @compiled

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -30,7 +30,7 @@ class QuantizationNoise(Source):
             tau0_s,
         )
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a series of differences of white angle noise."""
         scale = self.Q * rate_hz
         last = scale * float(rng.standard_normal())  # last angle error, divided by the sample interval
@@ -44,4 +44,4 @@ class QuantizationNoise(Source):
             values[1:] -= angles[:-1]
             last = float(angles[-1])
 
-        return NoiseSeries(add_differences)
+        return RunningSource(add_differences)

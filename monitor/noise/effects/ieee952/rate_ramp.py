@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -26,7 +26,7 @@ class RateRamp(Source):
         """Return a spectrum with zero density that contains only the slope of the ramp."""
         return Spectrum(np.zeros_like, lambda tau: 0.5 * (self.R * tau) ** 2, tau0_s, slope=self.R)
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a ramp at zero."""
         count = 0
 
@@ -35,4 +35,4 @@ class RateRamp(Source):
             values += self.R / rate_hz * np.arange(count, count + values.size, dtype=np.float64)
             count += values.size
 
-        return NoiseSeries(add_ramp)
+        return RunningSource(add_ramp)

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -34,7 +34,7 @@ class RateRandomWalk(Source):
             tau0_s,
         )
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a random walk at zero."""
         level = 0.0
 
@@ -42,7 +42,7 @@ class RateRandomWalk(Source):
             nonlocal level
             level = _add_random_walk(values, rng.standard_normal(out=block.scratch), self.K / rate_hz**0.5, level)
 
-        return NoiseSeries(add_random_walk)
+        return RunningSource(add_random_walk)
 
 
 @compiled

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum, allan_variance_of_line
 
 RENEWAL_SAMPLES: Final = 64
@@ -38,14 +38,14 @@ class Sinusoidal(Source):
         line = self.frequency, 0.5 * self.amplitude**2
         return Spectrum(np.zeros_like, lambda tau: allan_variance_of_line(*line, tau, tau0_s), tau0_s, lines=(line,))
 
-    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:
         """Start a sinusoid. The time is relative to the first sample of the stream."""
         phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
 
         def add_sinusoid(values: Floats, block: SampleBlockContext) -> None:
             _add_sinusoid(values, block.first, self.amplitude, self.frequency / rate_hz, phase)
 
-        return NoiseSeries(add_sinusoid, lambda: {"phase": phase} if self.phase is None else {})
+        return RunningSource(add_sinusoid, lambda: {"phase": phase} if self.phase is None else {})
 
 
 @compiled
