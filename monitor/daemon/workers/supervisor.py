@@ -186,7 +186,8 @@ class WorkerSupervisor(DaemonProcess):
                 _, command = self._commands.pop(number)
                 getattr(command, reply)(answer)
             case "refuse", (lines,):
-                raise ConfigError(*lines)
+                if not self._stop.is_set():  # otherwise, another worker's refusal has already ended the daemon
+                    raise ConfigError(*lines)
             case "add_device", (name,):
                 for device in self.config.devices:
                     if device.name == name:

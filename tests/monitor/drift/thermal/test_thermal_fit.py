@@ -43,7 +43,7 @@ def test_delayed_temperature_effect_is_modelled(lag_h, noise, max_ratio):
         assert fit.model.shape.difference_equation_order >= 1
         assert max(fit.model.shape.constants_s) == pytest.approx(3600.0 * lag_h, rel=0.7)
         assert fit.model.mean_bias_slope == pytest.approx(BIAS_SLOPE, rel=0.3)
-    for seed in range(2):
+    for seed in range(6):
         # in a single daily cycle, correlated noise explains the hysteresis as well
         two_days, three_days = (
             fit_thermal_model(

@@ -52,7 +52,8 @@ def test_analogue_filter_equals_a_much_faster_digital_filter(cutoff_hz):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("order", "cutoff_hz"), [(1, 3.0), (1, 33.0), (2, 10.0), (3, 10.0), (4, 3.0), (4, 33.0)])
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize("cutoff_hz", [3.0, 10.0, 33.0])
 def test_n_is_correct_for_any_bandwidth(order, cutoff_hz):
     found = analyze_values(simulate_filtered_noise(order, cutoff_hz, 360_000, seed=order))
     assert count_intervals_containing_n(found) >= 4
