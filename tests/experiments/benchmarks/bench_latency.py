@@ -5,7 +5,7 @@
 One process writes VectorNav binary frames at 1 kHz to a pseudo-terminal and records the times. The daemon publishes
 coefficients, and this process receives them over zenoh. The field ``samples`` of a result identifies the newest frame.
 ``newest`` is the latency from the newest frame to the result. ``every`` is the latency from each frame to the first
-result that contains the frame, including the read time-out of the port (10 ms by default).
+result that contains the frame, including the time that received bytes wait for more bytes (4 ms for "every block").
 """
 
 import argparse
