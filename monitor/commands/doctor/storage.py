@@ -18,7 +18,7 @@ from monitor.settings.loading import Config, Storage
 SAMPLE_BYTES: Final = 38.0
 """Size in bytes of a sample with six axes, temperature and counter in a compressed recording.
 
-High-resolution sensors need 32.5 to 33.3 bytes per sample. Coarse-resolution sensors need 17 to 23 bytes.
+High-resolution sensors need 35.5 to 37.1 bytes per sample. Coarse-resolution sensors need 12 to 16 bytes.
 """
 
 
