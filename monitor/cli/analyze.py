@@ -55,5 +55,6 @@ def analyze(
 
         analysis = results.analysis
         print_analysis(analysis.estimate, analysis.axes_of_temperature, analysis.notes, unit_system)
+    output.print_written_files(json, plot)
     if results.lacking:
         raise NotReady(results.lacking)

@@ -53,3 +53,4 @@ def compensate(
         save_compensation_plot(result, plot)
     if json != Path("-"):
         text.print_compensation(result, Console())
+    output.print_written_files(json, out, plot)

@@ -61,6 +61,7 @@ def export(
         name, colon, rest = str(error).partition(": ")
         raise ConfigError(f"{OPTION_NAMES.get(name, name)}{colon}{rest}") from None
     output.write_file_or_stdout("--out", out or Path("-"), text.encode())
+    output.print_written_files(out)
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> "NoiseCoefficients":

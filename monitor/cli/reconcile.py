@@ -61,3 +61,4 @@ def reconcile(
     output.write_json(json, lambda: data)
     if json != Path("-"):
         show(Console())
+    output.print_written_files(json, out / "report.html", out / "model.toml")

@@ -48,6 +48,7 @@ def thermal_fit(
         save_thermal_fit_plot(study, plot)
     if Path("-") not in (json, out):
         text.print_thermal_fit(study, Console())
+    output.print_written_files(json, out, plot)
 
 
 @options.with_loading_options
@@ -77,3 +78,4 @@ def thermal_predict(
         save_thermal_prediction_plot(outlook, plot)
     if json != Path("-"):
         text.print_thermal_prediction(outlook, Console())
+    output.print_written_files(json, plot)

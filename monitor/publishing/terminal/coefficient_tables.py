@@ -26,7 +26,7 @@ from monitor.publishing.coefficient_cells import (
     mark_temperature_axis,
 )
 from monitor.publishing.remote_device_states import DeviceCoefficients
-from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
+from monitor.publishing.terminal.tables import WidthDependentTable, plain_table, print_notes
 
 K_OR_R: Final = "K or R"
 """Text that the tables show for K and R if the data cannot distinguish K from R."""
@@ -58,8 +58,7 @@ def print_analysis(
     curve = estimate.curve
     console.print(f"{curve.n} samples at {estimate.rate_hz:g} Hz, {curve.n / estimate.rate_hz:.6g} s")
     console.print(analysis_table(estimate, axes_of_temperature, units))
-    for note in notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    print_notes(notes, console)
 
 
 def analysis_table(

@@ -889,7 +889,7 @@ def test_model_is_exported(run_program: RunProgram, arguments: tuple[str, ...], 
     assert "source: consumer-mems.toml" in run.out
     for word in message:
         assert word in run.out
-    assert run_program("export", MODEL, "--format", *arguments, "--out", "x").out == ""
+    assert run_program("export", MODEL, "--format", *arguments, "--out", "x").out == "x written\n"
     assert Path("x").read_text() == run.out
 
 
