@@ -86,6 +86,8 @@ class TableOutput(Output):
         self._process(StatusMessage.from_result(device, unix_s, health.received, health))
         for message, newest in self._newest.pop(device, {}).items():
             self._process(message.from_result(device, *newest))
+            if isinstance(newest[-1], Estimate):
+                self.states.set_allan_curve(f"{PREFIX}/{device}", newest[-1].curve)
         if self._redraw is not None:
             self._redraw()
 
