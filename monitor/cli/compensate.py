@@ -24,11 +24,11 @@ def compensate(
         str | None,
         typer.Option(metavar="P,Q", help="Order of the ARMA model of the drift, up to 2,1; by default by a criterion."),
     ] = None,
-    loading: options.Loading = None,
     json: options.JsonFile = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
     ] = None,
+    loading: options.Loading = None,
 ) -> None:
     """Remove the gyro drift from a recording, and write the compensated recording."""
     from rich.console import Console

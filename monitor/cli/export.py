@@ -20,9 +20,10 @@ def export(
         str,
         typer.Option(
             "--format",
-            metavar="kalibr|allan_variance_ros|openvins|vins_fusion|orb_slam3|lio_sam|fast_lio|gtsam|px4_ekf2|"
-            "ardupilot_ekf3|robot_localization|imu_utils|gnss_ins_sim|gyroparams|kalman",
-            help="Program that reads the parameters.",
+            metavar="FORMAT",
+            help="Program that reads the parameters: kalibr, allan_variance_ros, openvins, vins_fusion, orb_slam3, "
+            "lio_sam, fast_lio, gtsam, px4_ekf2, ardupilot_ekf3, robot_localization, imu_utils, gnss_ins_sim, "
+            "gyroparams, kalman.",
         ),
     ],
     source: Annotated[

@@ -28,9 +28,9 @@ def reconcile(
         ),
     ] = None,
     seed: options.ReportSeed = 1,
-    loading: options.Loading = None,
     json: options.JsonFile = None,
     details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
+    loading: options.Loading = None,
 ) -> None:
     """Compare recordings with a noise model, and find the effects that are missing from the model."""
     require_extra("reconcile", "reconcile")

@@ -22,9 +22,9 @@ def thermal_fit(
             metavar="S", help="Averaging interval; also 10min, 1h. By default about 72 intervals per recording."
         ),
     ] = None,
-    loading: options.Loading = None,
     json: options.JsonFile = None,
     plot: PlotPath = None,
+    loading: options.Loading = None,
 ) -> None:
     """Fit the bias of each axis as a function of the temperature and its history."""
     from rich.console import Console
@@ -55,9 +55,9 @@ def thermal_fit(
 def thermal_predict(
     recording: RecordingPath,
     model: Annotated[Path, typer.Option(metavar="MODEL.json", help="Model file that thermal fit has written.")],
-    loading: options.Loading = None,
     json: options.JsonFile = None,
     plot: PlotPath = None,
+    loading: options.Loading = None,
 ) -> None:
     """Predict the bias of another recording with a model, and print the errors of the prediction."""
     from rich.console import Console
