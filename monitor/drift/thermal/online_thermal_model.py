@@ -218,7 +218,7 @@ class OnlineThermalModel:
                 self._means(), len(self._rows) - (self._interval_count - self._new_offset_at)
             )
         except NotReady:
-            # Nothing is lost: the mean residual is the new offset, and the next model selection fits all intervals again.
+            # Nothing is lost: the mean residual is the new offset, and a later model selection fits all intervals again.
             pass
         else:
             size, model = stepped.step, stepped.model
