@@ -9,6 +9,7 @@ import io
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
@@ -70,7 +71,8 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     unit = SystemdNotifier.from_environment(os.environ)
     config = _with_viewer(config, viewer_mode, units)
     console, board, asked = Console(file=sys.stdout), RemoteDeviceRegistry(), threading.Event()
-    table, terminal = LiveTable(console, units=UNIT_SYSTEMS[config.viewer.units]), console.is_terminal
+    table = LiveTable(console, units=UNIT_SYSTEMS[config.viewer.units], begun_s=time.monotonic())
+    terminal = console.is_terminal
     screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
     writers = {"terminal": screen} if terminal else {}
     shared = terminal and _same_file(sys.stdout, sys.stderr)
