@@ -5,6 +5,7 @@ A separate thread writes to the terminal, so that a blocked terminal or pipe can
 
 import contextlib
 import errno
+import gc
 import io
 import os
 import signal
@@ -90,6 +91,7 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
                 if terminal
                 else [TableOutput(board), EventAndStatusLogOutput()]
             )
+            gc.freeze()  # a full collection would examine all imported modules and stop every thread for 0.1 s
             workers = count_workers(config)
             service: DaemonProcess = (
                 Service(config, outputs, unit=unit, writers=writers)
