@@ -51,17 +51,10 @@ class Finding:
         return self.error.partition(":")[0], self.location
 
 
-class _PeakMemory:
-    """Peak memory after the previous input. The system call is slow on some machines, so it is made once per input."""
-
-    resident_bytes = 0
-
-
 @contextmanager
 def enforce_limits() -> Iterator[None]:
     """Turn warnings into errors and limit the address space within the ``with`` block."""
     before = signal.signal(signal.SIGVTALRM, _raise_too_slow)
-    _PeakMemory.resident_bytes = _peak_resident_bytes()
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (mapped + MAX_ADDRESS_SPACE_BYTES, hard))
@@ -76,13 +69,12 @@ def enforce_limits() -> Iterator[None]:
 
 def try_input(target: Target, data: bytes) -> Finding | None:
     """Return the finding that an input causes, or None. Call this within ``enforce_limits``."""
-    resident = _PeakMemory.resident_bytes
+    resident = _peak_resident_bytes()
     signal.setitimer(signal.ITIMER_VIRTUAL, MAX_CPU_S)
     try:
         target.check(data)
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
-        _PeakMemory.resident_bytes = _peak_resident_bytes()
-        grown = _PeakMemory.resident_bytes - resident
+        grown = _peak_resident_bytes() - resident
         if grown > MAX_GROWTH_BYTES:
             raise TooLarge(f"{grown} bytes for an input of {len(data)}")
     except KeyboardInterrupt:
@@ -99,8 +91,10 @@ def _raise_too_slow(_signal: int, _frame: FrameType | None) -> None:
 
 def _peak_resident_bytes() -> int:
     """Return the largest resident memory of the process so far, in bytes."""
-    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return size if sys.platform == "darwin" else size * 1024
+    if sys.platform == "darwin":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # On Linux, both calls return the peak of the process, and this one is up to 200 times as fast.
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_maxrss * 1024
 
 
 def _format_error(error: BaseException) -> str:
