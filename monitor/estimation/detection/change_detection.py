@@ -31,7 +31,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.validation.number_ranges import DAY_S
-from monitor.common.unit_formatting import format_axis_value
+from monitor.common.unit_formatting import COEFFICIENT_NAMES, format_axis_value, sensor_kind
 from monitor.estimation.detection.change_kernel import (
     AFTER,
     BEFORE,
@@ -96,16 +96,6 @@ MAX_CLIPPED_RATIO: Final = 4.0
 
 Q_OR_VIBRATION: Final = "quantization noise or vibration near Nyquist"
 """Description of a change of Q, which can be caused by quantization noise or by a vibration."""
-NOISE_NAMES: Final = {
-    "g": {"Q": Q_OR_VIBRATION, "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
-    "a": {
-        "Q": Q_OR_VIBRATION,
-        "N": "velocity random walk",
-        "B": "bias instability",
-        "K": "acceleration random walk",
-    },
-}
-"""Names of the noise coefficients for gyroscopes (g) and accelerometers (a)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,7 +323,7 @@ class NoiseAndBiasChangeDetector:
 
 
 def _noise_text(axis: str, what: Mapping[str, tuple[float, float]]) -> str:
-    names = NOISE_NAMES[axis[0]]
+    names = COEFFICIENT_NAMES[sensor_kind(axis)] | {"Q": Q_OR_VIBRATION}
     letters = [f"{names[letter]} {_format_change(*what[letter])}" for letter in what if letter in names]
     if letters:
         return ", ".join(letters)
