@@ -259,7 +259,7 @@ def _select_trial(
         if _is_gaussian_and_stationary(whitened, null):
             after, tried = replace_by_likelier_alternative(after, tried)
             whitened = whitened if after.fit is whitened.fit else whiten_axis(after.fit)
-        validation = cross_validate(current.hypothesis, after, added, diagnostic, null[diagnostic], rng)
+        validation = cross_validate(current.hypothesis, after, added, diagnostic, null[diagnostic])
         if validation.kept:
             done = SearchRound(current.findings_and_plots(), tuple(tried), after, validation)
             return done, _diagnose(after, whitened)
