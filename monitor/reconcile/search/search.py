@@ -139,7 +139,9 @@ def search_missing_effects(axis: Axis, model: Effects, null: AxisNull, rng: np.r
             break
         done, current = completed
         rounds.append(done)
-    kept = keep_uncontradicted_effects(current.hypothesis.added, _gains_by_type(rounds), current.findings, null)
+    kept = keep_uncontradicted_effects(
+        current.hypothesis.added, _gains_by_type(rounds), current.findings, null, axis.rate_hz
+    )
     kept, before_withdrawal = _without_zero_sizes(kept), None
     while kept != current.hypothesis.added:
         before_withdrawal = before_withdrawal or current.findings_and_plots()
