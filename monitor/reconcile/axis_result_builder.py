@@ -60,7 +60,7 @@ def build_axis_result(
         True if the original model was fitted to the same recording.
     """
     snapshots = [_snapshot(one.before, null) for one in search.rounds]
-    end = _snapshot(_with_outlier_misfit(search), final_null)
+    end = _snapshot(with_outlier_misfit(search), final_null)
     snapshots.append(end if search.before_withdrawal is None else _snapshot(search.before_withdrawal, null))
     changes = _remaining_changes(search)
     gains = decompose_explained_gain(search, fitted_first)
@@ -78,7 +78,7 @@ def build_axis_result(
     return AxisResult(search.hypothesis.axis.name, decision, snapshots[0], tuple(steps), left_over, end, remaining)
 
 
-def _with_outlier_misfit(search: AxisSearchResult) -> HypothesisDiagnostics:
+def with_outlier_misfit(search: AxisSearchResult) -> HypothesisDiagnostics:
     """Return the final diagnostics, including the misfit that the replacement of outliers removes."""
     if not any(isinstance(effect, Outliers) for effect in search.hypothesis.added):
         return search.final

@@ -24,13 +24,14 @@ from monitor.noise.effects import (
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.standard_terms import UNIT_SOURCES
-from monitor.reconcile.axis_result_builder import build_axis_result
+from monitor.reconcile.axis_result_builder import build_axis_result, with_outlier_misfit
 from monitor.reconcile.diagnostics.null_distribution import (
     SIMULATED_RECORDINGS,
     AxisNull,
     Findings,
     all_simulations_have_improbable_gain,
     estimate_null_distributions,
+    is_significance_clear,
     run_diagnostics,
 )
 from monitor.reconcile.effect_properties import PENALTY_NATS
@@ -145,8 +146,9 @@ def reconcile(
     final = null
     if found.searches_that_changed_model or found.sample_rate_error:
         report_stage("simulating the extended model", None)
-        changed = recording.values if found.sample_rate_error else found.searches_that_changed_model
-        simulated |= _diagnose_simulations(extended, run, seed + SIMULATED_RECORDINGS, changed)
+        changed = found.searches if found.sample_rate_error else found.searches_that_changed_model
+        recorded = {name: with_outlier_misfit(one).findings for name, one in changed.items()}
+        simulated |= _diagnose_simulations(extended, run, seed + SIMULATED_RECORDINGS, changed, recorded)
         final = estimate_null_distributions(simulated)
     report_stage("describing the result", None)
     axes = {
@@ -212,11 +214,16 @@ def _with_floor(effect: Effect, floor: float | None) -> Effect:
 
 
 def _diagnose_simulations(
-    model: NoiseModel, run: RecordingContext, first_seed: int, names: Collection[str]
+    model: NoiseModel,
+    run: RecordingContext,
+    first_seed: int,
+    names: Collection[str],
+    recorded: Mapping[str, Findings] | None = None,
 ) -> dict[str, list[Findings]]:
     """Run the diagnostics on simulated recordings of a model, and return the findings of each named axis.
 
-    An axis with Gaussian noise is simulated until its gains are probable under a true model.
+    An axis with Gaussian noise is simulated until its gains are probable under a true model. If the findings on the
+    recording are given, an axis is only simulated until it is clear which of these findings are significant.
     """
     effects = _effects_by_axis(model, run.recording)
     findings: dict[str, list[Findings]] = {name: [] for name in names}
@@ -228,6 +235,7 @@ def _diagnose_simulations(
             name
             for name in remaining
             if not is_stationary_gaussian(effects[name]) or all_simulations_have_improbable_gain(findings[name])
+            if recorded is None or not is_significance_clear(recorded[name], findings[name], len(names))
         )
         if not remaining:
             break

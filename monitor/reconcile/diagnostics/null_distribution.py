@@ -7,7 +7,8 @@ quartile of the gain. Above q, the density of a gain g is modelled as exp(−(g 
 
 One simulated recording is used to check that the noise model is Gaussian enough. If a gain is improbably large, more
 recordings are simulated. If a gain is improbably large in all ``SIMULATED_RECORDINGS`` recordings, the thresholds are
-raised above the simulated gains if necessary. A model that is not Gaussian is always simulated this number of times.
+raised above the simulated gains if necessary. A model that is not Gaussian is simulated this number of times, or until
+it is clear which findings on the recording are significant (``is_significance_clear``).
 
 If the noise model is true, 1 % of all recordings exceed a threshold in any diagnostic on any axis.
 """
@@ -35,6 +36,8 @@ IMPROBABLE: Final = 0.002
 """A gain is improbably large if its probability is below this value. Another recording is then simulated."""
 AXIS_MARGIN_NATS: Final = 3.0
 """Margin between the largest simulated gain of an axis and the threshold, in nats."""
+CLEAR_GAIN_RATIO: Final = 2.0
+"""Smallest ratio of gain and threshold at which a finding is significant without further simulations."""
 
 Findings = Mapping[str, Finding]
 """Findings of all diagnostics on one axis, by the name of the diagnostic."""
@@ -101,10 +104,33 @@ def run_diagnostics(whitened: WhitenedAxis) -> Findings:
 def all_simulations_have_improbable_gain(findings: Sequence[Findings]) -> bool:
     """Return True if a diagnostic has an improbably large gain in all simulated recordings of an axis."""
     return any(
-        diagnostic not in NULL_GAIN_QUANTILE_PARAMETERS
-        or all(one[diagnostic].gain > _quantile(diagnostic, one[diagnostic], IMPROBABLE) for one in findings)
+        all(one[diagnostic].gain > _quantile(diagnostic, one[diagnostic], IMPROBABLE) for one in findings)
         for diagnostic in DIAGNOSTICS
     )
+
+
+def is_significance_clear(recorded: Findings, simulated: Sequence[Findings], axis_count: int) -> bool:
+    """Return True if further simulations can hardly change which findings of an axis are significant.
+
+    A simulation can only raise a threshold. A finding below the known threshold or below a simulated gain is therefore
+    not significant. A finding is clearly significant if its gain is ``CLEAR_GAIN_RATIO`` times the threshold so far.
+
+    Parameters
+    ----------
+    recorded : Findings
+        Findings on the axis of the recording.
+    simulated : sequence of Findings
+        Findings on the simulated recordings of the axis so far.
+    axis_count : int
+        Number of simulated axes.
+    """
+    chance = _false_alarm_probability_of_one_diagnostic(axis_count)
+    for diagnostic, one in recorded.items():
+        known = _quantile(diagnostic, one, chance)
+        largest = max(findings[diagnostic].gain for findings in simulated)
+        if max(known, largest) < one.gain < CLEAR_GAIN_RATIO * max(known, largest + AXIS_MARGIN_NATS):
+            return False
+    return True
 
 
 def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> dict[str, AxisNull]:
@@ -113,19 +139,20 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
     Parameters
     ----------
     simulated : mapping of str to sequence of Findings
-        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. If an axis has all recordings, its
-        thresholds are raised above the gains if necessary.
+        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. If an axis has all recordings, or
+        if all its recordings have an improbably large gain, its thresholds are raised above the gains if necessary.
     """
-    chance = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * max(len(simulated), 1))
-    complete = [axis for axis, of in simulated.items() if len(of) >= SIMULATED_RECORDINGS]
+    chance = _false_alarm_probability_of_one_diagnostic(len(simulated))
+    complete = [
+        axis
+        for axis, of in simulated.items()
+        if len(of) >= SIMULATED_RECORDINGS or all_simulations_have_improbable_gain(of)
+    ]
     null: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
     for diagnostic in DIAGNOSTICS:
         pooled = [one[diagnostic].gain for axis in complete for one in simulated[axis]]
         for axis, of in simulated.items():
-            expected = [
-                _quantile(diagnostic, of[0][diagnostic], p) if diagnostic in NULL_GAIN_QUANTILE_PARAMETERS else 0.0
-                for p in (0.05, chance)
-            ]
+            expected = [_quantile(diagnostic, of[0][diagnostic], p) for p in (0.05, chance)]
             if axis in complete:
                 own = _simulated_null_distribution(pooled, max(one[diagnostic].gain for one in of), chance)
                 expected = [max(expected[0], own.null95), max(expected[1], own.threshold)]
@@ -149,6 +176,10 @@ def _simulated_null_distribution(pooled: Sequence[float], largest: float, chance
 
 def _quantile(diagnostic: str, found: Finding, probability: float) -> float:
     return NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].quantile(found.places, probability)
+
+
+def _false_alarm_probability_of_one_diagnostic(axis_count: int) -> float:
+    return FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * max(axis_count, 1))
 
 
 def compute_diagnostic_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:

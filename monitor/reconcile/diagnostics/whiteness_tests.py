@@ -228,12 +228,6 @@ def _regressor_gain(whitened: WhitenedAxis, regressors: Sequence[Regressor]) -> 
     return _gain_of_normal_equations(normal, right)
 
 
-def _column_gain(whitened: WhitenedAxis, columns: Sequence[Floats]) -> float:
-    """Return the log-likelihood gain of fitted columns, each of shape (n − 1,)."""
-    stacked = np.stack([column * whitened.weights for column in columns])
-    return _gain_of_normal_equations(stacked @ stacked.T, stacked @ whitened.coefficients)
-
-
 def _gain_of_normal_equations(normal: Floats, right: Floats) -> float:
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     solved, *_ = np.linalg.lstsq(normal / np.outer(scale, scale), right / scale, rcond=1e-9)
@@ -304,7 +298,9 @@ def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> Finding:
     for name, coefficients in whitened.axis.leak_sources.items():
         common = _common_vibration_columns(whitened, coefficients)
         if common:
-            gain = _column_gain(whitened, [coefficients, *common]) - _column_gain(whitened, common)
+            columns = np.stack([column * whitened.weights for column in (coefficients, *common)])
+            normal, right = columns @ columns.T, columns @ whitened.coefficients
+            gain = _gain_of_normal_equations(normal, right) - _gain_of_normal_equations(normal[1:, 1:], right[1:])
         else:
             gain = _regressor_gain(whitened, [(CrossAxis(source=name, coefficient=1.0), 0)])
         if gain > best.gain:

@@ -12,6 +12,7 @@ the larger likelihood is used.
   approximation is suitable for strong lines.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log, pi, sqrt, tanh
 from typing import Final, NamedTuple
@@ -216,13 +217,9 @@ def draw_line(z: Complexes, rate_hz: float, parameters: WanderingLineParameters,
     ndarray of complex128, shape (m,)
         Drawn line. The line is zero if z is too short.
     """
-    lengths = possible_block_lengths(z.size)
-    if not lengths or not parameters.power > 0.0:
+    if not possible_block_lengths(z.size) or not parameters.power > 0.0:
         return np.zeros_like(z)
-    filtered = max(
-        (_transform_and_filter_blocks(z, rate_hz, length, parameters) for length in lengths),
-        key=lambda one: one.log_likelihood,
-    )
+    filtered = filter_with_best_block_length(z, rate_hz, [parameters])
     tracked, phase = phase_log_likelihood(z, rate_hz, track_phase(filtered, z.size), parameters)
     if tracked > filtered.log_likelihood:
         draws = rng.standard_normal((z.size, 2))
@@ -230,7 +227,9 @@ def draw_line(z: Complexes, rate_hz: float, parameters: WanderingLineParameters,
         return np.asarray(sqrt(parameters.power) * np.exp(1j * phase))
     length = filtered.emission.blocks.length
     padded = np.concatenate([z, np.zeros(-z.size % length)])
-    filtered = _transform_and_filter_blocks(padded, rate_hz, length, parameters)
+    filtered = filter_blocks(
+        compute_block_emission(transform_blocks(padded, rate_hz, length), parameters.power), parameters
+    )
     blocks = filtered.emission.blocks
     at = _draw_states(filtered.forward, filtered.transition, np.asarray(rng.random(filtered.forward.shape[0])))
     found = blocks.transforms[np.arange(at.size), at]
@@ -244,15 +243,39 @@ class FilteredBlocks(NamedTuple):
     """Hidden Markov model of the frequency in blocks of z."""
 
     log_likelihood: float
+    parameters: WanderingLineParameters
     emission: BlockEmission
     transition: Floats  # [k, k] probability of each change of the frequency
     forward: Floats  # [b, k] probability of the frequency given this block and all earlier blocks
 
 
-def _transform_and_filter_blocks(
-    z: Complexes, rate_hz: float, length: int, parameters: WanderingLineParameters
+def filter_with_best_block_length(
+    z: Complexes, rate_hz: float, trials: Sequence[WanderingLineParameters]
 ) -> FilteredBlocks:
-    return filter_blocks(compute_block_emission(transform_blocks(z, rate_hz, length), parameters.power), parameters)
+    """Run the forward algorithm with the most likely parameters and block length.
+
+    The likelihood increases with the length of a block until the frequency changes within a block. Longer blocks are
+    therefore not tried after the likelihood has decreased.
+
+    Parameters
+    ----------
+    z : ndarray of complex128, shape (m,)
+        Series in a band, long enough for the shortest block length.
+    rate_hz : float
+        Sample rate of z, Hz.
+    trials : sequence of WanderingLineParameters
+        Possible parameters of the line.
+    """
+    best: FilteredBlocks | None = None
+    for length in possible_block_lengths(z.size):
+        blocks = transform_blocks(z, rate_hz, length)
+        emissions = {power: compute_block_emission(blocks, power) for power in {one.power for one in trials}}
+        found = max((filter_blocks(emissions[one.power], one) for one in trials), key=lambda one: one.log_likelihood)
+        if best is not None and found.log_likelihood < best.log_likelihood:
+            break
+        best = found
+    assert best is not None
+    return best
 
 
 def filter_blocks(emission: BlockEmission, parameters: WanderingLineParameters) -> FilteredBlocks:
@@ -273,7 +296,7 @@ def filter_blocks(emission: BlockEmission, parameters: WanderingLineParameters) 
     transition = _normalised(from_centre - decay * from_centre[:, None], variance * (1.0 - decay**2) + rounding)
     first = _normalised(from_centre[None, :], variance + rounding)[0]
     value, forward = _forward(emission.relative, transition, first)
-    return FilteredBlocks(value + emission.log_scale, emission, transition, forward)
+    return FilteredBlocks(value + emission.log_scale, parameters, emission, transition, forward)
 
 
 @compiled

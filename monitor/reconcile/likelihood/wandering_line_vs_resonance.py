@@ -27,10 +27,10 @@ from monitor.reconcile.likelihood.wandering_line_likelihood import (
     expand_band,
     extract_band,
     filter_blocks,
+    filter_with_best_block_length,
     phase_log_likelihood,
     possible_block_lengths,
     track_phase,
-    transform_blocks,
 )
 from monitor.reconcile.result import ParameterInterval
 
@@ -176,31 +176,23 @@ def _fit_line(
 ) -> tuple[float, WanderingLineParameters, Floats]:
     """Return the log-likelihood, the parameters and the standard deviations of the logarithms of the first three."""
     starts = [
-        (
-            emission,
-            WanderingLineParameters(
-                power * factor, _deviation(width_hz, float(time_s)) * other, float(time_s), centre_hz
-            ),
-        )
-        for length in possible_block_lengths(z.size)
-        for blocks in [transform_blocks(z, rate_hz, length)]
+        WanderingLineParameters(power * factor, _deviation(width_hz, float(time_s)) * other, float(time_s), centre_hz)
         for factor in START_FACTORS
-        for emission in [compute_block_emission(blocks, power * factor)]
         for time_s in np.geomspace(1.0 / rate_hz, 0.25 * z.size / rate_hz, START_TIMES)
         for other in START_FACTORS
     ]
-    emission, start = max(starts, key=lambda one: filter_blocks(*one).log_likelihood)
-    blocks = emission.blocks
+    best = filter_with_best_block_length(z, rate_hz, starts)
+    blocks = best.emission.blocks
 
     def log_likelihood_in_blocks(power: float, deviation_hz: float, time_s: float) -> float:
         parameters = WanderingLineParameters(power, deviation_hz, time_s, centre_hz)
         return filter_blocks(compute_block_emission(blocks, power), parameters).log_likelihood
 
-    value, at = maximise_over_log_parameters(log_likelihood_in_blocks, start[:3])
+    value, at = maximise_over_log_parameters(log_likelihood_in_blocks, best.parameters[:3])
     fitted = _line_parameters(at, centre_hz)
     # the blocks do not resolve the deviation of a narrow line, so the phase is tracked with each start too
     block_phase = track_phase(filter_blocks(compute_block_emission(blocks, fitted.power), fitted), z.size)
-    candidates = dict.fromkeys([fitted, *(one._replace(power=fitted.power) for _, one in starts)])
+    candidates = dict.fromkeys([fitted, *(one._replace(power=fitted.power) for one in starts)])
     tracked, phase, with_tracked = max(
         ((*phase_log_likelihood(z, rate_hz, block_phase, one), one) for one in candidates), key=lambda one: one[0]
     )

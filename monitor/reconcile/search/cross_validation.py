@@ -28,13 +28,12 @@ from monitor.noise.effects import (
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 from monitor.reconcile.effect_properties import ONE_TIME_EFFECTS, SERIES_SIZE_PARAMETERS
-from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
+from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit
 from monitor.reconcile.likelihood.effect_roles import linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
 from monitor.reconcile.preparation.value_artifacts import ValueArtifacts
-from monitor.reconcile.search.sample_repair import repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest log-likelihood gain of an effect in one half of the recording, in nats."""
@@ -72,7 +71,6 @@ def cross_validate(
     added_effect: Effect | None,
     diagnostic: str,
     null: NullDistribution,
-    rng: np.random.Generator,
 ) -> CrossValidationResult:
     """Cross-validate a search step on the two halves of an axis.
 
@@ -86,8 +84,6 @@ def cross_validate(
         Name of the diagnostic that detected the difference.
     null : NullDistribution
         Null distribution of the diagnostic.
-    rng : numpy.random.Generator
-        Generator for the replacement samples.
     """
     if added_effect is not None and added_effect.name in ONE_TIME_EFFECTS:
         return accept_without_validation("the effect happens only once")
@@ -97,9 +93,9 @@ def cross_validate(
     n = after.axis.n
     parts = [slice(0, n // 2), slice(n - n // 2, n)]
     sources = {getattr(effect, "source", "") for effect in (*before.effects, *after.effects)}
-    repaired = [_half_axis(after.axis, part, after.effects, sources, rng) for part in parts]
+    repaired = [_half_axis(after.axis, part, sources) for part in parts]
     if alters_samples:
-        halves = [_half_axis(after.axis, part, before.effects, sources, rng) for part in parts]
+        halves = [_half_axis(before.axis, part, sources) for part in parts]
         gap_before, gap_after = _summed_gap(halves, before, diagnostic), _summed_gap(repaired, after, diagnostic)
         return CrossValidationResult(gap_before, gap_after, gap_after < gap_before, "")
     if added_effect is not None and added_effect.name in SERIES_SIZE_PARAMETERS:
@@ -144,7 +140,8 @@ def _exchange_halves(
     return CrossValidationResult(gap_before, gap_after, bool(better > 0.0 and below), "")
 
 
-def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[str], rng: np.random.Generator) -> Axis:
+def _half_axis(axis: Axis, part: slice, sources: Collection[str]) -> Axis:
+    """Return a half of an axis, with the repaired samples of the whole axis."""
     raw, y = axis.raw[part], axis.repaired[part]
     temperature_c = None if axis.temperature_c is None else axis.temperature_c[part]
     others = {
@@ -152,7 +149,7 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
         for name, one in axis.leak_sources.items()
         if name in sources
     }
-    half = Axis(
+    return Axis(
         axis.name,
         raw,
         y,
@@ -163,7 +160,6 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
         ValueArtifacts(raw),
         axis.regressors.restrict_to_part(part),
     )
-    return repair_axis_again(half, effects, rng)
 
 
 def _expected_gain(fit: AxisFit, effect: Effect) -> float:

@@ -139,7 +139,9 @@ def search_missing_effects(axis: Axis, model: Effects, null: AxisNull, rng: np.r
             break
         done, current = completed
         rounds.append(done)
-    kept = keep_uncontradicted_effects(current.hypothesis.added, _gains_by_type(rounds), current.findings, null)
+    kept = keep_uncontradicted_effects(
+        current.hypothesis.added, _gains_by_type(rounds), current.findings, null, axis.rate_hz
+    )
     kept, before_withdrawal = _without_zero_sizes(kept), None
     while kept != current.hypothesis.added:
         before_withdrawal = before_withdrawal or current.findings_and_plots()
@@ -259,7 +261,7 @@ def _select_trial(
         if _is_gaussian_and_stationary(whitened, null):
             after, tried = replace_by_likelier_alternative(after, tried)
             whitened = whitened if after.fit is whitened.fit else whiten_axis(after.fit)
-        validation = cross_validate(current.hypothesis, after, added, diagnostic, null[diagnostic], rng)
+        validation = cross_validate(current.hypothesis, after, added, diagnostic, null[diagnostic])
         if validation.kept:
             done = SearchRound(current.findings_and_plots(), tuple(tried), after, validation)
             return done, _diagnose(after, whitened)

@@ -32,9 +32,10 @@ from monitor.noise.effects import (
     WanderingLine,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
-from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
+from monitor.reconcile.search.trials import MAX_BAND_FRACTION
 
 MIN_COMB_LINES: Final = 4
 MAX_HARMONIC: Final = 60
@@ -68,7 +69,7 @@ FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")
 
 
 def keep_uncontradicted_effects(
-    added: Effects, explained_gains: Mapping[type[Effect], float], findings: Findings, null: AxisNull
+    added: Effects, explained_gains: Mapping[type[Effect], float], findings: Findings, null: AxisNull, rate_hz: float
 ) -> Effects:
     """Return the added effects that the final diagnostics do not contradict.
 
@@ -82,6 +83,8 @@ def keep_uncontradicted_effects(
         Findings on the axis at the end of the search.
     null : AxisNull
         Null distribution of each diagnostic.
+    rate_hz : float
+        Sample rate in Hz.
     """
 
     def significant_gain_or_zero(diagnostic: str) -> float:
@@ -97,7 +100,7 @@ def keep_uncontradicted_effects(
 
     withdrawn = _overlapping_features(added) | _harmonic_comb(added) | _pulses_with_lines(added)
     for diagnostic in FREQUENCY_DIAGNOSTICS:
-        place = findings[diagnostic].where.frequency
+        place = _resolved_frequency(diagnostic, findings[diagnostic], rate_hz)
         if place is not None:
             candidates = contradicted_effects(Effect, significant_gain_or_zero(diagnostic), MAX_REMAINING_SHARE)
             overlapping = {at for at, effect in enumerate(added) if _overlaps(effect, place)}
@@ -130,11 +133,23 @@ def difference_remains_near_line(line: WanderingLine, before: Findings, whitened
     largest = max(before[diagnostic].gain for diagnostic in FREQUENCY_DIAGNOSTICS)
     for diagnostic in FREQUENCY_DIAGNOSTICS:
         one = DIAGNOSTICS[diagnostic](whitened)
-        if one.gain > max(null[diagnostic].threshold, MAX_REMAINING_SHARE * largest) and one.where.frequency:
+        place = _resolved_frequency(diagnostic, one, whitened.axis.rate_hz)
+        if place and one.gain > max(null[diagnostic].threshold, MAX_REMAINING_SHARE * largest):
             lo, hi = _frequency_range(line)
-            if lo < one.where.frequency[1] and one.where.frequency[0] < hi:
+            if lo < place[1] and place[0] < hi:
                 return True
     return False
+
+
+def _resolved_frequency(diagnostic: str, finding: Finding, rate_hz: float) -> tuple[float, float] | None:
+    """Return the frequency range of a difference, or None if the diagnostic does not resolve its frequency.
+
+    If the power changes in time over a wide band, such as during a knock, the spectrogram does not contradict an effect
+    at one frequency.
+    """
+    place = finding.where.frequency
+    is_wide = place is not None and np.ptp(place) >= MAX_BAND_FRACTION * rate_hz
+    return None if diagnostic == "spectrogram" and is_wide else place
 
 
 def _frequency_range(effect: Effect) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from monitor.reconcile.diagnostics.null_distribution import (
     all_simulations_have_improbable_gain,
     compute_diagnostic_gaps,
     estimate_null_distributions,
+    is_significance_clear,
     run_diagnostics,
 )
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
@@ -104,6 +105,23 @@ def test_improbable_gain_is_discarded_if_the_next_simulation_is_probable():
     assert all_simulations_have_improbable_gain([odd])
     assert not all_simulations_have_improbable_gain([odd, usual])
     assert estimate_null_distributions({"gz": [odd, usual]}) == estimate_null_distributions({"gz": [usual]})
+
+
+def test_simulations_continue_while_the_significance_of_a_finding_is_unclear():
+    simulated = draw_findings(1, np.random.default_rng(6))
+    threshold = estimate_null_distributions({"gz": simulated})["gz"]["psd"].threshold
+    odd = [{**simulated[0], "psd": Finding(3.0 * threshold, Location(), PLACES)}]
+
+    def is_clear(gain, simulations):
+        recorded = {**simulated[0], "psd": Finding(gain, Location(), PLACES)}
+        return is_significance_clear(recorded, simulations, 1)
+
+    assert is_clear(0.99 * threshold, simulated)
+    assert not is_clear(1.5 * threshold, simulated)
+    assert is_clear(2.1 * threshold, simulated)
+    assert is_clear(2.1 * threshold, odd)  # below a simulated gain
+    assert not is_clear(4.0 * threshold, odd)
+    assert estimate_null_distributions({"gz": odd})["gz"]["psd"].threshold > 2.1 * threshold
 
 
 def test_diagnostic_without_gains_has_a_threshold():

@@ -26,7 +26,7 @@ def make_lines(*f_hz):
 
 
 def list_kept(found, seen=QUIET, closing=None):
-    return [type(effect) for effect in keep_uncontradicted_effects(found, closing or {}, seen, NULL)]
+    return [type(effect) for effect in keep_uncontradicted_effects(found, closing or {}, seen, NULL, 100.0)]
 
 
 def test_distant_lines_are_kept():
@@ -55,6 +55,13 @@ def test_three_harmonics_are_kept():
 @pytest.mark.parametrize(("left", "stands"), [(50.0, False), (15.0, True)])
 def test_resonance_is_kept_if_it_closed_most_of_its_gap(left, stands):
     seen = {**QUIET, "psd": Finding(left, Location(frequency=(16.0, 18.0)))}
+    found = (Narrowband(sigma=1e-4, frequency=17.0, bandwidth=1.0),)
+    assert bool(list_kept(found, seen, {Narrowband: 200.0})) == stands
+
+
+@pytest.mark.parametrize(("highest_hz", "stands"), [(18.0, False), (25.0, True)])
+def test_change_in_time_over_a_wide_band_does_not_contradict_a_resonance(highest_hz, stands):
+    seen = {**QUIET, "spectrogram": Finding(150.0, Location(frequency=(0.0, highest_hz)))}
     found = (Narrowband(sigma=1e-4, frequency=17.0, bandwidth=1.0),)
     assert bool(list_kept(found, seen, {Narrowband: 200.0})) == stands
 
