@@ -24,12 +24,12 @@ def compensate(
         str | None,
         typer.Option(metavar="P,Q", help="Order of the ARMA model of the drift, up to 2,1; by default by a criterion."),
     ] = None,
-    loading: options.Loading = None,
     units: options.Units = "imu",
     json: options.JsonFile = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
     ] = None,
+    loading: options.Loading = None,
 ) -> None:
     """Remove the gyro drift from a recording, and write the compensated recording."""
     from rich.console import Console
@@ -54,3 +54,4 @@ def compensate(
         save_compensation_plot(result, plot, unit_system)
     if json != Path("-"):
         text.print_compensation(result, Console(), unit_system)
+    output.print_written_files(json, out, plot)

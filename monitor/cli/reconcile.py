@@ -28,10 +28,10 @@ def reconcile(
         ),
     ] = None,
     seed: options.ReportSeed = 1,
-    loading: options.Loading = None,
     units: options.Units = "imu",
     json: options.JsonFile = None,
     details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
+    loading: options.Loading = None,
 ) -> None:
     """Compare recordings with a noise model, and find the effects that are missing from the model."""
     require_extra("reconcile", "reconcile")
@@ -67,3 +67,4 @@ def reconcile(
     output.write_json(json, lambda: data)
     if json != Path("-"):
         show(Console())
+    output.print_written_files(json, out / "report.html", out / "model.toml")

@@ -22,10 +22,10 @@ def thermal_fit(
             metavar="S", help="Averaging interval; also 10min, 1h. By default about 72 intervals per recording."
         ),
     ] = None,
-    loading: options.Loading = None,
     units: options.Units = "imu",
     json: options.JsonFile = None,
     plot: PlotPath = None,
+    loading: options.Loading = None,
 ) -> None:
     """Fit the bias of each axis as a function of the temperature and its history."""
     from rich.console import Console
@@ -50,16 +50,17 @@ def thermal_fit(
         save_thermal_fit_plot(study, plot, unit_system)
     if Path("-") not in (json, out):
         text.print_thermal_fit(study, Console(), unit_system)
+    output.print_written_files(json, out, plot)
 
 
 @options.with_loading_options
 def thermal_predict(
     recording: RecordingPath,
     model: Annotated[Path, typer.Option(metavar="MODEL.json", help="Model file that thermal fit has written.")],
-    loading: options.Loading = None,
     units: options.Units = "imu",
     json: options.JsonFile = None,
     plot: PlotPath = None,
+    loading: options.Loading = None,
 ) -> None:
     """Predict the bias of another recording with a model, and print the errors of the prediction."""
     from rich.console import Console
@@ -81,3 +82,4 @@ def thermal_predict(
         save_thermal_prediction_plot(outlook, plot, unit_system)
     if json != Path("-"):
         text.print_thermal_prediction(outlook, Console(), unit_system)
+    output.print_written_files(json, plot)

@@ -73,11 +73,8 @@ COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
 }
 """Customary unit of each noise coefficient, for gyroscopes and accelerometers."""
 
-DEVIATION_UNITS: Final[dict[Kind, Unit]] = {
-    "gyro": Unit(DEGREE * HOUR_S, "°/h"),
-    "accel": Unit(MICRO_G, "µg"),
-}
-"""Customary unit of Allan deviations."""
+DEVIATION_UNITS: Final = {kind: units["B"] for kind, units in COEFFICIENT_UNITS.items()}
+"""Customary unit of Allan deviations, which is the unit of the bias instability B."""
 SAMPLE_UNITS: Final[dict[Kind, Unit]] = {"gyro": Unit(DEGREE, "°/s"), "accel": Unit(1.0, "m/s²")}
 
 COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {

@@ -5,10 +5,12 @@ A separate thread writes to the terminal, so that a blocked terminal or pipe can
 
 import contextlib
 import errno
+import gc
 import io
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
@@ -70,7 +72,8 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     unit = SystemdNotifier.from_environment(os.environ)
     config = _with_viewer(config, viewer_mode, units)
     console, board, asked = Console(file=sys.stdout), RemoteDeviceRegistry(), threading.Event()
-    table, terminal = LiveTable(console, units=UNIT_SYSTEMS[config.viewer.units]), console.is_terminal
+    table = LiveTable(console, units=UNIT_SYSTEMS[config.viewer.units], begun_s=time.monotonic())
+    terminal = console.is_terminal
     screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
     writers = {"terminal": screen} if terminal else {}
     shared = terminal and _same_file(sys.stdout, sys.stderr)
@@ -88,6 +91,7 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
                 if terminal
                 else [TableOutput(board), EventAndStatusLogOutput()]
             )
+            gc.freeze()  # a full collection would examine all imported modules and stop every thread for 0.1 s
             workers = count_workers(config)
             service: DaemonProcess = (
                 Service(config, outputs, unit=unit, writers=writers)

@@ -1,12 +1,11 @@
 """HTML reports of a reconciliation and of the comparison of several recordings, ``report.html``.
 
-The pages are self-contained. The report of one recording begins with the summary, the Allan deviation of each axis that
-differs, and the ranked findings. A collapsible section contains a table of the axes and, for each step, all diagnostics
-before and after the step. The comparison contains a summary, the results of each recording, and the noise effects that
-were found. If an effect was not found in a recording, the page states why it may be absent.
+The pages are self-contained. The report of one recording begins with the summary, the ranked findings, and the Allan
+deviation of each axis that differs. A collapsible section contains each step and all diagnostics of these axes. An axis
+that agrees is one collapsible line. The comparison contains a summary, the results of each recording, and the noise
+effects that were found. If an effect was not found in a recording, the page states why it may be absent.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from math import log
@@ -18,7 +17,6 @@ from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots import reconcile_figures, style
 from monitor.publishing.plots.reconcile_figures import (
     allan_before_and_after_svg,
-    before_and_after_svgs,
     diagnostic_comparison_svg,
     interval_chart_svg,
     select_diagnostic_view,
@@ -43,8 +41,7 @@ from monitor.reconcile.summary.summary_sentences import summarize
 RANGE_INCHES: Final = (8.0, 3.3)  # size of a plot without a detail plot
 RANGE_WITH_DETAIL_INCHES: Final = (4.9, 3.3)  # size of a plot next to a detail plot
 DETAIL_INCHES: Final = (3.33, 3.3)
-PAIR_INCHES: Final = (6.8, 2.35)
-SINGLE_INCHES: Final = (3.4, 2.05)
+PANEL_INCHES: Final = (3.4, 2.35)
 MIN_MARKED_LOG_RATIO: Final = 0.01
 """Smallest logarithmic change of the Allan deviation that is marked, about the width of a line in the figure."""
 
@@ -88,12 +85,10 @@ def render_page(r: Reconciliation, title: str = "", units: UnitSystem = DEFAULT_
         effects=EFFECTS,
         figures=reconcile_figures,
         colours=style,
-        snapshots=lambda result: [result.start, *(step.snapshot_after for step in result.steps)],
-        pair_scores=_pair_scores,
-        scores_by_diagnostic=_scores_by_diagnostic,
+        snapshots=_snapshots,
+        gaps_by_diagnostic=_gaps_by_diagnostic,
         draw_range=partial(_draw_range, units=units),
-        draw_pairs=partial(_draw_pairs, units=units),
-        draw_singles=partial(_draw_singles, units=units),
+        draw_other_diagnostics=partial(_draw_other_diagnostics, units=units),
     )
 
 
@@ -141,37 +136,43 @@ def _draw_allan(result: AxisResult, ranking: GapRanking, units: UnitSystem) -> s
     return allan_before_and_after_svg(before, after, result.axis, marks, units)
 
 
-def _pair_scores(
-    before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap]
-) -> list[tuple[DiagnosticGap, DiagnosticGap | None]]:
-    later = {score.diagnostic: score for score in after}
-    return [(score, later.get(score.diagnostic)) for score in before]
+def _snapshots(result: AxisResult) -> list[AxisModelDiagnostics]:
+    """Return the diagnostics before the search and after each step."""
+    return [result.start, *(step.snapshot_after for step in result.steps)]
 
 
-def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list[DiagnosticGap | None]]]:
-    known = [{score.diagnostic: score for score in result.start.gaps} for result in results]
-    return [
-        (diagnostic, [scores.get(diagnostic) for scores in known])
-        for diagnostic in dict.fromkeys(one for k in known for one in k)
+def _gaps_by_diagnostic(result: AxisResult) -> list[list[DiagnosticGap | None]]:
+    """For each diagnostic, return the gap before the search and after each step."""
+    known = [{gap.diagnostic: gap for gap in snapshot.gaps} for snapshot in _snapshots(result)]
+    return [[gaps.get(diagnostic) for gaps in known] for diagnostic in known[0]]
+
+
+def _draw_other_diagnostics(result: AxisResult, units: UnitSystem) -> list[tuple[int, str]]:
+    """Draw the significant diagnostics before and after the search, without the panels that the page already shows.
+
+    The page shows the Allan deviation of an axis that differs, and the diagnostic that led to each step or remains.
+    Return the number of panels and the SVG element of each figure.
+    """
+    if result.verdict == "agrees":
+        views = [view for view in result.start.plots if view.diagnostic == "allan"]
+        return [(1, diagnostic_comparison_svg([("", view)], result.axis, *PANEL_INCHES, units=units)) for view in views]
+    found = [
+        *((before, step.before) for before, step in zip(_snapshots(result), result.steps, strict=False)),
+        *((result.end, gap) for gap in result.left_over),
     ]
-
-
-def _draw_singles(result: AxisResult, units: UnitSystem) -> list[str]:
-    """Draw the Allan deviation and the diagnostics with a significant gap, before the search."""
-    drawn = _drawn_diagnostics(result.start)
-    views = [view for view in result.start.plots if view.diagnostic in drawn]
-    return [diagnostic_comparison_svg([("", view)], result.axis, *SINGLE_INCHES, units=units) for view in views]
-
-
-def _draw_pairs(before: AxisModelDiagnostics, after: AxisModelDiagnostics, axis: str, units: UnitSystem) -> list[str]:
-    """Draw the diagnostics with a significant gap, before and after a step."""
-    later, drawn = {view.diagnostic: view for view in after.plots}, _drawn_diagnostics(before) - {"allan"}
-    pairs = [(view, later[view.diagnostic]) for view in before.plots if view.diagnostic in drawn & set(later)]
-    return before_and_after_svgs(pairs, axis, *PAIR_INCHES, units)
-
-
-def _drawn_diagnostics(snapshot: AxisModelDiagnostics) -> set[str]:
-    return {"allan"} | {gap.diagnostic for gap in snapshot.gaps if gap.is_significant}
+    shown = {id(select_diagnostic_view(snapshot.plots, gap.diagnostic, gap.where)) for snapshot, gap in found}
+    significant = {gap.diagnostic for gap in result.start.gaps if gap.is_significant} - {"allan"}
+    ends = [("before", result.start), ("after", result.end)] if result.steps else [("", result.start)]
+    drawn = []
+    for name in (view.diagnostic for view in result.start.plots if view.diagnostic in significant):
+        panels = [(title, view) for title, end in ends for view in end.plots if view.diagnostic == name]
+        panels = [(title, view) for title, view in panels if id(view) not in shown]
+        if panels:
+            width, height = PANEL_INCHES
+            drawn.append(
+                (len(panels), diagnostic_comparison_svg(panels, result.axis, width * len(panels), height, units=units))
+            )
+    return drawn
 
 
 def _draw_range(snapshot: AxisModelDiagnostics, found: DiagnosticGap, axis: str, units: UnitSystem) -> list[str]:

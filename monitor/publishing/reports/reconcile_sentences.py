@@ -285,6 +285,11 @@ def describe_result(result: AxisResult) -> str:
             return "Model and measurement differ. No known effect explains the difference, so no effect is named."
 
 
+def describe_largest_gap(result: AxisResult) -> str:
+    """Describe the gap of an axis that is closest to its threshold."""
+    return describe_gap(max(result.start.gaps, key=gap_to_threshold_ratio), result.axis)
+
+
 def describe_alternatives(step: AddedOrResizedEffect) -> str:
     """Describe the alternative effects of a step and their probabilities."""
     if not step.runners_up:

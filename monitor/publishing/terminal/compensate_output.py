@@ -22,7 +22,7 @@ from monitor.drift.compensation.compensation_score import (
     RateQualityAtRest,
 )
 from monitor.publishing.messages.message import encode_json
-from monitor.publishing.terminal.tables import plain_table, print_notes
+from monitor.publishing.terminal.tables import plain_table, print_line, print_notes
 
 SCHEMA: Final = "imu-monitor/compensate/1"
 ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
@@ -63,9 +63,8 @@ def print_compensation(result: DriftCompensationResult, console: Console, units:
     )
     for axis, one in result.axes.items():
         if one.steps or one.rejected_intervals:
-            console.print(f"{axis}: {_describe_exceptions(one, result.interval_s)}", highlight=False, soft_wrap=True)
+            print_line(f"{axis}: {_describe_exceptions(one, result.interval_s)}", console)
     print_notes(result.notes, console)
-    console.print(f"{result.out} written", highlight=False, soft_wrap=True)
 
 
 def encode_compensation(result: DriftCompensationResult) -> bytes:

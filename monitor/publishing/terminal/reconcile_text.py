@@ -16,7 +16,7 @@ from drivers.data_types import AXES
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem, format_duration
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.reports import recording_comparison_sentences
-from monitor.publishing.terminal.tables import plain_table, print_notes
+from monitor.publishing.terminal.tables import plain_table, print_line, print_notes
 from monitor.reconcile.result import AddedOrResizedEffect, AxisResult, Reconciliation
 from monitor.reconcile.several_recordings.comparison import EffectInRecordings, RecordingsComparison
 from monitor.reconcile.summary.ranked_findings import rank_findings
@@ -55,7 +55,7 @@ def print_reconciliation(
     console.print(_verdict(r.verdict), Text(" ".join(summarize(r))))
     for finding in r.recording_findings:
         sign = "◐" if finding.corrected else "✖"
-        console.print(Text(f"{sign} recording: {finding.sentence}", style="yellow"), soft_wrap=True)
+        print_line(Text(f"{sign} recording: {finding.sentence}", style="yellow"), console)
     if details:
         console.print(_findings_table(r))
         console.print(_axes_table(r, units))

@@ -21,7 +21,7 @@ from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalPredictionErrors, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import encode_json
-from monitor.publishing.terminal.tables import plain_table, print_notes
+from monitor.publishing.terminal.tables import plain_table, print_line, print_notes
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
@@ -217,5 +217,5 @@ def _format_deviation(axis: str, si: float, units: UnitSystem) -> str:
 
 def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
     for axis, reason in refused.items():
-        console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
+        print_line(f"{axis}: {reason}", console)
     print_notes(notes, console)
