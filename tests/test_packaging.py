@@ -71,6 +71,11 @@ def test_wheel_contains_every_package_and_its_types(wheel: zipfile.ZipFile, meta
     assert {line.partition(",")[0] for line in metadata.get_all("Project-URL", [])} >= {"Source", "Documentation"}
 
 
+def test_upload_is_refused_while_the_addresses_are_placeholders(metadata: Message) -> None:
+    placeholder = any(".example/" in address for address in metadata.get_all("Project-URL", []))
+    assert ("Private :: Do Not Upload" in metadata.get_all("Classifier", [])) == placeholder
+
+
 def test_sdist_contains_what_the_wheel_and_the_tests_need(packages: Path) -> None:
     (path,) = packages.glob("*.tar.gz")
     with tarfile.open(path) as sdist:
