@@ -193,7 +193,7 @@ class OnlineThermalModel:
             without = yield from fit_thermal_model_stepwise(means, always_try_lags=True)
             stepped = yield from fit_thermal_model_stepwise(means, since, always_try_lags=True)
         except NotReady:
-            # Nothing is lost: the step is reported below with the size of the suspicion, and the current model remains.
+            # Nothing is lost: the suspected size is reported below, and the current model remains.
             pass
         else:
             if without.aicc - stepped.aicc < STEP_AICC_MARGIN:
@@ -218,7 +218,7 @@ class OnlineThermalModel:
                 self._means(), len(self._rows) - (self._interval_count - self._new_offset_at)
             )
         except NotReady:
-            # Nothing is lost: the mean residual is the new offset, and a later model selection fits all intervals again.
+            # Nothing is lost: the mean residual is the new offset, and a later selection fits all intervals again.
             pass
         else:
             size, model = stepped.step, stepped.model

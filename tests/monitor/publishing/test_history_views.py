@@ -85,6 +85,14 @@ def test_axis_history_has_one_line_per_bucket() -> None:
     assert lines[9].split()[-2:] == ["12", "lost"]
 
 
+def test_axis_history_of_80_columns_omits_ranges_and_keeps_all_columns() -> None:
+    console = Console(width=80, file=io.StringIO(), record=True)
+    history_text.print_axis_history(make_history(), "gz", SYMBOLS, console)
+    text = console.export_text()
+    assert "…" not in text
+    assert text.split("\n")[1].split() == "UTC Q µrad N °/√h B °/h K °/h/√h R °/h/h °C lost state".split()
+
+
 def test_tables_and_plot_have_the_units_of_data_sheets(tmp_path: Path) -> None:
     history, units = make_history(), UNIT_SYSTEMS["datasheet"]
     text = render_text(
