@@ -145,7 +145,7 @@ def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Re
                 rows += len(timed)
             limit.check_row_count(rows)
     except LinkEnded:
-        pass  # the whole file has been decoded
+        pass  # the expected end of the file; its text repeats link.notes, which are part of the result
     except LinkUnavailable as error:
         raise RecordingError(str(error)) from error
     finally:

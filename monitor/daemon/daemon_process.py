@@ -17,6 +17,7 @@ import structlog
 from drivers.data_types import SenderTimedFormat
 from drivers.errors import ConfigError
 from monitor.common.device_health import Health, format_service_status
+from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.daemon.config_changes import ConfigChange
 from monitor.daemon.operations.hooks import Hooks
 from monitor.daemon.operations.log_level import set_log_level
@@ -313,7 +314,9 @@ def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) ->
 
     own = config.viewer
     return RerunView(
-        ViewerSettings(own.mode, own.port, own.web_port, own.memory), _device_features(config.devices), recall
+        ViewerSettings(own.mode, own.port, own.web_port, own.memory, UNIT_SYSTEMS[own.units]),
+        _device_features(config.devices),
+        recall,
     )
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.unit_formatting import DEVIATION_UNITS, sensor_kind
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem, sensor_kind
 from monitor.publishing.plots import style
 from monitor.publishing.reports.reconcile_sentences import (
     displayed_unit,
@@ -68,6 +68,7 @@ def diagnostic_comparison_svg(
     width: float,
     height: float,
     where: Location | None = None,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> str:
     """Draw one diagnostic with a panel for each model, and return the figure as an SVG element.
 
@@ -81,9 +82,12 @@ def diagnostic_comparison_svg(
         Size of the figure [inches].
     where
         Range to mark in the first panel.
+    units
+        Unit system.
     """
     plots = [
-        to_displayed_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
+        to_displayed_units(title, view, axis, where if i == 0 else None, units)
+        for i, (title, view) in enumerate(model_panels)
     ]
     with style.figure_style():
         return _draw_comparison(*_create_panels(len(plots), width, height), plots, axis)
@@ -177,7 +181,7 @@ def zoomed_view(view: DiagnosticPlotData, where: Location) -> DiagnosticPlotData
 
 
 def to_displayed_units(
-    title: str, view: DiagnosticPlotData, axis: str, where: Location | None
+    title: str, view: DiagnosticPlotData, axis: str, where: Location | None, units: UnitSystem = DEFAULT_UNITS
 ) -> DiagnosticPanelCurves:
     """Convert the data of a diagnostic to displayed units.
 
@@ -191,13 +195,15 @@ def to_displayed_units(
         Name of the axis.
     where
         Range to mark. The range is ignored if the x axis shows another quantity.
+    units
+        Unit system.
     """
     x_unit, y_unit = (
-        displayed_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
+        displayed_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)), units)
         for unit, line in ((view.x_unit, view.x), (view.y_unit, view.measured))
     )
     if view.x_name == "averaging time" and view.y_unit in ("rad/s", "m/s²"):
-        y_unit = DEVIATION_UNITS[sensor_kind(axis)]  # as in all Allan plots
+        y_unit = units.deviation(sensor_kind(axis))  # as in all Allan plots
     x_name, factor = x_unit.name, x_unit.factor
     if view.x_name == "time" and not view.log:
         x_name, seconds = style.select_time_unit(float(np.ptp(view.x)))
@@ -215,7 +221,7 @@ def to_displayed_units(
         lo=lo,
         hi=hi,
         mark=None if mark is None else (mark[0] * factor, mark[1] * factor),
-        mark_label="" if where is None else format_range(where, axis),
+        mark_label="" if where is None else format_range(where, axis, units),
     )
 
 
@@ -271,7 +277,11 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPanelCurves, colour: str, limits:
 
 
 def allan_before_and_after_svg(
-    before: DiagnosticPlotData, after: DiagnosticPlotData, axis: str, marks: Mapping[float, str]
+    before: DiagnosticPlotData,
+    after: DiagnosticPlotData,
+    axis: str,
+    marks: Mapping[float, str],
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> str:
     """Draw the measured Allan deviation, and the Allan deviation of the model before and after the search.
 
@@ -288,10 +298,12 @@ def allan_before_and_after_svg(
         Name of the axis.
     marks
         Averaging time [s] and label of each mark.
+    units
+        Unit system.
     """
     replaced = np.fmax(before.measured**2 - after.measured**2, 0.0)
     curves = {name: np.sqrt(getattr(after, name) ** 2 + replaced) for name in ("measured", "expected", "lo", "hi")}
-    first, last = (to_displayed_units("", view, axis, None) for view in (before, replace(after, **curves)))
+    first, last = (to_displayed_units("", view, axis, None, units) for view in (before, replace(after, **curves)))
     with style.figure_style():
         figure = style.create_figure(*ALLAN_INCHES)
         panel = figure.subplots()

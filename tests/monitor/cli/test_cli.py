@@ -37,7 +37,7 @@ from tests.monitor.publishing.example_results import make_estimate
 from tests.support.ports import free_endpoint
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
-PROGRAM = [sys.executable, "-m", "monitor.cli"]
+PROGRAM = [sys.executable, "-m", "imu_monitor"]
 COMMANDS = ("demo", "run", "check", "doctor", "watch", "analyze", "simulate", "reconcile", "export")
 RATE_HZ = 100.0
 DEVICE = '[[device]]\nname = "bench-1"\n'

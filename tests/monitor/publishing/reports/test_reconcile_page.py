@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 import pytest
 
 from drivers.errors import ConfigError
+from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.reports import reconcile_page
 from monitor.publishing.reports.reconcile_page import render_comparison_page, render_page
@@ -172,6 +173,17 @@ def test_page_is_self_contained_and_escaped() -> None:
 
 def test_report_with_two_steps_is_below_a_megabyte() -> None:
     assert len(render_example("explained").encode()) < 1_000_000
+
+
+def test_tables_and_figures_have_the_chosen_units() -> None:
+    si, r, runs = UNIT_SYSTEMS["si"], samples.explained(), make_comparison()
+    for default, page in (
+        (render_page(r), render_page(r, "", si)),
+        (render_comparison_page(runs), render_comparison_page(runs, si)),
+    ):
+        assert "°/h" in default
+        assert "°/h" not in page
+        assert "rad/s</" in page
 
 
 def test_same_reconciliation_gives_the_same_page() -> None:
