@@ -13,11 +13,14 @@ from typing import Any, Final
 
 from monitor.publishing.plots import axis_colours, style
 from monitor.publishing.plots.allan_figure import draw_allan_panel
+from monitor.publishing.reports import html_page
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 from tests.monitor.publishing.example_results import make_estimate
 
 PICTURES: Final = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 CHECKSUMS: Final = PICTURES / "sources.json"
+TEMPLATES: Final = Path(html_page.__file__).parent / "templates"
+REPORT_TEMPLATES: Final = (TEMPLATES / "page.html.j2", TEMPLATES / "report.html.j2")
 
 
 def describe_viewer(*devices: str, fleet: bool = False) -> object:
@@ -69,7 +72,8 @@ SOURCES: Final[dict[str, Callable[[], object]]] = {
     ),
     "viewer-fleet": lambda: describe_viewer("a", "b", "c"),
     "view-fleet": lambda: describe_viewer("a", "b", fleet=True),
-    **dict.fromkeys(("allan-plot", "report", "dynamic-plot"), describe_allan_figure),
+    **dict.fromkeys(("allan-plot", "dynamic-plot"), describe_allan_figure),
+    "report": lambda: (describe_allan_figure(), [path.read_text("utf-8") for path in REPORT_TEMPLATES]),
 }
 """Description of each picture, by the name of its file."""
 

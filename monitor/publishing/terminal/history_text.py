@@ -31,13 +31,13 @@ from monitor.common.unit_formatting import (
 )
 from monitor.history.bucketed_history import ColumnStatistics, HistoryTable
 from monitor.history.history_row import COUNTS, STATES
-from monitor.publishing.terminal.tables import plain_table, print_line
+from monitor.publishing.terminal.tables import WidthDependentTable, plain_table, print_line
 
 LETTERS: Final = ("N", "B", "K")
 """Noise coefficients in the table of all axes. The table of a single axis shows all five coefficients."""
 SPARKLINE_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 GAP: Final = "·"
-SPARKLINE_WIDTH: Final = 32
+SPARKLINE_WIDTH: Final = 28
 """Width of a sparkline [characters]."""
 MAX_EVENTS: Final = 20
 """Largest number of events that are printed."""
@@ -93,14 +93,21 @@ def print_axis_history(
     units
         Units of the coefficients.
     """
-    table, columns = plain_table("UTC"), units.columns(sensor_kind(axis), symbols)
+    columns = units.columns(sensor_kind(axis), symbols)
+    tables = (_axis_table(past, axis, columns, with_range) for with_range in (True, False))
+    console.print(Padding(WidthDependentTable(*tables), (1, 0, 0, 0)))
+
+
+def _axis_table(past: HistoryTable, axis: str, columns: list[CoefficientColumn], with_range: bool) -> Table:
+    """Return the history of one axis. If ``with_range`` is True, cells include the smallest and largest values."""
+    table = plain_table("UTC", gap=2 if with_range else 1)
     for one in columns:
         table.add_column(f"{one.symbol} {one.unit.name}", justify="right", no_wrap=True)
     for name in ("°C", "lost", "state"):
         table.add_column(name, justify="right")
     temperature = past.select_column("temperature")
     for p in range(len(past)):
-        cells = [_cell(past, axis, one, p) for one in columns]
+        cells = [_cell(past, axis, one, p, with_range) for one in columns]
         lost = int(past.counts[p, COUNTS.index("lost")])
         table.add_row(
             format_utc(float(past.start_s[p]))[:16],
@@ -109,7 +116,7 @@ def print_axis_history(
             f"{lost:,}" if lost else "",
             STATES[int(past.state[p])],
         )
-    console.print(Padding(table, (1, 0, 0, 0)))
+    return table
 
 
 def _print_events(past: HistoryTable, console: Console) -> None:
@@ -215,11 +222,11 @@ def _bound(past: HistoryTable, axis: str, symbol: str, unit: Unit) -> tuple[str,
     return f"≤ {format_number(float(there[-1]) * unit.factor)}", NO_VALUE, NO_VALUE
 
 
-def _cell(past: HistoryTable, axis: str, shown: CoefficientColumn, p: int) -> str:
+def _cell(past: HistoryTable, axis: str, shown: CoefficientColumn, p: int, with_range: bool) -> str:
     column, unit = past.select_column(f"{axis}.{shown.symbol}"), shown.unit
     low, high, last = (float(part[p]) * unit.factor for part in (column.low, column.high, column.last))
     if math.isfinite(last):
-        alike = format_number(low) == format_number(high)
+        alike = not with_range or format_number(low) == format_number(high)
         return format_number(last) if alike else f"{format_number(last)} [{format_number(low)} … {format_number(high)}]"
     bound = float(past.select_column(f"{axis}.{shown.symbol}.bound").last[p]) * unit.factor
     return f"≤ {format_number(bound)}" if math.isfinite(bound) else NO_VALUE

@@ -85,6 +85,12 @@ def test_axis_history_has_one_line_per_bucket() -> None:
     assert lines[9].split()[-2:] == ["12", "lost"]
 
 
+def test_axis_history_of_80_columns_omits_ranges_and_keeps_all_columns() -> None:
+    text = render_text(history_text.print_axis_history, make_history(), "gz", SYMBOLS, width=80)
+    assert "…" not in text
+    assert " ".join(text.split("\n")[1].split()) == "UTC Q µrad N °/√h B °/h K °/h/√h R °/h/h °C lost state"
+
+
 def test_tables_and_plot_have_the_units_of_data_sheets(tmp_path: Path) -> None:
     history, units = make_history(), UNIT_SYSTEMS["datasheet"]
     text = render_text(
