@@ -202,12 +202,6 @@ class NoiseAndBiasChangeDetector:
         found, self._found = self._found, []
         return found
 
-    def restart_references(self, axis: int | None = None) -> None:
-        """Discard the reference variances of one axis, or of all axes if ``axis`` is None."""
-        for one in range(len(AXES)) if axis is None else (axis,):
-            self._restart_reference(one)
-        set_next_decision_sample(self._state)
-
     def _decide(self, axis: int) -> None:
         s = self._state
         alarm = s.alarm[axis].copy()
