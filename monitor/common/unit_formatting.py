@@ -111,10 +111,15 @@ class UnitSystem:
     coefficients: Mapping[Kind, Mapping[str, Unit]]
     densities: Mapping[Kind, Unit] = field(default_factory=dict)
     """Units of the one-sided noise density, which is shown in addition to the random walk N. Empty without density."""
+    is_si: bool = False
 
     def deviation(self, kind: Kind) -> Unit:
         """Return the unit of Allan deviations, which is the unit of the bias instability B."""
         return self.coefficients[kind]["B"]
+
+    def single(self, kind: Kind, symbol: str) -> Unit:
+        """Return the unit of a coefficient where there is only one: the noise density rather than the random walk."""
+        return self.columns(kind, symbol)[-1].unit
 
     def columns(self, kind: Kind, symbols: Sequence[str] = "QNBKR") -> list[CoefficientColumn]:
         """Return the columns of a table of coefficients.
@@ -163,7 +168,8 @@ UNIT_SYSTEMS: Final = {
                 "K": Unit(1.0, "m/s³/√Hz"),
                 "R": Unit(1.0, "m/s³"),
             },
-        }
+        },
+        is_si=True,
     ),
 }
 """Unit systems of the option ``--units``. In SI, N and K are two-sided densities: rad/s/√Hz is the same as rad/√s."""
