@@ -127,7 +127,7 @@ class Service(DaemonProcess):
     def _build_worker(self, device: Device) -> DeviceWorker:
         link, simulated = device.link, None
         if isinstance(link, VirtualTable):
-            from monitor.simulator import SimulatedDevice
+            from monitor.simulator.simulated_device import SimulatedDevice
 
             simulated = SimulatedDevice(link, device.decoder, device.name)
             link = simulated.port.link

@@ -158,7 +158,7 @@ def detect_disturbances(result: RecordingAnalysis, alarms_per_day: float = 1.0 /
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 
 
-def fit_other_samples(result: RecordingAnalysis, samples: Floats, map_axes: EachAxis = map) -> Fit:
+def fit_other_samples(result: RecordingAnalysis, samples: Floats) -> Fit:
     """Fit noise coefficients to other samples with the sample rate and averaging times of an existing analysis.
 
     Parameters
@@ -167,10 +167,8 @@ def fit_other_samples(result: RecordingAnalysis, samples: Floats, map_axes: Each
         Analysis from which the sample rate and the averaging times are taken.
     samples : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s², for example after temperature compensation; NaN means missing.
-    map_axes : EachAxis
-        Function that applies a computation to each axis.
     """
-    _, found, _ = _fit_curve(samples, result.estimate.rate_hz, result.estimate.curve.factors, map_axes)
+    _, found, _ = _fit_curve(samples, result.estimate.rate_hz, result.estimate.curve.factors, map)
     return found
 
 

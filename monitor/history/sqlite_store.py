@@ -245,19 +245,11 @@ class HistoryFileWriter:
         return None if found is None else _parse_row(self._db, found, {})
 
     def _write(self, device: int, row: HistoryRow) -> None:
-        self._db.execute(
-            f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (
-                *(
-                    device,
-                    row.start_s,
-                    row.width_s,
-                    row.newest_s,
-                    _identifier(self._db, "layout", "names", " ".join(row.names)),
-                ),
-                *(*row.counts, row.state, pack_count_min_max_last(row)),
-            ),
-        )
+        layout = _identifier(self._db, "layout", "names", " ".join(row.names))
+        numbers = pack_count_min_max_last(row)
+        fields = (device, row.start_s, row.width_s, row.newest_s, layout, *row.counts, row.state, numbers)
+        marks = ", ".join("?" for _ in fields)
+        self._db.execute(f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES ({marks})", fields)
 
     def _newest_end_s(self) -> dict[int, float]:
         """Return the Unix time at which the newest row of each device ends, or -inf if a device has no rows."""

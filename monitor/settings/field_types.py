@@ -16,8 +16,9 @@ from monitor.common.topics import ENDPOINT
 
 UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Length of each unit of a duration, in seconds."""
-DURATION_TEXT: Final = re.compile(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*")
-RATE_TEXT: Final = re.compile(r"\s*([0-9.]+)\s*Hz\s*")
+NUMBER: Final = r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)"
+DURATION_TEXT: Final = re.compile(rf"\s*({NUMBER}(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*")
+RATE_TEXT: Final = re.compile(rf"\s*({NUMBER})\s*Hz\s*")
 ENDPOINT_TEXT: Final = re.compile(r"[a-z]+/.+")
 ZENOH_KEY: Final = re.compile(r"[^/*$?#]+(/[^/*$?#]+)*")
 ADDRESS_TEXT: Final = re.compile(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):([0-9]{1,5})", re.ASCII)
@@ -61,7 +62,7 @@ def parse_rate_as_period(value: str, always_text: str) -> float:
     if value == always_text:
         return 0.0
     match = RATE_TEXT.fullmatch(value)
-    rate_hz = _positive_number(match[1]) if match else 0.0
+    rate_hz = float(match[1]) if match else 0.0
     if not rate_hz > 0.0:
         raise ConfigError(f'{format_value(value)} is not a rate; write "10 Hz" or "{always_text}"')
     return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
@@ -99,17 +100,10 @@ def _parse_duration_text(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     match = DURATION_TEXT.fullmatch(value)
-    duration_s = _positive_number(match[1]) * UNITS_S.get(match[2], 0.0) if match else 0.0
+    duration_s = float(match[1]) * UNITS_S.get(match[2], 0.0) if match else 0.0
     if not duration_s > 0.0:
         raise ConfigError(f'{format_value(value)} is not a duration; write seconds, or "90s", "30min", "1h", "2d"')
     return duration_s
-
-
-def _positive_number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return 0.0
 
 
 def _path(name: str, folder: Path | None) -> Path:

@@ -76,10 +76,8 @@ def format_link_defaults(name: str) -> str:
     ConfigError
         If no link has this name.
     """
-    settings, decoder = (
-        driver_settings.link_settings_class(name),
-        driver_settings.default_decoder(name) or FIRST_DECODER,
-    )
+    settings = driver_settings.link_settings_class(name)
+    decoder = driver_settings.default_decoder(name) or FIRST_DECODER
     header, keys = _table(settings, "device.driver", omit=("faults",)).split("\n", 1)
     link = _line("link", name, f"one of {', '.join(driver_settings.list_link_names())}")
     text = "\n".join((header, link, f"{keys}{_line('decoder', decoder, 'wire format of the sensor')}\n"))
@@ -172,11 +170,8 @@ def format_toml_value(value: Any) -> str:
     ('{ gx = 0.5 }', '["a", "b"]', 'true')
     """
     if isinstance(value, Mapping):
-        return (
-            "{}"
-            if not value
-            else f"{{ {', '.join(f'{key} = {format_toml_value(one)}' for key, one in value.items())} }}"
-        )
+        entries = ", ".join(f"{key} = {format_toml_value(one)}" for key, one in value.items())
+        return f"{{ {entries} }}" if entries else "{}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(format_toml_value, value))}]"
     return json.dumps(value, ensure_ascii=False)

@@ -14,7 +14,8 @@ from monitor.noise.model_loading import read_model
 from monitor.noise.model_toml import prefix_config_errors
 from monitor.settings import loading
 from monitor.settings.loading import Config, VirtualTable
-from monitor.simulator import DEFAULT_RATE_HZ, parse_effects
+from monitor.simulator.effect_option_parser import parse_effects
+from monitor.simulator.encoding_sensor import DEFAULT_RATE_HZ
 
 DEMO_CONFIG: Final = CONFIG_FOLDER / "demo.toml"
 """Path of the shipped configuration."""

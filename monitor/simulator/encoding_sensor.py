@@ -82,6 +82,7 @@ class SimulatedSensor:
     """
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str) -> None:
+        check_noise_model_and_effects(table)
         self._name = name
         self._model = read_model(Path(table.model))
         self.rate_hz = self._model.sample_rate_hz or DEFAULT_RATE_HZ
@@ -92,7 +93,6 @@ class SimulatedSensor:
         self._stream = self._create_stream(table.seed)
         self._unix_ns = 0  # time of the first sample
         self._made = 0
-        self._add_effects(self._create_stream(table.seed))  # reports errors of the effects before the sensor starts
 
     def compile_kernels_and_start_clock(self) -> None:
         """Compile the simulation kernels, and start the clock of the sensor."""
@@ -140,11 +140,8 @@ class SimulatedSensor:
 
     def _add_effects(self, stream: ModelStream) -> None:
         """Add the pending effects to a simulated stream."""
-        for text, axis, effect in self._pending_effects:
-            try:
-                stream.add_effect(axis, effect)
-            except ConfigError as error:
-                raise ConfigError(f'effect "{text}": {error}') from error
+        for _, axis, effect in self._pending_effects:
+            stream.add_effect(axis, effect)
 
     def _ticks(self, index: Ints) -> Ints:
         timing = self._decoder.timing

@@ -81,10 +81,6 @@ class DrawnFaults:
     position: Floats  # [n] position of the fault in the frame, 0 to 1
     pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
-    def kind_per_sample(self) -> list[FaultKind]:
-        """Return the kind of fault of each sample."""
-        return [FaultKind(kind) for kind in self.kind.tolist()]
-
     def __getitem__(self, rows: slice) -> "DrawnFaults":
         """Return the faults of the selected samples."""
         return DrawnFaults(self.kind[rows], self.position[rows], self.pulled[rows])

@@ -17,7 +17,7 @@ from drivers.decoders.base import Decoder
 from drivers.errors import LinkUnavailable
 from monitor.settings.loading import VirtualTable
 from monitor.simulator.encoding_sensor import SimulatedSensor
-from monitor.simulator.faults import DrawnFaults, FaultCounts, Faults
+from monitor.simulator.faults import DrawnFaults, FaultCounts, FaultKind, Faults
 from monitor.simulator.ports import create_port
 
 BURST_S: Final = 0.01
@@ -112,9 +112,10 @@ class SimulatedDevice:
             at = stop
 
     def _send(self, frames: list[list[Chunk]], draws: DrawnFaults) -> None:
+        kinds = map(FaultKind, draws.kind.tolist())
         faulty = [
             (kind, self._faults.apply_fault(kind, position, chunks))
-            for kind, position, chunks in zip(draws.kind_per_sample(), draws.position.tolist(), frames, strict=True)
+            for kind, position, chunks in zip(kinds, draws.position.tolist(), frames, strict=True)
         ]
         sent = self.port.send_and_count_chunks([chunk for _, chunks in faulty for chunk in chunks])
         for kind, chunks in faulty:

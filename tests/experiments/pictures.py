@@ -52,8 +52,8 @@ from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDesc
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
-from monitor.simulator import AMBIENT_C, WARM_UP_C, WARM_UP_S
 from monitor.simulator.demo_config import build_demo_config
+from monitor.simulator.encoding_sensor import AMBIENT_C, WARM_UP_C, WARM_UP_S
 from tests.experiments.picture_sources import store_checksum
 from tests.monitor.publishing.example_results import make_estimate, make_true_coefficients
 

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import Final
 
 from drivers.driver import Driver
-from monitor.simulator import SimulatedDevice
 from monitor.simulator.ports import PtyPort, ZenohPort
+from monitor.simulator.simulated_device import SimulatedDevice
 
 AHEAD: Final = 32
 """Samples that the sensor may be ahead of its reader. A pseudo-terminal holds them in every wire format."""

@@ -28,7 +28,7 @@ from monitor.estimation.window_sample_snapshot import WindowSnapshot
 from monitor.settings.loading import Device, VirtualTable
 
 if TYPE_CHECKING:
-    from monitor.simulator import SimulatedDevice
+    from monitor.simulator.simulated_device import SimulatedDevice
 
 RING_S: Final = 65.536
 """Capacity of the ring buffer in seconds, limited to RING_SAMPLES_RANGE. Samples wait while kernels are compiled."""

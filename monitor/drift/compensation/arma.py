@@ -67,8 +67,6 @@ class ArmaModel:
     # limits of the 95 % confidence intervals of φ1, φ2 and θ1; NaN if they are not computed
     lo: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     hi: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    log_likelihood: float = np.nan  # logarithm of the maximum likelihood
-    bic: float = np.nan
     count: int = 0  # number of interval means from which the model was identified
 
     @property
@@ -109,11 +107,12 @@ def fit_arma(
         raise NotReady("all values are equal")
     unit = (interval_means - origin) / scale
     share = white_variance / scale**2
-    best = min((_fit_order(unit, share, order) for order in orders), key=lambda one: one[0])
-    found = _to_model(unit, share, origin, scale, best)
+    likelihoods = [_ArmaLikelihood(unit, share, order) for order in orders]
+    _, u, likelihood = min(((*_maximize(one), one) for one in likelihoods), key=lambda fit: fit[0])
+    found = _to_model(likelihood, u, origin, scale)
     if not with_confidence_intervals:
         return found
-    lo, hi = _confidence_intervals(unit, share, *best[1:])
+    lo, hi = _confidence_intervals(likelihood, u)
     return replace(found, lo=lo, hi=hi)
 
 
@@ -196,137 +195,142 @@ def compute_likelihood_sums(
     return count, logs, zz - mean * zo, mean
 
 
-_OrderFit = tuple[float, Order, Floats]  # BIC, order and search parameters
-
-
-def _fit_order(z: Floats, white: float, order: Order) -> _OrderFit:
-    """Fit an ARMA model of the given order by maximum likelihood.
+@dataclass(frozen=True, slots=True)
+class _ArmaLikelihood:
+    """Likelihood of the ARMA models of one order, as a function of the search parameters u.
 
     The search parameters are the inverse hyperbolic tangents of the partial autocorrelations and of θ1. If the white
     noise v has a positive variance, the logarithm of the innovation variance is an additional search parameter.
     """
-    count = int(np.isfinite(z).sum())
-    free = sum(order) + (white > 0.0 and order != (0, 0))
 
-    def loss(u: Floats) -> float:
-        return -_log_likelihood(z, white, order, u)
+    z: Floats  # [n] interval means; NaN means missing
+    white: float  # variance of the white noise v
+    order: Order
 
-    starts = _start_parameters(white, order)
-    tried = sorted(((loss(u), i) for i, u in enumerate(starts)))
+    @property
+    def has_variance_parameter(self) -> bool:
+        """True if the innovation variance is a search parameter."""
+        return self.white > 0.0 and self.order != (0, 0)
+
+    def start_parameters(self) -> list[Floats]:
+        return [
+            np.array(
+                [
+                    *map(atanh, partial),
+                    *((atanh(theta),) if self.order[1] else ()),
+                    *((log(share),) if self.has_variance_parameter else ()),
+                ]
+            )
+            for partial in START_PARTIAL_AUTOCORRELATIONS[self.order[0]]
+            for theta in (START_THETAS if self.order[1] else (0.0,))
+            for share in (START_VARIANCE_SHARES if self.has_variance_parameter else (0.0,))
+        ]
+
+    def model_coefficients(self, u: Floats) -> tuple[float, float, float, float]:
+        """Convert search parameters to φ1, φ2, θ1 and the innovation variance."""
+        p, q = self.order
+        partial = [
+            max(min(tanh(one), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION)
+            for one in u[: p + q].tolist()
+        ]
+        phi1 = phi2 = 0.0
+        if p == 1:
+            phi1 = partial[0]
+        if p == 2:
+            phi1, phi2 = partial[0] * (1.0 - partial[1]), partial[1]
+        theta = partial[-1] if q else 0.0
+        return phi1, phi2, theta, exp(min(max(float(u[-1]), -60.0), 60.0)) if self.has_variance_parameter else 1.0
+
+    def log_likelihood(self, u: Floats) -> float:
+        """Return the log-likelihood, maximised over the mean.
+
+        Without white noise, the log-likelihood is also maximised over the innovation variance.
+        """
+        count, logs, square, _ = compute_likelihood_sums(self.z, *self.model_coefficients(u), self.white)
+        if self.has_variance_parameter:
+            return float(-0.5 * (count * log(2.0 * pi) + logs + square))
+        size = max(square / count, 1e-300)
+        return float(-0.5 * (count * (log(2.0 * pi * size) + 1.0) + logs))
+
+    def negative_log_likelihood(self, u: Floats) -> float:
+        return -self.log_likelihood(u)
+
+
+def _maximize(likelihood: _ArmaLikelihood) -> tuple[float, Floats]:
+    """Return the BIC of the model with the maximum likelihood, and its search parameters."""
+    count = int(np.isfinite(likelihood.z).sum())
+    loss, starts = likelihood.negative_log_likelihood, likelihood.start_parameters()
+    tried = sorted((loss(u), i) for i, u in enumerate(starts))
     best, at = tried[0][0], starts[tried[0][1]]
-    if free:
+    if at.size:
         for _, i in tried[:2]:
             least, place = minimize_bfgs(loss, starts[i], 1e-4 * count**0.5)
             if least < best:
                 best, at = least, place
-    return 2.0 * best + (free + 2) * log(count), order, at
+    return 2.0 * best + (at.size + 2) * log(count), at
 
 
-def _start_parameters(white: float, order: Order) -> list[Floats]:
-    return [
-        np.array([*map(atanh, partial), *((atanh(theta),) if order[1] else ()), *((log(share),) if share else ())])
-        for partial in START_PARTIAL_AUTOCORRELATIONS[order[0]]
-        for theta in (START_THETAS if order[1] else (0.0,))
-        for share in (START_VARIANCE_SHARES if white > 0.0 and order != (0, 0) else (0.0,))
-    ]
-
-
-def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
-    """Return the log-likelihood, maximised over the mean.
-
-    Without white noise, the log-likelihood is also maximised over the innovation variance.
-    """
-    phi1, phi2, theta, variance = _model_coefficients(order, u, white)
-    count, logs, square, _ = compute_likelihood_sums(z, phi1, phi2, theta, variance, white)
-    if white > 0.0 and order != (0, 0):
-        return float(-0.5 * (count * log(2.0 * pi) + logs + square))
-    size = max(square / count, 1e-300)
-    return float(-0.5 * (count * (log(2.0 * pi * size) + 1.0) + logs))
-
-
-def _model_coefficients(order: Order, u: Floats, white: float) -> tuple[float, float, float, float]:
-    """Convert search parameters to φ1, φ2, θ1 and the innovation variance."""
-    partial = [
-        max(min(tanh(one), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION)
-        for one in u[: order[0] + order[1]].tolist()
-    ]
-    phi1 = phi2 = 0.0
-    if order[0] == 1:
-        phi1 = partial[0]
-    if order[0] == 2:
-        phi1, phi2 = partial[0] * (1.0 - partial[1]), partial[1]
-    theta = partial[-1] if order[1] else 0.0
-    free = white > 0.0 and order != (0, 0)
-    return phi1, phi2, theta, exp(min(max(float(u[-1]), -60.0), 60.0)) if free else 1.0
-
-
-def _to_model(z: Floats, white: float, origin: float, scale: float, best: _OrderFit) -> ArmaModel:
-    bic, order, u = best
-    phi1, phi2, theta, variance = _model_coefficients(order, u, white)
-    seen = white if order != (0, 0) else 0.0
-    count, _, square, mean = compute_likelihood_sums(z, phi1, phi2, theta, variance, seen)
-    if seen == 0.0:
+def _to_model(likelihood: _ArmaLikelihood, u: Floats, origin: float, scale: float) -> ArmaModel:
+    phi1, phi2, theta, variance = likelihood.model_coefficients(u)
+    white = likelihood.white if likelihood.order != (0, 0) else 0.0
+    count, _, square, mean = compute_likelihood_sums(likelihood.z, phi1, phi2, theta, variance, white)
+    if white == 0.0:
         variance = square / count
-    nothing = order == (0, 0) and white > 0.0
+    nothing = likelihood.order == (0, 0) and likelihood.white > 0.0
     return ArmaModel(
         phi=(phi1, phi2),
         theta=theta,
         variance=0.0 if nothing else variance * scale**2,
         mean=origin + scale * mean,
-        white_variance=(variance if nothing else white) * scale**2,
-        order=order,
-        log_likelihood=_log_likelihood(z, white, order, u) - count * log(scale),
-        bic=bic + 2.0 * count * log(scale),
+        white_variance=(variance if nothing else likelihood.white) * scale**2,
+        order=likelihood.order,
         count=count,
     )
 
 
-def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> tuple[_Triple, _Triple]:
+def _confidence_intervals(likelihood: _ArmaLikelihood, u: Floats) -> tuple[_Triple, _Triple]:
     """Compute the 95 % confidence intervals of φ1, φ2 and θ1 from the profile likelihood.
 
     If a root of the autoregressive polynomial nearly cancels θ1, the likelihood has a long ridge or two maxima. The
     curvature at the maximum would then underestimate the uncertainty. The confidence intervals therefore include all
     maxima within the 95 % limit.
     """
-    there = (order[0] > 0, order[0] > 1, order[1] > 0)
-    tops = _likelihood_maxima(z, white, order, u)
-    best = max(_log_likelihood(z, white, order, one) for one in tops)
+    p, q = likelihood.order
+    there = (p > 0, p > 1, q > 0)
+    tops = _likelihood_maxima(likelihood, u)
+    best = max(map(likelihood.log_likelihood, tops))
     nothing = (np.nan, np.nan)
-    ends = [[_interval_ends(z, white, order, one, i, best) if there[i] else nothing for i in range(3)] for one in tops]
+    ends = [[_interval_ends(likelihood, one, i, best) if there[i] else nothing for i in range(3)] for one in tops]
     lo, hi = np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]
     return (float(lo[0]), float(lo[1]), float(lo[2])), (float(hi[0]), float(hi[1]), float(hi[2]))
 
 
-def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list[Floats]:
+def _likelihood_maxima(likelihood: _ArmaLikelihood, u: Floats) -> list[Floats]:
     """Return the search parameters at all likelihood maxima within the 95 % limit. The global maximum comes first."""
     found = [u]
-    if sum(order) == MAX_COEFFICIENTS:
-        for start in _start_parameters(white, order):
-            _, one = minimize_bfgs(lambda u: -_log_likelihood(z, white, order, u), start, 0.1)
+    if sum(likelihood.order) == MAX_COEFFICIENTS:
+        for start in likelihood.start_parameters():
+            _, one = minimize_bfgs(likelihood.negative_log_likelihood, start, 0.1)
             if all(
                 np.abs(np.tanh(one[:MAX_COEFFICIENTS]) - np.tanh(other[:MAX_COEFFICIENTS])).max() > MIN_MAXIMA_DISTANCE
                 for other in found
             ):
                 found.append(one)
-    best = max(_log_likelihood(z, white, order, one) for one in found)
-    return [one for one in found if best - _log_likelihood(z, white, order, one) < HALF_CHI2_95]
+    best = max(map(likelihood.log_likelihood, found))
+    return [one for one in found if best - likelihood.log_likelihood(one) < HALF_CHI2_95]
 
 
-def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: float) -> tuple[float, float]:
+def _interval_ends(likelihood: _ArmaLikelihood, u: Floats, which: int, top: float) -> tuple[float, float]:
     """Return the ends of the confidence interval of one coefficient around a likelihood maximum."""
-    value = _model_coefficients(order, u, white)[which]
-    limits = (
-        (-MAX_PARTIAL_AUTOCORRELATION, MAX_PARTIAL_AUTOCORRELATION)
-        if which or order[0] < 2
-        else (-2.0 * MAX_PARTIAL_AUTOCORRELATION, 2.0 * MAX_PARTIAL_AUTOCORRELATION)
-    )
+    value = likelihood.model_coefficients(u)[which]
+    largest = MAX_PARTIAL_AUTOCORRELATION * (1.0 if which or likelihood.order[0] < 2 else 2.0)
     found = []
-    for limit in limits:
-        inside, outside, near = value, limit, _free_parameters(order, u, which)
+    for limit in (-largest, largest):
+        inside, outside, near = value, limit, np.delete(u, _parameter_index(likelihood.order, which))
         step = max(abs(limit - value) / 64.0, 1e-9)
         while abs(inside - limit) > 1e-9:  # The search for the end moves outwards in growing steps.
             further = inside + np.sign(limit - value) * min(step, abs(limit - inside))
-            fallen, moved = _profile_likelihood(z, white, order, which, float(further), near)
+            fallen, moved = _profile_likelihood(likelihood, which, float(further), near)
             if top - fallen > HALF_CHI2_95:
                 outside = float(further)
                 break
@@ -336,7 +340,7 @@ def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int,
             continue
         for _ in range(BISECTION_STEPS):
             middle = 0.5 * (inside + outside)
-            fallen, moved = _profile_likelihood(z, white, order, which, middle, near)
+            fallen, moved = _profile_likelihood(likelihood, which, middle, near)
             if top - fallen > HALF_CHI2_95:
                 outside = middle
             else:
@@ -345,39 +349,29 @@ def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int,
     return found[0], found[1]
 
 
-def _free_parameters(order: Order, u: Floats, which: int) -> Floats:
-    """Return the search parameters except the parameter that corresponds to a fixed coefficient."""
-    held = order[0] if which == 2 else which
-    return np.delete(u, held)
+def _parameter_index(order: Order, which: int) -> int:
+    """Return the index of the search parameter that corresponds to φ1, φ2 or θ1."""
+    return order[0] if which == 2 else which
 
 
-def _profile_likelihood(
-    z: Floats, white: float, order: Order, which: int, value: float, near: Floats
-) -> tuple[float, Floats]:
+def _profile_likelihood(likelihood: _ArmaLikelihood, which: int, value: float, near: Floats) -> tuple[float, Floats]:
     """Maximise the log-likelihood for a fixed coefficient, and return the maximum and its position."""
+    at = _parameter_index(likelihood.order, which)
 
     def insert_coefficient_held_at_value(free: Floats) -> Floats:
-        u = np.insert(free, order[0] if which == 2 else which, 0.0)
-        if which == 2:
-            u[order[0]] = atanh(value)
-        elif order[0] == 1 or which == 1:
-            u[which] = atanh(value)
-        else:  # the relation φ1 = r1 (1 − φ2) implies |φ1| < 1 − φ2
-            highest = 1.0 - abs(value)
-            phi2 = (
-                -MAX_PARTIAL_AUTOCORRELATION
-                + 0.5
-                * (1.0 + tanh(float(u[1])))
-                * (highest + MAX_PARTIAL_AUTOCORRELATION)
-                * MAX_PARTIAL_AUTOCORRELATION
-            )
-            u[1] = atanh(phi2)
-            u[0] = atanh(max(min(value / (1.0 - phi2), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION))
-        return u
+        if which or likelihood.order[0] == 1:
+            return np.insert(free, at, atanh(value))
+        # the relation φ1 = r1 (1 − φ2) implies |φ1| < 1 − φ2
+        highest = 1.0 - abs(value)
+        phi2 = (
+            -MAX_PARTIAL_AUTOCORRELATION
+            + 0.5 * (1.0 + tanh(float(free[0]))) * (highest + MAX_PARTIAL_AUTOCORRELATION) * MAX_PARTIAL_AUTOCORRELATION
+        )
+        r1 = max(min(value / (1.0 - phi2), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION)
+        return np.array([atanh(r1), atanh(phi2), *free[1:]])
 
-    if not near.size:
-        return _log_likelihood(z, white, order, insert_coefficient_held_at_value(near)), near
-    least, place = minimize_bfgs(
-        lambda free: -_log_likelihood(z, white, order, insert_coefficient_held_at_value(free)), near, 1e-2
-    )
+    def loss(free: Floats) -> float:
+        return likelihood.negative_log_likelihood(insert_coefficient_held_at_value(free))
+
+    least, place = minimize_bfgs(loss, near, 1e-2) if near.size else (loss(near), near)
     return -least, place

@@ -24,7 +24,7 @@ from monitor.drift.thermal.thermal_model import (
     predict_bias_and_variance,
     regressor_derivatives_by_log_time_constant,
 )
-from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors
+from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors, solve_least_squares
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,8 +146,7 @@ class RecursiveThermalFit:
         """Return the thermal model with coefficients that are fitted to all intervals so far."""
         own = self._terms + self._k
         x, z = self._triangle[:, :own], self._triangle[:, -1]
-        scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
-        sizes = np.linalg.lstsq(x / scale, z, rcond=1e-10)[0] / scale
+        sizes = solve_least_squares(x, z)
         square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
         sigma = (square / self.degrees_of_freedom) ** 0.5
         bends = combine_regressor_derivatives(self._model.shape, self._triangle[:, own:-1], sizes)

@@ -18,7 +18,6 @@ from monitor.drift.thermal.interval_means import compute_interval_means
 from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means_suffice_for_fit, fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict_interval_means
 from monitor.drift.thermal.thermal_results import choose_interval_s
-from monitor.estimation.allan.batch import EachAxis
 from monitor.estimation.analysis import RecordingAnalysis, fit_other_samples
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 
@@ -91,7 +90,7 @@ def temperature_varied(temperatures_c: Floats) -> bool:
 
 
 def remove_temperature_effect(
-    analysis: RecordingAnalysis, temperature_c: Floats, parallel_map: EachAxis = map
+    analysis: RecordingAnalysis, temperature_c: Floats
 ) -> TemperatureRemovalComparison | None:
     """Compute the noise coefficients of a recording after removal of the temperature dependence of the bias.
 
@@ -101,8 +100,6 @@ def remove_temperature_effect(
         Analysis of a recording.
     temperature_c : ndarray, shape (n,)
         Temperature of each sample, °C.
-    parallel_map : callable
-        Function that applies a computation to each axis, like ``map``, possibly in parallel.
 
     Returns
     -------
@@ -133,7 +130,7 @@ def remove_temperature_effect(
     before, k_or_r = analysis.estimate.coefficients, analysis.estimate.k_or_r
     after = before
     if models:
-        fit = fit_other_samples(analysis, values, parallel_map)
+        fit = fit_other_samples(analysis, values)
         after, k_or_r = fit.coefficients, fit.k_or_r
     return TemperatureRemovalComparison(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
 
@@ -180,11 +177,6 @@ def _natural_spline(y: Floats) -> Floats:
     >>> _natural_spline(np.array([0.0, 1.0, 0.0])).tolist()
     [0.0, -3.0, 0.0]
     """
-    bend, right = np.zeros(y.size), 6.0 * np.diff(y, 2)
-    diagonal = np.full(right.size, 4.0)
-    for i in range(1, right.size):
-        diagonal[i] -= 1.0 / diagonal[i - 1]
-        right[i] -= right[i - 1] / diagonal[i - 1]
-    for i in reversed(range(right.size)):
-        bend[i + 1] = (right[i] - bend[i + 2]) / diagonal[i]
-    return bend
+    inner = y.size - 2
+    matrix = 4.0 * np.eye(inner) + np.eye(inner, k=1) + np.eye(inner, k=-1)
+    return np.pad(np.linalg.solve(matrix, 6.0 * np.diff(y, 2)), 1)

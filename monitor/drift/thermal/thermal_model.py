@@ -15,6 +15,7 @@ from monitor.common.distributions import Z95
 from monitor.drift.thermal.thermal_response import (
     ThermalModelForm,
     build_regressors,
+    compute_lag_roots,
     difference_equation_coefficients,
     temperature_beyond_range,
 )
@@ -110,7 +111,7 @@ def predict_interval_means(
     if not starts_with_fit and k:
         swing = (model.highest_c - model.lowest_c) / 12.0**0.5
         lags = model.coefficients[1 + model.shape.powers :]
-        p = np.exp(-model.interval_s / np.asarray(model.shape.constants_s))
+        p = compute_lag_roots(model.shape, model.interval_s)
         variance += ((lags * swing) ** 2 * p ** (2.0 * np.arange(excess.size)[:, None])).sum(axis=1)
     half = Z95 * np.sqrt(variance)
     return ThermalPrediction(bias, bias - half, bias + half)

@@ -5,7 +5,7 @@ import pytest
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from monitor.noise.effects import EFFECTS
-from monitor.simulator import parse_effects
+from monitor.simulator.effect_option_parser import parse_effects
 
 
 def test_effect_is_parsed_for_one_axis_or_a_kind_of_axes() -> None:

@@ -13,9 +13,9 @@ from drivers.driver import Driver
 from drivers.timing.sample_clock import SampleClock
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.settings.loading import FaultsTable, VirtualTable
-from monitor.simulator import SimulatedDevice
 from monitor.simulator.faults import FaultKind, Faults
 from monitor.simulator.ports import CanPort, PtyPort, ZenohPort
+from monitor.simulator.simulated_device import SimulatedDevice
 from tests.contracts.decoder_examples import EXAMPLES, Example
 from tests.support.paced_sensor import follow_reader, is_open
 from tests.support.waiting import PATIENCE_S, wait_for

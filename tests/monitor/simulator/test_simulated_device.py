@@ -13,7 +13,7 @@ from drivers.errors import ConfigError
 from drivers.timing.sample_clock import SampleClock
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.settings.loading import VirtualTable
-from monitor.simulator import SimulatedDevice
+from monitor.simulator.simulated_device import SimulatedDevice
 from tests.support.paced_sensor import follow_reader, is_open
 from tests.support.waiting import PATIENCE_S, wait_for
 

@@ -50,7 +50,6 @@ def test_fit_is_invariant_to_offset_and_scale():
     assert scaled_fit.phi == pytest.approx(fit.phi, abs=1e-6)
     assert scaled_fit.mean == pytest.approx(5.0 + 1e-4 * fit.mean, rel=1e-9)
     assert scaled_fit.variance == pytest.approx(1e-8 * fit.variance, rel=1e-5)
-    assert scaled_fit.bic == pytest.approx(fit.bic + 2.0 * 400 * np.log(1e-4), rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -112,6 +111,5 @@ def test_parameters_and_intervals_equal_those_found_with_scipy(monkeypatch, whit
     monkeypatch.setattr(arma, "minimize_bfgs", minimize_with_scipy)
     expected = fit_arma(z, white, with_confidence_intervals=True)
     assert found.order == expected.order
-    assert found.bic == pytest.approx(expected.bic, abs=1e-5)
     assert (*found.phi, found.theta) == pytest.approx((*expected.phi, expected.theta), abs=1e-4)
     assert (*found.lo, *found.hi) == pytest.approx((*expected.lo, *expected.hi), abs=1e-3, nan_ok=True)
