@@ -12,12 +12,12 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from monitor.common.unit_formatting import (
-    COEFFICIENT_UNITS,
-    DEVIATION_UNITS,
+    DEFAULT_UNITS,
     KIND_NAMES,
     KINDS,
     SAMPLE_UNITS,
     Kind,
+    UnitSystem,
     axes_of,
 )
 from monitor.publishing.rerun import dynamic_heat_map
@@ -43,7 +43,9 @@ MAX_GRID_COLUMNS: Final = 4
 SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
-def blueprint(devices: Sequence[ViewerDeviceDescription], fleet: bool = False) -> rrb.Blueprint:
+def blueprint(
+    devices: Sequence[ViewerDeviceDescription], fleet: bool = False, units: UnitSystem = DEFAULT_UNITS
+) -> rrb.Blueprint:
     """Return the Rerun layout for a list of devices.
 
     Parameters
@@ -52,21 +54,23 @@ def blueprint(devices: Sequence[ViewerDeviceDescription], fleet: bool = False) -
         Devices to show.
     fleet
         True if the overview is a table that also lists devices that are not shown in detail.
+    units
+        Units of the plots.
     """
-    pages, names = [_device(one) for one in devices], [one.name for one in devices]
+    pages, names = [_device(one, units) for one in devices], [one.name for one in devices]
     if fleet:
-        root: rrb.Container = rrb.Tabs(_fleet(names), *pages, active_tab=0)
+        root: rrb.Container = rrb.Tabs(_fleet(names, units), *pages, active_tab=0)
     else:
-        root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(names), *pages, active_tab=0)
+        root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(names, units), *pages, active_tab=0)
     return collapsed_blueprint(root, TIMELINE)
 
 
-def _device(device: ViewerDeviceDescription) -> rrb.Container:
-    tabs = [tab for panel in PANELS if (tab := panel.tab_layout(device)) is not None]
-    return rrb.Tabs(_now(device), _dynamic(device.name), *tabs, active_tab=0, name=device.name)
+def _device(device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container:
+    tabs = [tab for panel in PANELS if (tab := panel.tab_layout(device, units)) is not None]
+    return rrb.Tabs(_now(device, units), _dynamic(device.name, units), *tabs, active_tab=0, name=device.name)
 
 
-def _now(device: ViewerDeviceDescription) -> rrb.Container:
+def _now(device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container:
     name = device.name
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{name}/status", name="Is it healthy?"),
@@ -75,8 +79,8 @@ def _now(device: ViewerDeviceDescription) -> rrb.Container:
         row_shares=[2.35, 6.3, 1.35],
     )
     rows = [
-        (5.0, rrb.Horizontal(*(_allan(name, kind) for kind in KINDS))),
-        (2.2, rrb.Horizontal(*(_coefficient(name, kind, symbol) for kind in KINDS for symbol in NOW_COEFFICIENTS))),
+        (5.0, rrb.Horizontal(*(_allan(name, kind, units) for kind in KINDS))),
+        (2.2, rrb.Horizontal(*(_coefficient(name, kind, one, units) for kind in KINDS for one in NOW_COEFFICIENTS))),
         (1.6, rrb.Horizontal(*(_gap(name, kind) for kind in KINDS))),
         (2.2, rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), temperature_view(name), column_shares=[2, 2, 1])),
     ]
@@ -86,11 +90,11 @@ def _now(device: ViewerDeviceDescription) -> rrb.Container:
     return rrb.Horizontal(left, right, column_shares=[3, 7], name="Now")
 
 
-def _dynamic(device: str) -> rrb.Container:
+def _dynamic(device: str, units: UnitSystem) -> rrb.Container:
     columns = [
         rrb.Vertical(
             *(_heat_map(device, axis) for axis in axes_of(kind)),
-            rrb.Horizontal(*(_coefficient(device, kind, symbol) for symbol in DYNAMIC_COEFFICIENTS)),
+            rrb.Horizontal(*(_coefficient(device, kind, symbol, units) for symbol in DYNAMIC_COEFFICIENTS)),
             row_shares=[3, 3, 3, 2.6],
         )
         for kind in KINDS
@@ -98,9 +102,9 @@ def _dynamic(device: str) -> rrb.Container:
     return rrb.Horizontal(*columns, name="Dynamic")
 
 
-def _overview(devices: Sequence[str]) -> rrb.Container:
+def _overview(devices: Sequence[str], units: UnitSystem) -> rrb.Container:
     kinds = KINDS if len(devices) <= MAX_DEVICES_WITH_ACCEL else KINDS[:1]
-    charts = [_allan(device, kind, f"{device}: ") for kind in kinds for device in devices]
+    charts = [_allan(device, kind, units, f"{device}: ") for kind in kinds for device in devices]
     return rrb.Vertical(
         rrb.Horizontal(*_overview_texts(), column_shares=[11, 9]),
         rrb.Grid(*charts, grid_columns=min(len(devices), MAX_GRID_COLUMNS)),
@@ -109,8 +113,8 @@ def _overview(devices: Sequence[str]) -> rrb.Container:
     )
 
 
-def _fleet(devices: Sequence[str]) -> rrb.Container:
-    charts = [_allan(device, kind, f"{device}: ") for device in devices for kind in KINDS]
+def _fleet(devices: Sequence[str], units: UnitSystem) -> rrb.Container:
+    charts = [_allan(device, kind, units, f"{device}: ") for device in devices for kind in KINDS]
     if not charts:
         return rrb.Vertical(*_overview_texts(), row_shares=[4, 1], name="Fleet")
     left = rrb.Vertical(*_overview_texts(), row_shares=[4, 1])
@@ -135,14 +139,14 @@ def _heat_map(device: str, axis: str) -> rrb.View:
     return drawing_view(f"/{device}/dynamic/{axis}", name, "$origin/**", x, y)
 
 
-def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
+def _allan(device: str, kind: Kind, units: UnitSystem, prefix: str = "") -> rrb.View:
     paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
-    name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {DEVIATION_UNITS[kind].name}"
+    name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {units.deviation(kind).name}"
     return drawing_view(f"/{device}/allan", name, paths, (-1.6, WIDTH + 0.6), (-1.3, HEIGHT + 2.5))
 
 
-def _coefficient(device: str, kind: Kind, symbol: str) -> rrb.View:
-    name = f"{SHORT_KIND_NAMES[kind]} {symbol}, {COEFFICIENT_UNITS[kind][symbol].name}"
+def _coefficient(device: str, kind: Kind, symbol: str, units: UnitSystem) -> rrb.View:
+    name = f"{SHORT_KIND_NAMES[kind]} {symbol}, {units.single(kind, symbol).name}"
     return time_series_view(f"/{device}/coefficients/{symbol}", name, [f"$origin/{axis}/**" for axis in axes_of(kind)])
 
 

@@ -67,6 +67,7 @@ class RerunView:
         history_source: HistorySource = lambda _device: None,
         fleet: bool = False,
     ) -> None:
+        self.units = settings.units
         self._settings = settings
         self._history_source = history_source
         self._fleet = fleet
@@ -171,7 +172,7 @@ class RerunView:
         output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self.url = output.child, output.url
         try:
-            scene = rerun_scene.AllDevicesScene(output.stream, self._fleet)
+            scene = rerun_scene.AllDevicesScene(output.stream, self._fleet, settings.units)
             self._draw(output, scene)
         finally:
             self._child = None
@@ -182,7 +183,7 @@ class RerunView:
     ) -> None:
         from monitor.publishing.rerun import blueprint
 
-        layout = blueprint.blueprint(devices, self._fleet)
+        layout = blueprint.blueprint(devices, self._fleet, scene.units)
         output.stream.send_blueprint(layout, make_active=True, make_default=True)
         scene.set_detailed_devices(devices)
         self._phase = f"ok, but {output.note}" if output.note else "ok"
