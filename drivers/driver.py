@@ -6,6 +6,7 @@ silent, the driver closes the link and reports an event. The driver then tries t
 increasing length. A fault of one device does not affect other devices.
 """
 
+import json
 import threading
 import time
 from collections import deque
@@ -294,8 +295,13 @@ class Driver:
         if len(data) < missing:
             return
         found = identify_wire_format(self._undecoded_capture)
-        if found is not None:
-            self._format_hint = f'; the bytes fit decoder = "{found.decoder}" (see imu-monitor identify)'
+        if found is None:
+            return
+        fitting = f'decoder = "{found.decoder}"'
+        if type(self.decoder).__module__.endswith(f".{found.decoder}"):  # only its options do not fit
+            options = ", ".join(f"{key} = {json.dumps(value)}" for key, value in found.options.items())
+            fitting = f"decoder_options = {{ {options} }}" if options else "the default decoder_options"
+        self._format_hint = f"; the bytes fit {fitting} (see imu-monitor identify)"
 
     def _handle_recovery(self) -> None:
         if self.state == "lost":

@@ -149,7 +149,7 @@ class ZenohLink:
                     self._enqueue(chunk)
                     self._changed.notify_all()
         except zenoh.ZError:
-            pass  # the session was closed or has failed
+            pass  # the session is closed: the reader gets the queued messages, and then LinkLost
         finally:
             with self._changed:
                 self._running = False

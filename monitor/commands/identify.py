@@ -8,9 +8,10 @@ from typing import Final
 
 import msgspec
 
-from drivers.errors import LinkLost, LinkUnavailable, NotReady
+from drivers.errors import ConfigError, LinkLost, LinkUnavailable, NotReady
 from drivers.host import file_access
 from drivers.links import serial_link
+from drivers.validation.settings_model import check_table
 from drivers.wire_format_identification import TEXT_DECODER, UNKNOWN, IdentifiedFormat, identify_wire_format
 
 BAUD_RATES: Final = (115200, 460800, 921600, 230400, 9600, 57600, 38400, 19200, 374400, 1000000, 1843200, 2000000)
@@ -62,6 +63,8 @@ def identify_port(port: str, listen_s: float, report: Callable[[str], None]) -> 
 
     Raises
     ------
+    ConfigError
+        If the port is a URL of an unknown kind.
     LinkUnavailable
         If the port cannot be opened.
     NotReady
@@ -89,7 +92,10 @@ def identify_port(port: str, listen_s: float, report: Callable[[str], None]) -> 
 
 def _listen(port: str, baudrate: int, listen_s: float) -> tuple[bytes, float]:
     """Return the received bytes and the time in s from the first to the last byte."""
-    link = serial_link.build(serial_link.Settings(port=port, baudrate=baudrate))
+    checked = check_table(serial_link.Settings, {"port": port, "baudrate": baudrate})
+    if checked.problems or checked.value is None:
+        raise ConfigError(*map(str, checked.problems))
+    link = serial_link.build(checked.value)
     data = b""
     first_s = last_s = 0.0
     link.open()
@@ -127,6 +133,11 @@ def write_configuration(found: IdentifiedSource) -> str:
     elif UNKNOWN in found.format.options.values():
         lines.append('# replace "?"; imu-monitor check names the possible values')
     lines += [f"{key} = {_to_toml(value)}" for key, value in found.format.options.items()]
+    if found.format.decoder == TEXT_DECODER:
+        lines.append(
+            "# the units cannot be identified; the board may send deg/s and g, or raw counts (key preset or scale)"
+        )
+        lines += ['gyro_unit = "rad/s"', 'accel_unit = "m/s²"']
     return "\n".join(lines) + "\n"
 
 

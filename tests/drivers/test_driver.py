@@ -372,6 +372,21 @@ def test_status_names_the_decoder_that_fits_undecoded_bytes():
         rig.wait_until(lambda: rig.driver.state == "running" and not rig.driver.text)
 
 
+@pytest.mark.parametrize(
+    ("configured", "sent", "hint"),
+    [
+        ({"packet": "S1"}, {"packet": "S0"}, 'the bytes fit decoder_options = { packet = "S0" }'),
+        ({"packet": "z1"}, {}, "the bytes fit the default decoder_options"),
+    ],
+)
+def test_status_names_the_options_that_fit_undecoded_bytes(configured, sent, hint):
+    encoder = aceinna_dmu.build(aceinna_dmu.Settings(**sent))
+    with run_driver(aceinna_dmu.build(aceinna_dmu.Settings(**configured))) as rig:
+        for chunk in encoder.encode(make_samples(0, 200, tick_s=1.0, modulus=256)):
+            rig.link.write(chunk.data)
+        rig.wait_until(lambda: hint in rig.driver.text)
+
+
 def test_times_are_unix_if_the_link_has_unix_times():
     rig = DriverRig()
     rig.link.epoch = "unix"

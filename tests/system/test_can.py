@@ -2,6 +2,7 @@
 
 import csv
 import gzip
+import itertools
 import os
 import threading
 import time
@@ -12,11 +13,14 @@ import can
 import numpy as np
 import pytest
 
-from drivers.data_types import AXES, Chunk
+from drivers.data_types import AXES, Chunk, make_block
+from drivers.decoders import dbc
 from drivers.links.base import Link
+from drivers.units import DEGREE, G0
 from tests.support.recordings import recordings
+from tests.support.settings import read_settings
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.system.rig import PluggableTerminal, run_service, send_at_rate
+from tests.system.rig import PluggableTerminal, check_deviations_equal_batch, run_service, send_at_rate
 
 OPTIONS = """
 [device.driver.decoder_options]
@@ -88,6 +92,66 @@ decoder = "dbc"
     want = read_expected_values(folder / f"{name}.npz")
     assert len(want) == len(sent)
     assert (np.abs(run.output.values("imu") - want[valid]) <= HALF_LSB).all()
+
+
+OXTS = {
+    **{f"g{axis}": f"RateVehicle.AngRate{axis.upper()}" for axis in "xyz"},
+    **{f"a{axis}": f"AccelVehicle.Accel{axis.upper()}" for axis in "xyz"},
+}
+CANOPEN = {
+    **{f"g{axis}": f"Tpdo2.Rate{axis.upper()}" for axis in "xyz"},
+    **{f"a{axis}": f"Tpdo1.Acceleration{axis.upper()}" for axis in "xyz"},
+}
+SAMPLES, CUT = 2000, (400, 1500)
+
+
+@pytest.mark.parametrize(
+    ("file", "signals", "gyro_step_deg_s", "accel_step_m_s2"),
+    [
+        ("oxts_rt", OXTS, 0.01, 0.01),
+        ("sick_tmm61", CANOPEN, 7 / 800, G0 / 4096),
+        ("dis_qg65d", CANOPEN, 0.01, 1e-3 * G0),
+    ],
+)
+def test_received_and_bad_samples_of_shipped_databases_add_up(
+    tmp_path: Path, file: str, signals: dict[str, str], gyro_step_deg_s: float, accel_step_m_s2: float
+) -> None:
+    steps = np.repeat([gyro_step_deg_s * DEGREE, accel_step_m_s2], 3)
+    values = np.random.default_rng(6).normal(0.0, 20.0 * steps, (SAMPLES, 6))
+    encoder = dbc.build(read_settings(dbc.Settings, {"file": file, "signals": signals}))
+    chunks = encoder.encode(make_block(np.arange(1, SAMPLES + 1) * 10_000_000, values, None))
+    frames = [list(group) for _, group in itertools.groupby(chunks, key=lambda chunk: chunk.t_ns)]
+    with can.Logger(str(tmp_path / "drive.asc")) as log:
+        for i, parts in enumerate(frames):
+            for frame in parts:
+                data = frame.data[:1] if i in CUT else frame.data
+                log.on_message_received(can.Message(frame.t_ns * 1e-9, frame.address, is_extended_id=False, data=data))
+    table = "".join(f'{axis} = "{signal}"\n' for axis, signal in signals.items())
+    config = f"""[[device]]
+name = "imu"
+rate = 100.0
+window = 60.0
+restart = false
+[device.driver]
+link = "replay"
+path = "drive.asc"
+speed = "max"
+decoder = "dbc"
+[device.driver.decoder_options]
+file = "{file}"
+[device.driver.decoder_options.signals]
+{table}[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+"""
+    with run_service(tmp_path, config) as run:
+        run.join()  # the service ends with the replay
+        counts = run.worker("imu").driver.counts
+    kept = np.setdiff1d(np.arange(SAMPLES), CUT)
+    assert (counts.received, counts.bad, counts.lost) == (len(kept), len(CUT), 0)
+    assert (np.abs(run.output.values("imu") - values[kept]) <= 0.501 * steps).all()
+    check_deviations_equal_batch(run.output, "imu", kept)
 
 
 class SlcanAdapter(threading.Thread):

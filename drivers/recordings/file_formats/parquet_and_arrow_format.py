@@ -154,7 +154,7 @@ def read_ipc(path: Path, options: ReadingOptions) -> table.Table:
                 batch.validate()
                 batches.append(batch)
         except StopIteration:
-            pass  # the stream has ended
+            notes.append(f"Only {len(batches)} of {count} batches could be read: the stream ends before them.")
         except (pa.ArrowException, OSError) as error:
             notes.append(f"Only {len(batches)} complete batches could be read: {first_message_line(error)}.")
     schema = batches[0].schema if batches else schema

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from drivers.decoders.binary_frames.stim300 import Stim300Decoder
-from drivers.errors import LinkUnavailable, NotReady
+from drivers.errors import ConfigError, LinkUnavailable, NotReady
 from monitor.cli import app
 from monitor.commands import identify
 from monitor.settings.loading import load_config
@@ -74,6 +74,11 @@ def test_silent_port_names_the_wiring() -> None:
     os.close(slave)
 
 
+def test_unknown_kind_of_url_is_one_error() -> None:
+    with pytest.raises(ConfigError, match=r'port: "udp://127\.0\.0\.1:1" has an unknown kind of URL'):
+        identify.identify_port("udp://127.0.0.1:1", 0.01, lambda line: None)
+
+
 def test_missing_port_is_one_error() -> None:
     with pytest.raises(LinkUnavailable, match="no such port"):
         identify.identify_port("/dev/ttyNOTHERE", 0.01, lambda line: None)
@@ -88,6 +93,7 @@ def test_command_prints_the_configuration_of_a_capture(example: Example, tmp_pat
     assert f'decoder = "{example.name}"' in result.stdout
     assert "found " in result.stderr
     assert ('columns = ["?","?"' in result.stdout) == (example.name == "text")
+    assert ('gyro_unit = "rad/s"' in result.stdout) == (example.name == "text")
     assert ('model = "?"' in result.stdout) == (example.name == "epson_uart")
 
 
