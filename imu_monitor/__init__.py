@@ -10,7 +10,7 @@ names ``monitor`` and ``drivers`` to these folders. The order of ``sys.path`` st
 ``site-packages`` cannot take the place of a module of the standard library. ``config`` holds data only and is found
 beside ``monitor`` by its path.
 
-``imu-monitor``, ``python -m imu_monitor`` and ``python -m monitor.cli`` end in ``main``.
+``imu-monitor`` and ``python -m imu_monitor`` end in ``main``.
 """
 
 import contextlib

@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -11,7 +12,11 @@ from hypothesis import HealthCheck, settings
 
 # This must be set before NumPy is imported. As in the program, the matrices are too small for parallel linear algebra.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ.get("OPENBLAS_NUM_THREADS", "1")
+# The module path may begin with foreign packages named monitor, drivers or config. Tests and the programs that they
+# start import the packages of this project.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
 
+import imu_monitor  # noqa: F401 - binds the packages of the project
 from tests.support.kernels import compile_kernels
 from tests.support.ports import release_claims
 from tests.support.waiting import PATIENCE_S

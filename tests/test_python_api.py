@@ -422,6 +422,18 @@ def test_interface_works_behind_foreign_packages(form: str, tmp_path: Path) -> N
     assert done.stdout == f"estimated\n{files}\n"
 
 
+@pytest.mark.parametrize("form", ["packages", "sitecustomize"])
+def test_tests_work_behind_foreign_packages(form: str, tmp_path: Path) -> None:
+    path = create_foreign_packages(tmp_path / "ros", form)
+    files = [str(ROOT / "tests" / name) for name in ("drivers/test_units.py", "drivers/test_irregular_files.py")]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-k", "units or socket", *files],
+        cwd=ROOT, env=os.environ | {"PYTHONPATH": str(path)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout
+
+
 def test_import_loads_only_the_standard_library() -> None:
     program = "import sys; before = set(sys.modules); import imu_monitor; print(*set(sys.modules) - before)"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

@@ -32,7 +32,6 @@ from drivers.recordings.recording import (
     iter_blocks,
     take_last,
 )
-from drivers.recordings.table import EXAMPLE_HEADER
 from drivers.recordings.writing import open_recording_writer, save_samples
 from drivers.validation.number_ranges import DURATION_S, RATE_HZ
 
@@ -124,7 +123,7 @@ def _load_file(path: Path, rate_hz: float | None, options: ReadingOptions) -> Re
             f"{' '.join(FORMATS)}"
         )
     raise RecordingError(
-        f"{path}: the file is empty, expected columns such as {EXAMPLE_HEADER}; record it again, or name another file"
+        f"{path}: the file is empty, expected samples of an IMU; record it again, or name another file"
     )
 
 

@@ -24,7 +24,7 @@ from typing import IO, Any, Final, Literal
 import msgspec
 import numpy as np
 
-from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, ns_to_seconds, seconds_to_ns
+from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, seconds_to_ns
 from drivers.errors import ImuError, RecordingError
 from drivers.host.file_access import open_regular_file
 from drivers.recordings.file_formats.arrow_message_sizes import iter_batch_sizes
@@ -42,6 +42,7 @@ SUFFIX: Final = ".arrows"
 NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
+T_LIMIT_NS: Final = round(T_LIMIT_S * 1e9)
 MAX_BATCH_BYTES: Final = 64_000_000
 """Maximum unpacked size of a batch in bytes. The batches that the daemon writes are much smaller."""
 MAX_LOST_SAMPLES: Final = 10**11
@@ -256,11 +257,12 @@ def read_samples(path: Path) -> Iterator[GapFreeSegmentPart]:
 def _split_batch(batch: Any, meta: Any) -> Iterator[GapFreeSegmentPart]:
     """Split the samples of a batch where samples are missing. Skip a batch with implausible values."""
     columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
+    columns = _with_times_in_ns(columns)
     values = np.column_stack([columns[axis] for axis in AXES])
     if not _is_plausible(columns) or np.isinf(values).any():
         return
     state = _decode_state(meta)
-    rows = make_block(seconds_to_ns(columns["t"]), values, columns["temperature"].copy(), columns["ticks"].copy())
+    rows = make_block(columns["t_ns"].copy(), values, columns["temperature"].copy(), columns["ticks"].copy())
     lost = columns["lost"]
     edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), len(rows)]
     for a, b in pairwise(edges):
@@ -273,9 +275,20 @@ def _split_batch(batch: Any, meta: Any) -> Iterator[GapFreeSegmentPart]:
 def _is_plausible(columns: Mapping[str, Any]) -> bool:
     """Return True if all times and all numbers of missing samples are in the supported ranges."""
     # A null value would convert a column of integers to floats.
-    lost, ticks = columns["lost"], columns["ticks"]
-    whole = lost.dtype == ticks.dtype == np.int64
-    return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= MAX_LOST_SAMPLES)).all())
+    t_ns, lost, ticks = columns["t_ns"], columns["lost"], columns["ticks"]
+    if not t_ns.dtype == lost.dtype == ticks.dtype == np.int64:
+        return False
+    in_range = (t_ns > -T_LIMIT_NS) & (t_ns < T_LIMIT_NS) & (lost >= 0) & (lost <= MAX_LOST_SAMPLES)
+    return bool(in_range.all())
+
+
+def _with_times_in_ns(columns: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns of a batch with times in ns. Earlier revisions wrote the column ``t`` in s."""
+    if "t" not in columns:
+        return columns
+    t_s = columns["t"]
+    t_ns = seconds_to_ns(np.where(np.abs(t_s) < T_LIMIT_S, t_s, T_LIMIT_S))
+    return {"t_ns": t_ns, **{name: column for name, column in columns.items() if name != "t"}}
 
 
 def _decode_state(meta: Any) -> DaemonState:
@@ -367,7 +380,10 @@ def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tu
 
 def _combine_batches(pa: Any, schema: Any, batches: list[Any]) -> Any:
     table = pa.Table.from_batches(batches).combine_chunks()
-    return pa.RecordBatch.from_arrays([column.chunk(0) for column in table.columns], schema=schema)
+    columns = {name: column.chunk(0) for name, column in zip(table.column_names, table.columns, strict=True)}
+    if "t" in columns:
+        columns = _with_times_in_ns({**columns, "t": columns["t"].to_numpy(zero_copy_only=False)})
+    return pa.RecordBatch.from_arrays([pa.array(columns[name]) for name in schema.names], schema=schema)
 
 
 def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any, Any]]:
@@ -441,14 +457,17 @@ def _check_schema(path: Path, schema: Any) -> SegmentMetadata:
     found = msgspec.json.decode(meta, type=SegmentMetadata)
     if found.schema != SCHEMA:
         raise RecordingError(f'{path}: schema "{found.schema[:64]}" is not {SCHEMA}')
-    if not schema.equals(_schema(import_pyarrow(path), found), check_metadata=False):
+    pa = import_pyarrow(path)
+    if not any(schema.equals(_schema(pa, found, times), check_metadata=False) for times in ("t_ns", "t")):
         raise RecordingError(f"{path}: is no segment of a recording: its columns differ")
     return found
 
 
-def _schema(pa: Any, of: SegmentMetadata) -> Any:
+def _schema(pa: Any, of: SegmentMetadata, times: str = "t_ns") -> Any:
+    """Return the Arrow schema of a segment. ``times`` is "t" for the times in s of earlier revisions."""
     if of.kind == "samples":
-        fields = [(name, pa.float64()) for name in ("t", *AXES, "temperature")]
+        fields = [(times, pa.int64() if times == "t_ns" else pa.float64())]
+        fields += [(name, pa.float64()) for name in (*AXES, "temperature")]
         fields += [(name, pa.int64()) for name in SEGMENT_COLUMNS]
     else:
         fields = [("t_ns", pa.int64()), ("address", pa.uint32()), ("data", pa.binary()), ("attachment", pa.binary())]
@@ -462,7 +481,7 @@ def _sample_batch(pa: Any, schema: Any, blocks: Sequence[SampleBlock]) -> Any:
     for one in blocks:
         lost[at] = one.lost
         at += len(one)
-    columns = [ns_to_seconds(rows.t_ns), *rows.values.T, rows.temperature_c, rows.ticks, lost]
+    columns = [rows.t_ns, *rows.values.T, rows.temperature_c, rows.ticks, lost]
     return pa.record_batch([pa.array(np.ascontiguousarray(column)) for column in columns], schema=schema)
 
 

@@ -35,6 +35,7 @@ from monitor.cli import (
     watch,
     worker,
 )
+from monitor.cli.shared.command_help import PlainHelpCommand
 from monitor.cli.shared.errors import DEBUG, INTERRUPTED, error_message_and_exit_status
 
 # The thread limits must be set before NumPy is imported. The matrices are too small for parallel linear algebra.
@@ -46,6 +47,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    epilog="Examples: imu-monitor demo; imu-monitor identify /dev/ttyUSB0; imu-monitor analyze run.csv",
 )
 
 
@@ -73,32 +75,44 @@ def _options_of_all_commands(
     """Live noise monitor for MEMS IMUs: windowed Allan variance and Q, N, B, K, R while the sensor runs."""
 
 
-for _command, _example in (
-    (demo.demo, "demo --effect gz.sinusoidal:amplitude=4e-3,frequency=17"),
-    (run.run, "run bench.toml"),
-    (check.check, "check bench.toml"),
-    (doctor.doctor, "doctor bench.toml"),
-    (identify.identify, "identify /dev/ttyUSB0"),
-    (warm_up.warm_up, "warm-up"),
-    (watch.watch, "watch --connect tcp/127.0.0.1:7450"),
-    (view.view, "view --detail bench-1"),
-    (analyze.analyze, "analyze run.csv --rest --plot allan.png"),
-    (simulate.simulate, "simulate mpu-6050 --seconds 1h --out hour.npz"),
-    (reconcile.reconcile, "reconcile run.csv --model mpu-6050 --out report"),
-    (compensate.compensate, "compensate run.csv --out compensated.csv"),
-    (convert.convert, "convert flight.ulg flight.mcap"),
-    (history.history, "history bench.toml --from -7d --plot week.png"),
-    (export.export, "export result.json --format kalibr --out imu.yaml"),
+for _command, _summary, _example in (
+    (demo.demo, "Run the service with a simulated IMU.", "demo --effect gz.sinusoidal:amplitude=4e-3,frequency=17"),
+    (run.run, "Run the service with the devices of a configuration file.", "run bench.toml"),
+    (check.check, "Report all mistakes in a configuration file.", "check bench.toml"),
+    (doctor.doctor, "Check this machine: ports, permissions, clock, disk.", "doctor bench.toml"),
+    (identify.identify, "Find the baud rate and the decoder of a sensor.", "identify /dev/ttyUSB0"),
+    (warm_up.warm_up, "Compile the numerical kernels in advance.", "warm-up"),
+    (watch.watch, "Show a live table of several daemons.", "watch --connect tcp/127.0.0.1:7450"),
+    (view.view, "Show several daemons in one viewer.", "view --detail bench-1"),
+    (
+        analyze.analyze,
+        "Compute Allan deviations and coefficients of a recording.",
+        "analyze run.csv --plot report.html",
+    ),
+    (simulate.simulate, "Simulate a recording from a noise model.", "simulate mpu-6050 --seconds 1h --out hour.npz"),
+    (
+        reconcile.reconcile,
+        "Find the effects that a noise model lacks.",
+        "reconcile run.csv --model mpu-6050 --out report",
+    ),
+    (compensate.compensate, "Remove the gyro drift from a recording.", "compensate run.csv --out compensated.csv"),
+    (convert.convert, "Write a recording in another format.", "convert flight.ulg flight.mcap"),
+    (history.history, "Print, plot or export past results.", "history bench.toml --from -7d --plot week.png"),
+    (export.export, "Write noise parameters for other programs.", "export mpu-6050 --format kalibr --out imu.yaml"),
 ):
-    app.command(epilog=f"Example: imu-monitor {_example}")(_command)
+    app.command(cls=PlainHelpCommand, short_help=_summary, epilog=f"Example: imu-monitor {_example}")(_command)
 app.command(hidden=True)(worker.worker)
 _thermal = typer.Typer(
-    help="Bias against temperature: fit a model to a recording, and predict another recording.", rich_markup_mode=None
+    help="Bias against temperature: fit a model to a recording, and predict another recording.",
+    short_help="Fit bias against temperature, and predict it.",
+    rich_markup_mode=None,
 )
-_thermal.command("fit", epilog="Example: imu-monitor thermal fit run.csv --out thermal.json")(thermal.thermal_fit)
-_thermal.command("predict", epilog="Example: imu-monitor thermal predict new.csv --model thermal.json")(
-    thermal.thermal_predict
+_thermal.command("fit", cls=PlainHelpCommand, epilog="Example: imu-monitor thermal fit run.csv --out thermal.json")(
+    thermal.thermal_fit
 )
+_thermal.command(
+    "predict", cls=PlainHelpCommand, epilog="Example: imu-monitor thermal predict new.csv --model thermal.json"
+)(thermal.thermal_predict)
 app.add_typer(_thermal, name="thermal")
 
 

@@ -12,7 +12,6 @@ from monitor.cli.shared import options, output
 @options.with_loading_options
 def analyze(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
-    loading: options.Loading = None,
     tau: Annotated[
         str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or a list of seconds.")
     ] = "octave",
@@ -29,6 +28,7 @@ def analyze(
         Path | None,
         typer.Option(metavar="FILE.png|.html", help="Allan deviations as a picture, or the whole result as a page."),
     ] = None,
+    loading: options.Loading = None,
 ) -> None:
     """Print the Allan deviations, noise coefficients Q, N, B, K, R, motion and noise changes of a recording."""
     from monitor.commands import analyze as offline
@@ -55,5 +55,6 @@ def analyze(
 
         analysis = results.analysis
         print_analysis(analysis.estimate, analysis.axes_of_temperature, analysis.notes, unit_system)
+    output.print_written_files(json, plot)
     if results.lacking:
         raise NotReady(results.lacking)

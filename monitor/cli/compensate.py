@@ -24,11 +24,12 @@ def compensate(
         str | None,
         typer.Option(metavar="P,Q", help="Order of the ARMA model of the drift, up to 2,1; by default by a criterion."),
     ] = None,
-    loading: options.Loading = None,
+    units: options.Units = "imu",
     json: options.JsonFile = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
     ] = None,
+    loading: options.Loading = None,
 ) -> None:
     """Remove the gyro drift from a recording, and write the compensated recording."""
     from rich.console import Console
@@ -42,7 +43,7 @@ def compensate(
         if place is not None and real_path(place) == real_path(out):
             raise ConfigError(f"{name}: {place} is also the output file of --out; choose another name")
     service_in_terminal.exit_on_sigterm()
-    arma_order = options.parse_arma_order(order)
+    arma_order, unit_system = options.parse_arma_order(order), options.parse_units(units)
     with output.show_progress_bar() as tell:
         output.compile_analysis_kernels(tell)
         result = compensating.run_compensation(recording, out, method, arma_order, loading, tell)
@@ -50,6 +51,7 @@ def compensate(
     if plot is not None:
         from monitor.publishing.plots.compensate_plot import save_compensation_plot
 
-        save_compensation_plot(result, plot)
+        save_compensation_plot(result, plot, unit_system)
     if json != Path("-"):
-        text.print_compensation(result, Console())
+        text.print_compensation(result, Console(), unit_system)
+    output.print_written_files(json, out, plot)

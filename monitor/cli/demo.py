@@ -24,15 +24,14 @@ def demo(
     ] = None,
     seconds: options.Seconds = None,
     viewer: options.Viewer = None,
-    units: options.Units = "imu",
+    units: options.ConfiguredUnits = None,
 ) -> None:
     """Run the service on a simulated MEMS IMU that sends a real wire format over a pseudo-terminal."""
     from monitor.simulator.demo_config import build_demo_config as configuration
 
-    unit_system = options.parse_units(units)
     service_in_terminal.run_service(
         configuration(sensor, effect or (), options.parse_duration("--effect-at", effect_at)),
         seconds,
         viewer,
-        unit_system,
+        units,
     )

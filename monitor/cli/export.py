@@ -20,9 +20,10 @@ def export(
         str,
         typer.Option(
             "--format",
-            metavar="kalibr|allan_variance_ros|openvins|vins_fusion|orb_slam3|lio_sam|fast_lio|gtsam|px4_ekf2|"
-            "ardupilot_ekf3|robot_localization|imu_utils|gnss_ins_sim|gyroparams|kalman",
-            help="Program that reads the parameters.",
+            metavar="FORMAT",
+            help="Program that reads the parameters: kalibr, allan_variance_ros, openvins, vins_fusion, orb_slam3, "
+            "lio_sam, fast_lio, gtsam, px4_ekf2, ardupilot_ekf3, robot_localization, imu_utils, gnss_ins_sim, "
+            "gyroparams, kalman.",
         ),
     ],
     source: Annotated[
@@ -61,6 +62,7 @@ def export(
         name, colon, rest = str(error).partition(": ")
         raise ConfigError(f"{OPTION_NAMES.get(name, name)}{colon}{rest}") from None
     output.write_file_or_stdout("--out", out or Path("-"), text.encode())
+    output.print_written_files(out)
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> "NoiseCoefficients":

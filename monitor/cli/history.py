@@ -82,6 +82,7 @@ def history(
         from monitor.publishing.plots.history_plot import save_history_plot
 
         save_history_plot(past, plot, asked.axes, unit_system)
+    output.print_written_files(json, out, plot)
     if json == Path("-"):
         return
     console = Console()

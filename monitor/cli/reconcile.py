@@ -28,9 +28,10 @@ def reconcile(
         ),
     ] = None,
     seed: options.ReportSeed = 1,
-    loading: options.Loading = None,
+    units: options.Units = "imu",
     json: options.JsonFile = None,
     details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
+    loading: options.Loading = None,
 ) -> None:
     """Compare recordings with a noise model, and find the effects that are missing from the model."""
     require_extra("reconcile", "reconcile")
@@ -41,6 +42,7 @@ def reconcile(
     from monitor.publishing.terminal import reconcile_text as text
     from monitor.reconcile import json_report
 
+    unit_system = options.parse_units(units)
     tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
     service_in_terminal.exit_on_sigterm()
@@ -48,16 +50,21 @@ def reconcile(
         with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
             if several:
-                runs = reconciling.compare_recordings(recordings, tested, out, seed, loading, tell)
-                data, show = json_report.encode_comparison(runs), partial(text.print_comparison, runs)
+                runs = reconciling.compare_recordings(recordings, tested, out, seed, loading, tell, unit_system)
+                data, show = (
+                    json_report.encode_comparison(runs),
+                    partial(text.print_comparison, runs, units=unit_system),
+                )
             else:
                 one = reconciling.reconcile_and_write_report(
-                    recordings[0], tested, out, seed, loading, report_progress=tell
+                    recordings[0], tested, out, seed, loading, report_progress=tell, units=unit_system
                 )
-                data, show = json_report.encode_report(one), partial(text.print_reconciliation, one, details=details)
+                data = json_report.encode_report(one)
+                show = partial(text.print_reconciliation, one, details=details, units=unit_system)
     except NotReady:
         output.write_json(json, (out / reconciling.REPORT).read_bytes)
         raise
     output.write_json(json, lambda: data)
     if json != Path("-"):
         show(Console())
+    output.print_written_files(json, out / "report.html", out / "model.toml")

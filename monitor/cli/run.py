@@ -12,17 +12,16 @@ def run(
     config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="Configuration file.")],
     seconds: options.Seconds = None,
     viewer: options.Viewer = None,
-    units: options.Units = "imu",
+    units: options.ConfiguredUnits = None,
     history: Annotated[
         str | None,
         typer.Option(metavar="S", help="Show the last part of the history in the live view: 1d, 12h; needs [storage]."),
     ] = None,
 ) -> None:
     """Run the service for all devices of a configuration file until the process is interrupted."""
-    unit_system = options.parse_units(units)
     from monitor.settings import loading
 
     found = service_in_terminal.with_viewer_history_length(
         loading.load_config(config, allow_pipe=True), options.parse_duration("--history", history)
     )
-    service_in_terminal.run_service(found, seconds, viewer, unit_system)
+    service_in_terminal.run_service(found, seconds, viewer, units)

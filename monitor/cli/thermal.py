@@ -22,9 +22,10 @@ def thermal_fit(
             metavar="S", help="Averaging interval; also 10min, 1h. By default about 72 intervals per recording."
         ),
     ] = None,
-    loading: options.Loading = None,
+    units: options.Units = "imu",
     json: options.JsonFile = None,
     plot: PlotPath = None,
+    loading: options.Loading = None,
 ) -> None:
     """Fit the bias of each axis as a function of the temperature and its history."""
     from rich.console import Console
@@ -34,6 +35,7 @@ def thermal_fit(
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--out", out)
+    unit_system = options.parse_units(units)
     interval_s = options.parse_duration("--interval", interval)
     with output.show_progress_bar() as tell:
         study = thermal.fit_thermal_models(recording, interval_s, loading, tell)
@@ -45,18 +47,20 @@ def thermal_fit(
     if plot is not None:
         from monitor.publishing.plots.thermal_plot import save_thermal_fit_plot
 
-        save_thermal_fit_plot(study, plot)
+        save_thermal_fit_plot(study, plot, unit_system)
     if Path("-") not in (json, out):
-        text.print_thermal_fit(study, Console())
+        text.print_thermal_fit(study, Console(), unit_system)
+    output.print_written_files(json, out, plot)
 
 
 @options.with_loading_options
 def thermal_predict(
     recording: RecordingPath,
     model: Annotated[Path, typer.Option(metavar="MODEL.json", help="Model file that thermal fit has written.")],
-    loading: options.Loading = None,
+    units: options.Units = "imu",
     json: options.JsonFile = None,
     plot: PlotPath = None,
+    loading: options.Loading = None,
 ) -> None:
     """Predict the bias of another recording with a model, and print the errors of the prediction."""
     from rich.console import Console
@@ -65,6 +69,7 @@ def thermal_predict(
     from monitor.publishing.terminal import thermal_output as text
 
     output.check_output_file("--plot", plot, ".png")
+    unit_system = options.parse_units(units)
     models = thermal.read_model_file(model)
     with output.show_progress_bar() as tell:
         outlook = thermal.predict_bias_of_recording(recording, models, loading, tell)
@@ -74,6 +79,7 @@ def thermal_predict(
     if plot is not None:
         from monitor.publishing.plots.thermal_plot import save_thermal_prediction_plot
 
-        save_thermal_prediction_plot(outlook, plot)
+        save_thermal_prediction_plot(outlook, plot, unit_system)
     if json != Path("-"):
-        text.print_thermal_prediction(outlook, Console())
+        text.print_thermal_prediction(outlook, Console(), unit_system)
+    output.print_written_files(json, plot)

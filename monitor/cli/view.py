@@ -17,6 +17,9 @@ def view(
     ] = None,
     viewer: options.Viewer = None,
     seconds: options.Seconds = None,
+    units: options.Units = "imu",
 ) -> None:
     """Show several daemons in one viewer, with a table of all devices and details of selected devices."""
-    service_in_terminal.run_fleet_viewer(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)
+    service_in_terminal.run_fleet_viewer(
+        keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds, options.parse_units(units)
+    )

@@ -23,6 +23,7 @@ from drivers.recordings import Recording as Samples
 from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.json_report import COMPARISON_SCHEMA, SCHEMA, encode_comparison, encode_report
@@ -42,6 +43,7 @@ def reconcile_and_write_report(
     loading: LoadingOptions = DEFAULT_LOADING,
     notes: Sequence[str] = (),
     report_progress: ProgressCallback = ignore_progress,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> Reconciliation:
     """Compare a recording with a noise model and write the report.
 
@@ -61,6 +63,8 @@ def reconcile_and_write_report(
         Additional notes for the report.
     report_progress : callable, optional
         Progress callback.
+    units : UnitSystem, optional
+        Units of the report.
 
     Raises
     ------
@@ -77,7 +81,7 @@ def reconcile_and_write_report(
         _write(out / REPORT, _encode_failure(str(error), len(found)))
         raise
     report_progress("writing", None)
-    write_report(result, out, recording.name)
+    write_report(result, out, recording.name, units)
     return result
 
 
@@ -121,6 +125,7 @@ def compare_recordings(
     seed: int = 1,
     loading: LoadingOptions = DEFAULT_LOADING,
     report_progress: ProgressCallback = ignore_progress,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> RecordingsComparison:
     """Compare several recordings with a noise model and with each other, and write the reports.
 
@@ -138,6 +143,8 @@ def compare_recordings(
         Options for reading the recordings.
     report_progress : callable, optional
         Progress callback.
+    units : UnitSystem, optional
+        Units of the report.
 
     Raises
     ------
@@ -157,7 +164,7 @@ def compare_recordings(
         )
         tell = _tell_for(report_progress, f"{name}, {at} of {len(named)}")
         try:
-            result = reconcile_and_write_report(path, model, out / name, seed, loading, notes, tell)
+            result = reconcile_and_write_report(path, model, out / name, seed, loading, notes, tell, units)
         except NotReady as error:
             silent[name] = str(error)
             if model is None:
@@ -172,16 +179,16 @@ def compare_recordings(
         raise NotReady(why)
     report_progress("writing", None)
     comparison = compare_results(runs, fitted_to, silent)
-    _write_comparison(comparison, out)
+    _write_comparison(comparison, out, units)
     return comparison
 
 
-def _write_comparison(result: RecordingsComparison, folder: Path) -> None:
+def _write_comparison(result: RecordingsComparison, folder: Path, units: UnitSystem) -> None:
     from monitor.publishing.reports.reconcile_page import render_comparison_page
 
     _write(folder / REPORT, encode_comparison(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
-    _write(folder / "report.html", render_comparison_page(result).encode())
+    _write(folder / "report.html", render_comparison_page(result, units).encode())
 
 
 def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:
@@ -227,7 +234,7 @@ def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
     return lambda what, share: tell(f"{which}: {what}", share)
 
 
-def write_report(result: Reconciliation, folder: Path, title: str) -> None:
+def write_report(result: Reconciliation, folder: Path, title: str, units: UnitSystem = DEFAULT_UNITS) -> None:
     """Write ``report.json``, ``model.toml``, ``report.html`` and, if Rerun is installed, ``reconcile.rrd``.
 
     Parameters
@@ -238,6 +245,8 @@ def write_report(result: Reconciliation, folder: Path, title: str) -> None:
         Existing folder of the report.
     title : str
         Title of the page ``report.html``.
+    units : UnitSystem, optional
+        Units of ``report.html`` and ``reconcile.rrd``.
 
     Raises
     ------
@@ -248,13 +257,13 @@ def write_report(result: Reconciliation, folder: Path, title: str) -> None:
 
     _write(folder / REPORT, encode_report(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
-    _write(folder / "report.html", render_page(result, title).encode())
+    _write(folder / "report.html", render_page(result, title, units).encode())
     try:
         from monitor.publishing.reports.reconcile_rrd import write_rrd
     except ImportError:  # the library of the viewer is optional
         return
     with atomic_write_path(folder / "reconcile.rrd") as place:
-        write_rrd(result, place)
+        write_rrd(result, place, units)
 
 
 def _encode_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:

@@ -18,11 +18,14 @@ import drivers.decoders
 from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Times, Timing, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
+from drivers.host.file_access import open_regular_file
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
+from drivers.recordings.file_formats.csv_header import COMMENT_MARKS, parse_number, split_header
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.reading_progress import listen_to_reading_progress
 from drivers.recordings.table import TIME_NS
+from drivers.recordings.table_layout import names_an_axis
 from drivers.timing.sample_clock import SampleClock
 from drivers.validation import module_lookup
 from drivers.validation.settings_model import TableError
@@ -36,6 +39,7 @@ CONTENTS: Final = {"log": "CAN frames", "capture": "captured bytes", "raw": "raw
 """Description of each kind of file that needs a decoder."""
 BATCH_NS: Final = 100_000_000
 """Duration in ns of the samples that are passed to the sample clock at once. A live link returns similar batches."""
+MAX_HEADER_BYTES: Final = 1000
 SINGLE_NS: Final = 2_000_000_000
 """Time in ns after the first sample during which samples are passed singly, because the rate is not known yet."""
 READ_TIMEOUT_S: Final = 1.0
@@ -94,6 +98,8 @@ def load_recording(
         kind = detect_file_kind(path) if path.exists() else None
     if decoder is None:
         if kind in CONTENTS:
+            if kind in CARRIERS and _is_table(path):
+                raise ConfigError(f"{path}: contains a table of samples; rename the file to end in .csv")
             names = list_decoders(CARRIERS[kind]) if kind in CARRIERS else module_lookup.list_modules(drivers.decoders)
             raise ConfigError(f"{path}: contains {CONTENTS[kind]}; name the decoder with --decoder: {', '.join(names)}")
         report_progress("reading", None)
@@ -107,6 +113,14 @@ def load_recording(
     with listen_to_reading_progress(lambda share: report_progress("decoding", share)):
         found = _decode_file(path, decoder, options.rate_hz)
     return found if options.last_s is None else take_last(found, options.last_s)
+
+
+def _is_table(path: Path) -> bool:
+    """Return True if the first line that is not a comment contains column names such as ``t,gx,gy,gz``."""
+    with open_regular_file(path) as file:
+        lines = file.read(MAX_HEADER_BYTES).decode("ascii", "replace").splitlines()
+    names = split_header(next((line for line in lines if line and not line.startswith(COMMENT_MARKS)), ""))
+    return names_an_axis(names) and all(parse_number(name, ",") is None for name in names)
 
 
 def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Recording:
@@ -131,7 +145,7 @@ def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Re
                 rows += len(timed)
             limit.check_row_count(rows)
     except LinkEnded:
-        pass  # the whole file has been decoded
+        pass  # the expected end of the file; its text repeats link.notes, which are part of the result
     except LinkUnavailable as error:
         raise RecordingError(str(error)) from error
     finally:

@@ -88,20 +88,20 @@ def chi2_quantile(edf: Floats, probability: float) -> Floats:
     >>> chi2_quantile(np.array([1.0, 10.0, 1e6]), 0.975).round(3).tolist()
     [5.024, 20.483, 1002773.701]
     """
-    z = normal_quantile(probability)
     flat = np.ascontiguousarray(edf, np.float64).ravel()
-    return _chi2_quantiles(flat, probability, z, _coefficients(z)).reshape(edf.shape)
+    return _chi2_quantiles(flat, probability, *_expansion(probability)).reshape(edf.shape)
 
 
 @lru_cache(maxsize=16)
-def _coefficients(z: float) -> Floats:
-    """Return the coefficients y_k(z) of the Cornish-Fisher expansion of a gamma quantile.
+def _expansion(probability: float) -> tuple[float, Floats]:
+    """Return the normal quantile z and the coefficients y_k(z) of the Cornish-Fisher expansion of a gamma quantile.
 
     With shape a, normal quantile z and ε = 1/√a, the expansion is x = a (1 + ε Σ y_k ε^k). For the normal density φ and
     the gamma density f, the differential equation x' = φ(z)/f(x) gives y_0 = z and y_k'' − z y_k' − y_k = r_k. The
     coefficient y_k is the only polynomial solution of the equation of order k. The first five coefficients agree with
     Goldberg & Levine (Annals of Mathematical Statistics 17, 1946).
     """
+    z = normal_quantile(probability)
     poly = np.polynomial.Polynomial
     x = poly([0.0, 1.0])
     y, first, second, squares = [x], [poly([1.0])], [poly([0.0])], [poly([1.0])]  # coefficients of y, y', y'', y'²
@@ -116,7 +116,7 @@ def _coefficients(z: float) -> Floats:
         first.append(y[k].deriv())
         second.append(first[k].deriv())
         squares.append(square + 2.0 * first[k])
-    return np.array([float(one(z)) for one in y])
+    return z, np.array([float(one(z)) for one in y])
 
 
 @compiled

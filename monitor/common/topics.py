@@ -47,23 +47,9 @@ GAP: Final = Topic("gap", JSON, "publish", kept=1)
 THERMAL: Final = Topic("thermal", JSON, "intervals", kept=1)
 EVENT: Final = Topic("event", JSON, "event", kept=10)
 STATUS: Final = Topic("status", JSON, "1 Hz", kept=1)
-HISTORY: Final = Topic("history", JSON, "query")
 ALIVE: Final = Topic("alive", "", "presence")
+HISTORY: Final = Topic("history", JSON, "query")
 RESET: Final = Topic("command/reset", JSON, "query")
 RECONCILE: Final = Topic("command/reconcile", JSON, "query")
 
-TOPICS: Final = (
-    SAMPLES,
-    COMPENSATED,
-    ALLAN,
-    COEFFICIENTS,
-    TOTAL,
-    GAP,
-    THERMAL,
-    EVENT,
-    STATUS,
-    ALIVE,
-    HISTORY,
-    RESET,
-    RECONCILE,
-)
+TOPICS: Final = tuple(value for value in tuple(vars().values()) if isinstance(value, Topic))

@@ -73,11 +73,8 @@ COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
 }
 """Customary unit of each noise coefficient, for gyroscopes and accelerometers."""
 
-DEVIATION_UNITS: Final[dict[Kind, Unit]] = {
-    "gyro": Unit(DEGREE * HOUR_S, "°/h"),
-    "accel": Unit(MICRO_G, "µg"),
-}
-"""Customary unit of Allan deviations."""
+DEVIATION_UNITS: Final = {kind: units["B"] for kind, units in COEFFICIENT_UNITS.items()}
+"""Customary unit of Allan deviations, which is the unit of the bias instability B."""
 SAMPLE_UNITS: Final[dict[Kind, Unit]] = {"gyro": Unit(DEGREE, "°/s"), "accel": Unit(1.0, "m/s²")}
 
 COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
@@ -114,10 +111,15 @@ class UnitSystem:
     coefficients: Mapping[Kind, Mapping[str, Unit]]
     densities: Mapping[Kind, Unit] = field(default_factory=dict)
     """Units of the one-sided noise density, which is shown in addition to the random walk N. Empty without density."""
+    is_si: bool = False
 
     def deviation(self, kind: Kind) -> Unit:
         """Return the unit of Allan deviations, which is the unit of the bias instability B."""
         return self.coefficients[kind]["B"]
+
+    def single(self, kind: Kind, symbol: str) -> Unit:
+        """Return the unit of a coefficient where there is only one: the noise density rather than the random walk."""
+        return self.columns(kind, symbol)[-1].unit
 
     def columns(self, kind: Kind, symbols: Sequence[str] = "QNBKR") -> list[CoefficientColumn]:
         """Return the columns of a table of coefficients.
@@ -166,7 +168,8 @@ UNIT_SYSTEMS: Final = {
                 "K": Unit(1.0, "m/s³/√Hz"),
                 "R": Unit(1.0, "m/s³"),
             },
-        }
+        },
+        is_si=True,
     ),
 }
 """Unit systems of the option ``--units``. In SI, N and K are two-sided densities: rad/s/√Hz is the same as rad/√s."""

@@ -17,13 +17,13 @@ import structlog
 from drivers.data_types import SenderTimedFormat
 from drivers.errors import ConfigError
 from monitor.common.device_health import Health, format_service_status
+from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.daemon.config_changes import ConfigChange
 from monitor.daemon.operations.hooks import Hooks
 from monitor.daemon.operations.log_level import set_log_level
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.outputs.history_output import HistoryOutput
 from monitor.daemon.outputs.output import Output
-from monitor.daemon.outputs.terminal_outputs import TableOutput
 from monitor.daemon.outputs.viewer_output import ViewerOutput
 from monitor.daemon.outputs.zenoh_output import ZenohOutput
 from monitor.history.bucketed_history import HistoryTable
@@ -247,17 +247,14 @@ class DaemonProcess:
         self._unit.send_status(format_service_status(healths, states, stuck))
 
     def _announce_viewer_url(self) -> None:
-        """Log the URL of the web viewer each time the URL changes."""
+        """Pass the URL of the web viewer to the outputs each time the URL changes."""
         url = self.viewer.url if self.viewer is not None else ""
         page = url if url.startswith("http://") else ""
         if page == self._viewer_url:
             return
         self._viewer_url = page
-        if page:
-            _log.info("viewer", url=page)
         for output in self.outputs:
-            if isinstance(output, TableOutput):
-                output.set_viewer_url(page)
+            output.set_viewer_url(page)
 
     def _read_viewer_history(self, device: str) -> HistoryTable | None:
         """Return the stored results that the viewer shows at the start, or None if there are no results.
@@ -317,7 +314,9 @@ def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) ->
 
     own = config.viewer
     return RerunView(
-        ViewerSettings(own.mode, own.port, own.web_port, own.memory), _device_features(config.devices), recall
+        ViewerSettings(own.mode, own.port, own.web_port, own.memory, UNIT_SYSTEMS[own.units]),
+        _device_features(config.devices),
+        recall,
     )
 
 

@@ -28,7 +28,7 @@ MAX_BATCH_S: Final = 0.1
 """Maximum duration of a batch of samples in seconds."""
 TOTAL_INTERVAL_S: Final = 0.1
 """Minimum interval between two steps of the total and Hadamard deviations."""
-TOTAL_CPU_SHARE: Final = 0.005
+TOTAL_CPU_SHARE: Final = 0.002
 """Maximum fraction of one processor that is spent on the total and Hadamard deviations of a device."""
 INTERPRETED_REFIT_S: Final = 1.0
 """Minimum interval between two fits with interpreted kernels."""
@@ -78,8 +78,9 @@ class ResultPublisher:
     def publish_events(self, events: Sequence[Event]) -> None:
         """Publish events to all outputs."""
         for event in events:
+            unix_s = self.timeline.to_unix_s(event.t_ns)
             for output in self.outputs:
-                output.publish_event(self.device.name, self._unix_s(event.t_ns), self._received, event)
+                output.publish_event(self.device.name, unix_s, self._received, event)
 
     def batch_samples_and_publish_if_due(self, blocks: Sequence[SampleBlock]) -> bool:
         """Add samples to the batch, and publish the batch if it is due; return True if it was published."""
@@ -135,12 +136,10 @@ class ResultPublisher:
     def _received(self) -> int:
         return self.driver.counts.received
 
-    def _unix_s(self, t_ns: int) -> float:
-        return self.timeline.to_unix_s(t_ns)
-
     def _result(self, t_ns: int, result: Any) -> None:
+        unix_s = self.timeline.to_unix_s(t_ns)
         for output in self.outputs:
-            output.publish_result(self.device.name, self._unix_s(t_ns), self._received, result)
+            output.publish_result(self.device.name, unix_s, self._received, result)
 
     def _compensated(self, live: LiveDriftCompensation, samples: SampleBlock) -> None:
         """Publish samples after drift compensation, and the state of the drift compensation."""

@@ -66,7 +66,8 @@ class SlewedClock:
 
     def unix_offset_ns(self, monotonic_ns: int) -> int:
         """Return the offset from a monotonic time to the Unix time, in nanoseconds."""
-        return int(np.max(self.unix_offsets_ns(np.array([monotonic_ns], np.int64))))
+        offsets = self.unix_offsets_ns(np.array([monotonic_ns], np.int64))
+        return offsets if isinstance(offsets, int) else int(offsets[0])
 
     def unix_offsets_ns(self, monotonic_ns: Ints) -> Ints | int:
         """Return the offsets [n] from increasing monotonic times to Unix times in nanoseconds, or one common offset."""

@@ -220,9 +220,13 @@ class Estimator:
         avar, terms = self._window.avar(), self._window.term_counts()
         own, recent = slice(0, self._m), slice(self._m, None)
         result = self._fit(avar[own], terms[own]) if fit_coefficients else empty_fit(avar[own])
-        curve = self._curve(avar[own], terms[own], result.edf, n)
-        quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
-        quick = self._curve(avar[recent], terms[recent], quick_edf, n)
+        edf = np.concatenate([result.edf, self._spans.edf(result.theta, self.rate_hz, terms[recent])])
+        lo, hi = deviation_intervals(avar, edf)
+        tau_s = self._factors / self.rate_hz
+        curve, quick = (
+            AllanCurve(tau_s, self._factors, avar[rows], terms[rows], edf[rows], lo[rows], hi[rows], n)
+            for rows in (own, recent)
+        )
         history = concatenate_successive_coefficients(self._history)
         self._history.clear()
         self._history_samples = 0
@@ -308,7 +312,3 @@ class Estimator:
                 )
                 return
             self._low_passes[self._search_axis] = None
-
-    def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
-        lo, hi = deviation_intervals(avar, edf)
-        return AllanCurve(self._factors / self.rate_hz, self._factors, avar, terms, edf, lo, hi, n)

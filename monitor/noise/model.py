@@ -186,23 +186,6 @@ class NoiseModel:
 
     # --- time series
 
-    def check_can_be_simulated(self, rate_hz: float, *, has_temperature: bool = True) -> None:
-        """Check that the model can be simulated at a stated sample rate.
-
-        Parameters
-        ----------
-        rate_hz : float
-            Stated sample rate, Hz.
-        has_temperature : bool
-            True if the model or a recording provides a temperature.
-
-        Raises
-        ------
-        ConfigError
-            If an effect cannot be simulated at the sample rate.
-        """
-        check_effects_can_be_simulated(self.effects, rate_hz * self.true_to_stated_rate_ratio, has_temperature)
-
     def start_stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
         """Start an endless simulation of six axes, which is reproducible for the same rate and seed.
 
@@ -251,7 +234,10 @@ class NoiseModel:
         for axes, given in effects:
             model += cls(dict.fromkeys(axes, given))
         if rate_hz is not None:
-            model.check_can_be_simulated(rate_hz)
+            # a recording may provide the temperature
+            check_effects_can_be_simulated(
+                model.effects, rate_hz * model.true_to_stated_rate_ratio, has_temperature=True
+            )
         return model
 
     def to_toml(self) -> str:

@@ -107,7 +107,7 @@ def format_model_as_text_table(
 
 @contextlib.contextmanager
 def prefix_config_errors(location: str) -> Iterator[None]:
-    """Add a location in the model file to the beginning of the message of a ConfigError."""
+    """Add a location, such as a table of a model file, to the beginning of the message of a ConfigError."""
     try:
         yield
     except ConfigError as error:

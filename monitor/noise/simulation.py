@@ -10,9 +10,11 @@ of preceding effects of that name. Common vibrations with the same source number
 """
 
 import copy
+from bisect import insort
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, Final
 from zlib import crc32
 
@@ -207,14 +209,12 @@ class ModelStream:
             series = effect.start_series(self._true_hz, self._rng(key[0], effect.name, key[1]))
             (line.white if isinstance(effect, AngleRandomWalk) else line.others).append(series)
             self._truths.append((axis, effect, series.drawn_random_values))
-        elif isinstance(effect, WhiteNoiseGain):
+        elif isinstance(effect, WhiteNoiseGain | HeavyTails):
             gain = effect.start_gain(self._true_hz, self._rng(axis, effect.name, occurrence))
             line.gains.append(gain)
             self._truths.append((axis, effect, gain.drawn_random_values))
         elif isinstance(effect, AxisPermutation):
             self._columns[AXES.index(axis)] = AXES.index(effect.source)
-        elif isinstance(effect, HeavyTails):
-            line.factors.append(effect.start_factors(self._rng(axis, effect.name, occurrence)))
         elif isinstance(effect, AxisLeak):
             line.add_leak(effect)
             self._axes[effect.source].leaks_out = True
@@ -257,7 +257,6 @@ class _AxisSimulator:
         self.white: list[RunningSource] = []
         self.others: list[RunningSource] = []
         self.gains: list[RunningGain] = []  # gains of the white noise
-        self.factors: list[Callable[[Floats], None]] = []  # functions that multiply the white noise
         self.leaks: list[AxisLeak] = []
         self.leaks_out = False
         # These are the transforms and their positions in TRANSFORM_ORDER, sorted by position.
@@ -276,10 +275,8 @@ class _AxisSimulator:
     def insert_transform(self, order: int, transform: RunningTransform) -> None:
         """Insert a transform that has the position ``order`` in TRANSFORM_ORDER."""
         if self.leaks:
-            self._alone.append((order, copy.deepcopy(transform)))
-            self._alone.sort(key=lambda one: one[0])
-        self._chain.append((order, transform))
-        self._chain.sort(key=lambda one: one[0])
+            insort(self._alone, (order, copy.deepcopy(transform)), key=itemgetter(0))
+        insort(self._chain, (order, transform), key=itemgetter(0))
 
     def add_leak(self, leak: AxisLeak) -> None:
         """Add a leak from another axis."""
@@ -290,15 +287,13 @@ class _AxisSimulator:
     def sum_own_sources(self, block: SampleBlockContext, n: int) -> Floats:
         """Return the sum [n] of the sources of the axis.
 
-        White noise is added first, because gains and heavy tails multiply only the white noise.
+        White noise is added first, because gains multiply only the white noise.
         """
         values = np.zeros(n)
         for series in self.white:
             series.add_next_samples(values, block)
         for gain in self.gains:
             values *= gain.compute_gain(block.first, n)
-        for multiply_in_place in self.factors:
-            multiply_in_place(values)
         for series in self.others:
             series.add_next_samples(values, block)
         return values

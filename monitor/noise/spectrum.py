@@ -95,10 +95,6 @@ class Spectrum:
             peaks=self.peaks + narrow_peaks,
         )
 
-    def without_lines(self) -> "Spectrum":
-        """Return a copy of the spectrum without spectral lines."""
-        return replace(self, lines=())
-
     def avar(self, tau_s: Floats) -> Floats:
         """Return the overlapping Allan variance in unit² at averaging times in seconds."""
         if self.closed_form_avar is not None:
@@ -122,7 +118,7 @@ class Spectrum:
         f = frequency_grid(lowest_hz, self.tau0_s, self.peaks)
         weighted = self.density(f) if weight is None else self.density(f) * weight(f)
         lines = sum(size * (1.0 if weight is None else float(weight(np.array([f]))[0])) for f, size in self.lines)
-        return 2.0 * _integrate_log_trapezoid(weighted, f) + lines
+        return 2.0 * float(np.trapezoid(weighted * f, np.log(f))) + lines
 
 
 def white_noise_spectrum(mean_square: float, tau0_s: float) -> Spectrum:
@@ -232,12 +228,11 @@ def _allan_variance_at(tau: float, f: Floats, rest: Floats, tau0_s: float) -> fl
     split = int(np.clip(np.searchsorted(f, MAX_SMOOTH_CYCLES / tau), 1, f.size - 1))
     low = slice(0, split + 1)
     smooth = rest[low] * np.sin(np.pi * f[low] * tau) ** 4
-    total = _integrate_log_trapezoid(smooth, f[low]) + _integral_below(smooth, f[low])
+    # the trapezoidal rule in ln f
+    total = float(np.trapezoid(smooth * f[low], np.log(f[low]))) + _integral_below(smooth, f[low])
     f, rest = f[split:], rest[split:]
-    steps = np.diff(f)
-    flat = float((0.5 * steps * (rest[1:] + rest[:-1])).sum())
-    slopes = np.diff(rest) / steps
-    total += 0.375 * flat - 0.5 * _integrate_cosine(2.0 * np.pi * tau, f, rest, slopes)
+    slopes = np.diff(rest) / np.diff(f)
+    total += 0.375 * float(np.trapezoid(rest, f)) - 0.5 * _integrate_cosine(2.0 * np.pi * tau, f, rest, slopes)
     total += 0.125 * _integrate_cosine(4.0 * np.pi * tau, f, rest, slopes)
     return 4.0 * total * (tau0_s / tau) ** 2
 
@@ -255,12 +250,6 @@ def _integral_below(values: Floats, f: Floats) -> float:
         return 0.0 * float(first)  # NaN remains NaN
     slope = float(np.log(second / first) / np.log(f[1] / f[0]))
     return float(first * f[0] / max(slope + 1.0, MIN_INTEGRAL_EXPONENT))
-
-
-def _integrate_log_trapezoid(values: Floats, f: Floats) -> float:
-    """Compute ∫ values df by the trapezoidal rule in ln f."""
-    g = values * f
-    return float((0.5 * np.diff(np.log(f)) * (g[1:] + g[:-1])).sum())
 
 
 def _nan(x: Floats) -> Floats:

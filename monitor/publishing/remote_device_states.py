@@ -15,6 +15,7 @@ from typing import Final
 
 from drivers.data_types import AXES
 from monitor.common import topics
+from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import Coefficients
 from monitor.publishing.messages.message import Message, decode_message
@@ -89,6 +90,7 @@ class RemoteDevice:
     coefficients: DeviceCoefficients | None = None
     disagreements: tuple[str, ...] = ()  # one text for each axis that disagrees with the noise model
     token_exists: bool | None = None  # True if the liveliness token exists; None if unknown
+    curve: AllanCurve | None = None  # newest Allan variances, if the device belongs to this process
 
     def state(self, now_s: float) -> str:
         """Return the state that the daemon reports, or "gone", "silent" or "present" if there is no current status."""
@@ -211,6 +213,20 @@ class RemoteDeviceRegistry:
             known = self._devices.get(device) or RemoteDevice(device, self._clock())
             if self._add(known):
                 known.token_exists = exists
+
+    def set_allan_curve(self, device: str, curve: AllanCurve) -> None:
+        """Store the newest Allan variances of a known device.
+
+        Parameters
+        ----------
+        device
+            Key of the device, such as imu/bench-1.
+        curve
+            Newest Allan variances.
+        """
+        with self._lock:
+            if known := self._devices.get(device):
+                known.curve = curve
 
     def remove_device(self, key: str) -> None:
         """Remove the state and the events of the device to which a zenoh key belongs."""

@@ -139,7 +139,8 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
     except (OSError, UnicodeDecodeError) as error:
         return ConfigReading(None, [f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"])
     except ConfigError as error:
-        return ConfigReading(None, [f"{path}: {error}"])
+        hint = "" if path.suffix in ("", ".toml") else "; imu-monitor analyze reads recordings"
+        return ConfigReading(None, [f"{path}: {error}{hint}"])
     checked = check_table(ConfigFile, table, path.resolve().parent)
     warnings = [*_check_zenoh_file(checked), *_check_token_file(checked)]
     wrong = [_format_problem(problem, table) for problem in checked.problems]

@@ -32,6 +32,7 @@ from drivers.validation.settings_model import (
 from drivers.zenoh.ros2_imu_message import FRAME_ID
 from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.common.topics import ENDPOINT
+from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.settings.driver_settings import BuiltLinkAndDecoder, VirtualTable, build_link_and_decoder
 from monitor.settings.field_types import (
     DURATION_FROM_TEXT,
@@ -282,6 +283,9 @@ class ViewerTable(SettingsModel):
     web_port: Annotated[int, number_ranges.PORT] = Field(9090, description="TCP port of the viewer's page, on loopback")
     memory: Annotated[str, checked_by(check_memory_limit)] = Field(
         "256MiB", description="memory for past data; the oldest data are dropped first"
+    )
+    units: Annotated[str, one_of(tuple(UNIT_SYSTEMS))] = Field(
+        "imu", description="units of the viewer and of the table in the terminal: imu, datasheet or si"
     )
     history: Duration | None = Field(
         None, examples=["1d"], description="part of the history in [storage] that is shown when the view opens"

@@ -3,21 +3,18 @@
 Options of the command can replace the sensor and add noise effects.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, ParamSpec, TypeVar
+from typing import Final
 
-from drivers.errors import ConfigError
 from monitor.common import shipped_config_paths
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.noise.model_loading import read_model
+from monitor.noise.model_toml import prefix_config_errors
 from monitor.settings import loading
 from monitor.settings.loading import Config, VirtualTable
 from monitor.simulator import DEFAULT_RATE_HZ, parse_effects
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 DEMO_CONFIG: Final = CONFIG_FOLDER / "demo.toml"
 """Path of the shipped configuration."""
@@ -46,28 +43,18 @@ def build_demo_config(
     (device,) = config.devices
     table = device.link
     assert isinstance(table, VirtualTable)
-    given = {
-        "model": None
-        if sensor is None
-        else str(_for_option("--sensor", shipped_config_paths.resolve_model_path, sensor, Path.cwd())),
-        "effect": tuple(effects) or None,
-        "effect_at": effect_at_s,
-    }
-    table = table.model_copy(update={key: value for key, value in given.items() if value is not None})
-    rate_hz = _for_option("--sensor", read_model, Path(table.model)).sample_rate_hz or DEFAULT_RATE_HZ
-    for text in effects:
-        _for_option("--effect", parse_effects, text)
+    with prefix_config_errors("--sensor"):
+        model = Path(table.model) if sensor is None else shipped_config_paths.resolve_model_path(sensor, Path.cwd())
+        rate_hz = read_model(model).sample_rate_hz or DEFAULT_RATE_HZ
+    with prefix_config_errors("--effect"):
+        for text in effects:
+            parse_effects(text)
+    given = {"effect": tuple(effects) or None, "effect_at": effect_at_s}
+    given = {key: value for key, value in given.items() if value is not None}
+    table = table.model_copy(update={"model": str(model), **given})
     window_s = min(device.window_s, loading.WINDOW_SAMPLES[1] / rate_hz)
     # the viewer then shows when the sensor no longer agrees with the noise model
     driver = replace(device.driver, link=table)
-    update = {"driver": driver, "rate_hz": rate_hz, "window_s": window_s, "model": Path(table.model)}
+    update = {"driver": driver, "rate_hz": rate_hz, "window_s": window_s, "model": model}
     device = device.model_copy(update=update)
     return replace(config, devices=(device,), path=None)
-
-
-def _for_option(option: str, function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
-    """Call a function, and prepend the name of the option to the message of a ConfigError."""
-    try:
-        return function(*arguments, **named)
-    except ConfigError as error:
-        raise ConfigError(f"{option}: {error}") from error

@@ -27,7 +27,7 @@ from monitor.publishing.zenoh.subscriber import client_configurations
 from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S
 
-IMU_MONITOR = [sys.executable, "-m", "monitor.cli"]
+IMU_MONITOR = [sys.executable, "-m", "imu_monitor"]
 ERROR_TEXTS = {
     "fifo": "is a FIFO",
     "socket": "is a socket",

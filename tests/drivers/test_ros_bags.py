@@ -204,7 +204,11 @@ class TestDamage:
 
     @pytest.mark.parametrize(
         ("kind", "remedy"),
-        [("ros1", "`rosbag reindex`"), ("mcap", "`mcap recover run.mcap -o indexed.mcap`"), ("sqlite", "folder")],
+        [
+            ("ros1", "`rosbag reindex run.bag`"),
+            ("mcap", "`mcap recover run.mcap -o indexed.mcap`"),
+            ("sqlite", "`sqlite3 run.db3 .recover | sqlite3 recovered.db3`"),
+        ],
     )
     def test_the_line_names_the_remedy(self, kind: str, remedy: str, tmp_path: Path) -> None:
         file = storage_file(write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(2000), noise(2000))}))

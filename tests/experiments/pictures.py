@@ -237,7 +237,7 @@ def compensation(out: Path, folder: Path) -> Path:
     )
     save_samples(source, np.arange(n) / 100.0, values)
     arguments = ["compensate", str(source), "--out", str(folder / "out.npz"), "--plot", str(path)]
-    subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)
+    subprocess.run([sys.executable, "-m", "imu_monitor", *arguments], check=True)
     return path
 
 
@@ -510,7 +510,7 @@ def reduce_colours(path: Path) -> Path:
 def run_analyze(source: Path, plot: Path, *more: str) -> Path:
     """Run ``imu-monitor analyze --plot`` on a recording."""
     arguments = ["analyze", str(source), "--plot", str(plot), *more]
-    subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)
+    subprocess.run([sys.executable, "-m", "imu_monitor", *arguments], check=True)
     return plot
 
 

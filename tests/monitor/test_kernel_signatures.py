@@ -65,7 +65,6 @@ USE_ALL_KERNELS = """
         estimator.restart_axis(2, 1000)
         while estimator.step_slow_statistics() is None:
             pass
-    gyro.bias_standard_error
     thermal_response.apply_first_order_lag(values[:, 0].copy(), 0.5)
     print(json.dumps([before, count_signatures(), len(found)]))
 """

@@ -18,6 +18,7 @@ from monitor.daemon.outputs.output import Output
 from monitor.daemon.service import Service
 from monitor.drift.compensation.live_compensation import MeasuredAndSubtractedDrift
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
+from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import TotalAndHadamardCurves
@@ -143,3 +144,24 @@ def send_at_rate(send: Callable[[bytes], None], frames: list[bytes], per_second:
         if early > 0.0:
             time.sleep(early)
         send(b"".join(frames[start : start + burst]))
+
+
+def check_deviations_equal_batch(output: RecordingOutput, device: str, index: np.ndarray) -> None:
+    """Check that the last Allan deviations of a device equal those of a batch computation.
+
+    Parameters
+    ----------
+    output : RecordingOutput
+        Blocks and results of a service whose window has contained all samples.
+    device : str
+        Name of the device.
+    index : ndarray of int, shape (n,)
+        Number of each received sample in the order of sending. Samples that were lost or rejected have no number here.
+    """
+    grid = np.full((index[-1] - index[0] + 1, 6), np.nan)
+    grid[index - index[0]] = output.values(device)
+    curve = output.estimates[device].curve
+    assert curve.n == len(grid)
+    avar, terms = overlapping_avar(grid, curve.factors)
+    np.testing.assert_array_equal(curve.terms, terms)
+    np.testing.assert_allclose(np.sqrt(curve.avar), np.sqrt(avar), rtol=1e-9)

@@ -1,6 +1,7 @@
 """Test of simulated sensors with counters through a pseudo-terminal, the decoder and the service.
 
-The line loses and damages frames. Every sample is received, rejected or counted as lost.
+The line loses and damages frames. Every sample is received, rejected or counted as lost, and the Allan deviations equal
+those of a batch computation.
 """
 
 import json
@@ -14,7 +15,7 @@ from monitor.daemon.service import Service
 from tests.contracts.decoder_examples import EXAMPLES, Example
 from tests.support.paced_sensor import follow_reader
 from tests.support.waiting import wait_for
-from tests.system.rig import run_service
+from tests.system.rig import check_deviations_equal_batch, run_service
 
 SAMPLES = 1000
 RATE_HZ = 100.0
@@ -22,7 +23,8 @@ CONFIG = """
 [[device]]
 name = "imu"
 rate = {rate}
-window = 5.0
+window = 600.0
+restart = false
 [device.driver]
 link = "virtual"
 speed = 10.0
@@ -64,3 +66,4 @@ def test_every_sample_is_received_rejected_or_lost(example: Example, tmp_path: P
     assert counts.received == sum(map(len, blocks)) == steps.size + 1
     assert counts.received + counts.bad + counts.lost == steps.sum() + 1
     assert min(counts.bad, counts.lost) > 0
+    check_deviations_equal_batch(run.output, "imu", np.concatenate([[0], np.cumsum(steps)]))

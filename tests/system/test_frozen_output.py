@@ -22,7 +22,7 @@ from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import open_router, open_session
 
-PROGRAM = [sys.executable, "-m", "monitor.cli"]
+PROGRAM = [sys.executable, "-m", "imu_monitor"]
 CONFIG = """
 [[device]]
 name = "bench"

@@ -11,7 +11,7 @@ from drivers.decoders.messages.iio import AXIS_CHANNELS
 from drivers.links import iio_link
 from tests.support.fake_iio_device import FakeIioDevice
 from tests.support.waiting import wait_for
-from tests.system.rig import run_service
+from tests.system.rig import check_deviations_equal_batch, run_service
 
 RATE_HZ = 200
 SAMPLES = 2000
@@ -28,6 +28,7 @@ CONFIG = f"""
 name = "imu"
 rate = {RATE_HZ}.0
 window = 60.0
+restart = false
 [device.driver]
 link = "iio"
 device = "adis16475-2"
@@ -71,6 +72,7 @@ def test_received_lost_and_bad_samples_add_up_and_the_device_can_be_unplugged(
         [1e-6 * (1000 + index), -1e-6 * index, 0 * index, 1e-5 * index, -2e-5 * index, 0 * index + 9.80665]
     )
     assert run.output.values("imu") == pytest.approx(expected)
+    check_deviations_equal_batch(run.output, "imu", index)
     t_ns = np.concatenate([block.t_ns for block in run.output.blocks["imu"]])
     assert t_ns.tolist() == (start_ns + index * (10**9 // RATE_HZ)).tolist()
     assert "iio:device" in driver.text or "no such device" in driver.text or "gone" in driver.text

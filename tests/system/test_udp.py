@@ -8,13 +8,14 @@ import pytest
 from pymavlink.dialects.v20 import common
 
 from tests.support.waiting import wait_for
-from tests.system.rig import run_service, send_at_rate
+from tests.system.rig import check_deviations_equal_batch, run_service, send_at_rate
 
 CONFIG = """
 [[device]]
 name = "autopilot"
 rate = {rate}
-window = 10.0
+window = 600.0
+restart = false
 driver = {{ link = "udp", port = 0, {decoder} }}
 [zenoh]
 mode = "none"
@@ -104,3 +105,4 @@ def test_every_sample_is_received_lost_or_bad(tmp_path: Path, decoder: str, buil
     assert (counts.received, counts.bad, counts.lost) == (SAMPLES - 60, 30, 30)
     kept = np.delete(np.arange(SAMPLES), np.concatenate([missing, damaged]))
     np.testing.assert_allclose(run.output.values("autopilot"), values[kept], rtol=1e-7)
+    check_deviations_equal_batch(run.output, "autopilot", kept)

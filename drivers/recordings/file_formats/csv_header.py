@@ -21,6 +21,8 @@ from drivers.recordings.table_layout import names_an_axis
 MAX_PREAMBLE_BYTES: Final = 1 << 20
 """Maximum total size of the blank lines and comments before the header."""
 COMMENT_MARKS: Final = ("#", "%")
+UNKNOWN_COMMENT_MARKS: Final = ("//", ";", "--", "!", "*")
+"""Comment marks of other programs, which the error message about a missing header names."""
 BOM: Final = "\N{ZERO WIDTH NO-BREAK SPACE}"
 BLANKS: Final = ""
 """Separator of files whose fields are separated by any number of blanks."""
@@ -202,6 +204,12 @@ def _build_header(
     fields = [] if sample is None else split_fields(sample, separator)
     if len(fields) == len(names) + 1 and not fields[-1].strip():
         names.append("")  # the lines of samples end with a separator
+    mark = next((mark for mark in UNKNOWN_COMMENT_MARKS if text.startswith(mark)), None)
+    if mark is not None and len(fields) not in (0, len(names)):
+        raise RecordingError(
+            f'{label}: line {header.number} begins with "{mark}" like a comment, but comments begin with # or %; '
+            "change the mark, or delete the line"
+        )
     return CsvHeader(names, separator, header.number, rest, rest_number)
 
 

@@ -42,8 +42,9 @@ MIN_LOG_NS: Final = 1_000_000_000
 MAX_METADATA_BYTES: Final = 4_000_000
 EXPECTED: Final = "messages of type sensor_msgs/Imu"
 REPAIRS: Final[Mapping[str, str]] = {
-    ".bag": "`rosbag reindex` repairs a bag that was not closed",
-    ".mcap": "`mcap recover` copies the intact messages",
+    ".bag": "if it is cut off or was not closed, `rosbag reindex {}` writes its index",
+    ".mcap": "`mcap recover {} -o recovered.mcap` copies the intact messages",
+    ".db3": "if it is cut off, `sqlite3 {} .recover | sqlite3 recovered.db3` copies the intact messages",
 }
 REINDEX: Final = "`ros2 bag reindex` writes the metadata again"
 
@@ -111,14 +112,21 @@ def _open_bag(path: Path) -> Iterator[tuple[_Bag, memory_check.RecordingSizeLimi
 
 
 def _bag_errors(path: Path) -> AbstractContextManager[None]:
-    return convert_library_errors(lambda cause: f"{path}: is no complete bag ({cause}){_describe_remedy(path)}")
+    def describe(cause: str) -> str:
+        text = cause.partition(": (")[0]  # rosbags appends the arguments of the first exception
+        return f"{path}: is no complete bag ({text}){_describe_remedy(path, cause)}"
+
+    return convert_library_errors(describe)
 
 
-def _describe_remedy(path: Path) -> str:
-    if path.is_file() and is_bag_folder(path.parent):
+def _describe_remedy(path: Path, cause: str) -> str:
+    if path.is_file() and is_bag_folder(path.parent) and "malformed" not in cause:
         return f"; read the folder {path.parent}, whose {METADATA} states how the messages are compressed"
     mismatch = table.describe_suffix_mismatch(path) if path.is_file() else ""
-    return mismatch or f"; {REPAIRS.get(path.suffix.lower(), REINDEX)}"
+    damaged = sorted(path.glob("*.db3"))[:1] if path.is_dir() and "malformed" in cause else [path]
+    return mismatch or "; " + REPAIRS.get("".join(one.suffix.lower() for one in damaged), REINDEX).format(
+        *(one.name for one in damaged)
+    )
 
 
 def _list_topics(connections: Iterable[Any], counts: Mapping[int, int]) -> list[Topic]:

@@ -89,7 +89,8 @@ def _usage(error: TyperException) -> str:
         near = get_close_matches(unknown.lstrip("-"), known, n=1)
         hint = f"did you mean {known[near[0]]}?" if near else f"known are {', '.join(known.values())}"
         return f"No such option: {unknown} of {context.command_path}; {hint}"
-    commands: Mapping[str, object] = getattr(context.command, "commands", {})
+    commands: Mapping[str, Any] = getattr(context.command, "commands", {})
     if commands and "Did you mean" not in text:
-        return f"{text.rstrip('.')}; known are {', '.join(commands)}"
+        known_names = ", ".join(name for name, command in commands.items() if not command.hidden)
+        return f"{text.rstrip('.')}; known are {known_names}. See {context.command_path} --help"
     return text

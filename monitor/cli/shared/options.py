@@ -116,13 +116,12 @@ CorrelationTime = Annotated[
     ),
 ]
 
-Units = Annotated[
-    str,
-    typer.Option(
-        metavar="imu|datasheet|si",
-        help="Units of tables and plots: °/√h, with noise density in m°/s/√Hz, or rad/s/√Hz.",
-    ),
-]
+_UNITS = typer.Option(
+    metavar="imu|datasheet|si",
+    help="Units of tables and plots: °/√h, with noise density in m°/s/√Hz, or rad/s/√Hz.",
+)
+Units = Annotated[str, _UNITS]
+ConfiguredUnits = Annotated[str | None, _UNITS]
 
 LENGTH_OPTIONS = {
     "rate": Annotated[

@@ -5,6 +5,8 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import typer
+
 from drivers.errors import ConfigError
 from monitor.commands.progress import ProgressCallback, ignore_progress
 
@@ -78,6 +80,17 @@ def write_file_or_stdout(option: str, path: Path, data: bytes) -> None:
         path.write_bytes(data)
     except OSError as error:
         raise ConfigError(f"{option}: {path}: cannot be written: {error.strerror}") from error
+
+
+def print_written_files(*paths: Path | None) -> None:
+    """Print the path of each file that a command has written.
+
+    The lines go to standard error if one of the paths is ``-``, because standard output then contains the data.
+    """
+    to_stderr = Path("-") in paths
+    for path in paths:
+        if path not in (None, Path("-")):
+            typer.echo(f"{path} written", err=to_stderr)
 
 
 @contextlib.contextmanager

@@ -5,10 +5,12 @@ A separate thread writes to the terminal, so that a blocked terminal or pipe can
 
 import contextlib
 import errno
+import gc
 import io
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
@@ -28,7 +30,7 @@ STDOUT: Final = "standard output"
 STDERR: Final = "standard error"
 
 
-def run_service(config: "Config", seconds: float | None, viewer_mode: str | None, units: "UnitSystem") -> None:
+def run_service(config: "Config", seconds: float | None, viewer_mode: str | None, units: str | None) -> None:
     """Run the service with a live table in a terminal, or with log lines if standard output is not a terminal.
 
     Without a terminal, the final table is printed when the service ends.
@@ -41,13 +43,13 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
         Duration in seconds. If None, the service runs until a signal is received or all replays have ended.
     viewer_mode : str or None
         Viewer mode that replaces the configured mode. None keeps the configured mode.
-    units : UnitSystem
-        Units of the table.
+    units : str or None
+        Unit system of the table and the viewer. None keeps the configured units.
 
     Raises
     ------
     ConfigError
-        If the viewer mode or a device cannot be used.
+        If the viewer mode, the unit system or a device cannot be used.
     OSError
         If the final table could not be written to a file or pipe, and no signal ended the service.
     """
@@ -56,6 +58,7 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     import structlog
     from rich.console import Console
 
+    from monitor.common.unit_formatting import UNIT_SYSTEMS
     from monitor.daemon.daemon_process import STATUS_INTERVAL_S, DaemonProcess
     from monitor.daemon.operations.systemd import SystemdNotifier
     from monitor.daemon.outputs.terminal_outputs import EventAndStatusLogOutput, TableOutput
@@ -67,9 +70,10 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
     unit = SystemdNotifier.from_environment(os.environ)
-    config = _with_viewer(config, viewer_mode)
+    config = _with_viewer(config, viewer_mode, units)
     console, board, asked = Console(file=sys.stdout), RemoteDeviceRegistry(), threading.Event()
-    table, terminal = LiveTable(console, units=units), console.is_terminal
+    table = LiveTable(console, units=UNIT_SYSTEMS[config.viewer.units], begun_s=time.monotonic())
+    terminal = console.is_terminal
     screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
     writers = {"terminal": screen} if terminal else {}
     shared = terminal and _same_file(sys.stdout, sys.stderr)
@@ -87,6 +91,7 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
                 if terminal
                 else [TableOutput(board), EventAndStatusLogOutput()]
             )
+            gc.freeze()  # a full collection would examine all imported modules and stop every thread for 0.1 s
             workers = count_workers(config)
             service: DaemonProcess = (
                 Service(config, outputs, unit=unit, writers=writers)
@@ -132,6 +137,7 @@ def run_fleet_viewer(
     detailed_devices: Sequence[str],
     viewer_mode: str,
     seconds: float | None,
+    units: "UnitSystem",
 ) -> None:
     """Show the devices of several daemons in one viewer until a signal is received.
 
@@ -149,6 +155,8 @@ def run_fleet_viewer(
         Viewer mode.
     seconds : float or None
         Duration in seconds. If None, the viewer runs until a signal is received.
+    units : UnitSystem
+        Units of tables and plots.
 
     Raises
     ------
@@ -169,7 +177,9 @@ def run_fleet_viewer(
     keys = tuple(dict.fromkeys(full_device_key(device, keyexpr) for device in detailed_devices))
     arriving = ZenohSubscriber(keyexpr, connect, zenoh_file, keys)
     rerun = RerunView(
-        ViewerSettings(mode=viewer_mode), [ViewerDeviceDescription(key, "over zenoh") for key in keys], fleet=True
+        ViewerSettings(mode=viewer_mode, units=units),
+        [ViewerDeviceDescription(key, "over zenoh") for key in keys],
+        fleet=True,
     )
     stop = threading.Event()
     install_signal_handlers(stop.set)
@@ -208,17 +218,20 @@ def with_viewer_history_length(config: "Config", history_s: float | None) -> "Co
     return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"history": history_s}))
 
 
-def _with_viewer(config: "Config", viewer: str | None) -> "Config":
-    """Return a copy of the configuration with a different viewer mode. None keeps the configured mode."""
+def _with_viewer(config: "Config", mode: str | None, units: str | None) -> "Config":
+    """Return a copy of the configuration with a different viewer mode or unit system. None keeps the configured one."""
     import dataclasses
 
+    from monitor.cli.shared.options import parse_units
     from monitor.settings import loading
 
-    if viewer is None:
-        return config
-    with name_option_in_config_errors("--viewer"):
-        loading.check_viewer_mode(viewer)
-    return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"mode": viewer}))
+    if mode is not None:
+        with name_option_in_config_errors("--viewer"):
+            loading.check_viewer_mode(mode)
+    if units is not None:
+        parse_units(units)
+    stated = {key: value for key, value in (("mode", mode), ("units", units)) if value is not None}
+    return dataclasses.replace(config, viewer=config.viewer.model_copy(update=stated))
 
 
 @contextlib.contextmanager

@@ -15,10 +15,10 @@ from monitor.commands.doctor.finding import Finding, doubt, user_name, well, wro
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, describe_lock_holder
 from monitor.settings.loading import Config, Storage
 
-SAMPLE_BYTES: Final = 35.0
+SAMPLE_BYTES: Final = 38.0
 """Size in bytes of a sample with six axes, temperature and counter in a compressed recording.
 
-High-resolution sensors need 32.5 to 33.3 bytes per sample. Coarse-resolution sensors need 17 to 23 bytes.
+High-resolution sensors need 35.5 to 37.1 bytes per sample. Coarse-resolution sensors need 12 to 16 bytes.
 """
 
 

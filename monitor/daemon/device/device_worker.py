@@ -38,7 +38,7 @@ MIN_REPLAY_RING_SAMPLES: Final = 65_536
 """Minimum capacity for a replayed recording, whose blocks of up to 4096 samples wait for space in the ring buffer."""
 UNKNOWN_RATE_HZ: Final = 1000.0
 """Assumed sample rate for the capacity of the ring buffer if no rate is configured."""
-READ_TIMEOUT_RANGE_S: Final = (0.005, 0.1)
+READ_TIMEOUT_RANGE_S: Final = (0.004, 0.1)
 """Shortest and longest time for which received bytes wait for more bytes, by default the interval of publication.
 
 A read takes about as much processor time for one sample as for 50 samples. Each read wakes the main loop, which
@@ -195,15 +195,15 @@ class DeviceWorker:
             self.pipeline.process_samples_held_by_motion_detector()
         if self.pipeline.thermal is not None and any(event.kind == "link_back" for event in events):
             self.pipeline.thermal.learn_new_offset()
-        published = self.publisher.batch_samples_and_publish_if_due(blocks)
+        self._check_rate(drain)
+        published = self.publisher.publish_estimate_if_due()
+        published |= self.publisher.batch_samples_and_publish_if_due(blocks)
+        if published:
+            self.status.latency.note_publication()
         self.publisher.publish_events(events + self.pipeline.take_events())
         self.publisher.publish_thermal_intervals()
         self._select_thermal_model()
-        self._check_rate(drain)
-        published |= self.publisher.publish_estimate_if_due()
         self.publisher.advance_total_and_hadamard()
-        if published:
-            self.status.latency.note_publication()
 
     def _can_take(self) -> bool:
         """Return True if the sample rate and the kernels are available to process samples."""

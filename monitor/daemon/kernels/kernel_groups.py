@@ -55,11 +55,11 @@ def _call_motion_detection() -> None:
 
 
 def _call_change_detection() -> None:
-    from monitor.estimation.detection.change_detection import NoiseAndBiasChangeDetector
+    from monitor.estimation.detection.change_kernel import make_change_state, set_next_decision_sample
     from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
 
     MotionAndChangeMonitor(100.0).process_samples(_samples(100))
-    NoiseAndBiasChangeDetector(100.0).restart_references()
+    set_next_decision_sample(make_change_state(1))
 
 
 def _call_compensation() -> None:
@@ -72,7 +72,6 @@ def _call_compensation() -> None:
         0, fit_arma(*compensator.means_and_noise_variance_for_identification(0), [(2, 1)])
     )
     compensator.compensate(np.zeros((1, 6)), lost=1)
-    _ = compensator.bias_standard_error
 
 
 def _call_slow_statistics() -> None:

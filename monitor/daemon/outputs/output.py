@@ -47,6 +47,9 @@ class Output:
     def set_alive(self, device: str, samples_arrive: bool) -> None:
         """Publish a notification that samples of a device have started or stopped arriving."""
 
+    def set_viewer_url(self, url: str) -> None:
+        """Show the URL of the web viewer, or remove the URL if it is ""."""
+
     def finish_round(self) -> None:
         """Send the results of one round of the main loop, if they have been collected."""
 

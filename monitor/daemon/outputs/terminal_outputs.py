@@ -41,6 +41,11 @@ class EventAndStatusLogOutput(Output):
             write = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
             write("status", device=device, state=health.state, text=health.text, received=health.received)
 
+    def set_viewer_url(self, url: str) -> None:
+        """Write a log line with the URL of the viewer."""
+        if url:
+            _log.info("viewer", url=url)
+
     def remove_device(self, device: str) -> None:
         """Remove the stored status of a device."""
         self._last_status.pop(device, None)
@@ -68,8 +73,9 @@ class TableOutput(Output):
         self._newest: dict[str, dict[type[Message], tuple[float, int, Any]]] = {}  # results since the last status
 
     def set_viewer_url(self, url: str) -> None:
-        """Show the URL of the viewer above the table, or remove the line if the URL is ""."""
-        self.states.note = f"viewer: {url}" if url else ""
+        """Show the URL of the viewer above a table that is redrawn. Otherwise, the log contains the URL."""
+        if self._redraw is not None:
+            self.states.note = f"viewer: {url}" if url else ""
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Store the newest estimate and the newest comparison with the noise model until the next status."""
@@ -86,6 +92,8 @@ class TableOutput(Output):
         self._process(StatusMessage.from_result(device, unix_s, health.received, health))
         for message, newest in self._newest.pop(device, {}).items():
             self._process(message.from_result(device, *newest))
+            if isinstance(newest[-1], Estimate):
+                self.states.set_allan_curve(f"{PREFIX}/{device}", newest[-1].curve)
         if self._redraw is not None:
             self._redraw()
 

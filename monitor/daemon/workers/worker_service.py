@@ -5,6 +5,7 @@ to the main process, which publishes them. In the other direction, the pipe carr
 main process asks for it, and also when the main process ends.
 """
 
+import gc
 import os
 import signal
 import threading
@@ -185,6 +186,7 @@ def _run_service(
 ) -> None:
     config = loading.load_selected_devices(table, folder)
     set_log_level(config.log.level)
+    gc.freeze()  # as in the main process
     service = WorkerService(config, output, main_pid)
     threading.Thread(target=service.receive_calls, args=(connection,), name="calls", daemon=True).start()
     service.run()

@@ -162,12 +162,6 @@ class Compensator:
         """Return the bias [3] that is currently subtracted in rad/s, or NaN if it is not known yet."""
         return self._state.bias.copy()
 
-    @property
-    def bias_standard_error(self) -> Floats:
-        """Return the standard error [3] of the bias in rad/s, or NaN if the bias is not known yet."""
-        known = [sage_husa.expected_bias_and_variance(drift)[1] ** 0.5 for drift in self._state.drift]
-        return np.where(np.isnan(self._state.bias), np.nan, known)
-
     def compensate(self, values: Floats, lost: int = 0) -> Floats:
         """Remove the gyro drift from samples.
 

@@ -193,7 +193,8 @@ class OnlineThermalModel:
             without = yield from fit_thermal_model_stepwise(means, always_try_lags=True)
             stepped = yield from fit_thermal_model_stepwise(means, since, always_try_lags=True)
         except NotReady:
-            pass  # keep the current model if there are too few intervals
+            # Nothing is lost: the step is reported below with the size of the suspicion, and the current model remains.
+            pass
         else:
             if without.aicc - stepped.aicc < STEP_AICC_MARGIN:
                 self._recursion = RecursiveThermalFit(without.model, self._means())
@@ -217,7 +218,8 @@ class OnlineThermalModel:
                 self._means(), len(self._rows) - (self._interval_count - self._new_offset_at)
             )
         except NotReady:
-            pass  # use the mean residual
+            # Nothing is lost: the mean residual is the new offset, and a later selection fits all intervals again.
+            pass
         else:
             size, model = stepped.step, stepped.model
         self._offset_differences = None

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
+from drivers.validation.number_ranges import HOUR_S
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_fit import ThermalFit
 from monitor.drift.thermal.thermal_model import ThermalModel, ThermalPrediction, predict_interval_means
@@ -14,26 +15,9 @@ from monitor.drift.thermal.thermal_model import ThermalModel, ThermalPrediction,
 DEFAULT_INTERVALS: Final = 72
 """Default number of intervals into which a recording is divided. Wang et al. use 72 intervals of 1 h."""
 ROUND_INTERVALS_S: Final = (
-    0.1,
-    0.2,
-    0.5,
-    1,
-    2,
-    5,
-    10,
-    15,
-    20,
-    30,
-    60,
-    120,
-    300,
-    600,
-    900,
-    1200,
-    1800,
-    3600,
-    7200,
-    14400,
+    *(0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30),
+    *(60 * minutes for minutes in (1, 2, 5, 10, 15, 20, 30)),
+    *(HOUR_S * hours for hours in (1, 2, 4)),
 )
 
 

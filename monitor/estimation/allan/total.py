@@ -20,6 +20,7 @@ out.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -190,26 +191,36 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
     On a coarse grid with one phase point per ``step`` samples, each pair represents step² pairs. The covariance of
     quantization noise is nonzero only if phase points coincide, so each coinciding pair represents ``step`` pairs. The
     two ends of the recording are exceptions, because all reflected second differences contain an end point.
+
+    The autocovariances at ``step`` times the lag are linear functions of the autocovariances at the lag, apart from a
+    term t² ln(step) of the flicker noise, which cancels in second differences.
     """
-    at = np.arange(n + 1)
-    lags = phase_autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
-    points, signs = _points(np.arange(1.0, n), n, m)
-    rows = points.astype(np.int64)
-    random = _combine_points(_combine_points(lags, rows, signs).transpose(0, 2, 1), rows, signs)
-    ends = signs[:, [0, 4]] @ signs[:, [0, 4]].T
-    random[0] -= ends
-    ramp = (signs * 0.5 * (step * points) ** 2).sum(axis=1)
-    parts = np.concatenate([random, np.outer(ramp, ramp)[None], ends[None]]).reshape(NUM_COEFFICIENTS + 1, -1)
-    products = step * step * (parts @ parts.T)
+    scale = np.diag([1.0, step, step**2, step**3, step**4, 1.0])
+    scale[3, 1] = (step - step**3) / 6.0
+    products = step * step * (scale @ _unit_step_products(n, m) @ scale.T)
     products[0] /= step
     products[1:, 0] /= step
-    products[0, 0] = step * (parts[0] @ parts[0])
     products[_RAMP, _RAMP] = 0.0  # a linear drift without noise has no variance
     joined = products[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS]
     joined[0] += products[NUM_COEFFICIENTS, :NUM_COEFFICIENTS]
     joined[:, 0] += products[:NUM_COEFFICIENTS, NUM_COEFFICIENTS]
     joined[0, 0] += products[NUM_COEFFICIENTS, NUM_COEFFICIENTS]
     return np.asarray(joined)
+
+
+@lru_cache(maxsize=2048)  # one computation takes about 12 ms, and a growing recording needs the same sizes again
+def _unit_step_products(n: int, m: int) -> Floats:
+    """Return the sums [6, 6] of products over all pairs for Q, N, B, K, R and the ends, with one point per sample."""
+    at = np.arange(n + 1)
+    lags = phase_autocovariance(np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
+    points, signs = _points(np.arange(1.0, n), n, m)
+    rows = points.astype(np.int64)
+    random = _combine_points(_combine_points(lags, rows, signs).transpose(0, 2, 1), rows, signs)
+    ends = signs[:, [0, 4]] @ signs[:, [0, 4]].T
+    random[0] -= ends
+    ramp = (signs * 0.5 * points**2).sum(axis=1)
+    parts = np.concatenate([random, np.outer(ramp, ramp)[None], ends[None]]).reshape(NUM_COEFFICIENTS + 1, -1)
+    return np.asarray(parts @ parts.T)
 
 
 def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
-from monitor.common.compiled import compiled, inlined
+from monitor.common.compiled import compiled, inlined, without_reference_count
 
 AXES: Final = 6
 LANES: Final = 8
@@ -115,9 +115,9 @@ def append_staged_samples(memory: Ints, taus: int, start: int, n: int) -> None:
     n : int
         Number of samples.
     """
-    # All fields are unpacked at once, because each access to a field of a named tuple changes a reference count.
+    # All fields are unpacked at once, because an access to a field of a named tuple takes time.
     state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = compiled_view_window_arrays(
-        memory, taus
+        without_reference_count(memory), taus
     )
     places = phase.size // LANES
     length = places - 1 - RUN_SAMPLES

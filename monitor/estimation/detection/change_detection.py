@@ -31,7 +31,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.validation.number_ranges import DAY_S
-from monitor.common.unit_formatting import format_axis_value
+from monitor.common.unit_formatting import COEFFICIENT_NAMES, format_axis_value, sensor_kind
 from monitor.estimation.detection.change_kernel import (
     AFTER,
     BEFORE,
@@ -96,16 +96,6 @@ MAX_CLIPPED_RATIO: Final = 4.0
 
 Q_OR_VIBRATION: Final = "quantization noise or vibration near Nyquist"
 """Description of a change of Q, which can be caused by quantization noise or by a vibration."""
-NOISE_NAMES: Final = {
-    "g": {"Q": Q_OR_VIBRATION, "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
-    "a": {
-        "Q": Q_OR_VIBRATION,
-        "N": "velocity random walk",
-        "B": "bias instability",
-        "K": "acceleration random walk",
-    },
-}
-"""Names of the noise coefficients for gyroscopes (g) and accelerometers (a)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,12 +201,6 @@ class NoiseAndBiasChangeDetector:
         """Return the changes that were detected since the last call, in the order of detection."""
         found, self._found = self._found, []
         return found
-
-    def restart_references(self, axis: int | None = None) -> None:
-        """Discard the reference variances of one axis, or of all axes if ``axis`` is None."""
-        for one in range(len(AXES)) if axis is None else (axis,):
-            self._restart_reference(one)
-        set_next_decision_sample(self._state)
 
     def _decide(self, axis: int) -> None:
         s = self._state
@@ -333,7 +317,7 @@ class NoiseAndBiasChangeDetector:
 
 
 def _noise_text(axis: str, what: Mapping[str, tuple[float, float]]) -> str:
-    names = NOISE_NAMES[axis[0]]
+    names = COEFFICIENT_NAMES[sensor_kind(axis)] | {"Q": Q_OR_VIBRATION}
     letters = [f"{names[letter]} {_format_change(*what[letter])}" for letter in what if letter in names]
     if letters:
         return ", ".join(letters)

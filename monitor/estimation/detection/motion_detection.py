@@ -26,6 +26,7 @@ from monitor.estimation.detection.motion_kernel import (
     LAST,
     PEAK,
     REMOVED_AFTER,
+    MotionState,
     advance_motion_detection,
     make_motion_state,
 )
@@ -73,7 +74,6 @@ class MotionDetector:
 
     def __init__(self, rate_hz: float) -> None:
         self.samples_in_motion = 0
-        self.episodes = 0
         self._rate_hz = rate_hz
         self._size = samples_per_block(rate_hz)
         self._state = make_motion_state()
@@ -91,19 +91,11 @@ class MotionDetector:
         first = self._index + samples.lost
         self._held.append((first, samples))
         self._index = first + len(samples)
-        blocks, moving, episodes = _allocate_output(len(samples), self._size)
-        filled = advance_motion_detection(
-            samples.values, first, self._size, False, self._state, blocks, moving, episodes
-        )
-        return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
+        return self._release(*_decide_blocks(samples.values, first, self._size, False, self._state))
 
     def flush_delayed_samples(self) -> list[SampleBlock]:
         """Return the delayed samples at the end of the stream, and end the current episode of motion."""
-        blocks, moving, episodes = _allocate_output(0, self._size)
-        filled = advance_motion_detection(
-            _read_only(np.empty((0, len(AXES)))), 0, self._size, True, self._state, blocks, moving, episodes
-        )
-        return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
+        return self._release(*_decide_blocks(_read_only(np.empty((0, len(AXES)))), 0, self._size, True, self._state))
 
     def take_motions(self) -> list[MotionEpisode]:
         """Return the episodes of motion that have ended since the last call."""
@@ -111,9 +103,7 @@ class MotionDetector:
         return motions
 
     def _release(self, blocks: Ints, moving: Ints, episodes: Floats) -> list[SampleBlock]:
-        motions = [_make_motion(episode, self._size, self._rate_hz) for episode in episodes]
-        self._motions += motions
-        self.episodes += len(motions)
+        self._motions += [_make_motion(episode, self._size, self._rate_hz) for episode in episodes]
         out: list[SampleBlock] = []
         end = (int(blocks[-1]) + 1) * self._size if blocks.size else 0
         while self._held and self._held[0][0] < end:
@@ -146,13 +136,9 @@ def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], li
         Detected episodes of motion.
     """
     size = samples_per_block(rate_hz)
-    kernel_state = make_motion_state()
-    blocks, moving, episodes = _allocate_output(len(values), size)
-    verdicts, stretches = advance_motion_detection(
-        _read_only(values), 0, size, True, kernel_state, blocks, moving, episodes
-    )
-    mask = np.repeat(moving[:verdicts].astype(bool), size)[: len(values)]
-    return mask, [_make_motion(episode, size, rate_hz) for episode in episodes[:stretches]]
+    _, moving, episodes = _decide_blocks(_read_only(values), 0, size, True, make_motion_state())
+    mask = np.repeat(moving.astype(bool), size)[: len(values)]
+    return mask, [_make_motion(episode, size, rate_hz) for episode in episodes]
 
 
 def samples_per_block(rate_hz: float) -> int:
@@ -170,9 +156,14 @@ def _read_only(values: Floats) -> Floats:
     return view
 
 
-def _allocate_output(rows: int, size: int) -> tuple[Ints, Ints, Floats]:
-    n = rows // size + 4
-    return np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 5))
+def _decide_blocks(
+    values: Floats, first_index: int, size: int, stream_ends: bool, state: MotionState
+) -> tuple[Ints, Ints, Floats]:
+    """Return the numbers of the newly decided blocks, 1 for each block in motion, and the completed episodes."""
+    n = len(values) // size + 4
+    blocks, moving, episodes = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 5))
+    decided, ended = advance_motion_detection(values, first_index, size, stream_ends, state, blocks, moving, episodes)
+    return blocks[:decided], moving[:decided], episodes[:ended]
 
 
 def _remove_moving(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlock:

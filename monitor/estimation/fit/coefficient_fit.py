@@ -26,6 +26,7 @@ If an axis has no noise or too few τ, the status of all its coefficients is UNE
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -56,7 +57,7 @@ THRESHOLDS_WATCHED: Final = (3.0, 1.5)
 """Thresholds in σ to add and to drop a noise term in repeated fits. The difference provides hysteresis."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class DesignMatrix:
     """Design matrix of the fit for given cluster sizes."""
 
@@ -119,16 +120,21 @@ def make_shared_inputs(
     may_drop_short_taus : bool
         True to leave out the shortest τ if they contradict the fit.
     """
+    inputs = _make_default_inputs(design, table)
+    if ignored_direction is not None:
+        inputs = inputs._replace(ignored_direction=ignored_direction)
+    return inputs if may_drop_short_taus else inputs._replace(may_drop_short_taus=False)
+
+
+@lru_cache(maxsize=64)  # a sensor repeats the fit with the same tables
+def _make_default_inputs(design: DesignMatrix, table: CovarianceTable) -> SharedInputs:
     flat = design.columns.copy()
     # The measured slope includes noise, so its subtraction reduces the expected contribution of each noise term.
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
     flat[:, ~design.columns.any(axis=0)] = 0.0  # zero columns represent terms that are not fitted
-
-    ignored_direction = np.zeros(design.factors.size) if ignored_direction is None else ignored_direction
+    nothing_ignored = np.zeros(design.factors.size)
     whole = table.terms.astype(np.float64)
-    return SharedInputs(
-        design.columns, flat, table.covariance, whole, table.slope, ignored_direction, may_drop_short_taus
-    )
+    return SharedInputs(design.columns, flat, table.covariance, whole, table.slope, nothing_ignored, True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Compiled functions that fit the noise coefficients of each axis by weighted non-negative least squares.
 
 The units are described in ``fit_kernel_types``. For given weights, the squared coefficients are a linear function of
-the Allan variances. This linear function and the limits within which it is valid are stored for ``continuous_refit``.
+the Allan variances. This linear function and the limits within which it is valid are stored for ``per_sample_refit``.
 """
 
 from typing import Final

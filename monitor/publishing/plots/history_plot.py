@@ -112,9 +112,7 @@ def _estimated_coefficients(past: HistoryTable, axis: str) -> list[str]:
 def _draw_coefficient(
     panel: "Axes", past: HistoryTable, kind: Kind, letter: str, axes: Sequence[str], units: UnitSystem
 ) -> None:
-    _, _, unit = units.columns(kind, letter)[
-        -1
-    ]  # the noise density rather than the random walk, if the units have both
+    unit = units.single(kind, letter)
     lows, highs = [], []
     for axis in axes:
         column, colour = past.select_column(f"{axis}.{letter}"), style.axis_colour(axis)

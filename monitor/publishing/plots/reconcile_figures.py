@@ -1,8 +1,7 @@
 """Figures of the ``reconcile`` reports as SVG elements.
 
 A diagnostic figure shows the measurement, the model expectation, and the band that contains 95 % of recordings
-simulated from the model. A gap chart shows the difference between measurement and model (gap), divided by the threshold
-of each diagnostic. An interval chart shows one parameter in several recordings.
+simulated from the model. An interval chart shows one parameter in several recordings.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,16 +12,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.unit_formatting import DEVIATION_UNITS, sensor_kind
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem, sensor_kind
 from monitor.publishing.plots import style
 from monitor.publishing.reports.reconcile_sentences import (
-    diagnostic_name,
     displayed_unit,
     format_range,
-    gap_to_threshold_ratio,
     readable_name,
 )
-from monitor.reconcile.result import DiagnosticGap, DiagnosticPlotData, Location, ParameterInterval
+from monitor.reconcile.result import DiagnosticPlotData, Location, ParameterInterval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +29,6 @@ MARGINS_INCHES: Final = (0.58, 0.15, 0.30, 0.44)  # left, right, top and bottom 
 BAND_COLOUR: Final = "#cfd5dd"
 RANGE_TEXT_COLOUR: Final = "#8a5a00"
 ABOVE_THRESHOLD_COLOUR: Final = "#b3261e"
-BELOW_THRESHOLD_COLOUR: Final = "#1b7f4d"
 MAX_MARKERS: Final = 60  # largest number of points that are drawn with markers
 MARGIN_SHARE: Final = 0.06  # margin above and below the curves, as a share of the height of the curves
 MAX_BAND_SHARE: Final = 0.35  # a band extends a panel by at most this share of the height of the curves
@@ -41,13 +37,12 @@ MIN_RANGE_SHARE: Final = 0.08  # a range narrower than this share of the width h
 DETAIL_WIDTHS: Final = 4.0  # a detail plot extends by this multiple of the range's width to either side
 MIN_DETAIL_SHARE: Final = 0.01  # smallest extension of a detail plot, as a share of the width of the whole plot
 MIN_DETAIL_POINTS: Final = 8
-ROW_INCHES: Final = 0.21  # height of one row of a gap chart or an interval chart
+ROW_INCHES: Final = 0.21  # height of one row of an interval chart
 ROWS_WIDTH_INCHES: Final = 5.6
 NAME_CHARACTER_INCHES: Final = 0.08  # width of a character in the name of a row
 ALLAN_INCHES: Final = (5.6, 3.5)  # size of an Allan deviation before and after the search
 MARK_SHARE: Final = 0.1  # height of the labels above the curves, as a share of the height of the curves
 MAX_NAME_LENGTH: Final = 32
-MIN_GAP_RATIO: Final = 0.05  # a smaller ratio of gap to threshold is drawn at this value
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +68,7 @@ def diagnostic_comparison_svg(
     width: float,
     height: float,
     where: Location | None = None,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> str:
     """Draw one diagnostic with a panel for each model, and return the figure as an SVG element.
 
@@ -86,42 +82,15 @@ def diagnostic_comparison_svg(
         Size of the figure [inches].
     where
         Range to mark in the first panel.
+    units
+        Unit system.
     """
     plots = [
-        to_displayed_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
+        to_displayed_units(title, view, axis, where if i == 0 else None, units)
+        for i, (title, view) in enumerate(model_panels)
     ]
     with style.figure_style():
         return _draw_comparison(*_create_panels(len(plots), width, height), plots, axis)
-
-
-def before_and_after_svgs(
-    views: Sequence[tuple[DiagnosticPlotData, DiagnosticPlotData]], axis: str, width: float, height: float
-) -> list[str]:
-    """Draw each diagnostic with a panel before and a panel after a step, and return the figures as SVG elements.
-
-    All figures use the same panels, because matplotlib takes a long time to create panels and ticks.
-
-    Parameters
-    ----------
-    views
-        Data of each diagnostic before and after the step.
-    axis
-        Name of the axis.
-    width, height
-        Size of each figure [inches].
-    """
-    drawn = []
-    with style.figure_style():
-        figure, panels = _create_panels(2, width, height)
-        for pair in views:
-            plots = [
-                to_displayed_units(title, view, axis, None)
-                for title, view in zip(("before", "after"), pair, strict=True)
-            ]
-            drawn.append(_draw_comparison(figure, panels, plots, axis))
-            for artist in [artist for panel in panels for artist in (*panel.lines, *panel.collections)]:
-                artist.remove()
-    return drawn
 
 
 def _create_panels(count: int, width: float, height: float) -> "tuple[Figure, list[Axes]]":
@@ -212,7 +181,7 @@ def zoomed_view(view: DiagnosticPlotData, where: Location) -> DiagnosticPlotData
 
 
 def to_displayed_units(
-    title: str, view: DiagnosticPlotData, axis: str, where: Location | None
+    title: str, view: DiagnosticPlotData, axis: str, where: Location | None, units: UnitSystem = DEFAULT_UNITS
 ) -> DiagnosticPanelCurves:
     """Convert the data of a diagnostic to displayed units.
 
@@ -226,13 +195,15 @@ def to_displayed_units(
         Name of the axis.
     where
         Range to mark. The range is ignored if the x axis shows another quantity.
+    units
+        Unit system.
     """
     x_unit, y_unit = (
-        displayed_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
+        displayed_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)), units)
         for unit, line in ((view.x_unit, view.x), (view.y_unit, view.measured))
     )
     if view.x_name == "averaging time" and view.y_unit in ("rad/s", "m/s²"):
-        y_unit = DEVIATION_UNITS[sensor_kind(axis)]  # as in all Allan plots
+        y_unit = units.deviation(sensor_kind(axis))  # as in all Allan plots
     x_name, factor = x_unit.name, x_unit.factor
     if view.x_name == "time" and not view.log:
         x_name, seconds = style.select_time_unit(float(np.ptp(view.x)))
@@ -250,7 +221,7 @@ def to_displayed_units(
         lo=lo,
         hi=hi,
         mark=None if mark is None else (mark[0] * factor, mark[1] * factor),
-        mark_label="" if where is None else format_range(where, axis),
+        mark_label="" if where is None else format_range(where, axis, units),
     )
 
 
@@ -306,7 +277,11 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPanelCurves, colour: str, limits:
 
 
 def allan_before_and_after_svg(
-    before: DiagnosticPlotData, after: DiagnosticPlotData, axis: str, marks: Mapping[float, str]
+    before: DiagnosticPlotData,
+    after: DiagnosticPlotData,
+    axis: str,
+    marks: Mapping[float, str],
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> str:
     """Draw the measured Allan deviation, and the Allan deviation of the model before and after the search.
 
@@ -323,10 +298,12 @@ def allan_before_and_after_svg(
         Name of the axis.
     marks
         Averaging time [s] and label of each mark.
+    units
+        Unit system.
     """
     replaced = np.fmax(before.measured**2 - after.measured**2, 0.0)
     curves = {name: np.sqrt(getattr(after, name) ** 2 + replaced) for name in ("measured", "expected", "lo", "hi")}
-    first, last = (to_displayed_units("", view, axis, None) for view in (before, replace(after, **curves)))
+    first, last = (to_displayed_units("", view, axis, None, units) for view in (before, replace(after, **curves)))
     with style.figure_style():
         figure = style.create_figure(*ALLAN_INCHES)
         panel = figure.subplots()
@@ -349,38 +326,6 @@ def allan_before_and_after_svg(
         panel.set_title(f"{axis}: {first.y_label}", fontsize=9.5, color=style.GREY)
         style.draw_legend_above(panel, 3)
         return style.to_svg_element(figure, f"{axis}: Allan deviation before and after the search")
-
-
-def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap] = ()) -> str:
-    """Draw the gap of each diagnostic divided by the threshold, and return the chart as an SVG element.
-
-    Parameters
-    ----------
-    before
-        Gaps with one model.
-    after
-        Gaps with the next model. Empty if there is only one model.
-    """
-    later = {score.diagnostic: score for score in after}
-    with style.figure_style():
-        figure, panel = _create_row_panel([diagnostic_name(score.diagnostic) for score in before], "gap over threshold")
-        panel.set_xscale("log")
-        ratios = [1.0]
-        for y, score in enumerate(before):
-            scores = [score] + ([later[score.diagnostic]] if score.diagnostic in later else [])
-            x = [max(gap_to_threshold_ratio(one), MIN_GAP_RATIO) for one in scores]
-            colours = [ABOVE_THRESHOLD_COLOUR if one.is_significant else BELOW_THRESHOLD_COLOUR for one in scores]
-            panel.plot(x, [y] * len(x), color=style.GREY, linewidth=1.4, zorder=2)
-            if len(x) > 1:
-                panel.plot(x[0], y, "o", mfc="white", mec=colours[0], mew=1.4, markersize=6)
-            panel.plot(x[-1], y, "o", color=colours[-1], markersize=6)
-            ratios += x
-        panel.axvline(1.0, color=style.DARK, linewidth=1.2, zorder=1)
-        panel.set_xlim(0.8 * MIN_GAP_RATIO, max(20.0, 1.3 * max(ratios)))
-        style.style_log_axis(panel, "x", minor_grid=False)
-        if after:
-            panel.set_title("○ before   ● after", loc="right", fontsize=9, color=style.GREY)
-        return style.to_svg_element(figure, "gap over threshold of each diagnostic")
 
 
 def interval_chart_svg(

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from monitor.common.unit_formatting import DEVIATION_UNITS, format_duration, sensor_kind
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem, format_duration, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import ThermalPrediction, predict_interval_means
 from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalPredictionReport
@@ -14,7 +14,7 @@ from monitor.publishing.plots import style
 ROW_INCHES: Final = (11.0, 2.6)
 
 
-def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
+def save_thermal_fit_plot(report: ThermalFitReport, path: Path, units: UnitSystem = DEFAULT_UNITS) -> None:
     """Write a plot of the mean bias in each interval and of the fitted thermal models to a file.
 
     Parameters
@@ -23,6 +23,8 @@ def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
         Results of the thermal model fit.
     path
         File to write. The suffix selects the format.
+    units
+        Units of the bias.
 
     Raises
     ------
@@ -38,10 +40,13 @@ def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
         )
         for axis, one in report.fits.items()
     ]
-    _save_plot(rows, f"{report.recording}: bias and temperature, means of {format_duration(report.interval_s)}", path)
+    title = f"{report.recording}: bias and temperature, means of {format_duration(report.interval_s)}"
+    _save_plot(rows, title, path, units)
 
 
-def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) -> None:
+def save_thermal_prediction_plot(
+    report: ThermalPredictionReport, path: Path, units: UnitSystem = DEFAULT_UNITS
+) -> None:
     """Write a plot of the mean bias in each interval and of the thermal predictions, without their offset, to a file.
 
     Parameters
@@ -50,6 +55,8 @@ def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) ->
         Results of the thermal prediction.
     path
         File to write. The suffix selects the format.
+    units
+        Units of the bias.
 
     Raises
     ------
@@ -61,15 +68,17 @@ def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) ->
         predicted = (bound + one.offset for bound in (one.multi_step.bias, one.multi_step.lo, one.multi_step.hi))
         rows.append((axis, report.means[axis], ThermalPrediction(*predicted), "multi-step prediction, offset removed"))
     duration = format_duration(report.interval_s)
-    _save_plot(rows, f"{report.recording}: bias predicted from temperature, means of {duration}", path)
+    _save_plot(rows, f"{report.recording}: bias predicted from temperature, means of {duration}", path, units)
 
 
-def _save_plot(rows: list[tuple[str, IntervalMeans, ThermalPrediction, str]], title: str, path: Path) -> None:
+def _save_plot(
+    rows: list[tuple[str, IntervalMeans, ThermalPrediction, str]], title: str, path: Path, units: UnitSystem
+) -> None:
     with style.figure_style():
         figure = style.create_figure(ROW_INCHES[0], 0.6 + ROW_INCHES[1] * len(rows))
         panels = figure.subplots(len(rows), 2, squeeze=False, sharex="col", sharey="row", width_ratios=[2.4, 1.0])
         for (over_time, against_temperature), (axis, means, model, name) in zip(panels, rows, strict=True):
-            unit, colour = DEVIATION_UNITS[sensor_kind(axis)], style.axis_colour(axis)
+            unit, colour = units.deviation(sensor_kind(axis)), style.axis_colour(axis)
             hours = np.asarray((np.arange(means.bias.size) + 0.5) * means.interval_s / 3600.0, np.float64)
             centre = float(np.nanmean(means.bias))
             bias, predicted, lo, hi = (

@@ -31,7 +31,7 @@ from monitor.publishing.plots.dynamic_figure import draw_dynamic_panels, dynamic
 from monitor.publishing.plots.style import axis_colour, create_figure, figure_style, to_svg_element
 from monitor.publishing.reports.html_page import render_template
 
-ALLAN_INCHES: Final = (7.2, 5.2)
+ALLAN_INCHES: Final = (7.2, 4.4)
 STATUS_TEXTS: Final = {Status.UPPER_BOUND: "(upper bound)", Status.UNESTIMATED: "(too few data)"}
 
 
@@ -92,7 +92,7 @@ def recording_facts(analysis: RecordingAnalysis) -> tuple[tuple[str, str], ...]:
 
 
 def format_value_and_interval(estimate: Estimate, column: CoefficientColumn, axis: str) -> tuple[str, str]:
-    """Return a noise coefficient with its unit, and its 95 % interval or the reason why there is no interval.
+    """Return a noise coefficient, and its 95 % interval or the reason why there is no interval.
 
     Parameters
     ----------
@@ -106,10 +106,9 @@ def format_value_and_interval(estimate: Estimate, column: CoefficientColumn, axi
     letter = column.symbol
     status = Status(int(estimate.coefficients.status[SYMBOLS.index(letter), AXES.index(axis)]))
     text = format_coefficient(estimate.coefficients, letter, axis, unit=column.unit)
-    value = text.value if status == Status.UNESTIMATED else f"{text.value} {text.unit}"
     if is_k_r_ambiguous(estimate, letter, axis):
-        return value, "(upper bound; K or R)"
-    return value, STATUS_TEXTS.get(status, text.interval)
+        return text.value, "(upper bound; K or R)"
+    return text.value, STATUS_TEXTS.get(status, text.interval)
 
 
 def _part(plot_data: AnalysisPlotData, kind: Kind) -> dict[str, Any]:

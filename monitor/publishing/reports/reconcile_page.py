@@ -1,23 +1,22 @@
 """HTML reports of a reconciliation and of the comparison of several recordings, ``report.html``.
 
-The pages are self-contained. The report of one recording begins with the summary, the Allan deviation of each axis that
-differs, and the ranked findings. A collapsible section contains a table of the axes and, for each step, all diagnostics
-before and after the step. The comparison contains a summary, the results of each recording, and the noise effects that
-were found. If an effect was not found in a recording, the page states why it may be absent.
+The pages are self-contained. The report of one recording begins with the summary, the ranked findings, and the Allan
+deviation of each axis that differs. A collapsible section contains each step and all diagnostics of these axes. An axis
+that agrees is one collapsible line. The comparison contains a summary, the results of each recording, and the noise
+effects that were found. If an effect was not found in a recording, the page states why it may be absent.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from math import log
 from typing import Final
 
 from drivers.data_types import AXES
-from monitor.common.unit_formatting import format_duration
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem, format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots import reconcile_figures, style
 from monitor.publishing.plots.reconcile_figures import (
     allan_before_and_after_svg,
-    before_and_after_svgs,
     diagnostic_comparison_svg,
     interval_chart_svg,
     select_diagnostic_view,
@@ -42,13 +41,12 @@ from monitor.reconcile.summary.summary_sentences import summarize
 RANGE_INCHES: Final = (8.0, 3.3)  # size of a plot without a detail plot
 RANGE_WITH_DETAIL_INCHES: Final = (4.9, 3.3)  # size of a plot next to a detail plot
 DETAIL_INCHES: Final = (3.33, 3.3)
-PAIR_INCHES: Final = (6.8, 2.35)
-SINGLE_INCHES: Final = (3.4, 2.05)
+PANEL_INCHES: Final = (3.4, 2.35)
 MIN_MARKED_LOG_RATIO: Final = 0.01
 """Smallest logarithmic change of the Allan deviation that is marked, about the width of a line in the figure."""
 
 
-def render_page(r: Reconciliation, title: str = "") -> str:
+def render_page(r: Reconciliation, title: str = "", units: UnitSystem = DEFAULT_UNITS) -> str:
     """Return the HTML report of a reconciliation as text.
 
     Parameters
@@ -57,6 +55,8 @@ def render_page(r: Reconciliation, title: str = "") -> str:
         Result of the reconciliation.
     title
         Title of the page.
+    units
+        Unit system.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def render_page(r: Reconciliation, title: str = "") -> str:
         summary=summarize(r),
         ranking=ranking,
         summary_words=summary_sentences,
-        allan_figures=draw_differing_allan_deviations(r, ranking),
+        allan_figures=draw_differing_allan_deviations(r, ranking, units),
         title=title or "Recording",
         r=r,
         results=_sort_by_axis(r),
@@ -81,19 +81,20 @@ def render_page(r: Reconciliation, title: str = "") -> str:
             ("seed", str(r.seed)),
         ),
         words=reconcile_sentences,
+        units=units,
         effects=EFFECTS,
         figures=reconcile_figures,
         colours=style,
-        snapshots=lambda result: [result.start, *(step.snapshot_after for step in result.steps)],
-        pair_scores=_pair_scores,
-        scores_by_diagnostic=_scores_by_diagnostic,
-        draw_range=_draw_range,
-        draw_pairs=_draw_pairs,
-        draw_singles=_draw_singles,
+        snapshots=_snapshots,
+        gaps_by_diagnostic=_gaps_by_diagnostic,
+        draw_range=partial(_draw_range, units=units),
+        draw_other_diagnostics=partial(_draw_other_diagnostics, units=units),
     )
 
 
-def draw_differing_allan_deviations(r: Reconciliation, ranking: GapRanking) -> list[str]:
+def draw_differing_allan_deviations(
+    r: Reconciliation, ranking: GapRanking, units: UnitSystem = DEFAULT_UNITS
+) -> list[str]:
     """For each axis that differs from the model, draw the Allan deviation before and after the search as SVG elements.
 
     Parameters
@@ -102,13 +103,15 @@ def draw_differing_allan_deviations(r: Reconciliation, ranking: GapRanking) -> l
         Result of the reconciliation.
     ranking
         Ranked findings, whose numbers mark the averaging times at which they change the Allan deviation most.
+    units
+        Unit system.
 
     Raises
     ------
     ConfigError
         If matplotlib is not installed.
     """
-    drawn = (_draw_allan(result, ranking) for result in _sort_by_axis(r) if result.verdict != "agrees")
+    drawn = (_draw_allan(result, ranking, units) for result in _sort_by_axis(r) if result.verdict != "agrees")
     return [figure for figure in drawn if figure is not None]
 
 
@@ -116,7 +119,7 @@ def _sort_by_axis(r: Reconciliation) -> list[AxisResult]:
     return [r.axes[axis] for axis in AXES if axis in r.axes]
 
 
-def _draw_allan(result: AxisResult, ranking: GapRanking) -> str | None:
+def _draw_allan(result: AxisResult, ranking: GapRanking, units: UnitSystem) -> str | None:
     """Draw the Allan deviation before and after the search. The marks are the numbers of the findings."""
     before, after = (
         next((view for view in snapshot.plots if view.diagnostic == "allan"), None)
@@ -130,57 +133,70 @@ def _draw_allan(result: AxisResult, ranking: GapRanking) -> str | None:
         if influence is not None and abs(log(influence.ratio)) > MIN_MARKED_LOG_RATIO:
             known = marks.get(influence.tau_s)
             marks[influence.tau_s] = f"{known}, {number}" if known else str(number)
-    return allan_before_and_after_svg(before, after, result.axis, marks)
+    return allan_before_and_after_svg(before, after, result.axis, marks, units)
 
 
-def _pair_scores(
-    before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap]
-) -> list[tuple[DiagnosticGap, DiagnosticGap | None]]:
-    later = {score.diagnostic: score for score in after}
-    return [(score, later.get(score.diagnostic)) for score in before]
+def _snapshots(result: AxisResult) -> list[AxisModelDiagnostics]:
+    """Return the diagnostics before the search and after each step."""
+    return [result.start, *(step.snapshot_after for step in result.steps)]
 
 
-def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list[DiagnosticGap | None]]]:
-    known = [{score.diagnostic: score for score in result.start.gaps} for result in results]
-    return [
-        (diagnostic, [scores.get(diagnostic) for scores in known])
-        for diagnostic in dict.fromkeys(one for k in known for one in k)
+def _gaps_by_diagnostic(result: AxisResult) -> list[list[DiagnosticGap | None]]:
+    """For each diagnostic, return the gap before the search and after each step."""
+    known = [{gap.diagnostic: gap for gap in snapshot.gaps} for snapshot in _snapshots(result)]
+    return [[gaps.get(diagnostic) for gaps in known] for diagnostic in known[0]]
+
+
+def _draw_other_diagnostics(result: AxisResult, units: UnitSystem) -> list[tuple[int, str]]:
+    """Draw the significant diagnostics before and after the search, without the panels that the page already shows.
+
+    The page shows the Allan deviation of an axis that differs, and the diagnostic that led to each step or remains.
+    Return the number of panels and the SVG element of each figure.
+    """
+    if result.verdict == "agrees":
+        views = [view for view in result.start.plots if view.diagnostic == "allan"]
+        return [(1, diagnostic_comparison_svg([("", view)], result.axis, *PANEL_INCHES, units=units)) for view in views]
+    found = [
+        *((before, step.before) for before, step in zip(_snapshots(result), result.steps, strict=False)),
+        *((result.end, gap) for gap in result.left_over),
     ]
+    shown = {id(select_diagnostic_view(snapshot.plots, gap.diagnostic, gap.where)) for snapshot, gap in found}
+    significant = {gap.diagnostic for gap in result.start.gaps if gap.is_significant} - {"allan"}
+    ends = [("before", result.start), ("after", result.end)] if result.steps else [("", result.start)]
+    drawn = []
+    for name in (view.diagnostic for view in result.start.plots if view.diagnostic in significant):
+        panels = [(title, view) for title, end in ends for view in end.plots if view.diagnostic == name]
+        panels = [(title, view) for title, view in panels if id(view) not in shown]
+        if panels:
+            width, height = PANEL_INCHES
+            drawn.append(
+                (len(panels), diagnostic_comparison_svg(panels, result.axis, width * len(panels), height, units=units))
+            )
+    return drawn
 
 
-def _draw_singles(result: AxisResult) -> list[str]:
-    """Draw the Allan deviation and the diagnostics with a significant gap, before the search."""
-    drawn = _drawn_diagnostics(result.start)
-    views = [view for view in result.start.plots if view.diagnostic in drawn]
-    return [diagnostic_comparison_svg([("", view)], result.axis, *SINGLE_INCHES) for view in views]
-
-
-def _draw_pairs(before: AxisModelDiagnostics, after: AxisModelDiagnostics, axis: str) -> list[str]:
-    """Draw the diagnostics with a significant gap, before and after a step."""
-    later, drawn = {view.diagnostic: view for view in after.plots}, _drawn_diagnostics(before) - {"allan"}
-    pairs = [(view, later[view.diagnostic]) for view in before.plots if view.diagnostic in drawn & set(later)]
-    return before_and_after_svgs(pairs, axis, *PAIR_INCHES)
-
-
-def _drawn_diagnostics(snapshot: AxisModelDiagnostics) -> set[str]:
-    return {"allan"} | {gap.diagnostic for gap in snapshot.gaps if gap.is_significant}
-
-
-def _draw_range(snapshot: AxisModelDiagnostics, found: DiagnosticGap, axis: str) -> list[str]:
+def _draw_range(snapshot: AxisModelDiagnostics, found: DiagnosticGap, axis: str, units: UnitSystem) -> list[str]:
     view = select_diagnostic_view(snapshot.plots, found.diagnostic, found.where)
     if view is None:
         return []
-    detail = zoomed_view(view, found.where)
+    draw, detail = partial(diagnostic_comparison_svg, axis=axis, units=units), zoomed_view(view, found.where)
     if detail is None:
-        return [diagnostic_comparison_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
-    whole = diagnostic_comparison_svg(
-        [("", view)], axis, *RANGE_WITH_DETAIL_INCHES, where=replace(found.where, source=None)
-    )
-    return [whole, diagnostic_comparison_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]
+        width, height = RANGE_INCHES
+        return [draw([("", view)], width=width, height=height, where=found.where)]
+    (width, height), (detail_width, detail_height) = RANGE_WITH_DETAIL_INCHES, DETAIL_INCHES
+    whole = draw([("", view)], width=width, height=height, where=replace(found.where, source=None))
+    return [whole, draw([("", detail)], width=detail_width, height=detail_height, where=found.where)]
 
 
-def render_comparison_page(c: RecordingsComparison) -> str:
+def render_comparison_page(c: RecordingsComparison, units: UnitSystem = DEFAULT_UNITS) -> str:
     """Return the HTML report on the comparison of several recordings as text.
+
+    Parameters
+    ----------
+    c
+        Comparison of several recordings.
+    units
+        Unit system.
 
     Raises
     ------
@@ -192,13 +208,14 @@ def render_comparison_page(c: RecordingsComparison) -> str:
         title=f"{len(c.runs)} recordings of one sensor",
         c=c,
         words=reconcile_sentences,
+        units=units,
         comparison_words=recording_comparison_sentences,
         effects=EFFECTS,
         axis_colour=axis_colour,
         format_duration=format_duration,
         rows_of=_rows,
-        parameters_of=lambda step, axis: _parameters_by_name(c, step, axis),
-        draw_intervals=_draw_intervals,
+        parameters_of=lambda step, axis: _parameters_by_name(c, step, axis, units),
+        draw_intervals=partial(_draw_intervals, units=units),
     )
 
 
@@ -207,18 +224,18 @@ def _rows(seen: EffectInRecordings) -> list[tuple[str, AddedOrResizedEffect]]:
 
 
 def _parameters_by_name(
-    c: RecordingsComparison, step: AddedOrResizedEffect, axis: str
+    c: RecordingsComparison, step: AddedOrResizedEffect, axis: str, units: UnitSystem
 ) -> dict[str, FormattedParameter]:
-    return {one.name: one for one in reconcile_sentences.format_parameters(step, axis, c.baseline)}
+    return {one.name: one for one in reconcile_sentences.format_parameters(step, axis, c.baseline, units)}
 
 
-def _draw_intervals(seen: EffectInRecordings, axis: str) -> str:
+def _draw_intervals(seen: EffectInRecordings, axis: str, units: UnitSystem) -> str:
     """Return a chart of the first effect parameter that has intervals, or an empty string if no parameter has any."""
     name = next((name for name, one in seen.parameters.items() if one.freedom), "")
     rows = [(run, step.parameters[name]) for run, step in _rows(seen) if name in step.parameters]
     if not any(one.lo is not None and one.hi is not None and one.hi > one.lo for _, one in rows):
         return ""
     size = max(abs(one.value) for _, one in rows if not isinstance(one.value, str))
-    unit = parameter_unit(seen.effect, name, axis, size)
+    unit = parameter_unit(seen.effect, name, axis, size, units)
     label = ", ".join(part for part in (readable_name(name), unit.name) if part)
     return interval_chart_svg(rows, f"{label}, with 95 % intervals", unit.factor, axis_colour(axis))

@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from monitor.common.unit_formatting import format_duration
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem, format_duration
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.reconcile_figures import (
     MAX_MARKERS,
@@ -53,7 +53,7 @@ GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
 )  # fmt: skip
 
 
-def write_rrd(r: Reconciliation, path: Path) -> None:
+def write_rrd(r: Reconciliation, path: Path, units: UnitSystem = DEFAULT_UNITS) -> None:
     """Write the result of a reconciliation as a Rerun recording.
 
     Parameters
@@ -62,6 +62,8 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
         Result of the reconciliation.
     path
         File to write.
+    units
+        Unit system.
 
     Raises
     ------
@@ -76,9 +78,9 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.save(path, default_blueprint=blueprint(r))
-    stream.log("overview", markdown_document(_overview(r)), static=True)
+    stream.log("overview", markdown_document(_overview(r, units)), static=True)
     for axis in _axes(r):
-        _log_axis(stream, r, r.axes[axis])
+        _log_axis(stream, r, r.axes[axis], units)
     stream.flush()
     stream.disconnect()
 
@@ -91,12 +93,12 @@ def blueprint(r: Reconciliation) -> rrb.Blueprint:
     return collapsed_blueprint(rrb.Tabs(*tabs, active_tab=0), TIMELINE)
 
 
-def _overview(r: Reconciliation) -> str:
+def _overview(r: Reconciliation, units: UnitSystem) -> str:
     rows = []
     for axis in _axes(r):
         result = r.axes[axis]
-        steps = "; ".join(f"{step.kind} {words.describe_step(step, axis, r.baseline)}" for step in result.steps)
-        left_over = "; ".join(words.describe_gap(one, axis) for one in result.left_over)
+        steps = "; ".join(f"{step.kind} {words.describe_step(step, axis, r.baseline, units)}" for step in result.steps)
+        left_over = "; ".join(words.describe_gap(one, axis, units) for one in result.left_over)
         rows.append(f"| **{axis}** | {words.RESULT_TEXTS[result.verdict]} | {steps or '—'} | {left_over or '—'} |")
     head = "| axis | verdict | changes of the model | left over |\n|:--|:--|:--|:--|"
     recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {format_duration(r.duration_s)}"
@@ -106,23 +108,25 @@ def _overview(r: Reconciliation) -> str:
     return "\n\n".join([title, " ".join(summarize(r)), *faults, recorded, table, *notes])
 
 
-def _steps_text(r: Reconciliation, result: AxisResult) -> str:
+def _steps_text(r: Reconciliation, result: AxisResult, units: UnitSystem) -> str:
     parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.describe_result(result)]
     for count, step in enumerate(result.steps, start=1):
-        known = words.format_parameters(step, result.axis, r.baseline)
+        known = words.format_parameters(step, result.axis, r.baseline, units)
         parts += [
             "---",
             f"**Step {count}: {step.kind} {words.readable_name(step.effect)}** "
             f"({words.format_probability(step.confidence)})",
             "\n".join(f"- {words.readable_name(one.name)} **{one.short}**" for one in known),
-            f"{words.diagnostic_name(step.before.diagnostic)}, {words.format_range(step.before.where, result.axis)}: "
+            f"{words.diagnostic_name(step.before.diagnostic)}, "
+            f"{words.format_range(step.before.where, result.axis, units)}: "
             f"gap **{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}**, "
             f"threshold {words.format_gap(step.after.threshold)}",
             step.because,
             words.describe_alternatives(step),
         ]
     if result.left_over:
-        parts += ["---", "**Left over**", *(f"- {words.describe_gap(one, result.axis)}" for one in result.left_over)]
+        gaps = [f"- {words.describe_gap(one, result.axis, units)}" for one in result.left_over]
+        parts += ["---", "**Left over**", *gaps]
     return "\n\n".join(parts)
 
 
@@ -166,10 +170,10 @@ def _diagnostic_view(result: AxisResult, diagnostic: str, when: str) -> rrb.View
     return drawing_view(origin, names[when], "$origin/**", (-2.6, WIDTH + 0.7), (-1.5, HEIGHT + 1.9))
 
 
-def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
-    stream.log(f"{result.axis}/steps", markdown_document(_steps_text(r, result)), static=True)
+def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult, units: UnitSystem) -> None:
+    stream.log(f"{result.axis}/steps", markdown_document(_steps_text(r, result, units)), static=True)
     for diagnostic in _drawn_diagnostics(result):
-        _log_diagnostic(stream, result, diagnostic)
+        _log_diagnostic(stream, result, diagnostic, units)
     _log_gaps(stream, result)
 
 
@@ -194,20 +198,22 @@ def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float])
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
-def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, diagnostic: str) -> None:
+def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, diagnostic: str, units: UnitSystem) -> None:
     axis = result.axis
     views = [
         next((view for view in snapshot.plots if view.diagnostic == diagnostic), None)
         for snapshot in _snapshots_by_step(result)
     ]
-    plots = {step: to_displayed_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
+    plots = {
+        step: to_displayed_units("", view, axis, None, units) for step, view in enumerate(views) if view is not None
+    }
     every = list(plots.values())
     scale = ChartDecadeRange(decade_range(plot.x for plot in every), decade_range([np.array(common_y_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
         _log_grid(stream, f"{axis}/{diagnostic}/{when}", scale, plots[0], axis)
     stream.reset_time()
     _log_curves(stream, f"{axis}/{diagnostic}/before", scale, plots[0], axis, static=True)
-    _log_found_ranges(stream, f"{axis}/{diagnostic}/before", scale, result, diagnostic)
+    _log_found_ranges(stream, f"{axis}/{diagnostic}/before", scale, result, diagnostic, units)
     for step, plot in plots.items() if result.steps else ():
         stream.set_time(TIMELINE, sequence=step)
         _log_curves(stream, f"{axis}/{diagnostic}/after", scale, plot, axis, static=False)
@@ -229,12 +235,19 @@ def _log_curves(
 
 
 def _log_found_ranges(
-    stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, result: AxisResult, diagnostic: str
+    stream: rr.RecordingStream,
+    path: str,
+    scale: ChartDecadeRange,
+    result: AxisResult,
+    diagnostic: str,
+    units: UnitSystem,
 ) -> None:
     view = next(view for view in result.start.plots if view.diagnostic == diagnostic)
     founds = [step.before for step in result.steps] + list(result.left_over)
     marks = [
-        to_displayed_units("", view, result.axis, found.where) for found in founds if found.diagnostic == diagnostic
+        to_displayed_units("", view, result.axis, found.where, units)
+        for found in founds
+        if found.diagnostic == diagnostic
     ]
     bounds = [mark.mark for mark in marks if mark.mark is not None]
     if not bounds:

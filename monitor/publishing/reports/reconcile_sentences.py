@@ -6,12 +6,12 @@ number of digits.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import floor, isfinite, log10, nan
 from typing import Any, Final
 
 from monitor.common.unit_formatting import (
-    COEFFICIENT_UNITS,
+    DEFAULT_UNITS,
     DEGREE,
     DEVIATION_UNITS,
     KINDS,
@@ -19,6 +19,7 @@ from monitor.common.unit_formatting import (
     SAMPLE_UNITS,
     Kind,
     Unit,
+    UnitSystem,
     format_number,
     sensor_kind,
 )
@@ -45,17 +46,17 @@ RESULT_TEXTS: Final = {
 """Text for each possible result of an axis or a recording."""
 DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
 """Displayed names of diagnostics whose identifiers are abbreviations."""
+WHITE_NOISE: Final = COEFFICIENT_EFFECTS["N"].name
 SAMPLE_SI_UNITS: Final[dict[Kind, str]] = {"gyro": "rad/s", "accel": "m/s²"}
 GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
 SMALL_UNIT_BELOW: Final = 0.1  # in °/s or m/s²; smaller values are displayed in °/h or µg
 _DEGREES_PER_HOUR: Final = DEVIATION_UNITS["gyro"].factor  # °/h per rad/s
-_SI_OF_COEFFICIENTS: Final = {
-    si: COEFFICIENT_UNITS[kind][letter]
+_COEFFICIENTS_BY_UNIT: Final = {
+    si: (kind, letter)
     for letter, effect in COEFFICIENT_EFFECTS.items()
     for kind, si in zip(KINDS, gyro_and_accel_units(effect)[letter], strict=True)
 }
 FIELD_UNITS: Final = {
-    **_SI_OF_COEFFICIENTS,
     "1": Unit(1.0, ""),
     "rad/s³": Unit(_DEGREES_PER_HOUR * 3600.0**2, "°/h/h²"),
     "m/s⁴": Unit(MICRO_G * 3600.0**2, "µg/h²"),
@@ -99,7 +100,7 @@ class FormattedParameter:
     given: str  # value in the model under test, if the model has the effect exactly once
 
 
-def displayed_unit(si_unit: str, value_si: float) -> Unit:
+def displayed_unit(si_unit: str, value_si: float, units: UnitSystem = DEFAULT_UNITS) -> Unit:
     """Return the displayed unit of a quantity.
 
     >>> displayed_unit("rad/s", 1e-4).name, displayed_unit("rad/s", 5.0).name, displayed_unit("Hz", 17.0).name
@@ -111,11 +112,18 @@ def displayed_unit(si_unit: str, value_si: float) -> Unit:
         SI unit.
     value_si
         Value of the quantity in the SI unit.
+    units
+        Unit system.
     """
-    for kind in KINDS:
+    for kind in () if units.is_si else KINDS:
         if si_unit == SAMPLE_SI_UNITS[kind]:
             large = SAMPLE_UNITS[kind]
             return DEVIATION_UNITS[kind] if abs(value_si) * large.factor < SMALL_UNIT_BELOW else large
+    if si_unit in _COEFFICIENTS_BY_UNIT:
+        kind, symbol = _COEFFICIENTS_BY_UNIT[si_unit]
+        return units.coefficients[kind][symbol]
+    if units.is_si:
+        return Unit(1.0, "" if si_unit == "1" else si_unit)
     return FIELD_UNITS.get(si_unit, Unit(1.0, si_unit))
 
 
@@ -142,7 +150,7 @@ def format_probability(probability: float) -> str:
     return "< 0.1 %" if probability < 0.001 else f"{100.0 * probability:.1f} %"
 
 
-def format_range(where: Location, axis: str) -> str:
+def format_range(where: Location, axis: str, units: UnitSystem = DEFAULT_UNITS) -> str:
     """Format the range in which a diagnostic found a difference. Without a range, return "everywhere".
 
     >>> format_range(Location(tau=(1.0, 4.0), source="ax"), "gz"), format_range(Location(time=(1800.0, 1800.5)), "gz")
@@ -154,6 +162,8 @@ def format_range(where: Location, axis: str) -> str:
         The range.
     axis
         Name of the axis, which determines the units.
+    units
+        Unit system.
     """
     texts = []
     for name, ends in where.resolved_location_dimensions().items():
@@ -162,7 +172,7 @@ def format_range(where: Location, axis: str) -> str:
             continue
         prefix, unit = RANGE_FORMATS.get(name, ("", Unit(1.0, "")))
         if name == "value":
-            unit = displayed_unit(SAMPLE_SI_UNITS[sensor_kind(axis)], max(map(abs, ends)))
+            unit = displayed_unit(SAMPLE_SI_UNITS[sensor_kind(axis)], max(map(abs, ends)), units)
         low, high = (end * unit.factor for end in ends)
         narrow = not abs(high - low) > MIN_RANGE_SHARE * max(abs(low), abs(high))
         text = _short(0.5 * (low + high)) if narrow else f"{_short(low)} … {_short(high)}"
@@ -170,7 +180,7 @@ def format_range(where: Location, axis: str) -> str:
     return ", ".join(texts) or "everywhere"
 
 
-def describe_gap(gap: DiagnosticGap, axis: str) -> str:
+def describe_gap(gap: DiagnosticGap, axis: str, units: UnitSystem = DEFAULT_UNITS) -> str:
     """Describe a difference between model and recording (gap) with the diagnostic, range and threshold.
 
     Parameters
@@ -179,9 +189,11 @@ def describe_gap(gap: DiagnosticGap, axis: str) -> str:
         Gap of a diagnostic.
     axis
         Name of the axis, which determines the units.
+    units
+        Unit system.
     """
     sizes = f"gap {format_gap(gap.gap)}, threshold {format_gap(gap.threshold)}"
-    return f"{diagnostic_name(gap.diagnostic)}, {format_range(gap.where, axis)}: {sizes}"
+    return f"{diagnostic_name(gap.diagnostic)}, {format_range(gap.where, axis, units)}: {sizes}"
 
 
 def format_gap(gap: float) -> str:
@@ -201,7 +213,9 @@ def gap_to_threshold_ratio(gap: DiagnosticGap) -> float:
     return share if isfinite(share) else 0.0
 
 
-def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> tuple[FormattedParameter, ...]:
+def format_parameters(
+    step: AddedOrResizedEffect, axis: str, baseline: NoiseModel, units: UnitSystem = DEFAULT_UNITS
+) -> tuple[FormattedParameter, ...]:
     """Format all parameters of the noise effect that a step adds or changes.
 
     Parameters
@@ -212,16 +226,24 @@ def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseMode
         Name of the axis.
     baseline
         Model under test.
+    units
+        Unit system.
     """
     known = [effect for effect in baseline.effects.get(axis, ()) if effect.name == step.effect]
     given = known[0] if len(known) == 1 and step.kind == "retuned" else None
-    return tuple(
-        _format_parameter(step.effect, name, bounds, axis, getattr(given, name, None))
-        for name, bounds in step.parameters.items()
-    )
+    shown = []
+    for name, bounds in step.parameters.items():
+        unit = parameter_unit(step.effect, name, axis, bounds.value, units)
+        shown.append(_format_parameter(step.effect, name, bounds, unit, getattr(given, name, None)))
+        for density in units.columns(sensor_kind(axis), "N")[1:] if step.effect == WHITE_NOISE else ():
+            one = _format_parameter(step.effect, name, bounds, density.unit, getattr(given, name, None))
+            shown.append(replace(one, name=density.name))
+    return tuple(shown)
 
 
-def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> str:
+def describe_step(
+    step: AddedOrResizedEffect, axis: str, baseline: NoiseModel, units: UnitSystem = DEFAULT_UNITS
+) -> str:
     """Describe the noise effect and the parameters of a step in one line.
 
     An example is "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
@@ -234,8 +256,10 @@ def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -
         Name of the axis.
     baseline
         Model under test.
+    units
+        Unit system.
     """
-    said = [f"{readable_name(one.name)} {one.short}" for one in format_parameters(step, axis, baseline)]
+    said = [f"{readable_name(one.name)} {one.short}" for one in format_parameters(step, axis, baseline, units)]
     return f"{readable_name(step.effect)}: {', '.join(said)}" if said else readable_name(step.effect)
 
 
@@ -261,6 +285,11 @@ def describe_result(result: AxisResult) -> str:
             return "Model and measurement differ. No known effect explains the difference, so no effect is named."
 
 
+def describe_largest_gap(result: AxisResult) -> str:
+    """Describe the gap of an axis that is closest to its threshold."""
+    return describe_gap(max(result.start.gaps, key=gap_to_threshold_ratio), result.axis)
+
+
 def describe_alternatives(step: AddedOrResizedEffect) -> str:
     """Describe the alternative effects of a step and their probabilities."""
     if not step.runners_up:
@@ -277,7 +306,7 @@ def describe_held_out_gap_change(step: AddedOrResizedEffect) -> str:
     return f"{format_gap(before)} → {format_gap(after)}, threshold {format_gap(step.after.threshold)}"
 
 
-def parameter_unit(effect: str, name: str, axis: str, value_si: float) -> Unit:
+def parameter_unit(effect: str, name: str, axis: str, value_si: float | str, units: UnitSystem = DEFAULT_UNITS) -> Unit:
     """Return the displayed unit of a parameter of a noise effect.
 
     Parameters
@@ -289,16 +318,20 @@ def parameter_unit(effect: str, name: str, axis: str, value_si: float) -> Unit:
     axis
         Name of the axis.
     value_si
-        Value of the parameter in the SI unit.
+        Value of the parameter in the SI unit, or text.
+    units
+        Unit system.
     """
+    if isinstance(value_si, str):
+        return Unit(1.0, "")
     si = gyro_and_accel_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
-    return UNITS_BY_NAME.get(name) or displayed_unit(si, value_si)
+    own = None if units.is_si else UNITS_BY_NAME.get(name)
+    return own or displayed_unit(si, value_si, units)
 
 
-def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> FormattedParameter:
+def _format_parameter(effect: str, name: str, bounds: ParameterInterval, unit: Unit, given: Any) -> FormattedParameter:
     if isinstance(bounds.value, str):
         return FormattedParameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
-    unit = parameter_unit(effect, name, axis, bounds.value)
 
     def with_unit(text: str) -> str:
         return f"{text} {unit.name}".rstrip()

@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 
 from drivers.data_types import AXES, Floats
-from monitor.common.unit_formatting import DEVIATION_UNITS, KINDS, Kind, axes_of, sensor_kind
+from monitor.common.unit_formatting import DEFAULT_UNITS, KINDS, Kind, UnitSystem, axes_of
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours
@@ -67,14 +67,17 @@ class AllanPlotPair:
         Function that logs a Rerun entity.
     path
         Path of the entities in the Rerun recording.
+    units
+        Units of the plots.
     """
 
-    def __init__(self, log: Log, path: str) -> None:
+    def __init__(self, log: Log, path: str, units: UnitSystem = DEFAULT_UNITS) -> None:
         self._log = log
         self._path = path
         self._drawn: dict[
             Kind, tuple[ChartDecadeRange, list[str], list[str]]
         ] = {}  # grid, signs and poorly fitted axes
+        self._units = units
 
     def draw(self, estimate: Estimate, gap: ModelComparison | None) -> None:
         """Draw the Allan deviations of an estimate.
@@ -87,9 +90,9 @@ class AllanPlotPair:
             Comparison with the noise model, which is drawn as dashed lines. None if the device has no model.
         """
         for kind in KINDS:
-            curves = [
-                curve for axis in axes_of(kind) if (curve := _Curve.from_estimate(estimate, axis, gap)) is not None
-            ]
+            factor = self._units.deviation(kind).factor
+            found = (_Curve.from_estimate(estimate, axis, gap, factor) for axis in axes_of(kind))
+            curves = [curve for curve in found if curve is not None]
             if not curves:
                 continue
             scale = ChartDecadeRange(
@@ -145,7 +148,7 @@ class AllanPlotPair:
 
     def _draw_rings(self, kind: Kind, scale: ChartDecadeRange, estimate: Estimate) -> None:
         """Draw a ring at the averaging time at which N, B or K is read, and a letter at the rings of all axes."""
-        factor, minimum_tau_s = DEVIATION_UNITS[kind].factor, tau_of_minimum_s(estimate, kind)
+        factor, minimum_tau_s = self._units.deviation(kind).factor, tau_of_minimum_s(estimate, kind)
         letters: dict[str, list[Floats]] = {}
         for axis in axes_of(kind):
             i = AXES.index(axis)
@@ -199,7 +202,9 @@ class _Curve:
         return self.deviation, self.fitted, self.model
 
     @classmethod
-    def from_estimate(cls, estimate: Estimate, axis: str, gap: ModelComparison | None) -> "_Curve | None":
+    def from_estimate(
+        cls, estimate: Estimate, axis: str, gap: ModelComparison | None, factor: float
+    ) -> "_Curve | None":
         """Return the curves of one axis, or None if the axis has fewer than two Allan deviations."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
@@ -210,7 +215,7 @@ class _Curve:
         model = np.full(fitted.shape, np.nan)
         if gap is not None and axis in gap.axes and gap.axes[axis].model.shape == rows.shape:
             model = gap.axes[axis].model[rows]
-        f = DEVIATION_UNITS[sensor_kind(axis)].factor
+        f = factor
         poor = axis in estimate.poorly_fitted_axes
         return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si, poor)
 

@@ -13,12 +13,12 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from monitor.common.unit_formatting import (
-    COEFFICIENT_UNITS,
-    DEVIATION_UNITS,
+    DEFAULT_UNITS,
     KIND_NAMES,
     KINDS,
     SAMPLE_UNITS,
     Kind,
+    UnitSystem,
     axes_of,
 )
 from monitor.publishing.rerun import dynamic_heat_map
@@ -70,7 +70,10 @@ DESCRIPTIONS: Final = {
 
 
 def blueprint(
-    devices: Sequence[ViewerDeviceDescription], fleet: bool = False, entities: Collection[str] | None = None
+    devices: Sequence[ViewerDeviceDescription],
+    fleet: bool = False,
+    entities: Collection[str] | None = None,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> rrb.Blueprint:
     """Return the Rerun layout for a list of devices.
 
@@ -82,13 +85,15 @@ def blueprint(
         True if the overview is a table that also lists devices that are not shown in detail.
     entities
         Paths of the entities that have data. Views of other entities are omitted. By default, no view is omitted.
+    units
+        Units of the plots.
     """
     waiting = {one.name for one in devices if entities is not None and f"/{one.name}/waiting" in entities}
-    pages, names = [_device(one, one.name in waiting) for one in devices], [one.name for one in devices]
+    pages, names = [_device(one, one.name in waiting, units) for one in devices], [one.name for one in devices]
     if fleet:
-        root: rrb.Container = rrb.Tabs(_fleet(names), *pages, active_tab=0)
+        root: rrb.Container = rrb.Tabs(_fleet(names, units), *pages, active_tab=0)
     else:
-        root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(names), *pages, active_tab=0)
+        root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(names, units), *pages, active_tab=0)
     if entities is not None:
         _remove_views_without_data(root, entities)
     return collapsed_blueprint(root, TIMELINE)
@@ -138,16 +143,16 @@ def _has_data(part: rrb.Container | rrb.View, entities: Collection[str]) -> bool
     return any(f"{entity}/".startswith(path) for path in own for entity in entities)
 
 
-def _device(device: ViewerDeviceDescription, waiting: bool) -> rrb.Container:
-    pages = [_now(device.name, waiting), _changes(device.name)]
-    if parts := [part for panel in PANELS if (part := panel.page_part(device)) is not None]:
+def _device(device: ViewerDeviceDescription, waiting: bool, units: UnitSystem) -> rrb.Container:
+    pages = [_now(device.name, waiting, units), _changes(device.name, units)]
+    if parts := [part for panel in PANELS if (part := panel.page_part(device, units)) is not None]:
         pages.append(_temperature_and_drift(device.name, parts))
     if device.has_model:
-        pages.append(_model_gap(device.name))
+        pages.append(_model_gap(device.name, units))
     return rrb.Tabs(*pages, active_tab=0, name=device.name)
 
 
-def _now(name: str, waiting: bool) -> rrb.Container:
+def _now(name: str, waiting: bool, units: UnitSystem) -> rrb.Container:
     left = rrb.Vertical(
         rrb.TextDocumentView(
             origin=f"/{name}/{'waiting' if waiting else 'status'}", contents="$origin", name="Is it healthy?"
@@ -157,19 +162,19 @@ def _now(name: str, waiting: bool) -> rrb.Container:
         row_shares=[2.35, 6.0, 1.65],
     )
     right = rrb.Vertical(
-        rrb.Horizontal(*(_allan(name, kind) for kind in KINDS)),
-        rrb.Horizontal(*(_coefficient(name, kind, symbol) for kind in KINDS for symbol in NOW_COEFFICIENTS)),
+        rrb.Horizontal(*(_allan(name, kind, units) for kind in KINDS)),
+        rrb.Horizontal(*(_coefficient(name, kind, symbol, units) for kind in KINDS for symbol in NOW_COEFFICIENTS)),
         rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), temperature_view(name), column_shares=[5, 5, 3]),
         row_shares=[5.0, 2.2, 2.2],
     )
     return rrb.Horizontal(left, right, column_shares=[3, 7], name="Device")
 
 
-def _changes(device: str) -> rrb.Container:
+def _changes(device: str, units: UnitSystem) -> rrb.Container:
     columns = [
         rrb.Vertical(
             *(_heat_map(device, axis) for axis in axes_of(kind)),
-            rrb.Horizontal(*(_coefficient(device, kind, symbol) for symbol in DYNAMIC_COEFFICIENTS)),
+            rrb.Horizontal(*(_coefficient(device, kind, symbol, units) for symbol in DYNAMIC_COEFFICIENTS)),
             row_shares=[3, 3, 3, 2.6],
         )
         for kind in KINDS
@@ -178,8 +183,8 @@ def _changes(device: str) -> rrb.Container:
     return rrb.Vertical(rrb.Horizontal(*columns), texts, row_shares=[6, 1], name="What changed")
 
 
-def _model_gap(device: str) -> rrb.Container:
-    plots = rrb.Horizontal(*(_allan(device, kind) for kind in KINDS))
+def _model_gap(device: str, units: UnitSystem) -> rrb.Container:
+    plots = rrb.Horizontal(*(_allan(device, kind, units) for kind in KINDS))
     return rrb.Vertical(
         rrb.Horizontal(*(_gap(device, kind) for kind in KINDS)), plots, _guide(device, "gap"), row_shares=[3, 5, 1],
         name="Model gap",
@@ -192,9 +197,9 @@ def _temperature_and_drift(device: str, parts: Sequence[rrb.Container]) -> rrb.C
     )
 
 
-def _overview(devices: Sequence[str]) -> rrb.Container:
+def _overview(devices: Sequence[str], units: UnitSystem) -> rrb.Container:
     kinds = KINDS if len(devices) <= MAX_DEVICES_WITH_ACCEL else KINDS[:1]
-    charts = [_allan(device, kind, f"{device}: ") for kind in kinds for device in devices]
+    charts = [_allan(device, kind, units, f"{device}: ") for kind in kinds for device in devices]
     return rrb.Vertical(
         rrb.Horizontal(*_overview_texts(), column_shares=[11, 9]),
         rrb.Grid(*charts, grid_columns=min(len(devices), MAX_GRID_COLUMNS)),
@@ -203,8 +208,8 @@ def _overview(devices: Sequence[str]) -> rrb.Container:
     )
 
 
-def _fleet(devices: Sequence[str]) -> rrb.Container:
-    charts = [_allan(device, kind, f"{device}: ") for device in devices for kind in KINDS]
+def _fleet(devices: Sequence[str], units: UnitSystem) -> rrb.Container:
+    charts = [_allan(device, kind, units, f"{device}: ") for device in devices for kind in KINDS]
     if not charts:
         return rrb.Vertical(*_overview_texts(), row_shares=[4, 1], name="Fleet")
     left = rrb.Vertical(*_overview_texts(), row_shares=[4, 1])
@@ -233,18 +238,18 @@ def _heat_map(device: str, axis: str) -> rrb.View:
     return drawing_view(f"/{device}/dynamic/{axis}", name, "$origin/**", x, y)
 
 
-def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
+def _allan(device: str, kind: Kind, units: UnitSystem, prefix: str = "") -> rrb.View:
     paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
-    name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {DEVIATION_UNITS[kind].name}"
+    name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {units.deviation(kind).name}"
     bottom = HEIGHT + KEY_BELOW + 2.0 * KEY_ROW
     if prefix:  # small plots have no space for a key
         paths.append(f"- /{device}/allan/{kind}/key/**")
-        name, bottom = f"{prefix}{KIND_NAMES[kind]}, {DEVIATION_UNITS[kind].name}", HEIGHT + 1.6
+        name, bottom = f"{prefix}{KIND_NAMES[kind]}, {units.deviation(kind).name}", HEIGHT + 1.6
     return drawing_view(f"/{device}/allan", name, paths, (-2.9, WIDTH + 0.9), (-1.5, bottom))
 
 
-def _coefficient(device: str, kind: Kind, symbol: str) -> rrb.View:
-    name = f"{SHORT_KIND_NAMES[kind]} {symbol}, {COEFFICIENT_UNITS[kind][symbol].name}"
+def _coefficient(device: str, kind: Kind, symbol: str, units: UnitSystem) -> rrb.View:
+    name = f"{SHORT_KIND_NAMES[kind]} {symbol}, {units.single(kind, symbol).name}"
     return time_series_view(f"/{device}/coefficients/{symbol}", name, [f"$origin/{axis}/**" for axis in axes_of(kind)])
 
 

@@ -129,7 +129,9 @@ class FleetView:
         """
         devices = self.board.devices_with_problems_first(now_s)
         note = connection_note(self.board, self._subscriber)
-        self._viewer.put("", wall_s, AllDevicesTableText(fleet_text(devices, now_s, MAX_ROWS, note)))
+        self._viewer.put(
+            "", wall_s, AllDevicesTableText(fleet_text(devices, now_s, MAX_ROWS, note, self._viewer.units))
+        )
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         if topic is topics.SAMPLES:

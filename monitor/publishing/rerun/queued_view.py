@@ -68,6 +68,7 @@ class RerunView:
         history_source: HistorySource = lambda _device: None,
         fleet: bool = False,
     ) -> None:
+        self.units = settings.units
         self._settings = settings
         self._history_source = history_source
         self._fleet = fleet
@@ -172,7 +173,7 @@ class RerunView:
         output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self.url = output.child, output.url
         try:
-            scene = rerun_scene.AllDevicesScene(output.stream, self._fleet)
+            scene = rerun_scene.AllDevicesScene(output.stream, self._fleet, settings.units)
             self._draw(output, scene)
         finally:
             self._child = None
@@ -188,7 +189,7 @@ class RerunView:
         """Send the layout if its views differ from the views that were sent, and return the views."""
         from monitor.publishing.rerun import blueprint
 
-        layout = blueprint.blueprint(devices, self._fleet, scene.entities)
+        layout = blueprint.blueprint(devices, self._fleet, scene.entities, scene.units)
         views = [(str(view.origin), str(view.name)) for view in blueprint.list_views(layout.root_container)]
         if views != sent:
             for path, text in blueprint.guide_texts(layout.root_container).items():

@@ -12,6 +12,7 @@ import rerun as rr
 
 from drivers.data_types import Floats
 from monitor.common.device_health import Health
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.rerun import panels
 from monitor.publishing.rerun.panels import Panel
@@ -35,10 +36,13 @@ class AllDevicesScene:
         Rerun stream to which the panels log.
     fleet
         True if the device table also contains devices that are not shown in detail.
+    units
+        Units of tables and plots.
     """
 
-    def __init__(self, stream: rr.RecordingStream, fleet: bool = False) -> None:
+    def __init__(self, stream: rr.RecordingStream, fleet: bool = False, units: UnitSystem = DEFAULT_UNITS) -> None:
         self.fleet = fleet
+        self.units = units
         self.devices: dict[str, ViewerDeviceDescription] = {}  # devices that are shown
         self.healths: dict[str, Health] = {}  # newest health of each shown device
         self.entities: set[str] = set()  # paths of the entities that have data

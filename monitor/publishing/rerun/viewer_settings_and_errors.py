@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
+
 
 class ViewerError(Exception):
     """Raised if a viewer cannot be opened or has ended."""
@@ -19,6 +21,7 @@ class ViewerSettings:
     port: int = 9876  # port of the Rerun server on the loopback interface
     web_port: int = 9090  # port of the web page on the loopback interface
     memory: str = "256MiB"  # memory limit for data; beyond it, the viewer drops the oldest data
+    units: UnitSystem = DEFAULT_UNITS
 
 
 @dataclass(frozen=True, slots=True)

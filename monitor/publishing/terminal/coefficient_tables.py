@@ -26,7 +26,7 @@ from monitor.publishing.coefficient_cells import (
     mark_temperature_axis,
 )
 from monitor.publishing.remote_device_states import DeviceCoefficients
-from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
+from monitor.publishing.terminal.tables import WidthDependentTable, plain_table, print_notes
 
 K_OR_R: Final = "K or R"
 """Text that the tables show for K and R if the data cannot distinguish K from R."""
@@ -58,8 +58,7 @@ def print_analysis(
     curve = estimate.curve
     console.print(f"{curve.n} samples at {estimate.rate_hz:g} Hz, {curve.n / estimate.rate_hz:.6g} s")
     console.print(analysis_table(estimate, axes_of_temperature, units))
-    for note in notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    print_notes(notes, console)
 
 
 def analysis_table(
@@ -80,7 +79,10 @@ def analysis_table(
 
 
 def coefficient_tables(
-    coefficients: DeviceCoefficients, axes_of_temperature: Collection[str] = (), units: UnitSystem = DEFAULT_UNITS
+    coefficients: DeviceCoefficients,
+    axes_of_temperature: Collection[str] = (),
+    units: UnitSystem = DEFAULT_UNITS,
+    with_intervals: bool = True,
 ) -> list[RenderableType]:
     """Return a legend, and tables of the noise coefficients of gyroscopes and accelerometers.
 
@@ -92,16 +94,20 @@ def coefficient_tables(
         Axes to mark, on which temperature explains most of the slow variance.
     units
         Units of the tables.
+    with_intervals
+        False to omit the 95 % intervals, so that each axis has one line.
     """
     time_text = "" if coefficients.filled_s is None else f"last {format_duration(coefficients.filled_s)}; "
     marks = f"; {K_OR_R}: one of them" if coefficients.k_or_r else ""
     marks += f"; {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
     marks += "; densities are one-sided" if units.densities else ""
-    legend = Text(f"{time_text}[95 % interval]; ≤ bound; {NO_VALUE} too few data yet{marks}", style="dim")
+    interval_text = "[95 % interval]; " if with_intervals else ""
+    legend = Text(f"{time_text}{interval_text}≤ bound; {NO_VALUE} too few data yet{marks}", style="dim")
     parts: list[RenderableType] = [legend]
+    line_counts = (1, 2, 3) if with_intervals else (0,)
     for kind in KINDS:
         if set(axes_of(kind)) & set(coefficients.axes):
-            layouts = (_kind_table(coefficients, kind, lines, axes_of_temperature, units) for lines in (1, 2, 3))
+            layouts = (_kind_table(coefficients, kind, lines, axes_of_temperature, units) for lines in line_counts)
             parts.append(WidthDependentTable(*layouts))
     return parts
 
@@ -109,8 +115,11 @@ def coefficient_tables(
 def _kind_table(
     known: DeviceCoefficients, kind: Kind, lines: int, axes_of_temperature: Collection[str], units: UnitSystem
 ) -> Table:
-    """Return a table with one to three lines for each axis: value, and lower and upper end of the interval."""
-    table = plain_table(KIND_NAMES[kind] if lines == 1 else kind, gap=2 if lines < 3 else 1)
+    """Return a table with one to three lines for each axis: value, and lower and upper end of the interval.
+
+    With 0 lines, the intervals are omitted.
+    """
+    table = plain_table(KIND_NAMES[kind] if lines == 1 else kind, gap=2 if 0 < lines < 3 else 1)
     columns = units.columns(kind)
     for one in columns:
         table.add_column(f"{one.symbol} {one.unit.name}", justify="right", no_wrap=True)
@@ -123,8 +132,8 @@ def _kind_table(
 def _cell(known: DeviceCoefficients, column: CoefficientColumn, axis: str, lines: int) -> Text:
     one = format_coefficient(known.coefficients, column.symbol, axis, unit=column.unit)
     interval = one.interval.replace(" … ", " …\n") if lines == 3 else one.interval
-    separator = " " if lines == 1 else "\n"
-    small = [f"[{interval}]"] if interval else []
+    separator = " " if lines < 2 else "\n"
+    small = [f"[{interval}]"] if interval and lines else []
     if axis in known.k_or_r and column.symbol in ("K", "R"):
         small.append(K_OR_R)
     return Text.assemble(one.value, *((separator + part, "dim") for part in small))

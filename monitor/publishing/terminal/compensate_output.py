@@ -6,7 +6,14 @@ import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 
-from monitor.common.unit_formatting import DEVIATION_UNITS, format_count, format_duration, format_number
+from monitor.common.unit_formatting import (
+    DEFAULT_UNITS,
+    Unit,
+    UnitSystem,
+    format_count,
+    format_duration,
+    format_number,
+)
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensation_score import (
     SPANS_S,
@@ -15,15 +22,14 @@ from monitor.drift.compensation.compensation_score import (
     RateQualityAtRest,
 )
 from monitor.publishing.messages.message import encode_json
-from monitor.publishing.terminal.tables import plain_table, print_notes
+from monitor.publishing.terminal.tables import plain_table, print_line, print_notes
 
 SCHEMA: Final = "imu-monitor/compensate/1"
-UNIT: Final = DEVIATION_UNITS["gyro"]
 ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
 """JSON keys of the coefficients φ₁, φ₂ and θ₁ of the ARMA model."""
 
 
-def print_compensation(result: DriftCompensationResult, console: Console) -> None:
+def print_compensation(result: DriftCompensationResult, console: Console, units: UnitSystem = DEFAULT_UNITS) -> None:
     """Print the drift models and errors of a compensated recording.
 
     Parameters
@@ -32,6 +38,8 @@ def print_compensation(result: DriftCompensationResult, console: Console) -> Non
         Results of the drift compensation.
     console : Console
         Terminal or file that receives the text.
+    units : UnitSystem, optional
+        Units of the rates.
     """
     learning, evaluated = (format_duration(one) for one in (result.learning_rest_s, result.evaluated_rest_s))
     console.print(
@@ -39,16 +47,15 @@ def print_compensation(result: DriftCompensationResult, console: Console) -> Non
         f"{evaluated} at rest, after {learning} of learning",
         highlight=False,
     )
-    rows = plain_table(
-        "axis", wrapped_headers=("drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S))
-    )
+    unit, spans = units.deviation("gyro"), (f"{span / 60.0:.0f} min" for span in SPANS_S)
+    rows = plain_table("axis", wrapped_headers=("drift", f"rms, {unit.name}", "worst minute", *spans))
     for axis, one in result.axes.items():
         pairs = [
             (one.uncompensated.rms, one.compensated.rms),
             (one.uncompensated.worst_minute, one.compensated.worst_minute),
         ]
         pairs += list(zip(one.uncompensated.drift, one.compensated.drift, strict=True))
-        rows.add_row(axis, "—" if one.model is None else one.model.name, *(_format_pair(*pair) for pair in pairs))
+        rows.add_row(axis, "—" if one.model is None else one.model.name, *(_format_pair(*pair, unit) for pair in pairs))
     console.print(Padding(rows, (1, 0)))
     console.print(
         "Values before → after compensation, at rest. 1 min, 10 min, 60 min: rms of the mean rate over this time.",
@@ -56,9 +63,8 @@ def print_compensation(result: DriftCompensationResult, console: Console) -> Non
     )
     for axis, one in result.axes.items():
         if one.steps or one.rejected_intervals:
-            console.print(f"{axis}: {_describe_exceptions(one, result.interval_s)}", highlight=False, soft_wrap=True)
+            print_line(f"{axis}: {_describe_exceptions(one, result.interval_s)}", console)
     print_notes(result.notes, console)
-    console.print(f"{result.out} written", highlight=False, soft_wrap=True)
 
 
 def encode_compensation(result: DriftCompensationResult) -> bytes:
@@ -121,10 +127,10 @@ def _rest(one: RateQualityAtRest) -> dict[str, Any]:
     }
 
 
-def _format_pair(before: float, after: float) -> str:
+def _format_pair(before: float, after: float, unit: Unit) -> str:
     if not (np.isfinite(before) and np.isfinite(after)):
         return "—"
-    return f"{format_number(UNIT.factor * before, 2)} → {format_number(UNIT.factor * after, 2)}"
+    return f"{format_number(unit.factor * before, 2)} → {format_number(unit.factor * after, 2)}"
 
 
 def _describe_exceptions(one: AxisCompensation, interval_s: float) -> str:

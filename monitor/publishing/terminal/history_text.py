@@ -31,7 +31,7 @@ from monitor.common.unit_formatting import (
 )
 from monitor.history.bucketed_history import ColumnStatistics, HistoryTable
 from monitor.history.history_row import COUNTS, STATES
-from monitor.publishing.terminal.tables import plain_table
+from monitor.publishing.terminal.tables import plain_table, print_line
 
 LETTERS: Final = ("N", "B", "K")
 """Noise coefficients in the table of all axes. The table of a single axis shows all five coefficients."""
@@ -65,7 +65,7 @@ def print_history_summary(
     units
         Units of the coefficients.
     """
-    console.print(summary_line(past), highlight=False, soft_wrap=True)
+    print_line(summary_line(past), console)
     for kind in KINDS:
         shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.list_axes()]
         if shown:
@@ -122,7 +122,7 @@ def _print_events(past: HistoryTable, console: Console) -> None:
         console.print(f"… {more:,} earlier events", style="dim")
     for event in shown:
         times = f" (and {event.represented_events - 1:,} more before it)" if event.represented_events > 1 else ""
-        console.print(f"{format_utc(event.t_s)}  {event.text}{times}", markup=False, highlight=False, soft_wrap=True)
+        print_line(f"{format_utc(event.t_s)}  {event.text}{times}", console)
 
 
 def summary_line(past: HistoryTable) -> str:

@@ -2,7 +2,8 @@
 
 The functions return objects of the package rich, which renders them. The table uses the most detailed layout that fits
 the terminal. In a terminal with fewer than 100 columns, each device has three lines, one for each axis. In a wider
-terminal, each device has one line. Each state has a word and a symbol in addition to the colour.
+terminal, each device has one line. Each state has a word and a symbol in addition to the colour. If there is only one
+device and the terminal has enough lines, the Allan deviations are drawn below the coefficients.
 """
 
 import time
@@ -14,6 +15,7 @@ from typing import Final
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -27,13 +29,22 @@ from monitor.common.unit_formatting import (
     axes_of,
     format_age,
     format_count,
+    format_duration,
     format_number,
     format_short_count,
 )
+from monitor.estimation.allan.curve import AllanCurve
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import EventMessage
-from monitor.publishing.remote_device_states import MAX_DEVICES, MAX_EVENTS, RemoteDevice, RemoteDeviceRegistry
+from monitor.publishing.remote_device_states import (
+    MAX_DEVICES,
+    MAX_EVENTS,
+    DeviceCoefficients,
+    RemoteDevice,
+    RemoteDeviceRegistry,
+)
+from monitor.publishing.terminal.allan_chart import allan_charts
 from monitor.publishing.terminal.coefficient_tables import coefficient_tables
 from monitor.publishing.terminal.tables import plain_table, unwrapped_table_width
 
@@ -54,6 +65,7 @@ STATES: Final = {
 }
 """Symbol and colour of each device state."""
 UNKNOWN_STATE_STYLE: Final = ("?", "yellow")
+RUNNING_PROBLEM_STYLE: Final = ("!", "yellow")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +76,7 @@ class DeviceTableLayout:
     full_counts: bool
     stacked: bool  # True if each axis has a separate line
     gap: int  # number of blanks between columns
+    brief: bool = False  # True to omit the counts except lost samples, the latency and the age
 
 
 LAYOUTS: Final = (
@@ -71,7 +84,9 @@ LAYOUTS: Final = (
     DeviceTableLayout(3, False, False, 1),
     DeviceTableLayout(2, False, False, 1),
 )
-NARROW_LAYOUT: Final = DeviceTableLayout(3, False, True, 1)
+NARROW_LAYOUTS: Final = (DeviceTableLayout(3, False, True, 1), DeviceTableLayout(3, False, True, 1, brief=True))
+FILE_CHART_LINES: Final = 12
+"""Number of lines of the chart in a file."""
 
 
 class LiveTable:
@@ -87,12 +102,19 @@ class LiveTable:
         State of all devices. If None, only log lines are written.
     units : UnitSystem, optional
         Units of the table.
+    begun_s : float, optional
+        Start of the service on the monotonic clock [s], whose running time the last table states.
     """
 
     def __init__(
-        self, console: Console, states: RemoteDeviceRegistry | None = None, units: UnitSystem = DEFAULT_UNITS
+        self,
+        console: Console,
+        states: RemoteDeviceRegistry | None = None,
+        units: UnitSystem = DEFAULT_UNITS,
+        begun_s: float | None = None,
     ) -> None:
         self.states = states
+        self._begun_s = begun_s
         self._units = units
         self._console = console
         self._live: Live | None = None
@@ -128,12 +150,16 @@ class LiveTable:
                 if self._live is not None:
                     self._live.stop()
                 if self.states is not None:
-                    self._console.print(device_overview(self.states, time.monotonic(), self._units))
+                    now_s = time.monotonic()
+                    ran_s = None if self._begun_s is None else now_s - self._begun_s
+                    self._console.print(device_overview(self.states, now_s, self._units, ran_s))
         return captured.get()
 
 
-def device_overview(states: RemoteDeviceRegistry, now_s: float, units: UnitSystem = DEFAULT_UNITS) -> RenderableType:
-    """Return a summary, the device table, problems and events. For a single device, add a table of coefficients.
+def device_overview(
+    states: RemoteDeviceRegistry, now_s: float, units: UnitSystem = DEFAULT_UNITS, ran_s: float | None = None
+) -> RenderableType:
+    """Return a summary, the device table, problems and events. For a single device, add coefficients and a chart.
 
     Parameters
     ----------
@@ -143,17 +169,47 @@ def device_overview(states: RemoteDeviceRegistry, now_s: float, units: UnitSyste
         Current time [s] on the clock of ``states``.
     units
         Units of the coefficients.
+    ran_s
+        Running time of a service that has ended [s].
     """
     devices, events = states.devices_with_problems_first(now_s), states.recent_events_in_time_order()
     names = _display_names([*(one.key for one in devices), *(key for key, _ in events)])
-    parts: list[RenderableType] = [_summary(states, devices, now_s)]
+    head: list[RenderableType] = [_summary(states, devices, now_s, ran_s)]
     if devices:
-        parts.append(_FittedDeviceRows(devices, now_s, units))
-    parts += _with_blank_line(_problem_lines(devices, now_s))
+        head.append(_FittedDeviceRows(devices, now_s, units))
+    head += _with_blank_line(_problem_lines(devices, now_s))
+    tail = _with_blank_line([_event_line(names[key], event) for key, event in events])
     if len(devices) == 1 and devices[0].coefficients is not None:
-        parts += _with_blank_line(coefficient_tables(devices[0].coefficients, units=units))
-    parts += _with_blank_line([_event_line(names[key], event) for key, event in events])
-    return Group(*parts)
+        return _SingleDeviceOverview(head, devices[0].coefficients, devices[0].curve, tail, units)
+    return Group(*head, *tail)
+
+
+@dataclass(frozen=True, slots=True)
+class _SingleDeviceOverview:
+    """Overview of one device with the most detailed coefficients and the largest chart that fit the terminal."""
+
+    head: list[RenderableType]
+    coefficients: DeviceCoefficients
+    curve: AllanCurve | None
+    tail: list[RenderableType]
+    units: UnitSystem
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        def render(parts: Sequence[RenderableType]) -> list[list[Segment]]:
+            return console.render_lines(Group(*parts), options, pad=False) if parts else []
+
+        tail, height = render(self.tail), console.size.height
+        for with_intervals in (True, False):
+            tables = coefficient_tables(self.coefficients, units=self.units, with_intervals=with_intervals)
+            lines = render([*self.head, *_with_blank_line(tables)])
+            if not console.is_terminal or len(lines) + len(tail) < height:
+                break
+        space = height - len(lines) - len(tail) - 2 if console.is_terminal else FILE_CHART_LINES
+        chart = None if self.curve is None else allan_charts(self.curve, self.units, options.max_width, space)
+        lines += render(_with_blank_line([] if chart is None else [chart])) + tail
+        for line in lines:
+            yield from line
+            yield Segment.line()
 
 
 class _FittedDeviceRows:
@@ -165,10 +221,10 @@ class _FittedDeviceRows:
         self._units = units
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for layout in (*LAYOUTS, NARROW_LAYOUT):
+        for layout in (*LAYOUTS, *NARROW_LAYOUTS):
             count = self._visible_rows(layout, console)
             table = _device_rows(self._devices[:count], self._now_s, layout, self._units)
-            if layout is NARROW_LAYOUT or unwrapped_table_width(table, console, options) <= options.max_width:
+            if unwrapped_table_width(table, console, options) <= options.max_width:
                 break
         yield table
         if len(self._devices) > count:
@@ -193,14 +249,16 @@ def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: DeviceTa
     ]
     if layout.stacked and columns:
         columns.insert(0, (Text(), [Text("x\ny\nz" if one.coefficients else "", style="bold") for one in devices]))
-    heads: list[str | Text] = ["Hz", "received", "lost", "bad", *(title for title, _ in columns), "p99 ms", "age"]
-    for head in heads:
+    counts = ("Hz", "lost") if layout.brief else ("Hz", "received", "lost", "bad")
+    for head in (*counts, *(title for title, _ in columns), *(() if layout.brief else ("p99 ms", "age"))):
         table.add_column(head, justify="right", no_wrap=True)
     names = _display_names([one.key for one in devices])
     for i, one in enumerate(devices):
         cells = [Text(names[one.key], style="bold"), _state_cell(one.state(now_s)), *_count_cells(one, layout)]
         cells += [column[i] for _, column in columns]
-        table.add_row(*cells, _latency_cell(one), Text(format_age(now_s - one.last_message_s)))
+        if not layout.brief:
+            cells += [_latency_cell(one), Text(format_age(now_s - one.last_message_s))]
+        table.add_row(*cells)
     return table
 
 
@@ -210,8 +268,8 @@ def _display_names(keys: Sequence[str]) -> dict[str, str]:
     return {key: remove_control_characters(key.rpartition("/")[2] if short else key) for key in keys}
 
 
-def _summary(states: RemoteDeviceRegistry, devices: list[RemoteDevice], now_s: float) -> Text:
-    line = Text("imu-monitor", style="bold")
+def _summary(states: RemoteDeviceRegistry, devices: list[RemoteDevice], now_s: float, ran_s: float | None) -> Text:
+    line = Text("imu-monitor" if ran_s is None else f"imu-monitor ran for {format_duration(ran_s)}", style="bold")
     line.append(f"  {format_count(len(devices), 'device')}", style="not bold")
     for state, count in Counter(one.state(now_s) for one in devices).items():
         symbol, colour = STATES.get(state, UNKNOWN_STATE_STYLE)
@@ -234,11 +292,11 @@ def _state_cell(state: str) -> Text:
 
 def _count_cells(one: RemoteDevice, layout: DeviceTableLayout) -> list[Text]:
     if one.status is None:
-        return [Text(NO_VALUE, style="dim")] * 4
+        return [Text(NO_VALUE, style="dim")] * (2 if layout.brief else 4)
     rate = NO_VALUE if one.status.rate_hz is None else format_number(one.status.rate_hz, 4)
     write = "{:,}".format if layout.full_counts else format_short_count
     lost, bad = (Text(write(count), style="yellow" if count else "dim") for count in (one.status.lost, one.status.bad))
-    return [Text(rate), Text(write(one.status.received)), lost, bad]
+    return [Text(rate), lost] if layout.brief else [Text(rate), Text(write(one.status.received)), lost, bad]
 
 
 def _latency_cell(one: RemoteDevice) -> Text:
@@ -281,8 +339,8 @@ def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
     lines = []
     for one in devices:
         if problems := one.describe_device_problems():
-            symbol, colour = STATES.get(one.state(now_s), UNKNOWN_STATE_STYLE)
-            symbol = "!" if symbol == "●" else symbol
+            state = one.state(now_s)
+            symbol, colour = RUNNING_PROBLEM_STYLE if state == "running" else STATES.get(state, UNKNOWN_STATE_STYLE)
             lines.append(Text.assemble((f"{symbol} {names[one.key]}  ", colour), problems))
     if len(lines) > MAX_PROBLEM_LINES:
         more = len(lines) - MAX_PROBLEM_LINES + 1

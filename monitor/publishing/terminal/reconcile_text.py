@@ -13,10 +13,10 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.data_types import AXES
-from monitor.common.unit_formatting import format_duration
+from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem, format_duration
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.reports import recording_comparison_sentences
-from monitor.publishing.terminal.tables import plain_table, print_notes
+from monitor.publishing.terminal.tables import plain_table, print_line, print_notes
 from monitor.reconcile.result import AddedOrResizedEffect, AxisResult, Reconciliation
 from monitor.reconcile.several_recordings.comparison import EffectInRecordings, RecordingsComparison
 from monitor.reconcile.summary.ranked_findings import rank_findings
@@ -36,7 +36,9 @@ RESULT_STYLES: Final = {
 """Symbol and colour of each possible result of a reconciliation."""
 
 
-def print_reconciliation(r: Reconciliation, console: Console, *, details: bool = False) -> None:
+def print_reconciliation(
+    r: Reconciliation, console: Console, *, details: bool = False, units: UnitSystem = DEFAULT_UNITS
+) -> None:
     """Print the summary of a reconciliation.
 
     Parameters
@@ -47,14 +49,16 @@ def print_reconciliation(r: Reconciliation, console: Console, *, details: bool =
         Console that receives the output.
     details
         If True, the findings, the axes and all steps are listed too.
+    units
+        Unit system.
     """
     console.print(_verdict(r.verdict), Text(" ".join(summarize(r))))
     for finding in r.recording_findings:
         sign = "◐" if finding.corrected else "✖"
-        console.print(Text(f"{sign} recording: {finding.sentence}", style="yellow"), soft_wrap=True)
+        print_line(Text(f"{sign} recording: {finding.sentence}", style="yellow"), console)
     if details:
         console.print(_findings_table(r))
-        console.print(_axes_table(r))
+        console.print(_axes_table(r, units))
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
     print_notes(r.notes, console)
 
@@ -77,31 +81,32 @@ def _findings_table(r: Reconciliation) -> RenderableType:
     return Padding(rows, (1, 0, 0, 0))
 
 
-def _axes_table(r: Reconciliation) -> RenderableType:
+def _axes_table(r: Reconciliation, units: UnitSystem) -> RenderableType:
     rows = plain_table("axis", "verdict")
     for head in ("gap", "conf."):
         rows.add_column(head, justify="right", no_wrap=True)
     rows.add_column("what", overflow="fold")
     for axis in (axis for axis in AXES if axis in r.axes):
-        _add(rows, r, r.axes[axis])
+        _add(rows, r, r.axes[axis], units)
     return Padding(rows, (1, 0))
 
 
-def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
-    lines = [_step(r, result.axis, step) for step in result.steps]
+def _add(rows: Table, r: Reconciliation, result: AxisResult, units: UnitSystem) -> None:
+    lines = [_step(r, result.axis, step, units) for step in result.steps]
     lines += [
-        ("", "", Text(f"left over: {words.describe_gap(one, result.axis)}", style="yellow")) for one in result.left_over
+        ("", "", Text(f"left over: {words.describe_gap(one, result.axis, units)}", style="yellow"))
+        for one in result.left_over
     ]
     head = (Text(result.axis, style="bold"), _verdict(result.verdict))
     if not lines and result.start.gaps:
         most = max(result.start.gaps, key=words.gap_to_threshold_ratio)
-        lines.append(("", "", Text(f"largest: {words.describe_gap(most, result.axis)}", style="dim")))
+        lines.append(("", "", Text(f"largest: {words.describe_gap(most, result.axis, units)}", style="dim")))
     for i, line in enumerate(lines or [("", "", Text())]):
         rows.add_row(*(head if i == 0 else ("", "")), *line)
 
 
-def _step(r: Reconciliation, axis: str, step: AddedOrResizedEffect) -> tuple[str, str, Text]:
-    what = Text.assemble(f"{step.kind} ", words.describe_step(step, axis, r.baseline))
+def _step(r: Reconciliation, axis: str, step: AddedOrResizedEffect, units: UnitSystem) -> tuple[str, str, Text]:
+    what = Text.assemble(f"{step.kind} ", words.describe_step(step, axis, r.baseline, units))
     what.highlight_words([words.readable_name(step.effect)], "bold")
     gap = f"{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}"
     return gap, words.format_probability(step.confidence), what
@@ -112,7 +117,7 @@ def _verdict(verdict: str) -> Text:
     return Text(f"{sign} {words.RESULT_TEXTS[verdict]}", style=style)
 
 
-def print_comparison(c: RecordingsComparison, console: Console) -> None:
+def print_comparison(c: RecordingsComparison, console: Console, units: UnitSystem = DEFAULT_UNITS) -> None:
     """Print the comparison of several recordings.
 
     Parameters
@@ -121,10 +126,12 @@ def print_comparison(c: RecordingsComparison, console: Console) -> None:
         Comparison of several recordings.
     console
         Console that receives the output.
+    units
+        Unit system.
     """
     console.print(_verdict(c.verdict), Text(recording_comparison_sentences.summarize(c)))
     console.print(Padding(_axes_by_runs(c), (1, 0)))
-    for title, found in (("common to all", _common(c)), ("in some only", _single(c))):
+    for title, found in (("common to all", _common(c, units)), ("in some only", _single(c, units))):
         if found:
             console.print(Text(title, style="bold"))
             console.print(Padding(_lines(found), (0, 0, 1, 2)))
@@ -160,11 +167,11 @@ def _lines(found: list[tuple[str, Text]]) -> Table:
     return rows
 
 
-def _common(c: RecordingsComparison) -> list[tuple[str, Text]]:
+def _common(c: RecordingsComparison, units: UnitSystem) -> list[tuple[str, Text]]:
     found = []
     for axis, one in c.axes.items():
         for seen in one.common:
-            said = _effect(c, axis, seen)
+            said = _effect(c, axis, seen, units)
             said.append(
                 f"; {recording_comparison_sentences.describe_size_agreement(seen)}",
                 style="yellow" if seen.sizes_agree is False else "",
@@ -173,10 +180,10 @@ def _common(c: RecordingsComparison) -> list[tuple[str, Text]]:
     return found
 
 
-def _single(c: RecordingsComparison) -> list[tuple[str, Text]]:
+def _single(c: RecordingsComparison, units: UnitSystem) -> list[tuple[str, Text]]:
     found = []
     for axis, seen in [(axis, seen) for axis, one in c.axes.items() for seen in one.single]:
-        said = _effect(c, axis, seen)
+        said = _effect(c, axis, seen, units)
         said.append(f"; in {', '.join(seen.steps)}")
         found.append((axis, said))
         for absence in seen.absent:
@@ -187,7 +194,7 @@ def _single(c: RecordingsComparison) -> list[tuple[str, Text]]:
     return found
 
 
-def _effect(c: RecordingsComparison, axis: str, seen: EffectInRecordings) -> Text:
-    said = Text(f"{seen.kind} {words.describe_step(seen.step_with_pooled_parameters(), axis, c.baseline)}")
+def _effect(c: RecordingsComparison, axis: str, seen: EffectInRecordings, units: UnitSystem) -> Text:
+    said = Text(f"{seen.kind} {words.describe_step(seen.step_with_pooled_parameters(), axis, c.baseline, units)}")
     said.highlight_words([words.readable_name(seen.effect)], "bold")
     return said

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
+from rich.text import Text
 
 UNLIMITED_WIDTH = 10_000
 
@@ -30,10 +31,15 @@ def plain_table(*headers: str, wrapped_headers: Sequence[str] = (), gap: int = 2
     return table
 
 
+def print_line(line: str | Text, console: Console) -> None:
+    """Print a line without markup. A terminal wraps the line at words, and a file receives one line."""
+    console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+
+
 def print_notes(notes: Iterable[str], console: Console) -> None:
-    """Print each note on a separate line."""
+    """Print each note as a line of its own."""
     for note in notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        print_line(f"note: {note}", console)
 
 
 def unwrapped_table_width(table: Table, console: Console, options: ConsoleOptions) -> int:

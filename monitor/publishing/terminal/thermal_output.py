@@ -7,7 +7,13 @@ import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 
-from monitor.common.unit_formatting import DEVIATION_UNITS, format_axis_value, format_duration, sensor_kind
+from monitor.common.unit_formatting import (
+    DEFAULT_UNITS,
+    UnitSystem,
+    format_axis_value,
+    format_duration,
+    sensor_kind,
+)
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemovalComparison
 from monitor.drift.thermal.thermal_fit import ThermalFit
@@ -15,7 +21,7 @@ from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalPredictionErrors, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import encode_json
-from monitor.publishing.terminal.tables import plain_table, print_notes
+from monitor.publishing.terminal.tables import plain_table, print_line, print_notes
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
@@ -23,7 +29,7 @@ ONE_WAY: Final = "temperature only rose or only fell, so neither a time lag nor 
 DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time would look the same"
 
 
-def print_thermal_fit(report: ThermalFitReport, console: Console) -> None:
+def print_thermal_fit(report: ThermalFitReport, console: Console, units: UnitSystem = DEFAULT_UNITS) -> None:
     """Print the thermal models of all axes and the errors of their fits.
 
     Parameters
@@ -32,6 +38,8 @@ def print_thermal_fit(report: ThermalFitReport, console: Console) -> None:
         Results of the thermal model fit.
     console
         Console that receives the output.
+    units
+        Units of the bias.
     """
     console.print(_summary_line(report.recording, report.interval_s, report.means), highlight=False)
     if report.fits:
@@ -39,7 +47,7 @@ def print_thermal_fit(report: ThermalFitReport, console: Console) -> None:
             "axis", "model", wrapped_headers=("per °C", "late by", "loop", "leaves", "explains", "validated")
         )
         for axis, one in report.fits.items():
-            rows.add_row(axis, *_fit_row(axis, one))
+            rows.add_row(axis, *_fit_row(axis, one, units))
         console.print(Padding(rows, (1, 0)))
         console.print(
             "loop: largest difference between heating and cooling, if noise does not explain it. leaves: rms of the "
@@ -52,7 +60,9 @@ def print_thermal_fit(report: ThermalFitReport, console: Console) -> None:
     _print_notes(report.refused, notes, console)
 
 
-def print_thermal_prediction(report: ThermalPredictionReport, console: Console) -> None:
+def print_thermal_prediction(
+    report: ThermalPredictionReport, console: Console, units: UnitSystem = DEFAULT_UNITS
+) -> None:
     """Print the predictions of thermal models for a recording and the prediction errors.
 
     Parameters
@@ -61,6 +71,8 @@ def print_thermal_prediction(report: ThermalPredictionReport, console: Console) 
         Results of the thermal prediction.
     console
         Console that receives the output.
+    units
+        Units of the bias.
     """
     console.print(_summary_line(report.recording, report.interval_s, report.means), highlight=False)
     if report.judged:
@@ -69,7 +81,7 @@ def print_thermal_prediction(report: ThermalPredictionReport, console: Console) 
         )
         for axis, one in report.judged.items():
             each = (one.rms_about_mean, one.rms, one.rms_without_offset, one.rms_one_step, one.offset)
-            rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.coverage:.0f} %")
+            rows.add_row(axis, *(_format_deviation(axis, x, units) for x in each), f"{100.0 * one.coverage:.0f} %")
         console.print(Padding(rows, (1, 0)))
     _print_notes(report.refused, report.notes, console)
 
@@ -185,25 +197,25 @@ def _summary_line(recording: str, interval_s: float, means: Any) -> str:
     return f"{recording}: {count} intervals of {format_duration(interval_s)}, {span}"
 
 
-def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
+def _fit_row(axis: str, one: ThermalFit, units: UnitSystem) -> tuple[str, ...]:
     model, best = one.model, one.candidates[0]
     cubic = next((each.validated for each in one.candidates if each.shape == ThermalModelForm(3, ())), None)
     return (
         model.shape.name,
-        _format_deviation(axis, model.mean_bias_slope) if model.shape != ThermalModelForm(0, ()) else "—",
+        _format_deviation(axis, model.mean_bias_slope, units) if model.shape != ThermalModelForm(0, ()) else "—",
         ", ".join(format_duration(each) for each in model.shape.constants_s) or "—",
-        "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis),
-        _format_deviation(axis, best.rms),
+        "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis, units),
+        _format_deviation(axis, best.rms, units),
         f"{100.0 * one.explained:.0f} %",
-        _format_deviation(axis, best.validated) + (f" ({best.validated / cubic:.2g})" if cubic else ""),
+        _format_deviation(axis, best.validated, units) + (f" ({best.validated / cubic:.2g})" if cubic else ""),
     )
 
 
-def _format_deviation(axis: str, si: float) -> str:
-    return DEVIATION_UNITS[sensor_kind(axis)].format_si_value(si)
+def _format_deviation(axis: str, si: float, units: UnitSystem) -> str:
+    return units.deviation(sensor_kind(axis)).format_si_value(si)
 
 
 def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
     for axis, reason in refused.items():
-        console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
+        print_line(f"{axis}: {reason}", console)
     print_notes(notes, console)

@@ -5,6 +5,5 @@ Without these checks, the search would use many noise effects to explain a wrong
 fault. Most checks compare the recording with one simulation of the model under test. The recording and the simulation
 are processed in the same way, so that systematic errors of the method cancel.
 
-``block_spectra`` computes the spectra for the checks of units and axes. ``sample_rate_from_features`` needs repaired
-axes, so ``reconcile.reconcile`` calls this check after the preparation.
+``sample_rate_from_features`` needs repaired axes, so ``reconcile.reconcile`` calls this check after the preparation.
 """

@@ -4,7 +4,7 @@ Wrong samples are marked as missing before the spectra of the axes are compared 
 needs samples in the right unit, so motion is checked after the units.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, get_args
 
@@ -28,6 +28,7 @@ from monitor.reconcile.recording_checks.missing_and_repeated_rows import (
     check_stuck_values,
 )
 from monitor.reconcile.recording_checks.motion import check_motion
+from monitor.reconcile.recording_checks.recording_under_test import CheckResult, RecordingUnderTest
 from monitor.reconcile.recording_checks.sample_rate_from_features import correct_impossible_sample_rate
 from monitor.reconcile.recording_checks.temporary_vibration import check_temporary_vibration
 from monitor.reconcile.recording_checks.unit_error import collect_triad_evidence, find_unit_error
@@ -64,31 +65,21 @@ def check_recording(recording: Recording, model: NoiseModel | None, seed: int) -
     """
     if recording.sample_count < MIN_SAMPLES:
         return CheckedRecording(recording, ())
-    findings = check_missing_rows(recording.values, recording.rate_hz)
+    findings: list[RecordingFinding] = []
     impossible = None if model is None else correct_impossible_sample_rate(recording, model)
     if impossible is not None:
         recording, finding = impossible
         findings.append(finding)
-    rate_hz = recording.rate_hz
     simulated = None if model is None else _simulate(recording, model, seed)
-    values, found = check_stuck_values(recording.values, rate_hz, simulated)
-    findings += found
-    values, found = check_corrupt_rows(values, rate_hz, simulated, model)
-    findings += found
-    for triad in TRIADS:
-        values, found = _check_triad(values, triad, rate_hz, model, simulated)
+    tested = RecordingUnderTest(recording.values, recording.rate_hz, model, simulated, seed)
+    for check in CHECKS:
+        values, found = check(tested)
+        tested = replace(tested, values=values)
+        if found and check is check_motion:
+            values, more = check_corrupt_rows(tested)  # large distances during the motion hid corrupt rows
+            tested, found = replace(tested, values=values), [*found, *more]
         findings += found
-    values, found = check_motion(values, rate_hz, simulated, model)
-    findings += found
-    if found:  # large distances during the motion hid corrupt rows
-        values, found = check_corrupt_rows(values, rate_hz, simulated, model)
-        findings += found
-    values, found = check_temporary_vibration(values, rate_hz, simulated, seed)
-    findings += found
-    findings += check_repeated_rows(values, rate_hz, model)
-    if model is not None:
-        findings += check_slow_terms(tuple(values), recording.sample_count, rate_hz, model)
-    return CheckedRecording(replace(recording, values=values), sort_findings(findings))
+    return CheckedRecording(replace(recording, values=dict(tested.values)), sort_findings(findings))
 
 
 def sort_findings(findings: Sequence[RecordingFinding]) -> tuple[RecordingFinding, ...]:
@@ -96,16 +87,19 @@ def sort_findings(findings: Sequence[RecordingFinding]) -> tuple[RecordingFindin
     return tuple(sorted(findings, key=lambda one: FINDING_KINDS.index(one.kind)))
 
 
-def _check_triad(
-    values: Mapping[str, Floats],
-    triad: tuple[str, ...],
-    rate_hz: float,
-    model: NoiseModel | None,
-    simulated: Mapping[str, Floats] | None,
-) -> tuple[dict[str, Floats], list[RecordingFinding]]:
-    """Correct the order and the unit of the axes of one triad, and return the findings."""
+def _check_gyroscopes(recording: RecordingUnderTest) -> CheckResult:
+    return _check_triad(recording, TRIADS[0])
+
+
+def _check_accelerometers(recording: RecordingUnderTest) -> CheckResult:
+    return _check_triad(recording, TRIADS[1])
+
+
+def _check_triad(recording: RecordingUnderTest, triad: tuple[str, ...]) -> CheckResult:
+    """Correct the order and the unit of the axes of one triad."""
+    values, rate_hz, model, simulated = recording.values, recording.rate_hz, recording.model, recording.simulated
     if not set(triad) <= set(values):
-        return dict(values), []
+        return values, []
     order: TriadOrder | None = None
     findings: list[RecordingFinding] = []
     corrected = dict(values)
@@ -114,7 +108,7 @@ def _check_triad(
         expected = [compute_robust_spectrum(simulated[axis], rate_hz) for axis in triad]
         if not all(recorded) or not all(expected):
             return corrected, []
-        peaks = compute_resonance_log_power_variances((effect for _, effect in model), values[triad[0]].size / rate_hz)
+        peaks = compute_resonance_log_power_variances((effect for _, effect in model), recording.sample_count / rate_hz)
         order = find_axis_order([one for one in recorded if one], [one for one in expected if one], peaks)
         described = describe_axis_order(triad, order)
         if described is not None:
@@ -137,3 +131,17 @@ def _simulate(recording: Recording, model: NoiseModel, seed: int) -> dict[str, F
         temperature_c = np.interp(whole, known, temperature_c[known]) if known.size else None
     drawn = model.simulate(recording.sample_count, recording.rate_hz, seed + SIMULATION_SEED_OFFSET, temperature_c)
     return {axis: np.ascontiguousarray(drawn[:, AXES.index(axis)]) for axis in recording.values}
+
+
+CHECKS: Final[tuple[Callable[[RecordingUnderTest], CheckResult], ...]] = (
+    check_missing_rows,
+    check_stuck_values,
+    check_corrupt_rows,
+    _check_gyroscopes,
+    _check_accelerometers,
+    check_motion,
+    check_temporary_vibration,
+    check_repeated_rows,
+    check_slow_terms,
+)
+"""Checks in the order in which they are run. A check sees the corrections of the checks before it."""

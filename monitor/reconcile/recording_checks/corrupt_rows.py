@@ -14,6 +14,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats, Ints
 from monitor.noise.effects import Outliers
 from monitor.noise.model import NoiseModel
+from monitor.reconcile.recording_checks.recording_under_test import CheckResult, RecordingUnderTest
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 MIN_DISTANCE: Final = 10.0
@@ -47,27 +48,11 @@ BLOCK_SAMPLES: Final = 64
 """Number of samples in a block for the estimate of the sample noise."""
 
 
-def check_corrupt_rows(
-    values: Mapping[str, Floats],
-    rate_hz: float,
-    simulated: Mapping[str, Floats] | None,
-    model: NoiseModel | None = None,
-) -> tuple[dict[str, Floats], list[RecordingFinding]]:
-    """Mark corrupt rows as missing on all axes, and return the values with the finding.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (n,)
-        Samples of each axis; NaN means missing.
-    rate_hz : float
-        Sample rate in Hz.
-    simulated : mapping of str to ndarray or None
-        Simulation of the model under test.
-    model : NoiseModel or None, optional
-        Model under test. Outliers of the model are not reported as corrupt rows.
-    """
+def check_corrupt_rows(recording: RecordingUnderTest) -> CheckResult:
+    """Mark corrupt rows as missing on all axes. Outliers of the model are not reported."""
+    values, rate_hz, model, simulated = recording.values, recording.rate_hz, recording.model, recording.simulated
     limits = {axis: _distance_limit(axis, None if simulated is None else simulated[axis], model) for axis in values}
-    n = next(iter(values.values())).size
+    n = recording.sample_count
     of_axes = np.zeros((len(values), n))
     for k, (axis, y) in enumerate(values.items()):
         rows, distances = compute_distances_from_neighbours(y)
@@ -80,7 +65,7 @@ def check_corrupt_rows(
         explained = (np.logical_and(wrong, usual).sum(axis=0) > 0) & (corrupt < END_ROWS)
         corrupt = corrupt[~explained]
     if not corrupt.size:
-        return dict(values), []
+        return values, []
     axes = tuple(axis for axis, of in zip(values, of_axes, strict=True) if of[corrupt].max() >= 1.0)
     marked = {axis: y.copy() for axis, y in values.items()}
     for y in marked.values():

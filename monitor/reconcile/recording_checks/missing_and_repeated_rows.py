@@ -10,7 +10,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from monitor.estimation.detection.repeated_share import estimate_stale_sample_share
 from monitor.noise.effects import RandomSampleHold
-from monitor.noise.model import NoiseModel
+from monitor.reconcile.recording_checks.recording_under_test import CheckResult, RecordingUnderTest
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 MIN_AXES: Final = 3
@@ -31,26 +31,19 @@ SAME_RUN_SHARE: Final = 0.8
 """Smallest overlap of two runs that are reported together, as a fraction of the total duration."""
 
 
-def check_missing_rows(values: Mapping[str, Floats], rate_hz: float) -> list[RecordingFinding]:
-    """Report rows that are missing on all axes.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (n,)
-        Samples of each axis on a regular grid; NaN means missing.
-    rate_hz : float
-        Sample rate in Hz.
-    """
+def check_missing_rows(recording: RecordingUnderTest) -> CheckResult:
+    """Report rows that are missing on all axes."""
+    values, rate_hz = recording.values, recording.rate_hz
     missing = np.logical_and.reduce([~np.isfinite(y) for y in values.values()])
     if not missing.any():
-        return []
+        return values, []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(np.int8)))
     lengths = edges[1::2] - edges[::2]
     longest = int(lengths.argmax())
     begin_s, duration_s = edges[2 * longest] / rate_hz, lengths[longest] / rate_hz
     rows, holes = int(missing.sum()), lengths.size
     where = f"in one hole at {begin_s:.5g} s" if holes == 1 else f"in {holes} holes, the longest at {begin_s:.5g} s"
-    return [
+    return values, [
         RecordingFinding(
             "missing_rows",
             tuple(values),
@@ -63,39 +56,29 @@ def check_missing_rows(values: Mapping[str, Floats], rate_hz: float) -> list[Rec
     ]
 
 
-def check_repeated_rows(
-    values: Mapping[str, Floats], rate_hz: float, model: NoiseModel | None
-) -> list[RecordingFinding]:
+def check_repeated_rows(recording: RecordingUnderTest) -> CheckResult:
     """Report rows that repeat on all axes more often than by chance.
 
     Such rows occur throughout a recording that was resampled to a higher rate. Quantized values also repeat by chance,
     but independently on each axis. The proportion of rows in which all axes repeat is therefore compared with the
     product of the proportions for the individual axes. The rows are kept, because the search for noise effects
-    describes the repeats.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (n,)
-        Samples of each axis; NaN means missing.
-    rate_hz : float
-        Sample rate in Hz.
-    model : NoiseModel or None
-        Model under test. Repeats are not reported if the model contains a random sample hold.
+    describes the repeats. Repeats are not reported if the model contains a random sample hold.
     """
+    values, rate_hz, model = recording.values, recording.rate_hz, recording.model
     if model is not None and any(isinstance(effect, RandomSampleHold) for _, effect in model):
-        return []
+        return values, []
     varying = [y for y in values.values() if np.isfinite(y).any() and np.nanmin(y) < np.nanmax(y)]
     if len(varying) < MIN_AXES:
-        return []
+        return values, []
     by_chance = float(np.prod([np.mean(y[1:] == y[:-1]) for y in varying]))
     if by_chance > MAX_CHANCE_SHARE:
-        return []
+        return values, []
     share = estimate_stale_sample_share(np.column_stack(varying))
     if share < MIN_SHARE:
-        return []
+        return values, []
     n = varying[0].size
     error = 2.0 * (share * (1.0 - share) / n) ** 0.5
-    return [
+    return values, [
         RecordingFinding(
             "repeated_rows",
             tuple(axis for axis in AXES if axis in values),
@@ -118,30 +101,20 @@ class Run:
     chance_log: float  # logarithm of the probability by chance
 
 
-def check_stuck_values(
-    values: Mapping[str, Floats], rate_hz: float, simulated: Mapping[str, Floats] | None
-) -> tuple[dict[str, Floats], list[RecordingFinding]]:
-    """Mark stuck samples as missing, and return the values with a finding for each group of stuck axes.
+def check_stuck_values(recording: RecordingUnderTest) -> CheckResult:
+    """Mark stuck samples as missing, with a finding for each group of stuck axes.
 
     Quantized values also repeat by chance. The length of a run is therefore compared with the repeats in the rest of
     the recording and with the longest run in a simulation of the model. A run at the largest or smallest value of the
     axis may be clipping, which the search for noise effects handles.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (n,)
-        Samples of each axis; NaN means missing.
-    rate_hz : float
-        Sample rate in Hz.
-    simulated : mapping of str to ndarray or None
-        Simulation of the model under test.
     """
+    values, simulated = recording.values, recording.simulated
     runs = [run for axis, y in values.items() if (run := find_stuck_run(axis, y, simulated)) is not None]
     marked, findings = dict(values), []
     while runs:
         together = [run for run in runs if _overlap_fraction(run, runs[0]) >= SAME_RUN_SHARE]
         runs = [run for run in runs if run not in together]
-        findings.append(_describe_stuck_values(together, values, rate_hz))
+        findings.append(_describe_stuck_values(together, values, recording.rate_hz))
         for run in together:
             y = marked[run.axis].copy()
             y[run.first + 1 : run.last] = np.nan

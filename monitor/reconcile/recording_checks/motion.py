@@ -16,7 +16,7 @@ from monitor.common.distributions import NORMAL_QUARTILE
 from monitor.common.unit_formatting import format_axis_value
 from monitor.estimation.detection.motion_detection import MotionEpisode, detect_motion, samples_per_block
 from monitor.noise.effects import BiasStep, NoiseStep, PoissonSteps, RandomTelegraph, TurnOnTransient
-from monitor.noise.model import NoiseModel
+from monitor.reconcile.recording_checks.recording_under_test import CheckResult, RecordingUnderTest
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 EVENT_EFFECTS: Final = (BiasStep, NoiseStep, PoissonSteps, RandomTelegraph, TurnOnTransient)
@@ -37,39 +37,22 @@ MAX_LISTED_EPISODES: Final = 3
 """Largest number of episodes in the description."""
 
 
-def check_motion(
-    values: Mapping[str, Floats],
-    rate_hz: float,
-    simulated: Mapping[str, Floats] | None,
-    model: NoiseModel | None = None,
-) -> tuple[dict[str, Floats], list[RecordingFinding]]:
-    """Mark samples in motion as missing, and return the values with the finding.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (n,)
-        Samples of each axis in rad/s or m/s²; NaN means missing.
-    rate_hz : float
-        Sample rate in Hz.
-    simulated : mapping of str to ndarray or None
-        Simulation of the model under test.
-    model : NoiseModel or None, optional
-        Model under test.
-    """
-    effects = {} if model is None else model.effects
+def check_motion(recording: RecordingUnderTest) -> CheckResult:
+    """Mark samples in motion as missing."""
+    values, rate_hz, simulated = recording.values, recording.rate_hz, recording.simulated
+    effects = {} if recording.model is None else recording.model.effects
     steady = {
         axis: y for axis, y in values.items() if not any(isinstance(e, EVENT_EFFECTS) for e in effects.get(axis, ()))
     }
     episodes = find_motion(steady, rate_hz) if steady else []
     if not episodes or (simulated is not None and find_motion({a: simulated[a] for a in steady}, rate_hz, min_axes=0)):
-        return dict(values), []
-    n = next(iter(values.values())).size
-    moving = np.zeros(n, np.bool_)
+        return values, []
+    moving = np.zeros(recording.sample_count, np.bool_)
     for motion, _ in episodes:
         moving[motion.since : motion.until] = True
     share = float(moving.mean())
     removed = share <= MAX_MOVING_SHARE
-    marked = {axis: np.where(moving, np.nan, y) for axis, y in values.items()} if removed else dict(values)
+    marked = {axis: np.where(moving, np.nan, y) for axis, y in values.items()} if removed else values
     return marked, [_describe(episodes, share, removed, rate_hz)]
 
 

@@ -9,7 +9,6 @@ noise.
 The band is replaced with random noise during the vibration. The noise has the power of the neighbouring frequencies.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,6 +20,7 @@ from scipy.special import gammaincinv
 from drivers.data_types import AXES, Floats
 from monitor.common.unit_formatting import format_axis_value
 from monitor.reconcile.likelihood.wandering_line_likelihood import expand_band, extract_band
+from monitor.reconcile.recording_checks.recording_under_test import CheckResult, RecordingUnderTest
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 BLOCKS: Final = 64
@@ -88,25 +88,9 @@ class _BlockSpectra:
         return slice(round(found.first_hz / self.bin_hz), round(found.last_hz / self.bin_hz) + 1)
 
 
-def check_temporary_vibration(
-    values: Mapping[str, Floats],
-    rate_hz: float,
-    simulated: Mapping[str, Floats] | None,
-    seed: int,
-) -> tuple[dict[str, Floats], list[RecordingFinding]]:
-    """Remove vibrations that last for a part of the recording, and return the values with the findings.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (n,)
-        Samples of each axis in rad/s or m/s²; NaN means missing.
-    rate_hz : float
-        Sample rate in Hz.
-    simulated : mapping of str to ndarray or None
-        Simulation of the model under test.
-    seed : int
-        Seed of the noise that replaces the vibration. The noise of each axis is independent.
-    """
+def check_temporary_vibration(recording: RecordingUnderTest) -> CheckResult:
+    """Replace vibrations that last for a part of the recording with noise, which is independent on each axis."""
+    values, rate_hz, simulated = recording.values, recording.rate_hz, recording.simulated
     spectra = {axis: found for axis, y in values.items() if (found := _block_spectra(y, rate_hz)) is not None}
     vibrations = [one for axis, spectrum in spectra.items() for one in _find_vibrations(axis, spectrum)]
     if vibrations and simulated is not None:
@@ -121,7 +105,7 @@ def check_temporary_vibration(
         axes = tuple(axis for axis in AXES if axis in spectra and _is_affected(spectra[axis], largest))
         amplitude = 0.0
         for axis in axes:
-            rng = np.random.default_rng([seed, len(findings), AXES.index(axis)])
+            rng = np.random.default_rng([recording.seed, len(findings), AXES.index(axis)])
             corrected[axis], size = _remove_vibration(corrected[axis], rate_hz, spectra[axis], largest, rng)
             amplitude = size if axis == largest.axis else amplitude
         findings.append(_describe(largest, axes, amplitude, spectra[largest.axis].block_samples / rate_hz))

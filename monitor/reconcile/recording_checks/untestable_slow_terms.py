@@ -18,6 +18,7 @@ from monitor.noise.effects import (
     RateRandomWalk,
 )
 from monitor.noise.model import NoiseModel
+from monitor.reconcile.recording_checks.recording_under_test import CheckResult, RecordingUnderTest
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 
 MIN_TIME_CONSTANTS: Final = 5.0
@@ -26,26 +27,17 @@ MIN_POWER_RATIO: Final = 0.05
 """Smallest power of a visible term at the lowest frequency, relative to the white noise."""
 
 
-def check_slow_terms(axes: tuple[str, ...], samples: int, rate_hz: float, model: NoiseModel) -> list[RecordingFinding]:
-    """Report terms of the model that need a longer recording.
-
-    Parameters
-    ----------
-    axes : tuple of str
-        Names of the recorded axes.
-    samples : int
-        Number of samples of each axis.
-    rate_hz : float
-        Sample rate in Hz.
-    model : NoiseModel
-        Model under test.
-    """
-    duration_s = samples / rate_hz
-    hidden = {axis: names for axis in axes if (names := _find_invisible_terms(axis, duration_s, rate_hz, model))}
+def check_slow_terms(recording: RecordingUnderTest) -> CheckResult:
+    """Report terms of the model that need a longer recording."""
+    values, rate_hz, model = recording.values, recording.rate_hz, recording.model
+    if model is None:
+        return values, []
+    duration_s = recording.sample_count / rate_hz
+    hidden = {axis: names for axis in values if (names := _find_invisible_terms(axis, duration_s, rate_hz, model))}
     if not hidden:
-        return []
+        return values, []
     which = "; ".join(f"{', '.join(names)} of {axis}" for axis, names in hidden.items())
-    return [
+    return values, [
         RecordingFinding(
             "too_short",
             tuple(hidden),

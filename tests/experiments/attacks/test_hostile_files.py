@@ -126,7 +126,7 @@ def check_analyze_rejects(tmp_path: Path, generate: hostile.Generator, suffix: s
     """Check that ``analyze`` rejects a generated file."""
     path = tmp_path / f"hostile{suffix}"
     generate(path)
-    check_rejected(run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100"), path, reason)
+    check_rejected(run_limited(tmp_path, "imu_monitor", "analyze", str(path), "--rate", "100"), path, reason)
 
 
 @pytest.mark.timeout(900)
@@ -157,7 +157,7 @@ def test_other_commands_reject_hostile_file_in_one_line(tmp_path: Path, command:
     path = tmp_path / "hostile.csv.gz"
     hostile.gz_rows_without_end(path)
     *words, out = command
-    result = run_limited(tmp_path, "monitor.cli", *words, str(tmp_path / out), str(path), "--rate", "100")
+    result = run_limited(tmp_path, "imu_monitor", *words, str(tmp_path / out), str(path), "--rate", "100")
     check_rejected(result, path, MEMORY_OR_ROWS)
 
 
@@ -166,7 +166,7 @@ def test_large_unused_column_needs_little_memory(tmp_path: Path, generate: Calla
     """The few samples beside a large unused column are read, and are too few for an analysis."""
     path = tmp_path / f"hostile{'.npz' if generate is hostile.npz_large_rate else '.arrows'}"
     generate(path)
-    result = run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100")
+    result = run_limited(tmp_path, "imu_monitor", "analyze", str(path), "--rate", "100")
     assert result.status == 3, result
     assert result.stderr.count("\n") == 1
     assert result.resident_bytes < MAX_RESIDENT_BYTES

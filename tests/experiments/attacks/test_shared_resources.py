@@ -30,7 +30,7 @@ from tests.experiments.benchmarks import faults
 from tests.support.ports import free_endpoint, free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
-IMU_MONITOR = [sys.executable, "-m", "monitor.cli"]
+IMU_MONITOR = [sys.executable, "-m", "imu_monitor"]
 RATE = 100
 needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun-sdk is not installed")
 

@@ -1,10 +1,11 @@
-"""Cost of the sliding window compared with the real-time class of allantools, of a fit, and of the first use.
+"""Cost of the sliding window compared with allantools and a NumPy loop, of a fit, and of the first use.
 
     python -m tests.experiments.benchmarks.bench_window [--rounds 15]
 
 The window has six axes. ``allantools.realtime.oadev_realtime`` has one axis and removes no samples. Both get the same
 20 cluster sizes, in logarithmic steps up to a quarter of the window. They are measured when each sample adds a term to
-every τ. The phase list of allantools is filled directly, because its normal way takes minutes.
+every τ. The phase list of allantools is filled directly, because its normal way takes minutes. The NumPy loop updates
+six axes and all τ of a sliding window with array operations for each sample.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -95,6 +97,25 @@ def make_allantools_loop(length: int, values: Floats) -> Callable[[], None]:
     return work
 
 
+def make_numpy_loop(length: int, values: Floats) -> Callable[[], None]:
+    """Return a function that updates the sums of squared second differences of a full window with NumPy."""
+    sizes, places = cluster_sizes(length), length + 1
+    phase, sums = np.zeros((places, AXES)), np.zeros((TAUS, AXES))
+    at = 0
+
+    def work() -> None:
+        nonlocal at, sums
+        for y in values:
+            now = (at + 1) % places
+            leaving = phase[now] - 2.0 * phase[(now + sizes) % places] + phase[(now + 2 * sizes) % places]
+            phase[now] = phase[at] + y
+            added = phase[now] - 2.0 * phase[now - sizes] + phase[now - 2 * sizes]
+            sums += added * added - leaving * leaving
+            at = now
+
+    return work
+
+
 def print_window_costs(rounds: int) -> None:
     """Print the cost per sample for both window lengths, and the ratio to allantools."""
     singles, many, few = simulate_noise(2_000, 2), simulate_noise(20_000, 3), simulate_noise(400, 4)
@@ -106,16 +127,17 @@ def print_window_costs(rounds: int) -> None:
         works[f"{length} chunks"] = make_append_loop(window, many, CHUNK)
         works[f"{length} singles"] = make_append_loop(window, singles, 1)
         works[f"{length} peer"] = make_allantools_loop(length, few)
+        works[f"{length} numpy"] = make_numpy_loop(length, few)
     took = time_alternately(works, rounds)
     table = create_table(
         f"a window of L samples, six axes, {TAUS} τ; median (best) of {rounds} rounds",
-        "samples a call", "L", "a sample", "ns a τ·axis", "allantools over this, a sample·axis",
+        "samples a call", "L", "a sample", "ns a τ·axis", "allantools over this, a sample·axis", "NumPy loop over this",
     )  # fmt: skip
     medians: dict[tuple[str, int], float] = {}
     for how, count in (("blocks", len(many)), ("chunks", len(many)), ("singles", len(singles))):
         for length in LENGTHS:
             median, best = (t / count for t in took[f"{length} {how}"])
-            theirs = took[f"{length} peer"][0] / len(few)
+            theirs, numpy = (took[f"{length} {name}"][0] / len(few) for name in ("peer", "numpy"))
             medians[how, length] = median
             table.add_row(
                 f"{SAMPLES_PER_CALL[how]}",
@@ -123,11 +145,12 @@ def print_window_costs(rounds: int) -> None:
                 f"{median * 1e6:.3f} ({best * 1e6:.3f}) µs",
                 f"{median * 1e9 / AXES / TAUS:.2f} ({best * 1e9 / AXES / TAUS:.2f})",
                 f"{theirs / (median / AXES):,.0f}",
+                f"{numpy / median:,.0f}",
             )
-    for length in LENGTHS:
-        median, best = (t / len(few) for t in took[f"{length} peer"])
+    for (name, axes, key), length in product((("allantools, no window", 1, "peer"), ("NumPy", AXES, "numpy")), LENGTHS):
+        median, best = (t / len(few) for t in took[f"{length} {key}"])
         text = f"{median * 1e6:.1f} ({best * 1e6:.1f}) µs"
-        table.add_row("allantools, one axis, no window", f"{length:,}", text, f"{median * 1e9 / TAUS:.0f}", "1")
+        table.add_row(f"{name}, axes: {axes}", f"{length:,}", text, f"{median * 1e9 / axes / TAUS:.0f}", "", "")
     console.print(table)
     short, long = LENGTHS
     ratios = {how: medians[how, long] / medians[how, short] for how in ("blocks", "chunks", "singles")}

@@ -5,16 +5,13 @@
 
 With ``--records 0 --page docs/measurements/statistics.md``, the program only writes the tables into the page.
 
-A cell is a noise and a length of record at 100 Hz. The tables contain these numbers for each cell, in percent with the
-95 % interval of Wilson:
+A cell is a noise and a length of record at 100 Hz. The tables contain these numbers for each cell, in percent:
 
 - the coverage of the two-sided 95 % intervals of deviations, for all τ up to an eighth of the record. The errors at
   neighbouring τ are correlated, so the number of independent intervals is estimated from the scatter between records.
-- for each present term: the share of true results, which are two-sided 95 % intervals or one-sided 95 % bounds, the
-  share of estimated terms, and the coverage of intervals and of bounds. A term is estimated if its estimate is large.
-  Therefore, rare intervals or rare bounds of a term are a biased sample. If a kind of result occurs in less than half
-  of the records, its coverage is not compared with a target.
-- for each absent term: the share of records in which it is estimated.
+- for each present term: the share of true results, which are two-sided 95 % intervals or one-sided 95 % bounds. Both
+  count together: a term is estimated if its estimate is large, so the rare intervals of a term are a biased sample.
+- for each term: the share of records in which it is estimated.
 
 Each record is analysed once by ``analyze``, in one process and one thread. An interrupted run can be continued.
 """
@@ -56,7 +53,6 @@ CELLS: Final = {
     "mix, ramp 1e-6": Noise(MIX.Q, MIX.N, MIX.B, MIX.K, R=1e-6),
 }
 TWO_SIDED: Final = (0.93, 0.97)
-ONE_SIDED: Final = (0.94, 1.0)
 ABSENT_TARGET: Final = (0.0, 0.05)
 RESULT_TARGET: Final = (0.93, 1.0)
 ANY: Final = (0.0, 1.0)
@@ -102,25 +98,20 @@ def tables(chunks: list[Chunk]) -> str:
     """Return the tables in Markdown."""
     groups = group_chunks(chunks)
     parts = [
-        "Two-sided 95 % intervals of deviations, for τ up to an eighth of the record:",
-        format_table(
-            ("record", "noise", "records", "holds, %", "worst and best τ, %"), [_deviations(*g) for g in groups.items()]
-        ),
-        "Terms that are present:",
-        format_table(
-            ("record", "noise", "term", "result holds, %", "estimated, %", "interval holds, %", "bound holds, %"),
-            [row for group in groups.items() for row in _present(*group)],
-        ),
-        "Absent terms that are estimated, %:",
-        format_table(("record", "noise", *SYMBOLS), [_absent(*group) for group in groups.items()]),
-        "A figure is bold if its interval lies entirely outside the expected range. The expected range is "
-        f"{_percent(*TWO_SIDED)} % for intervals, {_percent(*ONE_SIDED)} % for bounds, {_percent(*RESULT_TARGET)} % "
-        f"for all results of a term together, and {_percent(*ABSENT_TARGET)} % for absent terms.",
+        "Correct results, %. Deviations are averaged over τ up to an eighth of the record, with the worst τ in "
+        "parentheses:",
+        format_table(("record", "noise", "records", "deviations", *SYMBOLS), [_correct(*g) for g in groups.items()]),
+        "Records in which a term is estimated, %. Parentheses mark terms that the noise does not contain:",
+        format_table(("record", "noise", *SYMBOLS), [_estimated(*g) for g in groups.items()]),
+        "A figure is bold if its 95 % interval lies entirely outside the expected range. The expected range is "
+        f"{_percent(*TWO_SIDED)} % for deviations, {_percent(*RESULT_TARGET)} % for terms, and "
+        f"{_percent(*ABSENT_TARGET)} % for the estimates of absent terms.",
     ]
     return "\n\n".join(parts)
 
 
-def _deviations(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
+def _correct(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
+    """Return the shares of deviations and of terms whose interval or bound contains the true value."""
     seconds, cell = key
     records = sum(chunk["records"] for chunk in group)
     total, square = np.sum([chunk["shares"] for chunk in group], axis=0)
@@ -129,50 +120,34 @@ def _deviations(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
     total = share * (1.0 - share) / scatter
     m = np.array(group[0]["m"])
     by_tau = np.sum([chunk["deviations"] for chunk in group], axis=0)[m <= seconds * RATE_HZ / 8] / records
-    worst = f"{100 * by_tau.min():.1f}, {100 * by_tau.max():.1f}"
-    return format_length(seconds), cell, str(records), _share(share * total, total, TWO_SIDED), worst
-
-
-def _present(key: tuple[int, str], group: list[Chunk]) -> list[tuple[str, ...]]:
-    seconds, cell = key
-    records = sum(chunk["records"] for chunk in group)
-    rows: list[tuple[str, ...]] = []
-    for letter in CELLS[cell].present_terms():
-        counts = [sum(chunk["letters"][letter][name] for chunk in group) for name in COUNTED]
-        estimated, covered, bounded, bound_covered = counts
-        rows.append(
-            (
-                format_length(seconds),
-                cell,
-                letter,
-                _share(covered + bound_covered, estimated + bounded, RESULT_TARGET),
-                _share(estimated, records),
-                _share(covered, estimated, TWO_SIDED if 2 * estimated >= records else ANY),
-                _share(bound_covered, bounded, ONE_SIDED if 2 * bounded >= records else ANY),
-            )
+    deviations = f"{_share(share * total, total, TWO_SIDED)} ({100 * by_tau.min():.1f})"
+    terms = []
+    for letter in SYMBOLS:
+        covered, given = (
+            sum(chunk["letters"][letter][name] for chunk in group for name in names)
+            for names in (("held", "bound_held"), ("estimated", "bounded"))
         )
-    return rows
+        terms.append(_share(covered, given, RESULT_TARGET) if letter in CELLS[cell].present_terms() else "–")
+    return format_length(seconds), cell, str(records), deviations, *terms
 
 
-def _absent(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
+def _estimated(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
     seconds, cell = key
     records = sum(chunk["records"] for chunk in group)
-    present = CELLS[cell].present_terms()
-    entered = [
-        "–"
-        if c in present
-        else _share(sum(chunk["letters"][c]["estimated"] for chunk in group), records, ABSENT_TARGET)
-        for c in SYMBOLS
-    ]
-    return format_length(seconds), cell, *entered
+    shares = []
+    for letter in SYMBOLS:
+        estimated = sum(chunk["letters"][letter]["estimated"] for chunk in group)
+        present = letter in CELLS[cell].present_terms()
+        shares.append(_share(estimated, records) if present else f"({_share(estimated, records, ABSENT_TARGET)})")
+    return format_length(seconds), cell, *shares
 
 
 def _share(covered: float, total: float, target: tuple[float, float] = ANY) -> str:
-    """Return a share with its interval, in bold if the interval is outside the target."""
+    """Return a share, in bold if its 95 % interval is outside the target."""
     if not total:
         return "–"
     lo, hi = wilson_interval(covered, total)
-    text = f"{100 * covered / total:.1f} [{100 * lo:.1f}, {100 * hi:.1f}]"
+    text = f"{100 * covered / total:.1f}"
     return text if lo <= target[1] and hi >= target[0] else f"**{text}**"
 
 

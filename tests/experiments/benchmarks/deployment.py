@@ -102,7 +102,7 @@ def measure_daemon(count: int, rate_hz: int, seconds: float, wait_s: float = 0.0
             DEVICE.format(i=i, rate=float(rate_hz), port=port, wait_s=wait_s) for i, port in enumerate(sensors.ports)
         )
         (folder / "daemon.toml").write_text(text + REST.format(folder=folder / "store"))
-        command = [sys.executable, "-m", "monitor.cli", "run", str(folder / "daemon.toml")]
+        command = [sys.executable, "-m", "imu_monitor", "run", str(folder / "daemon.toml")]
         with (folder / "log").open("wb") as log:
             process = subprocess.Popen(command, stdout=log, stderr=log)
         try:

@@ -6,9 +6,8 @@
 With ``--records 0 --page docs/measurements/statistics.md``, the program only writes the tables into the page.
 
 A cell is a noise and a length of record at 100 Hz. For each cell, estimator and term, the table contains the rms of the
-relative error of the coefficient over its Cramér–Rao limit, with the 95 % interval of this ratio from the scatter of
-the squared errors. If the limit is above 15 %, the ratio is in parentheses. An estimator that is clipped at zero can
-then be better than any unbiased estimator.
+relative error of the coefficient over its Cramér–Rao limit. If the limit is above 15 %, the ratio is in parentheses. An
+estimator that is clipped at zero can then be better than any unbiased estimator.
 
 ``ESTIMATORS`` maps a name to a function of values [n, 6] and rate that returns Q N B K R [5, 6]. The methods of the
 other programs are implemented here after their sources:
@@ -189,14 +188,14 @@ def count(cell: str, seconds: int, seed: int, chunk: int) -> Chunk:
 def tables(chunks: list[Chunk]) -> str:
     """Return the table in Markdown."""
     rows = [row for group in group_chunks(chunks).items() for row in _rows(*group)]
-    return format_table(("record", "noise", "estimator", "records", "Q", "N", "B", "K"), rows)
+    return format_table(("record", "noise", "estimator", "Q", "N", "B", "K"), rows)
 
 
 def _rows(key: tuple[int, str], group: list[Chunk]) -> list[tuple[str, ...]]:
     seconds, cell = key
     limits = cramer_rao(CELLS[cell], round(seconds * RATE_HZ))
     limit_cells = [f"{100 * limits[letter]:.3g} %" for letter in "QNBK"]
-    rows: list[tuple[str, ...]] = [(format_length(seconds), cell, "*limit*", "", *limit_cells)]
+    rows: list[tuple[str, ...]] = [(format_length(seconds), cell, "*limit*", *limit_cells)]
     for name in dict.fromkeys(name for chunk in group for name in chunk["errors"]):
         # the first chunks may lack estimators that were added later
         chunks_with_name = [chunk for chunk in group if name in chunk["errors"]]
@@ -206,18 +205,18 @@ def _rows(key: tuple[int, str], group: list[Chunk]) -> list[tuple[str, ...]]:
             _ratio(limits[c], sums[1:, k] / records, records, TARGETS.get(name, {}).get(c))
             for k, c in enumerate("QNBK")
         ]
-        rows.append((format_length(seconds), cell, name, str(records), *figures))
+        rows.append((format_length(seconds), cell, name, *figures))
     return rows
 
 
 def _ratio(limit: float, moments: Floats, records: int, target: float | None) -> str:
-    """Return the rms error over the limit with its interval, in bold if the interval is above the target."""
+    """Return the rms error over the limit, in bold if its 95 % interval is above the target."""
     square, fourth = moments  # of the relative error: mean square, mean fourth power
     if np.isnan(square):
         return "–"
     reach = 1.96 * np.sqrt((fourth - square**2) / records)
-    lo, hi = np.sqrt(np.maximum([square - reach, square + reach], 0.0)) / limit
-    text = f"{np.sqrt(square) / limit:.3g} [{lo:.3g}, {hi:.3g}]"
+    lo = np.sqrt(max(square - reach, 0.0)) / limit
+    text = f"{np.sqrt(square) / limit:.3g}"
     if limit > MAX_COMPARED_LIMIT:
         return f"({text})"
     return f"**{text}**" if target is not None and lo > target else text

@@ -125,7 +125,7 @@ def start_daemon(
     path, model = folder / f"{i}.toml", folder / f"{i}.model.toml"
     model.write_text(MODEL.format(rate=float(rate)))
     path.write_text(DAEMON.format(i=i, rate=rate, publish=publish, router=router, model=model))
-    return Process("-m", "monitor.cli", "run", str(path))
+    return Process("-m", "imu_monitor", "run", str(path))
 
 
 class Watcher:

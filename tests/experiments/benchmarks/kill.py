@@ -219,7 +219,7 @@ class Bench:
         assert starts == sorted(set(starts))
 
     def _start(self) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "monitor.cli", "run", str(self._config)]
+        command = [sys.executable, "-m", "imu_monitor", "run", str(self._config)]
         return subprocess.Popen(command, stdout=self._log, stderr=self._log)
 
     def has_port(self, pid: int) -> bool:

@@ -249,7 +249,7 @@ def run_reconcile(folder: Path, columns: dict[str, Floats], rate_hz: float, mode
     options = ["--model", str(model)] if model else []
     begin = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-m", "monitor.cli", "reconcile", str(recording), *options, "--out", str(out)],
+        [sys.executable, "-m", "imu_monitor", "reconcile", str(recording), *options, "--out", str(out)],
         capture_output=True,
         text=True,
         timeout=TIME_LIMIT_S,

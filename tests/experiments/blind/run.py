@@ -145,7 +145,7 @@ def run_job(job: Job, in_process: bool = False, keep: Path | None = None) -> Out
 
 def _run_in_subprocess(arguments: list[str]) -> tuple[int, str]:
     done = subprocess.run(
-        [sys.executable, "-m", "monitor.cli", *arguments],
+        [sys.executable, "-m", "imu_monitor", *arguments],
         capture_output=True,
         text=True,
         timeout=TIME_LIMIT_S,

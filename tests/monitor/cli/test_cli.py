@@ -37,7 +37,7 @@ from tests.monitor.publishing.example_results import make_estimate
 from tests.support.ports import free_endpoint
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
-PROGRAM = [sys.executable, "-m", "monitor.cli"]
+PROGRAM = [sys.executable, "-m", "imu_monitor"]
 COMMANDS = ("demo", "run", "check", "doctor", "watch", "analyze", "simulate", "reconcile", "export")
 RATE_HZ = 100.0
 DEVICE = '[[device]]\nname = "bench-1"\n'
@@ -889,7 +889,7 @@ def test_model_is_exported(run_program: RunProgram, arguments: tuple[str, ...], 
     assert "source: consumer-mems.toml" in run.out
     for word in message:
         assert word in run.out
-    assert run_program("export", MODEL, "--format", *arguments, "--out", "x").out == ""
+    assert run_program("export", MODEL, "--format", *arguments, "--out", "x").out == "x written\n"
     assert Path("x").read_text() == run.out
 
 
@@ -900,10 +900,35 @@ def test_shipped_model_name_is_exported_like_its_file(run_program: RunProgram) -
         assert named.out == file.out
 
 
+@pytest.mark.parametrize(
+    ("command", "usage", "argument"),
+    [
+        (("analyze",), "[OPTIONS] RECORDING", "  RECORDING  File"),
+        (("reconcile",), "[OPTIONS] RECORDING…", "  RECORDING…  File"),
+        (("export",), "[OPTIONS] [MODEL.toml|NAME|RESULT.json]", "  MODEL.toml|NAME|RESULT.json  Model"),
+        (("thermal", "fit"), "[OPTIONS] RECORDING", "  RECORDING  File"),
+    ],
+)
+def test_help_names_arguments_without_types(
+    run_program: RunProgram, command: tuple[str, ...], usage: str, argument: str
+) -> None:
+    text = run_program(*command, "--help").out
+    assert text.splitlines()[0] == f"Usage: imu-monitor {' '.join(command)} {usage}"
+    assert argument in text
+    assert f"Example: imu-monitor {' '.join(command)} " in text
+
+
+def test_help_describes_every_command_in_a_complete_line(run_program: RunProgram) -> None:
+    text = run_program("--help").out
+    lines = text.partition("Commands:\n")[2].partition("\n\n")[0].splitlines()
+    assert len(lines) > 10
+    assert all(line.endswith(".") and not line.endswith("...") for line in lines)
+
+
 def test_help_lists_every_export_format() -> None:
     command = typer.main.get_command(app).commands["export"]  # type: ignore[attr-defined]
     [option] = [parameter for parameter in command.params if "--format" in parameter.opts]
-    assert option.metavar == "|".join(FORMATS)
+    assert option.help.endswith(f": {', '.join(FORMATS)}.")
 
 
 def test_present_result_of_a_daemon_is_exported(run_program: RunProgram, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1587,7 +1612,7 @@ def test_failed_thread_is_reported_in_one_line(
     [
         (
             ("export", "m.toml"),
-            "Missing option '--format' (kalibr|allan_variance_ros|openvins|",
+            "Missing option '--format' (FORMAT): Program that reads the parameters: kalibr, allan_variance_ros, ",
         ),
         (
             ("simulate", "m.toml", "--seconds", "1"),
@@ -1604,11 +1629,12 @@ def test_failed_thread_is_reported_in_one_line(
         (("analyze", "a.csv", "--rte", "1"), "No such option: --rte of imu-monitor analyze; did you mean --rate?"),
         (
             ("analyze", "a.csv", "--xyz"),
-            "No such option: --xyz of imu-monitor analyze; known are --rate, --last, --topic, --columns, --gyro-unit,",
+            "No such option: --xyz of imu-monitor analyze; known are --tau, --window, --rest, --units, --json,",
         ),
         (("thermal", "fitt", "a.csv"), "Did you mean 'fit'?"),
         (("quux",), "known are demo, run, check, "),
         ((), "Missing command; known are demo, run, check, "),
+        ((), "history, export, thermal. See imu-monitor --help"),  # without the hidden command
         (("thermal",), "Missing command; known are fit, predict"),
     ],
 )

@@ -29,9 +29,10 @@ def write_recording(path: Path, seconds: float = 300.0, turn: float = 0.0, **mor
 def test_compensated_recording_has_no_drift(tmp_path, capsys):
     recording, out = write_recording(tmp_path / "a.npz", turn=0.5), tmp_path / "out.csv"
     plot, summary = tmp_path / "a.png", tmp_path / "a.json"
-    assert exit_status("compensate", recording, "--out", out, "--json", summary, "--plot", plot) == 0
+    assert exit_status("compensate", recording, "--out", out, "--json", summary, "--plot", plot, "--units", "si") == 0
     text = capsys.readouterr().out
     assert "adaptive; evaluated on" in text
+    assert "rms, rad/s" in text
     assert "→" in text
     before, after = load_samples(recording), load_samples(out)
     assert after.axes == ("gx", "gz", "az")

@@ -317,7 +317,7 @@ def test_storage_folder_is_tested_and_left_unchanged(tmp_path: Path) -> None:
         examine_config(tmp_path, VIRTUAL + QUIET + '[storage]\nfolder = "kept/here"\n'), "storage"
     )
     assert found.mark in ("well", "doubt")
-    assert "about 0.302 GB per day" in found.text
+    assert "about 0.328 GB per day" in found.text
     assert not (tmp_path / "kept").exists()
     (tmp_path / "file").touch()
     found = require_one_finding(
@@ -430,7 +430,7 @@ def test_systemd_unit_state_is_rated(properties: dict[str, str], mark: str) -> N
 
 
 def run_doctor(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "monitor.cli", "doctor", *arguments]
+    command = [sys.executable, "-m", "imu_monitor", "doctor", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(CONFIG_FOLDER.parent), "COLUMNS": "200"}
     return subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False

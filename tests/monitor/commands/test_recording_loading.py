@@ -229,6 +229,14 @@ class TestRefusals:
             "contains captured bytes; name the decoder with --decoder: aceinna_dmu, "
         )
 
+    @pytest.mark.parametrize("name", ["bench.txt", "bench.log"])
+    def test_table_with_the_suffix_of_a_capture_is_recognized(self, tmp_path: Path, name: str) -> None:
+        path = tmp_path / name
+        path.write_text("# made on a bench\nt,gx,gy,gz\n0.00,1,2,3\n")
+        assert refusal(path) == "contains a table of samples; rename the file to end in .csv"
+        path.write_text("gx 0.01 gy 0.02\n")  # labelled text of a sensor
+        assert "name the decoder" in refusal(path)
+
     def test_wrong_decoder_and_options(self, tmp_path: Path) -> None:
         log, capture = tmp_path / "drive.blf", tmp_path / "capture.raw"
         write_can_log(log)

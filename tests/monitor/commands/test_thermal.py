@@ -27,8 +27,12 @@ def write_recording(path: Path, seed: int, lag_h: float = 2.0, offset: float = 0
 def test_model_of_one_recording_predicts_another(tmp_path, capsys):
     first, second = write_recording(tmp_path / "a.npz", 1), write_recording(tmp_path / "b.npz", 2, offset=1e-4)
     model, plot, out = tmp_path / "m.json", tmp_path / "a.png", tmp_path / "out.json"
-    assert exit_status("thermal", "fit", first, "--interval", "1h", "--out", model, "--plot", plot, "--json", out) == 0
-    assert "difference 1" in capsys.readouterr().out
+    fit = ("thermal", "fit", first, "--interval", "1h", "--out", model, "--plot", plot, "--json", out)
+    assert exit_status(*fit, "--units", "si") == 0
+    text = capsys.readouterr().out
+    assert "difference 1" in text
+    assert "rad/s" in text
+    assert "°/h" not in text
     found = json.loads(out.read_bytes())
     assert found["schema"] == "imu-monitor/thermal-fit/1"
     gz = found["axes"]["gz"]

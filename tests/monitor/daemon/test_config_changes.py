@@ -227,7 +227,7 @@ def test_sighup_reloads_the_configuration_and_notifies_systemd(tmp_path: Path) -
     path.write_text(format_device("a") + QUIET + '[log]\nformat = "json"\n')
     with NotificationReceiver(str(tmp_path / "notify")) as systemd:
         environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "9000000"}
-        command = [sys.executable, "-m", "monitor.cli", "run", str(path)]
+        command = [sys.executable, "-m", "imu_monitor", "run", str(path)]
         with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
             try:
                 wait_for(lambda: systemd.count_lines("READY=1") == 1)

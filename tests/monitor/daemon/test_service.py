@@ -17,7 +17,7 @@ from drivers.recordings import save_samples
 from monitor.common.device_health import Health
 from monitor.daemon.kernels import kernel_compilation, kernel_groups
 from monitor.daemon.outputs.output import Output
-from monitor.daemon.outputs.terminal_outputs import TableOutput
+from monitor.daemon.outputs.terminal_outputs import EventAndStatusLogOutput, TableOutput
 from monitor.daemon.service import Service
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
@@ -55,7 +55,7 @@ class StatusCounter(Output):
         self.healths += 1
 
 
-def test_viewer_address_is_logged_once_and_shown_above_the_table(
+def test_viewer_address_is_shown_above_the_table_and_not_logged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
@@ -64,7 +64,8 @@ def test_viewer_address_is_logged_once_and_shown_above_the_table(
     registry = RemoteDeviceRegistry()
     status_counter = StatusCounter()
     service = Service(
-        write_and_load_config(tmp_path, 'link = "virtual"', viewer), [TableOutput(registry), status_counter]
+        write_and_load_config(tmp_path, 'link = "virtual"', viewer),
+        [TableOutput(registry, lambda: None), status_counter],
     )
     assert service.viewer is not None
     thread = threading.Thread(target=service.run)
@@ -84,7 +85,17 @@ def test_viewer_address_is_logged_once_and_shown_above_the_table(
     assert url.startswith("http://127.0.0.1:")
     assert note == f"viewer: {url}"
     assert url in captured.get()
-    assert [line["url"] for line in logs if line["event"] == "viewer"] == [url]
+    assert not [line for line in logs if line["event"] == "viewer"]
+
+
+def test_viewer_address_is_logged_if_the_table_is_written_to_a_file() -> None:
+    registry = RemoteDeviceRegistry()
+    with capture_logs() as logs:
+        for output in (TableOutput(registry), EventAndStatusLogOutput()):
+            output.set_viewer_url("http://127.0.0.1:9090")
+            output.set_viewer_url("")
+    assert registry.note == ""
+    assert [line["url"] for line in logs] == ["http://127.0.0.1:9090"]
 
 
 def test_old_recording_shows_nothing_at_the_present_time(tmp_path: Path) -> None:

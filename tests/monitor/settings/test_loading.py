@@ -330,6 +330,14 @@ def test_invalid_configuration_is_reported_with_its_key(tmp_path, case):
         assert part in line
 
 
+def test_recording_is_not_taken_for_a_configuration(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("t,gx\n0,1\n")
+    (line,) = examine_config_file(path).wrong
+    assert line.startswith(f"{path}: not TOML: ")
+    assert line.endswith("; imu-monitor analyze reads recordings")
+
+
 def test_unknown_dbc_signal_is_reported(tmp_path):
     dbc = sorted((CONFIG_FOLDER / "dbc").glob("*.dbc"))[0]
     (line,) = list_mistakes(

@@ -44,7 +44,7 @@ def test_daemon_and_watcher_reconnect_after_an_interrupted_network(tmp_path: Pat
     path = tmp_path / "a.toml"
     path.write_text(CONFIG)
     with create_namespaces() as namespaces:
-        daemon = namespaces.start_python(namespaces.inside, "-m", "monitor.cli", "run", str(path))
+        daemon = namespaces.start_python(namespaces.inside, "-m", "imu_monitor", "run", str(path))
         watcher = namespaces.start_python(namespaces.outside, "-c", WATCH, f"tcp/{INSIDE}:7450")
         newest = [""]
 

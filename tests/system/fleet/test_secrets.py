@@ -38,7 +38,7 @@ format = "json"
 
 def run_program(*arguments: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "monitor.cli", *arguments],
+        [sys.executable, "-m", "imu_monitor", *arguments],
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,

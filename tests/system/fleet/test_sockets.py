@@ -50,7 +50,7 @@ def start_daemon(path: Path, *before: str) -> Iterator[psutil.Process]:
     ports = {name: free_port() for name in ("zenoh", "port", "web")}
     path.write_text(CONFIG.format(**ports))
     child = subprocess.Popen(
-        [*before, sys.executable, "-m", "monitor.cli", "run", str(path)],
+        [*before, sys.executable, "-m", "imu_monitor", "run", str(path)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
     )

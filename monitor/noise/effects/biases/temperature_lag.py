@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.compiled import compiled
 from monitor.noise.effect import BiasWithoutSpectrum, RunningSource, SampleBlockContext, parameter_field
+from monitor.noise.effects.ieee952.exponentially_correlated import add_recursion
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,16 +38,8 @@ class TemperatureLag(BiasWithoutSpectrum):
         def add_lagged_bias(values: Floats, block: SampleBlockContext) -> None:
             nonlocal lagged_c
             inside = float(block.temperature_c[0]) if lagged_c is None else lagged_c
-            lagged_c = _add_lagged_bias(values, block.temperature_c, inside, self.coefficient, self.reference, share)
+            course_c = np.zeros(values.size)
+            lagged_c = add_recursion(course_c, block.temperature_c, 1.0 - share, share, inside)
+            values += self.coefficient * (course_c - self.reference)
 
         return RunningSource(add_lagged_bias)
-
-
-@compiled
-def _add_lagged_bias(
-    values: Floats, temperature_c: Floats, inside: float, coefficient: float, reference: float, share: float
-) -> float:
-    for k in range(values.size):
-        values[k] += coefficient * (inside - reference)
-        inside += share * (temperature_c[k] - inside)
-    return inside

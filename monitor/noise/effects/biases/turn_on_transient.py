@@ -1,13 +1,11 @@
 """Transient of the bias after switching on."""
 
 from dataclasses import dataclass
-from math import exp
 from typing import ClassVar
 
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.compiled import compiled
 from monitor.noise.effect import BiasWithoutSpectrum, RunningSource, SampleBlockContext, parameter_field
 
 
@@ -30,13 +28,7 @@ class TurnOnTransient(BiasWithoutSpectrum):
 
         def add_decay(values: Floats, block: SampleBlockContext) -> None:
             nonlocal count
-            _add_decay(values, count, self.amplitude, step)
+            values += self.amplitude * np.exp(-step * np.arange(count, count + values.size))
             count += values.size
 
         return RunningSource(add_decay)
-
-
-@compiled
-def _add_decay(values: Floats, first: int, amplitude: float, step: float) -> None:
-    for k in range(values.size):
-        values[k] += amplitude * exp(-step * (first + k))

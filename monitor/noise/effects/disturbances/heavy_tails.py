@@ -1,6 +1,5 @@
 """White noise with heavier tails than a Gaussian distribution."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.validation.number_ranges import NumberRange
-from monitor.noise.effect import Effect, parameter_field
+from monitor.noise.effect import Effect, RunningGain, parameter_field
 
 DEGREES_OF_FREEDOM: Final = NumberRange("", 2.1, 1000.0)
 """Range of ν. The variance of Student's t distribution is infinite for ν ≤ 2."""
@@ -31,15 +30,12 @@ class HeavyTails(Effect):
 
     description: ClassVar[str] = "Large errors of the white noise are more frequent than in Gaussian noise."
 
-    def start_factors(self, rng: np.random.Generator) -> Callable[[Floats], None]:
-        """Return a function that multiplies the next samples [n] of the white noise by random factors.
-
-        The factors turn Gaussian samples into samples of Student's t distribution.
-        """
+    def start_gain(self, rate_hz: float, rng: np.random.Generator) -> RunningGain:
+        """Start a random gain, which turns Gaussian samples into samples of Student's t distribution."""
         choice, share = rng.spawn(1)[0], 1.0 if self.share is None else self.share
 
-        def multiply_in_place(white_noise: Floats) -> None:
-            factors = np.sqrt((self.nu - 2.0) / rng.chisquare(self.nu, white_noise.size))
-            white_noise *= np.where(choice.random(white_noise.size) < share, factors, 1.0)
+        def compute_gain(first: int, n: int) -> Floats:
+            factors = np.sqrt((self.nu - 2.0) / rng.chisquare(self.nu, n))
+            return np.where(choice.random(n) < share, factors, 1.0)
 
-        return multiply_in_place
+        return RunningGain(compute_gain)

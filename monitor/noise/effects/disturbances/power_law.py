@@ -16,8 +16,8 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.compiled import compiled
 from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
+from monitor.noise.effects.ieee952.bias_instability import add_filtered_noise
 from monitor.noise.spectrum import Spectrum, allan_variance_of_density
 
 MAX_EXPONENT: Final = 2.9
@@ -61,16 +61,20 @@ class PowerLaw(Source):
         decay, weights, direct, walk = _fractional_filter(gain, d - floor(d))
         overlap = decay[:, None] + decay - decay[:, None] * decay  # 1 − x_i x_j
         variances, vectors = np.linalg.eigh(1.0 / overlap)
-        states = vectors @ (np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(decay.size))
-        totals = np.zeros(2)  # of the integrator and of the output
+        stationary = vectors @ (np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(decay.size))
+        # the integrator W is a state with the pole 1 that starts at zero
+        states, poles, weights = np.append(stationary, 0.0), np.append(1.0 - decay, 1.0), np.append(weights, walk)
+        total = 0.0  # cumulative sum of y
         start: float | None = None
 
         def add_fractional_noise(values: Floats, block: SampleBlockContext) -> None:
-            nonlocal start
-            series = rng.standard_normal(out=block.scratch)
-            _integrate(series, states, 1.0 - decay, weights, direct, walk, totals)
+            nonlocal start, total
+            series = np.zeros(values.size)
+            add_filtered_noise(series, rng.standard_normal(out=block.scratch), states, poles, weights, direct)
             if d >= 1.0:
-                _sum_up(series, totals)
+                series[0] += total  # the sum does not depend on the division into blocks
+                np.cumsum(series, out=series)
+                total = float(series[-1])
             if start is None:
                 start = float(series[0]) if d >= 0.5 else 0.0
             values += series
@@ -87,26 +91,3 @@ def _fractional_filter(gain: float, d: float) -> tuple[Floats, Floats, float, fl
     # poles below the smallest node act as one integrator
     walk = float(scale * (decay[0] * np.exp(-0.5)) ** (1.0 - d) / (1.0 - d)) if d >= 0.5 else 0.0
     return decay, gain * weights, gain * (1.0 - float(weights.sum()) - walk), gain * walk  # ψ_0 = 1
-
-
-@compiled
-def _integrate(
-    series: Floats, states: Floats, poles: Floats, weights: Floats, direct: float, walk: float, totals: Floats
-) -> None:
-    """Replace white noise [n] with fractional noise."""
-    for k in range(series.size):
-        white = series[k]
-        totals[0] += white
-        value = direct * white + walk * totals[0]
-        for i in range(states.size):
-            states[i] = poles[i] * states[i] + white
-            value += weights[i] * states[i]
-        series[k] = value
-
-
-@compiled
-def _sum_up(series: Floats, totals: Floats) -> None:
-    """Replace a series [n] with its cumulative sum."""
-    for k in range(series.size):
-        totals[1] += series[k]
-        series[k] = totals[1]

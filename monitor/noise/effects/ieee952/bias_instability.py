@@ -83,7 +83,7 @@ class BiasInstability(Source):
         states = np.linalg.cholesky(1.0 / overlap) @ rng.standard_normal(ONE_MINUS_POLE.size)
 
         def add_flicker_noise(values: Floats, block: SampleBlockContext) -> None:
-            _add_flicker_noise(values, rng.standard_normal(out=block.scratch), states, poles, residues, direct)
+            add_filtered_noise(values, rng.standard_normal(out=block.scratch), states, poles, residues, direct)
 
         return RunningSource(add_flicker_noise)
 
@@ -106,9 +106,22 @@ def _partial_fractions(gain: float) -> tuple[float, Floats, Floats]:
 
 
 @compiled
-def _add_flicker_noise(
+def add_filtered_noise(
     values: Floats, white: Floats, states: Floats, poles: Floats, residues: Floats, direct: float
 ) -> None:
+    """Add the noise direct·w + Σ residue·s to values, with white noise w and s ← pole·s + w.
+
+    Parameters
+    ----------
+    values, white : ndarray, shape (n,)
+        Values to which the noise is added in place, and white noise.
+    states : ndarray, shape (k,)
+        States s, updated in place.
+    poles, residues : ndarray, shape (k,)
+        Pole and weight of each state.
+    direct : float
+        Weight of the white noise.
+    """
     for k in range(values.size):
         value = direct * white[k]
         for i in range(states.size):

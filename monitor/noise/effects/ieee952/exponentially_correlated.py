@@ -43,14 +43,25 @@ class ExponentiallyCorrelated(Source):
 
         def add_correlated_noise(values: Floats, block: SampleBlockContext) -> None:
             nonlocal state
-            state = _add_gauss_markov(values, rng.standard_normal(out=block.scratch), phi, drive, state)
+            state = add_recursion(values, rng.standard_normal(out=block.scratch), phi, drive, state)
 
         return RunningSource(add_correlated_noise)
 
 
 @compiled
-def _add_gauss_markov(values: Floats, white: Floats, phi: float, drive: float, state: float) -> float:
+def add_recursion(values: Floats, inputs: Floats, phi: float, drive: float, state: float) -> float:
+    """Add the states of the recursion x ← φx + drive·input to values, and return the next state.
+
+    Parameters
+    ----------
+    values, inputs : ndarray, shape (n,)
+        Values to which the states are added in place, and inputs of the recursion.
+    phi, drive : float
+        Coefficients of the recursion.
+    state : float
+        State that is added to the first value.
+    """
     for k in range(values.size):
         values[k] += state
-        state = phi * state + drive * white[k]
+        state = phi * state + drive * inputs[k]
     return state

@@ -6,7 +6,6 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.compiled import compiled
 from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
@@ -40,14 +39,10 @@ class RateRandomWalk(Source):
 
         def add_random_walk(values: Floats, block: SampleBlockContext) -> None:
             nonlocal level
-            level = _add_random_walk(values, rng.standard_normal(out=block.scratch), self.K / rate_hz**0.5, level)
+            steps = rng.standard_normal(out=block.scratch)
+            steps *= self.K / rate_hz**0.5
+            steps[0] += level  # the sum does not depend on the division into blocks
+            values += np.cumsum(steps, out=steps)
+            level = float(steps[-1])
 
         return RunningSource(add_random_walk)
-
-
-@compiled
-def _add_random_walk(values: Floats, steps: Floats, step: float, level: float) -> float:
-    for k in range(values.size):
-        level += step * steps[k]
-        values[k] += level
-    return level

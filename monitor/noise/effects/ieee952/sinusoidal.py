@@ -1,18 +1,14 @@
 """Sinusoidal noise, for example from a motor, the mains or a fan."""
 
 from dataclasses import dataclass
-from math import cos, floor, pi, sin
-from typing import ClassVar, Final
+from math import pi
+from typing import ClassVar
 
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.compiled import compiled
 from monitor.noise.effect import RunningSource, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum, allan_variance_of_line
-
-RENEWAL_SAMPLES: Final = 64
-"""Number of samples after which the sinusoid is computed exactly, which limits the rounding error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,22 +39,8 @@ class Sinusoidal(Source):
         phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
 
         def add_sinusoid(values: Floats, block: SampleBlockContext) -> None:
-            _add_sinusoid(values, block.first, self.amplitude, self.frequency / rate_hz, phase)
+            cycles = self.frequency / rate_hz * np.arange(block.first, block.first + values.size)
+            # whole cycles are removed to keep the rounding error small
+            values += self.amplitude * np.sin(2.0 * pi * np.mod(cycles, 1.0) + phase)
 
         return RunningSource(add_sinusoid, lambda: {"phase": phase} if self.phase is None else {})
-
-
-@compiled
-def _add_sinusoid(values: Floats, first: int, amplitude: float, step: float, phase: float) -> None:
-    """Add A sin(2π·step·k + phase) for k ≥ first. ``step`` is in cycles per sample."""
-    c, s = cos(2.0 * pi * step), sin(2.0 * pi * step)
-    k = first - first % RENEWAL_SAMPLES
-    while k < first + values.size:
-        cycles = step * k
-        angle = 2.0 * pi * (cycles - floor(cycles)) + phase
-        x, y = amplitude * cos(angle), amplitude * sin(angle)
-        for i in range(k, min(k + RENEWAL_SAMPLES, first + values.size)):
-            if i >= first:
-                values[i - first] += y
-            x, y = c * x - s * y, s * x + c * y
-        k += RENEWAL_SAMPLES

@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.common.compiled import compiled
 from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
@@ -62,22 +61,14 @@ class _SampleRepetition:
         self._repeat_count = 0
 
     def transform_in_place(self, values: Floats) -> None:
-        tosses = self._rng.random(values.size)
-        self._last, held = _repeat_samples(values, tosses, self._fraction, self._last)
-        self._repeat_count += held
+        repeats = self._rng.random(values.size) < self._fraction
+        if np.isnan(self._last):
+            repeats[0] = False
+        candidates = np.concatenate([[self._last], values])
+        sources = np.where(repeats, 0, np.arange(1, candidates.size))
+        values[:] = candidates[np.maximum.accumulate(sources)]
+        self._last = float(values[-1])
+        self._repeat_count += int(repeats.sum())
 
     def drawn_random_values(self) -> dict[str, Any]:
         return {"count": self._repeat_count}
-
-
-@compiled
-def _repeat_samples(values: Floats, tosses: Floats, fraction: float, last: float) -> tuple[float, int]:
-    """Repeat samples at random in place, and return the last value and the number of repeated samples."""
-    held = 0
-    for k in range(values.size):
-        if tosses[k] < fraction and not np.isnan(last):
-            values[k] = last
-            held += 1
-        else:
-            last = values[k]
-    return last, held

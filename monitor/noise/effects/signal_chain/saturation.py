@@ -1,6 +1,6 @@
 """Saturation at the limits of the measurement range."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
 import numpy as np
@@ -37,7 +37,7 @@ class Saturation(Transform):
         """Return the spectrum unchanged if the signal stays within the range for one hour, otherwise NaN."""
         steady = abs(spectrum.level) + sum((2.0 * size) ** 0.5 for _, size in spectrum.lines)
         steady += spectrum.slope * OBSERVATION_S
-        noise = spectrum.without_lines().mean_square(1.0 / max(OBSERVATION_S, 4.0 * spectrum.tau0_s)) ** 0.5
+        noise = replace(spectrum, lines=()).mean_square(1.0 / max(OBSERVATION_S, 4.0 * spectrum.tau0_s)) ** 0.5
         return spectrum if steady + NOISE_SIGMAS * noise < self.limit else nan_spectrum(spectrum.tau0_s)
 
     def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:

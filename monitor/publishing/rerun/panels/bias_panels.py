@@ -12,9 +12,9 @@ import rerun.blueprint as rrb
 from drivers.data_types import AXES, Floats
 from monitor.common.distributions import Z95
 from monitor.common.unit_formatting import (
-    DEVIATION_UNITS,
     KINDS,
     SAMPLE_UNITS,
+    UnitSystem,
     axes_of,
     sensor_kind,
 )
@@ -33,7 +33,7 @@ class DriftPanel(Panel):
 
     def log_styles(self) -> None:
         """Log the names, colours and widths of the lines."""
-        unit = DEVIATION_UNITS["gyro"].name
+        unit = self.scene.units.deviation("gyro").name
         for axis in axes_of("gyro"):
             colour, dim = (
                 axis_colours.AXIS_COLOURS[axis],
@@ -46,19 +46,20 @@ class DriftPanel(Panel):
 
     def draw(self, unix_s: Floats, results: Sequence[MeasuredAndSubtractedDrift]) -> None:
         """Draw the measured and predicted drift of the given updates, and the newest drift models."""
+        factor = self.scene.units.deviation("gyro").factor
         for i, axis in enumerate(axes_of("gyro")):
             expected = np.array([one.expected[i] for one in results])
             half = Z95 * np.array([one.error[i] for one in results])
             mean = np.array([one.mean[i] for one in results])
             rows = np.column_stack([mean, expected, expected - half, expected + half])
             if np.isfinite(rows).any():
-                self.scene.log_scalars(self.entity_path(f"drift/{axis}"), unix_s, rows * DEVIATION_UNITS["gyro"].factor)
+                self.scene.log_scalars(self.entity_path(f"drift/{axis}"), unix_s, rows * factor)
                 innovation = np.array([one.innovation[i] for one in results])
                 self.scene.log_scalars(self.entity_path(f"innovation/{axis}"), unix_s, innovation)
-        self._log_text("drift", float(unix_s[-1]), drift_text(results[-1]))
+        self._log_text("drift", float(unix_s[-1]), drift_text(results[-1], self.scene.units))
 
     @classmethod
-    def page_part(cls, device: ViewerDeviceDescription) -> rrb.Container | None:
+    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
         """Return the views of the drift, or None if the gyroscope drift of the device is not compensated."""
         if not device.compensated:
             return None
@@ -69,7 +70,7 @@ class DriftPanel(Panel):
             contents = (f"/{name}/samples/{axis}", f"$origin/{axis}")
             dimmed = {f"/{name}/samples/{axis}": rr.SeriesLines(colors=[axis_colours.FRAME], widths=[0.75])}
             rates = time_series_view(f"/{name}/compensated", title, contents, RAW_SAMPLES_S, styles=dimmed)
-            title = f"{axis}: means at rest, and predicted drift, {DEVIATION_UNITS['gyro'].name}"
+            title = f"{axis}: means at rest, and predicted drift, {units.deviation('gyro').name}"
             drift = time_series_view(f"/{name}/drift/{axis}", title)
             innovation = time_series_view(f"/{name}/innovation/{axis}", f"{axis}: innovation, σ")
             rows.append(rrb.Horizontal(rates, drift, innovation, column_shares=[3, 3, 2]))
@@ -87,7 +88,7 @@ class ThermalPredictionPanel(Panel):
                 axis_colours.AXIS_COLOURS[axis],
                 axis_colours.blend_colours(axis_colours.AXIS_COLOURS[axis], 0.45),
             )
-            unit = DEVIATION_UNITS[sensor_kind(axis)].name
+            unit = self.scene.units.deviation(sensor_kind(axis)).name
             lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", axis_colours.GREY, 1.0)]
             self._style_lines(
                 f"thermal/{axis}", [*lines, (f"{axis} 95 % low", dim, 0.75), (f"{axis} 95 % high", dim, 0.75)]
@@ -98,7 +99,7 @@ class ThermalPredictionPanel(Panel):
         for axis in AXES:
             rows = np.array([self._row(one.axes.get(axis)) for one in results])
             if np.isfinite(rows).any():
-                factor = DEVIATION_UNITS[sensor_kind(axis)].factor
+                factor = self.scene.units.deviation(sensor_kind(axis)).factor
                 self.scene.log_scalars(self.entity_path(f"thermal/{axis}"), unix_s, rows * factor)
 
     @staticmethod
@@ -109,13 +110,13 @@ class ThermalPredictionPanel(Panel):
         return one.bias, one.one_step.bias, one.one_step.lo, one.one_step.hi
 
     @classmethod
-    def page_part(cls, device: ViewerDeviceDescription) -> rrb.Container | None:
+    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
         """Return the views of the bias and the temperature, or None if the bias is not predicted from temperature."""
         if not device.has_thermal:
             return None
         columns = []
         for kind in KINDS:
-            title = f"bias, and prediction from temperature, {DEVIATION_UNITS[kind].name}"
+            title = f"bias, and prediction from temperature, {units.deviation(kind).name}"
             views = [time_series_view(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
             columns.append(rrb.Vertical(*views))
         temperature = temperature_view(device.name)

@@ -10,10 +10,7 @@ import numpy as np
 import rerun as rr
 
 from drivers.data_types import AXES, Floats
-from monitor.common.unit_formatting import (
-    COEFFICIENT_UNITS,
-    sensor_kind,
-)
+from monitor.common.unit_formatting import sensor_kind
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
@@ -60,13 +57,13 @@ class AllanAndCoefficientPanel(Panel):
 
     def __init__(self, scene: "AllDevicesScene", device: str) -> None:
         super().__init__(scene, device)
-        self._plot = allan_drawing.AllanPlotPair(scene.log, self.entity_path("allan"))
+        self._plot = allan_drawing.AllanPlotPair(scene.log, self.entity_path("allan"), scene.units)
         self._history = AllanHistory()
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
         """Draw the Allan deviations and coefficients of the newest estimate."""
         at_s, estimate = float(unix_s[-1]), results[-1]
-        self._log_text("coefficients", at_s, noise_text(estimate))
+        self._log_text("coefficients", at_s, noise_text(estimate, self.scene.units))
         self._plot.draw(estimate, self.scene.get_or_create_panel(self.device, ModelDifferencePanel).newest)
         if self._history.add_estimate_and_check_column_complete(at_s, estimate):
             dynamic_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._history)
@@ -83,7 +80,7 @@ class CoefficientsPanel(Panel):
                 axis_colours.blend_colours(axis_colours.AXIS_COLOURS[axis], 0.45),
             )
             for symbol in SYMBOLS:
-                unit = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].name
+                unit = self.scene.units.single(sensor_kind(axis), symbol).name
                 lines = [(f"{axis}, {unit}", colour, 2.0), (f"{axis} 95 % low", dim, 0.75)]
                 self._style_lines(f"coefficients/{symbol}/{axis}", [*lines, (f"{axis} 95 % high", dim, 0.75)])
                 mark = rr.SeriesPoints(
@@ -125,7 +122,7 @@ class CoefficientsPanel(Panel):
         name
             Suffix of the path of the entity.
         """
-        factor = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].factor
+        factor = self.scene.units.single(sensor_kind(axis), symbol).factor
         self.scene.log_scalars(self.entity_path(f"coefficients/{symbol}/{axis}{name}"), unix_s, values * factor)
 
 

@@ -10,6 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from drivers.data_types import Floats
+from monitor.common.unit_formatting import UnitSystem
 from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.rerun.shared_views import markdown_document
@@ -53,8 +54,16 @@ class Panel:
         """Draw the stored history of the device."""
 
     @classmethod
-    def page_part(cls, device: ViewerDeviceDescription) -> rrb.Container | None:
-        """Return the views of the panel on the page for temperature and drift, or None if there are none."""
+    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
+        """Return the views of the panel on the page for temperature and drift, or None if there are none.
+
+        Parameters
+        ----------
+        device
+            Device to show.
+        units
+            Units of the plots.
+        """
         return None
 
     def entity_path(self, name: str) -> str:

@@ -8,11 +8,12 @@ from typing import Final
 
 from monitor.common.device_health import Health
 from monitor.common.unit_formatting import (
-    COEFFICIENT_UNITS,
-    DEVIATION_UNITS,
+    DEFAULT_UNITS,
     KIND_NAMES,
     KINDS,
     Kind,
+    Unit,
+    UnitSystem,
     axes_of,
     format_duration,
     format_milliseconds,
@@ -81,7 +82,9 @@ def overview_text(healths: Mapping[str, Health]) -> str:
     return "\n".join([head, *rows])
 
 
-def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: str = "") -> str:
+def fleet_text(
+    devices: Sequence[RemoteDevice], now_s: float, rows: int, note: str = "", units: UnitSystem = DEFAULT_UNITS
+) -> str:
     """Return Markdown text with a table of many devices and the number of devices in each state.
 
     Parameters
@@ -94,13 +97,16 @@ def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: s
         Largest number of table rows.
     note
         Line of text above the table.
+    units
+        Units of the noise coefficients.
     """
     counts = Counter(one.state(now_s) for one in devices)
     states = ", ".join(f"**{count:,}** {_escape_cell(state)}" for state, count in counts.most_common())
+    unit = units.single("gyro", "N")
     head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
-    head[0] += f"; N in {COEFFICIENT_UNITS['gyro']['N'].name}" if devices else ""
+    head[0] += f"; N in {unit.name}" if devices else ""
     head += [f"**{remove_control_characters(note)}**"] if note else []
-    table = [_fleet_row(one, now_s) for one in devices[:rows]]
+    table = [_fleet_row(one, now_s, unit) for one in devices[:rows]]
     if table:
         columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES), ""]
         table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 3) + ":--|", *table]
@@ -108,12 +114,14 @@ def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: s
     return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
 
 
-def _fleet_row(one: RemoteDevice, now_s: float) -> str:
+def _fleet_row(one: RemoteDevice, now_s: float, unit: Unit) -> str:
     state, status = one.state(now_s), one.status
     name = _escape_cell(one.key)
     state_text = f"**{state.upper()}**" if one.problems_first_rank(now_s) == 0 else _escape_cell(state)
     noise = [
-        "" if one.coefficients is None else format_coefficient(one.coefficients.coefficients, "N", axis).value
+        ""
+        if one.coefficients is None
+        else format_coefficient(one.coefficients.coefficients, "N", axis, unit=unit).value
         for axis in FLEET_AXES
     ]
     if status is None:
@@ -131,10 +139,18 @@ def _escape_cell(text: str) -> str:
     return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remove_control_characters(text))
 
 
-def noise_text(estimate: Estimate) -> str:
-    """Return Markdown tables with Q, N, B, K and R of the gyroscopes and of the accelerometers."""
+def noise_text(estimate: Estimate, units: UnitSystem = DEFAULT_UNITS) -> str:
+    """Return Markdown tables with Q, N, B, K and R of the gyroscopes and of the accelerometers.
+
+    Parameters
+    ----------
+    estimate
+        Estimate with the noise coefficients.
+    units
+        Unit system.
+    """
     present = [axis for _, axis in measured_axes(estimate.curve)]
-    tables = [_noise_table(estimate, kind) for kind in KINDS if set(axes_of(kind)) & set(present)]
+    tables = [_noise_table(estimate, kind, units) for kind in KINDS if set(axes_of(kind)) & set(present)]
     if not tables:
         return "Too few samples yet."
     seen_s = estimate.curve.n / estimate.rate_hz
@@ -144,9 +160,17 @@ def noise_text(estimate: Estimate) -> str:
     return "\n\n".join([head, *note, *tables])
 
 
-def drift_text(update: MeasuredAndSubtractedDrift) -> str:
-    """Return a Markdown table with the drift models of the gyroscopes and the drift that is currently subtracted."""
-    unit = DEVIATION_UNITS["gyro"]
+def drift_text(update: MeasuredAndSubtractedDrift, units: UnitSystem) -> str:
+    """Return a Markdown table with the drift models of the gyroscopes and the drift that is currently subtracted.
+
+    Parameters
+    ----------
+    update
+        Newest measured and predicted drift.
+    units
+        Unit system.
+    """
+    unit = units.deviation("gyro")
     rows = ["| axis | drift now | model | φ₁ | φ₂ | θ₁ |", "|---|---|---|---|---|---|"]
     for at, axis in enumerate(axes_of("gyro")):
         expected, model = float(update.expected[at]), update.models[at]
@@ -173,14 +197,13 @@ def _coefficients_in_model(model: ArmaModel) -> tuple[bool, bool, bool]:
     return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
 
 
-def _noise_table(estimate: Estimate, kind: Kind) -> str:
+def _noise_table(estimate: Estimate, kind: Kind, units: UnitSystem) -> str:
     axes = axes_of(kind)
     lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
-    for symbol in SYMBOLS:
-        unit = COEFFICIENT_UNITS[kind][symbol].name
-        cells = [format_coefficient(estimate.coefficients, symbol, axis) for axis in axes]
+    for symbol, _, unit in units.columns(kind, SYMBOLS):
+        cells = [format_coefficient(estimate.coefficients, symbol, axis, unit=unit) for axis in axes]
         values = " | ".join(f"**{c.value}**" if c.value != "—" else "—" for c in cells)
-        lines.append(f"| **{symbol}** {unit} | {values} |")
+        lines.append(f"| **{symbol}** {unit.name} | {values} |")
         if any(c.interval for c in cells):
             lines.append("| | " + " | ".join(c.interval for c in cells) + " |")
     return "\n".join(lines)

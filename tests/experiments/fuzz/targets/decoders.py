@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 
 import msgspec
@@ -70,7 +71,7 @@ def build_samples(data: bytes, decoder: Decoder) -> SampleBlock:
 @cache
 def _settings(name: str, i: int) -> Any:
     example = _examples(name)[i]
-    module = module_lookup.import_module(decoders, name)
+    module = _import_decoder(name)
     return module.build, read_settings(module.Settings, dict(example.settings))
 
 
@@ -241,6 +242,15 @@ J1939_SIGNALS: Final = {
     "ax": "AccelerationSensor.LongitudinalAcceleration",
     "az": "AccelerationSensor.VerticalAcceleration",
 }
+CANOPEN_SIGNALS: Final = {
+    **{f"g{axis}": f"Tpdo2.Rate{axis.upper()}" for axis in "xyz"},
+    **{f"a{axis}": f"Tpdo1.Acceleration{axis.upper()}" for axis in "xyz"},
+    "temperature": "Tpdo1.Temperature",
+}
+OXTS_SIGNALS: Final = {
+    **{f"g{axis}": f"RateVehicle.AngRate{axis.upper()}" for axis in "xyz"},
+    **{f"a{axis}": f"AccelVehicle.Accel{axis.upper()}" for axis in "xyz"},
+}
 CAN: Final = (
     ("first", {"signals": CAN_SIGNALS}),
     ("second", {"signals": {**SECOND_SIGNALS, "temperature": "Warm.temp"}, "valid": "Rates.ok", "window": 0.005}),
@@ -248,6 +258,9 @@ CAN: Final = (
     ("second", {"signals": SECOND_SIGNALS, "counter": "Rates.cnt", "partial": True, "not_available": True}),
     ("j1939_imu", {"signals": J1939_SIGNALS}),
     ("j1939_imu", {"signals": J1939_SIGNALS, "source": 3, "tick": None, "partial": True}),
+    ("sick_tmm61", {"signals": CANOPEN_SIGNALS, "window": 0.005}),
+    ("dis_qg65d", {"signals": CANOPEN_SIGNALS, "partial": True}),
+    ("oxts_rt", {"signals": OXTS_SIGNALS}),
 )
 
 
@@ -321,8 +334,13 @@ def check_dbc(data: bytes) -> None:
 # --- messages
 
 
+@cache
+def _import_decoder(name: str) -> ModuleType:
+    return module_lookup.import_module(decoders, name)
+
+
 def _build_decoder(name: str) -> Decoder:
-    module = module_lookup.import_module(decoders, name)
+    module = _import_decoder(name)
     decoder: Decoder = module.build(module.Settings())
     return decoder
 
@@ -486,10 +504,14 @@ def wire_dbc(data: bytes) -> None:
 PATTERN: Final = "(?P<t>[0-9]+)[ ,](?:g=)?(?P<gx>[^ ,]*)[ ,](?:a=)?(?P<az>.*)( T(?P<temperature>.*))?"
 
 
+@cache
+def _pattern_settings() -> TextSettings:
+    return read_settings(TextSettings, {"pattern": PATTERN, "time_unit": "ms"})
+
+
 def wire_text_pattern(data: bytes) -> None:
     """Check lines that are decoded with a regular expression, as a whole and in two halves."""
-    build, half = module_lookup.import_module(decoders, "text").build, len(data) // 2
-    keys = read_settings(TextSettings, {"pattern": PATTERN, "time_unit": "ms"})
+    build, keys, half = _import_decoder("text").build, _pattern_settings(), len(data) // 2
     one, other = build(keys), build(keys)
     whole = feed_and_check(one, [[Chunk(data, START_NS)]])
     parts = feed_and_check(other, [[Chunk(data[:half], START_NS)], [Chunk(data[half:], START_NS)]])

@@ -154,7 +154,7 @@ def test_models_are_identified_repeatedly_with_bounded_memory():
     assert due.count(True) == 4  # after 60, 90, 135 and 203 intervals
     assert all(isinstance(model, ArmaModel) for model in compensator.models)
     assert compensator.means_and_noise_variance_for_identification(0)[0].size <= HISTORY_INTERVALS
-    assert compensator.bias_standard_error == pytest.approx(SIGMA / np.sqrt(100.0 * 60.0), rel=0.9)
+    assert compensator.take_finished_intervals()[-1].known == pytest.approx(SIGMA / np.sqrt(100.0 * 60.0), rel=0.9)
 
 
 @pytest.mark.long

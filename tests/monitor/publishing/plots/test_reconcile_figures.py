@@ -10,7 +10,6 @@ import pytest
 from monitor.publishing.plots.reconcile_figures import (
     common_y_limits,
     diagnostic_comparison_svg,
-    gap_chart_svg,
     interval_chart_svg,
     range_on_x_axis,
     select_diagnostic_view,
@@ -140,14 +139,6 @@ def test_diagnostic_without_plot_uses_the_plot_of_its_range() -> None:
     assert select_diagnostic_view(START.plots, "allan", Location()) is ALLAN
     assert select_diagnostic_view(START.plots, "lines", PEAK) is PSD
     assert select_diagnostic_view(START.plots, "other_axes", Location(source="ax")) is None
-
-
-def test_gap_chart_names_every_diagnostic_and_its_threshold() -> None:
-    after = samples.look("gz", n_true=samples.MORE_N, line=True, known_line=True)
-    chart = ElementTree.fromstring(gap_chart_svg(START.gaps, after.gaps))
-    assert {"spectrum", "Allan deviation", "level", "distribution", "other axes"} <= set(list_texts(chart))
-    assert {"gap over threshold", "○ before   ● after", "1"} <= set(list_texts(chart))
-    assert "○ before   ● after" not in list_texts(ElementTree.fromstring(gap_chart_svg(START.gaps)))
 
 
 def test_interval_chart_shortens_names_and_omits_values_without_interval() -> None:

@@ -3,6 +3,7 @@
 import functools
 import re
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
@@ -10,8 +11,11 @@ from html.parser import HTMLParser
 import pytest
 
 from drivers.errors import ConfigError
+from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.noise.effects import EFFECTS
+from monitor.publishing.reports import reconcile_page
 from monitor.publishing.reports.reconcile_page import render_comparison_page, render_page
+from monitor.reconcile.result import DiagnosticPlotData
 from monitor.reconcile.several_recordings.comparison import RecordingsComparison, compare_results
 from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import DIAGNOSTIC, line, run, step, with_axes
@@ -61,7 +65,7 @@ def test_summary_figures_and_findings_come_first() -> None:
     text = render_example("explained")
     words = parse_example("explained").words
     first = words.index("Line at 17.3 Hz on gz (96 %) and 1 smaller finding (4.3 %).")
-    assert first < words.index("added line at 17.3 Hz on gz") < words.index("Every axis, step and diagnostic")
+    assert first < words.index("added line at 17.3 Hz on gz") < words.index("Every step and diagnostic of gz")
     assert text.index("Allan deviation before and after") < text.index("<details>") < text.index("</details>")
     assert text.count("Allan deviation before and after") == 1  # the other axes agree and have no figure
     assert ["1", "96 %", "added line at 17.3 Hz on gz", "99.8 %", "× 1.05 at τ = 0.02 s (gz)"] in parse_example(
@@ -69,16 +73,12 @@ def test_summary_figures_and_findings_come_first() -> None:
     ).rows
 
 
-def test_axis_table_has_verdict_steps_and_remaining_gaps() -> None:
-    text = parse_example("explained")
-    table = {row[0]: row[1:] for row in text.rows if row}
-    assert table["gx"] == ["agrees", "nothing", "nothing"]
-    assert table["gz"] == [
-        "explained",
-        "added sinusoidal : amplitude 30.94 ± 0.54 °/h, frequency 17.300012 ± 0.000100 Hz (99.8 %) "
-        "retuned angle random walk : N 0.6188 ± 0.0014 °/√h (> 99.9 %)",
-        "nothing",
-    ]
+def test_axes_that_agree_are_one_folded_line_each() -> None:
+    folded = re.findall(r"<details>\s*<summary>(.*?)</summary>", render_example("explained"), flags=re.S)
+    lines = [" ".join(PageText(f"<p>{one}</p>").words.split()) for one in folded]
+    assert lines[0] == "Every step and diagnostic of gz"
+    assert [line[:2] for line in lines[1:-1]] == ["gx", "gy", "ax", "ay", "az"]
+    assert all(re.fullmatch(r"\w\w agrees largest gap: .*: gap [\d.]+, threshold [\d.]+", line) for line in lines[1:-1])
 
 
 def test_step_states_location_effect_reason_and_confidence() -> None:
@@ -99,20 +99,42 @@ def test_parameters_have_intervals_units_and_the_value_of_the_model() -> None:
     assert ["N", "0.6188", "0.6174 … 0.6202", "°/√h", "0.516 °/√h"] in rows
 
 
-def test_every_significant_diagnostic_is_drawn_before_and_after_each_step() -> None:
-    reconciliation = samples.explained()
+def test_gaps_are_listed_once_per_axis_with_a_column_for_each_step() -> None:
     rows = parse_example("explained").rows
-    assert ["spectrum", "17.1 … 17.5 Hz", "41.2", "4.60", "2.60", "1.90"] in rows
-    assert ["Allan deviation", "τ = 0.01 … 0.64 s", "8.70", "0.70", "2.40", "1.60"] in rows
-    text = render_example("explained")
-    gz = reconciliation.axes["gz"]
-    snapshots = [gz.start, *(step.snapshot_after for step in gz.steps[:-1])]
-    drawn = [{gap.diagnostic for gap in snapshot.gaps if gap.is_significant} - {"allan"} for snapshot in snapshots]
-    pairs = sum(
-        view.diagnostic in names for snapshot, names in zip(snapshots, drawn, strict=True) for view in snapshot.plots
-    )
-    assert pairs > 1
-    assert text.count(">before</text>") == text.count(">after</text>") == pairs
+    assert [
+        "diagnostic",
+        "largest gap at",
+        "gap",
+        "after step 1",
+        "after step 2",
+        "threshold",
+        "95 % of chance",
+    ] in rows
+    (spectrum,) = (row for row in rows if row[:3] == ["spectrum", "17.1 … 17.5 Hz", "41.2"])
+    assert spectrum[3] == "4.60"
+    assert len([row for row in rows if row[:1] == ["spectrum"]]) == len(samples.explained().axes)
+
+
+@pytest.mark.parametrize("name", ["explained", "partly_explained", "unexplained"])
+def test_no_figure_repeats_another(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[DiagnosticPlotData] = []
+
+    def draw(panels: Sequence[tuple[str, DiagnosticPlotData]], *_: object, **__: object) -> str:
+        drawn.extend(view for _, view in panels)
+        return ""
+
+    monkeypatch.setattr(reconcile_page, "diagnostic_comparison_svg", draw)
+    render_page(getattr(samples, name)())
+    assert len(drawn) > 1
+    assert len({id(view) for view in drawn}) == len(drawn)
+
+
+def test_every_significant_diagnostic_is_drawn_after_the_search() -> None:
+    gz = samples.explained().axes["gz"]
+    significant = {gap.diagnostic for gap in gz.start.gaps if gap.is_significant} - {"allan"}
+    drawn = [view for view in gz.end.plots if view.diagnostic in significant]
+    assert drawn
+    assert render_example("explained").count(">after</text>") == len(drawn)
 
 
 def test_agreeing_axes_have_one_figure_each() -> None:
@@ -120,9 +142,8 @@ def test_agreeing_axes_have_one_figure_each() -> None:
     assert text.count("<svg ") == 6
     assert "Step" not in text
     assert "Left over" not in text
-    diagnostics = {row[0]: row[1:] for row in PageText(text).rows[7:]}
-    assert diagnostics["spectrum"] == ["0.60 of 2.60"] * 6
-    assert diagnostics["diagnostic"] == ["gx", "gy", "gz", "ax", "ay", "az"]
+    rows = [row for row in PageText(text).rows if row[0] == "spectrum"]
+    assert [row[2:] for row in rows] == [["0.60", "2.60", "1.90"]] * 6
 
 
 def test_unexplained_gap_has_a_location_and_no_effect() -> None:
@@ -137,7 +158,7 @@ def test_unexplained_gap_has_a_location_and_no_effect() -> None:
 
 def test_remaining_gap_follows_the_steps() -> None:
     words = parse_example("partly_explained").words
-    assert words.index("Step 1") < words.index("Left over") < words.index("Axes that agree")
+    assert words.index("Step 1") < words.index("Left over") < words.index("gx")
     assert "Allan deviation, τ = 0.01 … 0.64 s: gap 8.70, threshold 2.40" in words[words.index("Left over") :]
 
 
@@ -146,12 +167,23 @@ def test_page_is_self_contained_and_escaped() -> None:
     assert not re.search(r"<script|<link|@import|url\((?!#)|\bsrc=|\bhref=.(?!#)|http(?!://www.w3.org)", text)
     assert "a &lt;b&gt; &amp; c" in text
     assert "12 missing samples &lt;in 1 gap&gt; &amp; filled" in text
-    assert unescape(PageText(text).words).count("sinusoidal") > 2
+    assert unescape(PageText(text).words).count("sinusoidal") > 1
     assert not [svg for svg in re.findall(r"<svg.*?</svg>", text, flags=re.S) if "nan" in svg]
 
 
 def test_report_with_two_steps_is_below_a_megabyte() -> None:
     assert len(render_example("explained").encode()) < 1_000_000
+
+
+def test_tables_and_figures_have_the_chosen_units() -> None:
+    si, r, runs = UNIT_SYSTEMS["si"], samples.explained(), make_comparison()
+    for default, page in (
+        (render_page(r), render_page(r, "", si)),
+        (render_comparison_page(runs), render_comparison_page(runs, si)),
+    ):
+        assert "°/h" in default
+        assert "°/h" not in page
+        assert "rad/s</" in page
 
 
 def test_same_reconciliation_gives_the_same_page() -> None:

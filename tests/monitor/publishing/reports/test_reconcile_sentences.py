@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, AngleRandomWalk
 from monitor.noise.model import NoiseModel
@@ -41,6 +42,25 @@ def test_each_parameter_has_a_conventional_unit(effect: str, axis: str) -> None:
         assert found.short.endswith(found.unit)
         if units[found.name] not in ("1", "axis"):
             assert found.unit
+
+
+@pytest.mark.parametrize("axis", ["gz", "az"])
+@pytest.mark.parametrize("effect", list(EFFECTS))
+def test_si_units_are_those_of_the_parameters(effect: str, axis: str) -> None:
+    units = {name: pair[axis == "az"] for name, pair in gyro_and_accel_units(EFFECTS[effect]).items()}
+    given = {name: ParameterInterval(2.0, 1.9, 2.1) for name, si in units.items() if si != "axis"}
+    for found in words.format_parameters(make_step(effect, **given), axis, EMPTY_MODEL, UNIT_SYSTEMS["si"]):
+        own = units[found.name].replace("1", "") if units[found.name] == "1" else units[found.name]
+        densities = {"rad/√s": "rad/s/√Hz", "m/s/√s": "m/s²/√Hz", "rad/s/√s": "rad/s²/√Hz", "m/s²/√s": "m/s³/√Hz"}
+        assert found.unit == densities.get(own, own)
+        assert float(found.value) == 2.0
+
+
+def test_datasheet_units_add_the_one_sided_noise_density() -> None:
+    step = make_step("angle_random_walk", N=ParameterInterval(1e-4, 0.9e-4, 1.1e-4))
+    walk, density = words.format_parameters(step, "gz", EMPTY_MODEL, UNIT_SYSTEMS["datasheet"])
+    assert walk.short == "0.344 ± 0.034 °/√h"
+    assert (density.name, density.short) == ("noise density, one-sided", "8.10 ± 0.81 m°/s/√Hz")
 
 
 def test_value_has_the_digits_that_its_interval_allows() -> None:

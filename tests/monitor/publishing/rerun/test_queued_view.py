@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES, Event
+from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.publishing.rerun import queued_view as rerun_view
 from monitor.publishing.rerun.queued_view import MISSING, RerunView
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription, ViewerSettings
@@ -133,9 +134,11 @@ def test_gap_and_model_curve_are_recorded(tmp_path: Path) -> None:
     assert not [entity for entity in rows if entity.startswith("/plain/gap/") and "Scalars:scalars" in rows[entity]]
 
 
-def test_thermal_means_and_predictions_are_recorded(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("units", "factor", "name"), [("imu", np.degrees(3600.0), "°/h"), ("si", 1.0, "rad/s")])
+def test_thermal_means_and_predictions_are_recorded(units: str, factor: float, name: str, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    view = RerunView(ViewerSettings(mode=str(path)), [ViewerDeviceDescription("bench-1", has_thermal=True)])
+    settings = ViewerSettings(mode=str(path), units=UNIT_SYSTEMS[units])
+    view = RerunView(settings, [ViewerDeviceDescription("bench-1", has_thermal=True)])
     view.start()
     wait_for(lambda: view.state == "ok")
     for i in range(3):
@@ -143,9 +146,9 @@ def test_thermal_means_and_predictions_are_recorded(tmp_path: Path) -> None:
     view.close()
     rows = read_entities(path)
     gz = read_column_values(rows["/bench-1/thermal/gz"], "Scalars:scalars").reshape(3, 4)
-    hour = np.degrees(3600.0)
-    assert gz[:, 0] == pytest.approx(np.array([1e-4, 2e-4, 3e-4]) * hour)
-    assert gz[:, 1:] == pytest.approx(np.tile(np.array([2.2e-4, 1.8e-4, 2.6e-4]) * hour, (3, 1)))
+    assert gz[:, 0] == pytest.approx(np.array([1e-4, 2e-4, 3e-4]) * factor)
+    assert gz[:, 1:] == pytest.approx(np.tile(np.array([2.2e-4, 1.8e-4, 2.6e-4]) * factor, (3, 1)))
+    assert f"gz bias, {name}" in str(rows["/bench-1/thermal/gz"])
     assert read_column_values(rows["/bench-1/thermal/gz"], "sample_time") / 1e9 == pytest.approx(
         T0 + 600.0 * np.arange(3), abs=1e-6
     )

@@ -4,6 +4,7 @@ import io
 import json
 import re
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -112,6 +113,48 @@ def test_nothing_is_cut_off_at_usual_widths(registry: RemoteDeviceRegistry, widt
     assert "…" not in text
     assert all(head in text for head in ("N °/√h", "B °/h", "N m/s/√h", "received", "p99 ms"))
     assert ("0.515" in text) == (width != 100)  # at width 100, only two digits fit in a line
+
+
+def test_60_columns_keep_all_labels(registry: RemoteDeviceRegistry) -> None:
+    for device in ("bench-1", "bench-2"):
+        send_status(registry, device)
+        send_coefficients(registry, device)
+    text = render_table(registry, 60)
+    assert "…" not in text
+    assert text.splitlines()[1].split() == ["device", "state", "Hz", "lost", "N", "°/√h", "B", "°/h", "N", "m/s/√h"]
+    assert re.findall(r"\b[xyz]\b", text) == ["x", "y", "z"] * 2
+    assert max(cell_len(line) for line in text.splitlines()) <= 60
+
+
+@pytest.mark.parametrize("height", [50, 24, 16])
+def test_chart_and_intervals_of_one_device_need_space(registry: RemoteDeviceRegistry, height: int) -> None:
+    send_status(registry, "bench-1")
+    send_coefficients(registry, "bench-1")
+    registry.set_allan_curve("imu/bench-1", example_results.make_estimate().curve)
+    text = render_table(registry, 100, height=height, is_terminal=True)
+    assert len(text.splitlines()) < height
+    assert ("Allan deviation, °/h" in text) == (height == 50)
+    assert ("[95 % interval]" in text) == (height > 16)
+    assert "K °/h/√h" in text
+
+
+def test_last_table_states_the_running_time(registry: RemoteDeviceRegistry) -> None:
+    send_status(registry, "bench-1")
+    send_coefficients(registry, "bench-1")
+    registry.set_allan_curve("imu/bench-1", example_results.make_estimate().curve)
+    stream = io.StringIO()
+    table = live_device_table.LiveTable(Console(file=stream, width=100), registry, begun_s=time.monotonic() - 75.0)
+    text = table.render([], is_last=True)
+    assert text.startswith("imu-monitor ran for 1 min 15 s  1 device")
+    assert "Allan deviation, °/h" in text
+
+
+def test_problem_of_a_running_device_is_yellow(registry: RemoteDeviceRegistry) -> None:
+    send_status(registry, "bench-1", text="measured rate 99.3 Hz differs from the configured 200 Hz")
+    console = Console(file=io.StringIO(), force_terminal=True, color_system="standard", width=100)
+    with console.capture() as captured:
+        console.print(live_device_table.device_overview(registry, NOW_S))
+    assert "\x1b[33m! bench-1" in captured.get()
 
 
 @pytest.mark.parametrize("units", UNIT_SYSTEMS)

@@ -28,7 +28,7 @@ from tests.monitor.publishing.messages.example_messages import EXAMPLES
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S
 
-PROGRAM = [sys.executable, "-m", "monitor.cli", "watch"]
+PROGRAM = [sys.executable, "-m", "imu_monitor", "watch"]
 
 
 def make_samples() -> bytes:

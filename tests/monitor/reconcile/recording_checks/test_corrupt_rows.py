@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from monitor.reconcile.recording_checks.corrupt_rows import check_corrupt_rows, compute_distances_from_neighbours
+from monitor.reconcile.recording_checks.recording_under_test import RecordingUnderTest
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 
 MODEL = make_model(gravity=True)
@@ -12,7 +13,7 @@ def values(seed=2):
 
 
 def check(recorded):
-    return check_corrupt_rows(recorded, RATE_HZ, draw(MODEL, 99).values, MODEL)
+    return check_corrupt_rows(RecordingUnderTest(recorded, RATE_HZ, MODEL, draw(MODEL, 99).values))
 
 
 @pytest.mark.parametrize("row", [0, 1, 7000, 15_998, 15_999])
@@ -56,9 +57,9 @@ def test_outliers_at_several_times_are_no_finding():
 def test_without_a_model_a_moderate_spike_on_one_axis_may_be_an_outlier():
     recorded = values()
     recorded["gx"][5000] += 30.0 * np.std(np.diff(recorded["gx"]))
-    assert check_corrupt_rows(recorded, RATE_HZ, None)[1] == []
+    assert check_corrupt_rows(RecordingUnderTest(recorded, RATE_HZ))[1] == []
     recorded["gy"][5000] += 30.0 * np.std(np.diff(recorded["gy"]))
-    assert len(check_corrupt_rows(recorded, RATE_HZ, None)[1]) == 1
+    assert len(check_corrupt_rows(RecordingUnderTest(recorded, RATE_HZ))[1]) == 1
 
 
 def test_missing_samples_are_no_spikes():

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from monitor.reconcile.recording_checks.missing_and_repeated_rows import check_stuck_values, find_longest_run_bounds
+from monitor.reconcile.recording_checks.recording_under_test import RecordingUnderTest
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 
 
@@ -14,7 +15,9 @@ def values(step=0.0, seed=2):
 def test_stuck_axis_is_marked(step, length):
     recorded = values(step)
     recorded["gz"][4000 : 4000 + length] = recorded["gz"][3999]
-    marked, (finding,) = check_stuck_values(recorded, RATE_HZ, draw(make_model(step=step), 9).values)
+    marked, (finding,) = check_stuck_values(
+        RecordingUnderTest(recorded, RATE_HZ, simulated=draw(make_model(step=step), 9).values)
+    )
     assert (finding.kind, finding.axes) == ("stuck_axis", ("gz",))
     assert finding.parameters["time"].value == pytest.approx(40.0, abs=0.1)
     assert finding.parameters["duration"].value == pytest.approx(length / RATE_HZ, abs=0.1)
@@ -27,14 +30,14 @@ def test_rows_that_keep_all_values_are_one_finding():
     recorded = values()
     for y in recorded.values():
         y[4000:4300] = y[3999]
-    _, (finding,) = check_stuck_values(recorded, RATE_HZ, None)
+    _, (finding,) = check_stuck_values(RecordingUnderTest(recorded, RATE_HZ))
     assert (finding.kind, len(finding.axes)) == ("frozen_rows", 6)
 
 
 def test_constant_axis_is_kept_for_the_note_about_it():
     recorded = values()
     recorded["ax"][:] = 0.0
-    marked, (finding,) = check_stuck_values(recorded, RATE_HZ, None)
+    marked, (finding,) = check_stuck_values(RecordingUnderTest(recorded, RATE_HZ))
     assert finding.kind == "stuck_axis"
     assert np.array_equal(marked["ax"], recorded["ax"])
 
@@ -43,7 +46,7 @@ def test_clipping_is_not_stuck():
     recorded = values()
     recorded["ax"] = np.minimum(recorded["ax"], np.quantile(recorded["ax"], 0.999))
     recorded["ax"][4000:4100] = recorded["ax"].max()
-    assert check_stuck_values(recorded, RATE_HZ, None)[1] == []
+    assert check_stuck_values(RecordingUnderTest(recorded, RATE_HZ))[1] == []
 
 
 @pytest.mark.parametrize("noise", [0.15, 0.3, 1.0])
@@ -51,7 +54,7 @@ def test_coarse_values_repeat_by_chance(noise):
     rng = np.random.default_rng(3)
     for _ in range(20):
         y = np.rint(noise * rng.standard_normal(20_000) + 0.3)
-        assert check_stuck_values({"gx": y}, RATE_HZ, None)[1] == []
+        assert check_stuck_values(RecordingUnderTest({"gx": y}, RATE_HZ))[1] == []
 
 
 def test_longest_run_ignores_missing_samples():

@@ -1,6 +1,7 @@
 import numpy as np
 
 from monitor.reconcile.recording_checks.motion import check_motion
+from monitor.reconcile.recording_checks.recording_under_test import RecordingUnderTest
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 
 MODEL = make_model(gravity=True)
@@ -15,7 +16,7 @@ def moved(axes, begin=8000, length=300, size=40.0):
 
 
 def check(recorded, model=MODEL):
-    return check_motion(recorded, RATE_HZ, None if model is None else draw(MODEL, 99).values, model)
+    return check_motion(RecordingUnderTest(recorded, RATE_HZ, model, None if model is None else draw(MODEL, 99).values))
 
 
 def test_motion_is_removed_from_all_axes():

@@ -5,6 +5,7 @@ from scipy import signal
 from monitor.noise.effects import Narrowband, WanderingLine
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.recording_checks.checks import check_recording
+from monitor.reconcile.recording_checks.recording_under_test import RecordingUnderTest
 from monitor.reconcile.recording_checks.temporary_vibration import check_temporary_vibration
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, SAMPLES, draw, make_model
 
@@ -27,7 +28,7 @@ def with_vibration(start_s, end_s, gains, frequency_hz=FREQUENCY_HZ, seed=4):
 
 
 def check(recorded):
-    return check_temporary_vibration(recorded, RATE_HZ, draw(MODEL, 99).values, seed=1)
+    return check_temporary_vibration(RecordingUnderTest(recorded, RATE_HZ, simulated=draw(MODEL, 99).values, seed=1))
 
 
 def test_vibration_is_found_on_all_its_axes_and_removed():
@@ -101,7 +102,8 @@ def test_other_changes_are_no_temporary_vibration(change):
 def test_oscillation_of_varying_frequency_or_strength_is_rarely_temporary(effect):
     model = NoiseModel({**MODEL.effects, "gx": (*MODEL.effects["gx"], effect)}, RATE_HZ)
     found = sum(
-        bool(check_temporary_vibration(draw(model, seed).values, RATE_HZ, None, seed=1)[1]) for seed in range(10)
+        bool(check_temporary_vibration(RecordingUnderTest(draw(model, seed).values, RATE_HZ, seed=1))[1])
+        for seed in range(10)
     )
     assert found <= 1
 

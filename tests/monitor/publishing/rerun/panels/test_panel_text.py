@@ -1,5 +1,8 @@
 """Tests of the texts of the viewer panels."""
 
+import pytest
+
+from monitor.common.unit_formatting import KINDS, UNIT_SYSTEMS, format_number
 from monitor.publishing.rerun.panels.panel_text import health_text, noise_text, overview_text
 from tests.monitor.publishing import example_results
 
@@ -26,6 +29,23 @@ def test_each_coefficient_has_its_unit():
         assert unit in text
     assert "≤ 2.23" in text  # this is R, 3e-9 rad/s², in °/h/h
     assert "gx | gy | gz" in text
+
+
+@pytest.mark.parametrize("name", UNIT_SYSTEMS)
+def test_tables_have_the_chosen_units(name: str) -> None:
+    estimate, units = example_results.make_estimate(), UNIT_SYSTEMS[name]
+    rows = [line.split(" | ") for line in noise_text(estimate, units).splitlines() if line.startswith("| **")]
+    columns = [(kind, column) for kind in KINDS for column in units.columns(kind)]
+    assert [row[0] for row in rows] == [f"| **{one.symbol}** {one.unit.name}" for _, one in columns]
+    n = [
+        (row[1], one.unit)
+        for row, (kind, one) in zip(rows, columns, strict=True)
+        if (kind, one.symbol) == ("gyro", "N")
+    ]
+    assert [text for text, _ in n] == [
+        f"**{format_number(unit.factor * estimate.coefficients.value[1, 0])}**" for _, unit in n
+    ]
+    assert len(n) == (2 if name == "datasheet" else 1)
 
 
 def test_gyroscope_alone_has_one_table():
