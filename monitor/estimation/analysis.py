@@ -109,7 +109,7 @@ def analyze(
     curve, fitted, filters = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), map_axes)
     estimate = Estimate(
         int(blocks[-1].t_ns[-1]), rate, curve.n / rate, sum(len(samples) for samples in blocks),
-        curve, fitted.fitted, fitted.coefficients, fitted.k_or_r,
+        curve, fitted.fitted, fitted.coefficients, fitted.k_or_r, poorly_fitted_axes=fitted.poorly_fitted_axes,
     )  # fmt: skip
     bandwidth_hz = np.array([np.nan if one is None else one.cutoff * rate for one in filters])
     few = [f"{len(curve.tau_s)} averaging times are too few to fit five terms; at least {MIN_ROWS} are needed"]

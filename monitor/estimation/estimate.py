@@ -48,6 +48,7 @@ class Estimate:
     history: CoefficientsAfterEachSample | None = (
         None  # coefficients after each sample since the previous estimate, if they are computed
     )
+    poorly_fitted_axes: tuple[str, ...] = ()  # axes whose residuals are significantly too large
 
     def without_coefficients(self) -> "Estimate":
         """Return a copy of the estimate without fitted coefficients."""
@@ -59,4 +60,5 @@ class Estimate:
             coefficients=Coefficients(nothing, nothing, nothing, np.full(shape, Status.UNESTIMATED, np.int8)),
             k_or_r=np.zeros_like(self.k_or_r),
             history=None,
+            poorly_fitted_axes=(),
         )

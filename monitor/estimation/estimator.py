@@ -232,7 +232,7 @@ class Estimator:
         self._history_samples = 0
         return Estimate(
             self._newest_ns, self.rate_hz, self.window_s, self._samples, curve, result.fitted, result.coefficients,
-            result.k_or_r, quick, history,
+            result.k_or_r, quick, history, result.poorly_fitted_axes,
         )  # fmt: skip
 
     def get_converged_estimate(self) -> Estimate:

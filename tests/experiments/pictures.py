@@ -66,7 +66,7 @@ GAP_S = (1403.0, 1404.5)  # since T0: gap in the recording
 NOISE_STEP_S = 2400.0  # since T0: time at which gz becomes noisier
 ADDED_N = 1.7e-4  # rad/√s: added white noise
 WINDOW = "5min"
-SPEED = 60.0
+SPEED = 120.0
 SETTLE_S = 6.0  # time for a software renderer to draw all data
 UNCHANGED_S = 5.0  # a page that has not changed for this time shows all data
 UNPLUGGED_S, PLUGGED_S, SECOND_UNPLUGGED_S, SCREENSHOT_S = 30.0, 34.0, 70.0, 74.0  # since the fleet's start
@@ -169,7 +169,7 @@ def native(out: Path, folder: Path) -> Path:
 
 
 def surfaces(out: Path, folder: Path) -> Path:
-    """Show the tab Dynamic of a device whose noise has changed."""
+    """Show the page What changed of a device whose noise has changed."""
     path = out / "viewer-dynamic.png"
     with window() as (port, shoot):
         with serving(folder, replay(folder, changed=True), port) as service:
@@ -181,7 +181,7 @@ def surfaces(out: Path, folder: Path) -> Path:
 
 
 def temperature(out: Path, folder: Path) -> Path:
-    """Show the tab Temperature of two days in which the bias of gz stepped once."""
+    """Show the page Temperature and drift of two days in which the bias of gz stepped once."""
     path = out / "viewer-temperature.png"
     source = folder / "warm.npz"
     model = read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
@@ -199,7 +199,7 @@ def temperature(out: Path, folder: Path) -> Path:
 
 
 def drift(out: Path, folder: Path) -> Path:
-    """Show the tab Drift of a sensor that is turned three times."""
+    """Show the page Temperature and drift of a sensor that is turned three times."""
     path = out / "viewer-drift.png"
     source = folder / "turned.npz"
     n = round(TURNED_RECORDING_S * 100.0)
@@ -219,7 +219,7 @@ def drift(out: Path, folder: Path) -> Path:
     with window() as (port, shoot):
         with serving(folder, REPLAY.format(recording=source, speed=SPEED), port) as service:
             wait_until(lambda: has_replayed(service, TURNED_RECORDING_S - 2.0), 120.0)
-        select_tab(port, 3)
+        select_tab(port, 2)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
@@ -249,7 +249,7 @@ def select_tab(port: int, tab: int) -> None:
     layout = viewer.get_blueprint().blueprint
     for part in layout.values():
         tabs = part.get("ContainerBlueprint", {})
-        if "active_tab" in tabs:
+        if "active_tab" in tabs and len(tabs["contents"]) > tab:
             tabs["active_tab"] = tabs["contents"][tab]
     viewer.set_blueprint(layout, of="recording")
 

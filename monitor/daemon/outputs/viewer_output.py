@@ -3,6 +3,7 @@
 ``monitor.publishing.result_kinds`` lists the messages and drawings of each kind of result.
 """
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from drivers.data_types import Event, Ints, SampleBlock
@@ -41,6 +42,5 @@ class ViewerOutput(Output):
         self._view.put(device, unix_s, event)
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Show the status of a device if the present time is known."""
-        if unix_s is not None:
-            self._view.put(device, unix_s, health)
+        """Show the status of a device, at the present time if it is known."""
+        self._view.put(device, math.nan if unix_s is None else unix_s, health)

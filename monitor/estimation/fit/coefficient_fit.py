@@ -32,7 +32,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.data_types import Floats, Ints
+from drivers.data_types import AXES, Floats, Ints
 from monitor.estimation.allan.uncertainty import NOISES, CovarianceTable
 from monitor.estimation.fit.coefficients_with_intervals import Coefficients, Status
 from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
@@ -79,6 +79,11 @@ class Fit:
     scatter: Floats  # [6] mean squared residual, relative to the variance that the five noise terms explain
     misfit: Floats  # [6] equal to ``scatter`` if the residuals are significantly too large, otherwise 1
     k_or_r: NDArray[np.bool_]  # [6] True if the rate drifts, but K and R cannot be distinguished
+
+    @property
+    def poorly_fitted_axes(self) -> tuple[str, ...]:
+        """Axes whose residuals are significantly too large, so that the fit does not describe the curve."""
+        return tuple(axis for axis, misfit in zip(AXES, self.misfit, strict=True) if misfit > 1.0)
 
 
 def make_design_matrix(factors: Ints, rate_hz: float) -> DesignMatrix:

@@ -1,8 +1,9 @@
 """Allan plot of the gyroscopes or the accelerometers, for the image of ``analyze --plot`` and for the HTML report.
 
-The plot shows the measured Allan deviations with 95 % bands, and the fitted Allan deviations as dashed lines. Each
-estimated noise term has a thin line with a ring at the averaging time at which its coefficient is read (IEEE Std 952).
-Markers, rings and dashes differ between axes, so that equal Allan deviations of two axes remain visible.
+The plot shows the measured Allan deviations with 95 % bands, and the fitted Allan deviations as dashed lines. A fit
+that does not describe the curve is grey. Each estimated noise term has a thin line with a ring at the averaging time at
+which its coefficient is read (IEEE Std 952). Markers, rings and dashes differ between axes, so that equal Allan
+deviations of two axes remain visible.
 """
 
 from collections.abc import Collection, Sequence
@@ -144,7 +145,8 @@ def draw_allan_panel(
         lo, hi = (a[valid, i] * factor for a in (estimate.curve.lo, estimate.curve.hi))
         measured, longest_allan_tau_s = measured[valid], float(tau_s[valid][-1])
         draw_band(panel, tau_s[valid], lo, hi, COLOURS[number])
-        panel.plot(tau_s, fitted, linestyle=FIT_DASHES[number], color=COLOURS[number], zorder=3)
+        fit_colour = GREY if axis in estimate.poorly_fitted_axes else COLOURS[number]
+        panel.plot(tau_s, fitted, linestyle=FIT_DASHES[number], color=fit_colour, zorder=3)
         style = {"color": COLOURS[number], "markersize": MARKER_SIZES[number], "mew": 1.1}
         style["mfc"] = COLOURS[number] if number == 0 else "none"
         panel.plot(tau_s[valid], measured, MARKERS[number], label=axis, zorder=4, **style)  # type: ignore[arg-type]
@@ -158,6 +160,10 @@ def draw_allan_panel(
         rings += coefficient_rings(estimate, i, factor, minimum_tau_s, float(measured.min()))
     _set_limits(panel, shown, rings)
     _draw_terms(panel, rings)
+    poor = [axis for axis in axes_of(kind) if axis in estimate.poorly_fitted_axes]
+    if poor:
+        text = f"{', '.join(poor)}: fit (grey) does not describe the curve"
+        panel.text(0.5, 0.98, text, transform=panel.transAxes, ha="center", va="top", color=GREY, bbox=LABEL_BOX)
     _draw_labels(panel, kind, others, drawn, units)
 
 

@@ -1,41 +1,37 @@
-"""Colours of the x, y and z axes in all plots, which colour-blind people can distinguish.
+"""Colours of the x, y and z axes in the viewer, which colour-blind people can distinguish.
 
-The colours are vermilion, bluish green and sky blue of the Okabe-Ito palette. They also differ in lightness.
-The gyroscope and the accelerometer of an axis have the same colour, because they never appear in the same plot.
+The colours are vermilion, bluish green and blue of the Okabe-Ito palette, as in the reports. The contrast of each
+colour is at least 3:1 on the white background of the light theme and on the black background of the dark theme. The
+gyroscope and the accelerometer of an axis have the same colour, because they never appear in the same plot.
 """
 
 from typing import Final
 
 Colour = tuple[int, int, int]
 
+VERMILION: Final[Colour] = (213, 94, 0)
+GREEN: Final[Colour] = (0, 158, 115)
+BLUE: Final[Colour] = (0, 114, 178)
 AXIS_COLOURS: Final[dict[str, Colour]] = {
-    "gx": (213, 94, 0),
-    "gy": (0, 158, 115),
-    "gz": (86, 180, 233),
-    "ax": (213, 94, 0),
-    "ay": (0, 158, 115),
-    "az": (86, 180, 233),
-}
-BACKGROUND: Final[Colour] = (13, 16, 17)
-FRAME: Final[Colour] = (92, 98, 104)
-MAJOR: Final[Colour] = (48, 53, 57)
-MINOR: Final[Colour] = (23, 27, 29)
-TEXT: Final[Colour] = (236, 239, 242)  # legible on label boxes in the dark and in the light theme of the viewer
-KEY: Final[Colour] = (150, 160, 170)  # signs in the key of a plot
-TEMPERATURE: Final[Colour] = (236, 180, 72)
+    "gx": VERMILION, "gy": GREEN, "gz": BLUE, "ax": VERMILION, "ay": GREEN, "az": BLUE,
+}  # fmt: skip
+GREY: Final[Colour] = (124, 129, 134)  # labels, keys, models, predictions, and fits that do not describe the curve
+FRAME: Final[Colour] = (135, 139, 143)
+PALE: Final[Colour] = (226, 228, 230)  # middle of a colour scale between two colours
+TEMPERATURE: Final[Colour] = (204, 121, 167)  # reddish purple of the same palette
 
 
-def blend_colours(colour: Colour, colour_share: float, background: Colour = BACKGROUND) -> Colour:
-    """Return the colour in which a translucent area appears on a background.
+def blend_colours(colour: Colour, colour_share: float, background: Colour = GREY) -> Colour:
+    """Return a mixture of two colours. By default, the colour becomes greyer.
 
     Parameters
     ----------
     colour
-        Colour of the area as red, green and blue, 0 to 255.
+        First colour as red, green and blue, 0 to 255.
     colour_share
-        Opacity of the area, 0 to 1.
+        Share of the first colour, 0 to 1.
     background
-        Colour of the background as red, green and blue, 0 to 255.
+        Second colour as red, green and blue, 0 to 255.
     """
     r, g, b = (round(colour_share * c + (1 - colour_share) * d) for c, d in zip(colour, background, strict=True))
     return r, g, b

@@ -32,11 +32,12 @@ from monitor.publishing.rerun.allan_chart_geometry import (
     HEIGHT,
     WIDTH,
     ChartDecadeRange,
+    band_outline,
     clip_to_box,
     decade_range,
     finite_sections,
 )
-from monitor.publishing.rerun.allan_drawing import fill_band, log_grid, log_lines
+from monitor.publishing.rerun.allan_drawing import log_grid, log_lines
 from monitor.publishing.rerun.shared_views import collapsed_blueprint, drawing_view, markdown_document
 from monitor.reconcile.result import AxisModelDiagnostics, AxisResult, Reconciliation
 from monitor.reconcile.summary.summary_sentences import summarize
@@ -44,9 +45,9 @@ from monitor.reconcile.summary.summary_sentences import summarize
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
 MAX_PLOTTED_DIAGNOSTICS: Final = 2  # largest number of drawn diagnostics per axis
-BAND_COLOUR: Final = axis_colours.blend_colours(axis_colours.FRAME, 0.55)
+BAND_COLOUR: Final = axis_colours.FRAME
 LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
-RANGE_COLOUR: Final = axis_colours.TEMPERATURE  # orange, as on the HTML page
+RANGE_COLOUR: Final = (230, 159, 0)  # orange, as on the HTML page
 GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
     *(axis_colours.AXIS_COLOURS[axis] for axis in AXES[:3]), axis_colours.TEMPERATURE, (190, 130, 230), (150, 160, 170),
 )  # fmt: skip
@@ -166,7 +167,7 @@ def _diagnostic_view(result: AxisResult, diagnostic: str, when: str) -> rrb.View
     what = what[0].upper() + what[1:]
     names = {"before": f"{what}: first model", "after": f"{what}: after the steps"}
     origin = f"/{result.axis}/{diagnostic}/{when}"
-    return drawing_view(origin, names[when], "$origin/**", (-1.7, WIDTH + 0.7), (-1.5, HEIGHT + 1.7))
+    return drawing_view(origin, names[when], "$origin/**", (-2.6, WIDTH + 0.7), (-1.5, HEIGHT + 1.9))
 
 
 def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult, units: UnitSystem) -> None:
@@ -187,7 +188,7 @@ def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
         line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.diagnostic_name(diagnostic)])
         stream.log(f"{path}/{diagnostic}", line, static=True)
         _log_by_step(stream, f"{path}/{diagnostic}", [snapshot.get(diagnostic, np.nan) for snapshot in snapshots])
-    line = rr.SeriesLines(colors=[axis_colours.TEXT], widths=[1.0], names=["threshold"])
+    line = rr.SeriesLines(colors=[axis_colours.GREY], widths=[1.0], names=["threshold"])
     stream.log(f"{path}/threshold", line, static=True)
     _log_by_step(stream, f"{path}/threshold", [1.0] * len(snapshots))
 
@@ -224,13 +225,13 @@ def _log_curves(
     # A lower end of zero is drawn below the box, because zero has no logarithm.
     low, high = (scale.to_chart_positions(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     log = partial(stream.log, static=static)
-    log(f"{path}/band", fill_band(low, high, BAND_COLOUR))
+    log_lines(log, f"{path}/band", band_outline(low, high), [BAND_COLOUR], 0.5, -20.0)
     colour, at = axis_colours.AXIS_COLOURS[axis], _inside(scale.to_chart_positions(plot.x, plot.measured))
     log_lines(log, f"{path}/measured", finite_sections(at), [colour], 0.8, 5.0)
     if len(at) <= MAX_MARKERS:
         log(f"{path}/points", rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
     expected = finite_sections(_inside(scale.to_chart_positions(plot.x, plot.expected)))
-    log_lines(log, f"{path}/expected", expected, [axis_colours.TEXT], 1.0, 10.0)
+    log_lines(log, f"{path}/expected", expected, [axis_colours.GREY], 1.0, 10.0)
 
 
 def _log_found_ranges(
@@ -261,7 +262,7 @@ def _log_grid(
     stream: rr.RecordingStream, path: str, scale: ChartDecadeRange, plot: DiagnosticPanelCurves, axis: str
 ) -> None:
     log = partial(stream.log, static=True)
-    key = [("measured", axis_colours.AXIS_COLOURS[axis]), ("model", axis_colours.TEXT), ("95 %", BAND_COLOUR)]
+    key = [("measured", axis_colours.AXIS_COLOURS[axis]), ("model", axis_colours.GREY), ("95 %", BAND_COLOUR)]
     names = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]
     strokes = [np.array([[x - 1.9, -0.42], [x - 1.2, -0.42]]) for x in LEGEND_X]
     log_lines(log, f"{path}/grid/key", strokes, [tint for _, tint in key], 2.0, 30.0)

@@ -12,12 +12,14 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
+from monitor.publishing.plots.style import format_tick
 
 WIDTH: Final = 16.0
 HEIGHT: Final = 11.5
 MIN_DECADES: Final = 2.0
 RING_RADIUS: Final = 0.28
-FILL_STEPS: Final = 96  # number of vertical lines that fill a confidence band
+MARKER_RADIUS: Final = 0.2
+MINOR_TICK: Final = 0.16  # length of the ticks between powers of ten
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,36 +102,32 @@ def dash_line(line: Floats, length: float = 0.22) -> list[Floats]:
     return [points[i : i + 2] for i in range(0, len(points) - 1, 2)]
 
 
-def band_strokes(low: Floats, high: Floats) -> Floats:
-    """Return vertical lines that fill the area between two curves, shape [FILL_STEPS, 2, 2].
+def band_outline(low: Floats, high: Floats) -> list[Floats]:
+    """Return the lines along the lower and the upper end of a confidence band, within the height of the chart.
 
     Parameters
     ----------
     low, high
-        Chart positions of the curves, shape [n, 2].
+        Chart positions of the ends, shape [n, 2]; NaN where an end is unknown.
     """
-    good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
-    if int(good.sum()) < 2:
-        return np.empty((0, 2, 2))
-    low, high = low[good], high[good]
-    half = (low[-1, 0] - low[0, 0]) / FILL_STEPS / 2
-    x = np.linspace(low[0, 0] + half, low[-1, 0] - half, FILL_STEPS)
-    bottom, top = (clip_to_box(np.interp(x, edge[:, 0], edge[:, 1])) for edge in (low, high))
-    return np.stack([np.column_stack([x, bottom]), np.column_stack([x, top])], axis=1)
+    edges = [np.column_stack([edge[:, 0], clip_to_box(edge[:, 1])]) for edge in (low, high)]
+    return [section for edge in edges for section in finite_sections(edge)]
 
 
-def interval_strokes(low: Floats, high: Floats) -> Floats:
-    """Return a vertical line for each interval from its lower to its upper end, shape [n, 2, 2].
+def marker_outlines(positions: Floats, corners: int) -> list[Floats]:
+    """Return a closed polygon around each chart position.
 
     Parameters
     ----------
-    low, high
-        Chart positions of the lower and upper ends, shape [n, 2].
+    positions
+        Chart positions, shape [n, 2].
+    corners
+        Number of corners of the polygon.
     """
-    good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
-    strokes = np.stack([low[good], high[good]], axis=1)
-    strokes[:, :, 1] = clip_to_box(strokes[:, :, 1])
-    return strokes
+    # One side is horizontal and at the bottom, because y points down.
+    angle = np.pi / 2.0 + np.pi / corners + 2.0 * np.pi * np.arange(corners + 1) / corners
+    polygon = MARKER_RADIUS * np.column_stack([np.cos(angle), np.sin(angle)])
+    return [position + polygon for position in positions[np.isfinite(positions).all(axis=1)]]
 
 
 def ring_outline(x: float, y: float) -> Floats:
@@ -140,7 +138,7 @@ def ring_outline(x: float, y: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class ChartGrid:
-    """Grid lines and tick labels of a chart."""
+    """Grid lines, ticks and tick labels of a chart."""
 
     frame: list[Floats]
     major: list[Floats]
@@ -149,16 +147,22 @@ class ChartGrid:
 
 
 def chart_grid(scale: ChartDecadeRange) -> ChartGrid:
-    """Return grid lines at powers of ten and their multiples, and tick labels outside the box of the chart."""
+    """Return grid lines at powers of ten, ticks at their multiples, and labels outside the box of the chart."""
     x_at, x_minor = _line_positions(scale.x, WIDTH)
     y_at, y_minor = _line_positions(scale.y, HEIGHT)
     flip = HEIGHT
-    ticks = [(x, HEIGHT + 0.25, _tick(p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)]
-    ticks += [(-0.75, flip - y - 0.35, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)]
+    ticks = [
+        (x, HEIGHT + 0.15, format_tick(10.0**p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)
+    ]
+    ticks += [
+        (-1.25, flip - y - 0.5, format_tick(10.0**p))
+        for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)
+    ]
     return ChartGrid(
         frame=[np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT], [0, 0]], float)],
         major=[_vertical(x) for x in x_at[1:-1]] + [_horizontal(flip - y) for y in y_at[1:-1]],
-        minor=[_vertical(x) for x in x_minor] + [_horizontal(flip - y) for y in y_minor],
+        minor=[np.array([[x, HEIGHT - MINOR_TICK], [x, HEIGHT]]) for x in x_minor]
+        + [np.array([[0.0, flip - y], [MINOR_TICK, flip - y]]) for y in y_minor],
         ticks=ticks,
     )
 
@@ -177,8 +181,3 @@ def _vertical(x: float) -> Floats:
 
 def _horizontal(y: float) -> Floats:
     return np.array([[0.0, y], [WIDTH, y]])
-
-
-def _tick(power: int) -> str:
-    """Format a power of ten. Values below 0.0001 or above 10000 are written in exponent notation."""
-    return f"{10.0**power:g}" if -4 <= power <= 4 else f"1e{power}"

@@ -19,26 +19,40 @@ from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.allan_figure import coefficient_rings, tau_of_minimum_s
 from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.rerun.allan_chart_geometry import (
-    FILL_STEPS,
     HEIGHT,
     WIDTH,
     ChartDecadeRange,
-    band_strokes,
+    band_outline,
     chart_grid,
     dash_line,
     decade_range,
     finite_sections,
-    interval_strokes,
+    marker_outlines,
     ring_outline,
 )
 
-KEY: Final = ("measured", "fit", "95 %", "model", "N, B, K")
-KEY_SPACING: Final = 3.4
-KEY_TEXT: Final = 1.6
-KEY_BELOW: Final = 2.0
-"""Distance of the key below the plot [chart units]."""
+KEY: Final = {
+    "measured": "measured",
+    "fit": "fit",
+    "band": "95 %",
+    "ring": "N, B, K",
+    "model": "model",
+    "poor": "poor fit",
+}
+"""Text beside each sign of the key, by the end of the path of the sign."""
+FIT_COLOURS: Final = (axis_colours.VERMILION, axis_colours.GREEN, axis_colours.BLUE)
+KEY_COLUMNS: Final = 3
+KEY_SPACING: Final = 6.0
+KEY_ROW: Final = 1.25
+KEY_BELOW: Final = 2.15
+"""Distance of the first row of the key below the plot [chart units]."""
+KEY_TEXT: Final = 3.3
+GRID_DASH: Final = 0.15
 RING_LETTERS: Final = "NBK"
-LETTER_OFFSET: Final = (0.6, -0.35)
+LETTER_OFFSET: Final = (0.9, -0.45)
+MARKER_CORNERS: Final = {"y": 4, "z": 3}
+"""Number of corners of the markers of each axis. The marker of an x axis is a dot."""
+POOR_FIT_TEXT: Final = "fit does not describe the curve"
 
 Log = Callable[..., Any]
 """Function that logs components under the path of a Rerun entity."""
@@ -60,8 +74,10 @@ class AllanPlotPair:
     def __init__(self, log: Log, path: str, units: UnitSystem = DEFAULT_UNITS) -> None:
         self._log = log
         self._path = path
+        self._drawn: dict[
+            Kind, tuple[ChartDecadeRange, list[str], list[str]]
+        ] = {}  # grid, signs and poorly fitted axes
         self._units = units
-        self._scales: dict[Kind, ChartDecadeRange] = {}  # range of the grid that was drawn last
 
     def draw(self, estimate: Estimate, gap: ModelComparison | None) -> None:
         """Draw the Allan deviations of an estimate.
@@ -83,42 +99,52 @@ class AllanPlotPair:
                 decade_range(one.tau for one in curves),
                 decade_range(part for one in curves for part in one.curves_that_set_y_range),
             )
-            if self._scales.get(kind) != scale:
-                self._scales[kind] = scale
+            poor = [one.axis for one in curves if one.poorly_fitted]
+            signs = _signs_in_use(curves)
+            if self._drawn.get(kind) != (scale, signs, poor):
+                self._drawn[kind] = scale, signs, poor
                 self._draw_grid(kind, scale, [one.axis for one in curves])
+                self._draw_key(kind, signs, poor)
             for curve in curves:
                 self._draw_curve(scale, curve)
             self._draw_rings(kind, scale, estimate)
 
     def _draw_grid(self, kind: Kind, scale: ChartDecadeRange, axes: Sequence[str]) -> None:
         path = f"{self._path}/{kind}"
-        titles = [
-            (WIDTH / 2, HEIGHT + 0.95, "averaging time τ, s"),
-            (1.2, -0.85, f"σ(τ), {self._units.deviation(kind).name}"),
-        ]
-        log_grid(self._log, path, scale, f"{path}/ticks", titles)
-        ends = [(axis, WIDTH - 2.0 * (len(axes) - 1 - i) - 0.5) for i, axis in enumerate(axes)]
-        strokes = [np.array([[x - 1.15, -0.42], [x - 0.5, -0.42]]) for _, x in ends]
+        unit = [(WIDTH + 0.75, HEIGHT - 1.0, "s")]
+        log_grid(self._log, path, scale, f"{path}/ticks", unit)
+        at = {axis: np.array([4.0 * i + 4.6, -0.55]) for i, axis in enumerate(axes)}
+        strokes = [position + np.array([[-0.7, 0.0], [0.7, 0.0]]) for position in at.values()]
         log_lines(
-            self._log, f"{path}/legend/strokes", strokes, [axis_colours.AXIS_COLOURS[axis] for axis in axes], 2.0, 30.0
+            self._log, f"{path}/legend/strokes", strokes, [axis_colours.AXIS_COLOURS[axis] for axis in at], 1.25, 30.0
         )
-        self._log(f"{path}/legend", label_points([(x, -0.85, axis) for axis, x in ends]))
-        self._draw_key(f"{path}/key")
+        for axis, position in at.items():
+            log_markers(self._log, f"{path}/legend/{axis}", position[None], axis)
+        self._log(f"{path}/legend", label_points([(x + 1.6, y - 0.5, axis) for axis, (x, y) in at.items()]))
 
-    def _draw_key(self, path: str) -> None:
-        """Draw a legend for points, lines, bands, dashes and rings below the plot."""
-        y = HEIGHT + KEY_BELOW
-        at = np.column_stack([np.arange(len(KEY)) * KEY_SPACING, np.zeros(len(KEY))])
-        sign = np.array([[0.0, y], [0.8, y]])
-        grey = axis_colours.KEY
-        log_lines(self._log, f"{path}/fit", [sign + at[1]], [grey], 1.25, 10.0)
-        log_lines(self._log, f"{path}/band", [sign + at[2]], [axis_colours.blend_colours(grey, 0.4)], 5.0, 10.0)
-        log_lines(self._log, f"{path}/model", dash_line(sign + at[3]), [axis_colours.TEXT], 0.75, 10.0)
-        log_lines(self._log, f"{path}/ring", [ring_outline(at[4, 0] + 0.4, y)], [grey], 0.9, 10.0)
-        self._log(path, rr.Points2D([(0.0, y)], colors=[grey], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
-        self._log(
-            f"{path}/text", label_points([(x + KEY_TEXT, y - 0.4, text) for (x, _), text in zip(at, KEY, strict=True)])
-        )
+    def _draw_key(self, kind: Kind, signs: Sequence[str], poor: Sequence[str]) -> None:
+        """Draw a key of the signs below the plot, and name the axes with a poor fit inside the plot."""
+        path, grey = f"{self._path}/{kind}/key", axis_colours.GREY
+        at = {
+            sign: np.array([KEY_SPACING * (i % KEY_COLUMNS), HEIGHT + KEY_BELOW + KEY_ROW * (i // KEY_COLUMNS)])
+            for i, sign in enumerate(signs)
+        }
+        line = np.array([[0.0, 0.0], [1.2, 0.0]])
+        strokes: dict[str, Callable[[Floats], list[Floats]]] = {
+            "fit": lambda xy: [xy + line / 3.0 + [0.4 * i, 0.0] for i in range(3)],
+            "band": lambda xy: [xy + line - [0.0, 0.2], xy + line + [0.0, 0.2]],
+            "ring": lambda xy: [ring_outline(xy[0] + 0.6, xy[1])],
+            "model": lambda xy: dash_line(xy + line),
+            "poor": lambda xy: [xy + line],
+        }
+        for sign, draw in strokes.items():
+            colours = FIT_COLOURS if sign == "fit" else [grey]
+            log_lines(self._log, f"{path}/{sign}", draw(at[sign]) if sign in at else [], colours, 1.0, 10.0)
+        dot = at["measured"] + [0.6, 0.0]
+        self._log(path, rr.Points2D([dot], colors=[grey], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
+        self._log(f"{path}/text", label_points([(x + KEY_TEXT, y - 0.5, KEY[sign]) for sign, (x, y) in at.items()]))
+        note = [(WIDTH / 2, 0.2, f"{', '.join(poor)}: {POOR_FIT_TEXT}")] if poor else []
+        self._log(f"{self._path}/{kind}/note", label_points(note))
 
     def _draw_rings(self, kind: Kind, scale: ChartDecadeRange, estimate: Estimate) -> None:
         """Draw a ring at the averaging time at which N, B or K is read, and a letter at the rings of all axes."""
@@ -146,20 +172,13 @@ class AllanPlotPair:
             scale.to_chart_positions(curve.tau, part)
             for part in (curve.lo, curve.hi, curve.fitted, curve.model, curve.deviation)
         )
-        fill = fill_band(low, high, axis_colours.blend_colours(colour, 0.22))
-        self._log(f"{path}/band", fill)
-        log_lines(
-            self._log,
-            f"{path}/interval",
-            list(interval_strokes(low, high)),
-            [axis_colours.blend_colours(colour, 0.6)],
-            0.75,
-            5.0,
-        )
-        log_lines(self._log, f"{path}/fit", finite_sections(fitted), [colour], 1.25, 10.0)
+        log_lines(self._log, f"{path}/band", band_outline(low, high), [colour], 0.4, 5.0)
+        fit_colour = axis_colours.GREY if curve.poorly_fitted else colour
+        log_lines(self._log, f"{path}/fit", finite_sections(fitted), [fit_colour], 1.25, 10.0)
         dashes = [stroke for section in finite_sections(model) for stroke in dash_line(section)]
-        log_lines(self._log, f"{path}/model", dashes, [axis_colours.TEXT], 0.75, 15.0)
-        points = rr.Points2D(deviation, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0)
+        log_lines(self._log, f"{path}/model", dashes, [axis_colours.GREY], 0.75, 15.0)
+        log_markers(self._log, f"{path}/marker", deviation, curve.axis)
+        points = rr.Points2D(deviation, colors=[colour], radii=rr.Radius.ui_points(0.0), draw_order=20.0)
         self._log(path, points, rr.AnyValues(drop_untyped_nones=True, **curve.si))
 
 
@@ -175,6 +194,7 @@ class _Curve:
     fitted: Floats
     model: Floats  # Allan deviation of the noise model; NaN without a model
     si: dict[str, Floats]
+    poorly_fitted: bool  # True if the fit does not describe the measured curve
 
     @property
     def curves_that_set_y_range(self) -> tuple[Floats, ...]:
@@ -196,7 +216,16 @@ class _Curve:
         if gap is not None and axis in gap.axes and gap.axes[axis].model.shape == rows.shape:
             model = gap.axes[axis].model[rows]
         f = factor
-        return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si)
+        poor = axis in estimate.poorly_fitted_axes
+        return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si, poor)
+
+
+def _signs_in_use(curves: Sequence[_Curve]) -> list[str]:
+    """Return the signs that the plot of the curves contains, in the order of KEY."""
+    missing = {"model"} if not any(np.isfinite(one.model).any() for one in curves) else set()
+    missing |= {"fit", "ring"} if not any(np.isfinite(one.fitted).any() for one in curves) else set()
+    missing |= {"poor"} if not any(one.poorly_fitted for one in curves) else set()
+    return [sign for sign in KEY if sign not in missing]
 
 
 def log_grid(
@@ -218,8 +247,9 @@ def log_grid(
         Further labels, each given by x, y and text.
     """
     lines = chart_grid(scale)
-    log_lines(log, f"{path}/minor", lines.minor, [axis_colours.MINOR], 0.5, -30.0)
-    log_lines(log, f"{path}/major", lines.major, [axis_colours.MAJOR], 0.5, -29.0)
+    log_lines(log, f"{path}/minor", lines.minor, [axis_colours.FRAME], 0.5, -30.0)
+    dots = [dash for line in lines.major for dash in dash_line(line, GRID_DASH)]
+    log_lines(log, f"{path}/major", dots, [axis_colours.FRAME], 0.2, -29.0)
     log_lines(log, f"{path}/frame", lines.frame, [axis_colours.FRAME], 0.5, -10.0)
     log(labels_path, label_points([*lines.ticks, *labels]))
 
@@ -248,18 +278,25 @@ def log_lines(
     log(path, rr.LineStrips2D(strips, colors=line_colours, radii=radii, draw_order=order))
 
 
-def fill_band(low: Floats, high: Floats, colour: Colour) -> rr.LineStrips2D:
-    """Return a Rerun component with vertical lines that fill the area between two curves.
+def log_markers(log: Log, path: str, positions: Floats, axis: str) -> None:
+    """Log a dot, a square or a triangle at each position, for an x, y or z axis.
 
     Parameters
     ----------
-    low, high
-        Curves in chart units, shape [n, 2].
-    colour
-        Colour of the area.
+    log
+        Function that logs a Rerun entity.
+    path
+        Path of the entity.
+    positions
+        Chart positions, shape [n, 2].
+    axis
+        Name of the axis, which selects the shape and the colour.
     """
-    width = WIDTH / FILL_STEPS
-    return rr.LineStrips2D(list(band_strokes(low, high)), colors=[colour], radii=[width / 2], draw_order=-20.0)
+    colours, corners = [axis_colours.AXIS_COLOURS[axis]], MARKER_CORNERS.get(axis[-1])
+    if corners is None:
+        log(path, rr.Points2D(positions, colors=colours, radii=rr.Radius.ui_points(2.5), draw_order=20.0))
+    else:
+        log_lines(log, path, marker_outlines(positions, corners), colours, 0.75, 20.0)
 
 
 def label_points(labels: Sequence[tuple[float, float, str]]) -> rr.Points2D:
@@ -267,7 +304,7 @@ def label_points(labels: Sequence[tuple[float, float, str]]) -> rr.Points2D:
     return rr.Points2D(
         [(x, y) for x, y, _ in labels],
         labels=[text for _, _, text in labels],
-        colors=[axis_colours.TEXT],
+        colors=[axis_colours.GREY],
         radii=[0.0],
         show_labels=True,
     )

@@ -1,12 +1,13 @@
 """Layout of the Rerun viewer.
 
 A single device fills the window of the viewer. With several devices, there is an overview and a tab for each device.
-The tab of a device contains panels for its present noise and for the noise over time. Importing this module imports
-Rerun.
+The tab of a device has a page for its present noise, for changes, for the model gap, and for temperature and drift. The
+layout contains only views whose entities have data. Importing this module imports Rerun.
 """
 
-from collections.abc import Sequence
-from typing import Final
+import re
+from collections.abc import Collection, Sequence
+from typing import Any, Final
 
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
@@ -22,6 +23,7 @@ from monitor.common.unit_formatting import (
 )
 from monitor.publishing.rerun import dynamic_heat_map
 from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, WIDTH
+from monitor.publishing.rerun.allan_drawing import KEY_BELOW, KEY_ROW
 from monitor.publishing.rerun.shared_views import (
     RAW_SAMPLES_S,
     TIMELINE,
@@ -41,10 +43,37 @@ MAX_DEVICES_WITH_ACCEL: Final = 4
 """Largest number of devices for which the overview shows accelerometers as well as gyroscopes."""
 MAX_GRID_COLUMNS: Final = 4
 SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
+ALWAYS_SHOWN: Final = ("/status", "/waiting", "/overview")
+"""Ends of the paths of views that are shown before their first data arrive."""
+GUIDE: Final = "/guide/"
+"""Part of the path of the text that describes the panels of a page."""
+DESCRIPTIONS: Final = {
+    "(status|waiting)": "**Is it healthy?** State of the device, its rate, and its samples since the start.",
+    "overview": "**Are they healthy?** One row for each device, with its state and its lost and bad samples.",
+    "coefficients": "**What is its noise now?** Noise coefficients with 95 % intervals, from the newest window.",
+    "events": "**Has it changed?** Changes of the noise, losses of samples and faults of the link, with UTC times.",
+    "allan": "**Allan deviation:** noise (up) that remains after averaging for a time (right); lower is better. Signs: "
+    "● x, □ y, △ z measured, line fit, thin lines 95 %, ring N, B or K, dashes model, grey line poor fit.",
+    "coefficients/[NBK]": "**N, B, K over time:** a step is a change of the noise, and thin lines are 95 % intervals.",
+    "samples": "**Samples:** the last 30 seconds as measured.",
+    "temperature": "**Temperature:** as the sensor reports it.",
+    "dynamic/..": "**Heat maps:** Allan deviation divided by its median over time. Vermilion is noisier and blue is "
+    "quieter than usual.",
+    "gap": "**Gap to the model:** above the grey threshold, the model does not describe the device.",
+    "thermal/..": "**Bias:** the grey line is the prediction from temperature, and thin lines are its 95 % interval.",
+    "compensated": "**Rates:** measured rate in grey, and rate without the predicted drift in colour.",
+    "drift/g.": "**Drift:** means at rest, with the prediction in grey and its 95 % interval.",
+    "innovation/g.": "**Innovation:** differences of the means from their predictions, mostly within ±2 σ.",
+    "drift": "**Drift models:** model and predicted drift of each gyroscope.",
+}
+"""Sentence about each kind of panel, by the end of the path of its view as a regular expression."""
 
 
 def blueprint(
-    devices: Sequence[ViewerDeviceDescription], fleet: bool = False, units: UnitSystem = DEFAULT_UNITS
+    devices: Sequence[ViewerDeviceDescription],
+    fleet: bool = False,
+    entities: Collection[str] | None = None,
+    units: UnitSystem = DEFAULT_UNITS,
 ) -> rrb.Blueprint:
     """Return the Rerun layout for a list of devices.
 
@@ -54,43 +83,94 @@ def blueprint(
         Devices to show.
     fleet
         True if the overview is a table that also lists devices that are not shown in detail.
+    entities
+        Paths of the entities that have data. Views of other entities are omitted. By default, no view is omitted.
     units
         Units of the plots.
     """
-    pages, names = [_device(one, units) for one in devices], [one.name for one in devices]
+    waiting = {one.name for one in devices if entities is not None and f"/{one.name}/waiting" in entities}
+    pages, names = [_device(one, one.name in waiting, units) for one in devices], [one.name for one in devices]
     if fleet:
         root: rrb.Container = rrb.Tabs(_fleet(names, units), *pages, active_tab=0)
     else:
         root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(names, units), *pages, active_tab=0)
+    if entities is not None:
+        _remove_views_without_data(root, entities)
     return collapsed_blueprint(root, TIMELINE)
 
 
-def _device(device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container:
-    tabs = [tab for panel in PANELS if (tab := panel.tab_layout(device, units)) is not None]
-    return rrb.Tabs(_now(device, units), _dynamic(device.name, units), *tabs, active_tab=0, name=device.name)
+def guide_texts(part: rrb.Container) -> dict[str, str]:
+    """Return the text of each guide in a layout by its path, with one sentence for each kind of panel of the page."""
+    texts: dict[str, str] = {}
+    for one in part.contents:
+        if isinstance(one, rrb.Container):
+            texts |= guide_texts(one)
+    views = list_views(part) if part.name else []  # only pages have names
+    origins = [str(view.origin) for view in views]
+    panels, guides = [one for one in origins if GUIDE not in one], [one for one in origins if GUIDE in one]
+    found = [text for ending, text in DESCRIPTIONS.items() if any(re.search(f"/{ending}$", one) for one in panels)]
+    return dict.fromkeys(guides, "\n".join(f"- {text}" for text in found)) | texts
 
 
-def _now(device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container:
-    name = device.name
+def list_views(part: rrb.Container | rrb.View) -> list[rrb.View]:
+    """Return all views of a layout, from left to right and from top to bottom."""
+    return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in list_views(one)]
+
+
+def _remove_views_without_data(part: rrb.Container, entities: Collection[str]) -> None:
+    """Remove the views whose entities have no data, and the containers that become empty."""
+    contents = list(part.contents)
+    for one in contents:
+        if isinstance(one, rrb.Container):
+            _remove_views_without_data(one, entities)
+    kept = [i for i, one in enumerate(contents) if _has_data(one, entities)]
+    for name in ("column_shares", "row_shares"):
+        shares = getattr(part, name, None)
+        if shares is not None:
+            setattr(part, name, [list(shares)[i] for i in kept])
+    part.contents = [contents[i] for i in kept]
+
+
+def _has_data(part: rrb.Container | rrb.View, entities: Collection[str]) -> bool:
+    if isinstance(part, rrb.Container):
+        return any(not part.name or GUIDE not in str(view.origin) for view in list_views(part))
+    origin = str(part.origin)
+    if origin.endswith(ALWAYS_SHOWN) or GUIDE in origin:
+        return True
+    contents: Any = [part.contents] if isinstance(part.contents, str) else part.contents
+    shown = [f"{one.removeprefix('+ ').replace('$origin', origin).removesuffix('/**')}/" for one in contents]
+    own = [path for path in shown if path.startswith(origin)]  # a view may add the samples for comparison
+    return any(f"{entity}/".startswith(path) for path in own for entity in entities)
+
+
+def _device(device: ViewerDeviceDescription, waiting: bool, units: UnitSystem) -> rrb.Container:
+    pages = [_now(device.name, waiting, units), _changes(device.name, units)]
+    if parts := [part for panel in PANELS if (part := panel.page_part(device, units)) is not None]:
+        pages.append(_temperature_and_drift(device.name, parts))
+    if device.has_model:
+        pages.append(_model_gap(device.name, units))
+    return rrb.Tabs(*pages, active_tab=0, name=device.name)
+
+
+def _now(name: str, waiting: bool, units: UnitSystem) -> rrb.Container:
     left = rrb.Vertical(
-        rrb.TextDocumentView(origin=f"/{name}/status", name="Is it healthy?"),
+        rrb.TextDocumentView(
+            origin=f"/{name}/{'waiting' if waiting else 'status'}", contents="$origin", name="Is it healthy?"
+        ),
         rrb.TextDocumentView(origin=f"/{name}/coefficients", contents="$origin", name="What is its noise now?"),
-        _event_log(f"/{name}/events"),
-        row_shares=[2.35, 6.3, 1.35],
+        rrb.Tabs(_event_log(f"/{name}/events"), _guide(name, "now"), active_tab=0),
+        row_shares=[2.35, 6.0, 1.65],
     )
-    rows = [
-        (5.0, rrb.Horizontal(*(_allan(name, kind, units) for kind in KINDS))),
-        (2.2, rrb.Horizontal(*(_coefficient(name, kind, one, units) for kind in KINDS for one in NOW_COEFFICIENTS))),
-        (1.6, rrb.Horizontal(*(_gap(name, kind) for kind in KINDS))),
-        (2.2, rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), temperature_view(name), column_shares=[2, 2, 1])),
-    ]
-    if not device.has_model:
-        del rows[2]
-    right = rrb.Vertical(*(row for _, row in rows), row_shares=[share for share, _ in rows])
-    return rrb.Horizontal(left, right, column_shares=[3, 7], name="Now")
+    right = rrb.Vertical(
+        rrb.Horizontal(*(_allan(name, kind, units) for kind in KINDS)),
+        rrb.Horizontal(*(_coefficient(name, kind, symbol, units) for kind in KINDS for symbol in NOW_COEFFICIENTS)),
+        rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), temperature_view(name), column_shares=[5, 5, 3]),
+        row_shares=[5.0, 2.2, 2.2],
+    )
+    return rrb.Horizontal(left, right, column_shares=[3, 7], name="Device")
 
 
-def _dynamic(device: str, units: UnitSystem) -> rrb.Container:
+def _changes(device: str, units: UnitSystem) -> rrb.Container:
     columns = [
         rrb.Vertical(
             *(_heat_map(device, axis) for axis in axes_of(kind)),
@@ -99,7 +179,22 @@ def _dynamic(device: str, units: UnitSystem) -> rrb.Container:
         )
         for kind in KINDS
     ]
-    return rrb.Horizontal(*columns, name="Dynamic")
+    texts = rrb.Horizontal(_event_log(f"/{device}/events"), _guide(device, "changes"))
+    return rrb.Vertical(rrb.Horizontal(*columns), texts, row_shares=[6, 1], name="What changed")
+
+
+def _model_gap(device: str, units: UnitSystem) -> rrb.Container:
+    plots = rrb.Horizontal(*(_allan(device, kind, units) for kind in KINDS))
+    return rrb.Vertical(
+        rrb.Horizontal(*(_gap(device, kind) for kind in KINDS)), plots, _guide(device, "gap"), row_shares=[3, 5, 1],
+        name="Model gap",
+    )  # fmt: skip
+
+
+def _temperature_and_drift(device: str, parts: Sequence[rrb.Container]) -> rrb.Container:
+    return rrb.Vertical(
+        rrb.Horizontal(*parts), _guide(device, "temperature"), row_shares=[8, 1], name="Temperature and drift"
+    )
 
 
 def _overview(devices: Sequence[str], units: UnitSystem) -> rrb.Container:
@@ -122,9 +217,13 @@ def _fleet(devices: Sequence[str], units: UnitSystem) -> rrb.Container:
     return rrb.Horizontal(left, right, column_shares=[6, 5], name="Fleet")
 
 
-def _overview_texts() -> tuple[rrb.View, rrb.View]:
-    table = rrb.TextDocumentView(origin="/overview", contents="$origin", name="Is it healthy?")
-    return table, _event_log("/overview/events")
+def _overview_texts() -> tuple[rrb.View, rrb.Container]:
+    table = rrb.TextDocumentView(origin="/overview", contents="$origin", name="Are they healthy?")
+    return table, rrb.Tabs(_event_log("/overview/events"), _guide("", "overview"), active_tab=0)
+
+
+def _guide(device: str, page: str) -> rrb.View:
+    return rrb.TextDocumentView(origin=f"{device}{GUIDE}{page}", contents="$origin", name="How to read this page")
 
 
 def _event_log(origin: str) -> rrb.View:
@@ -135,14 +234,18 @@ def _event_log(origin: str) -> rrb.View:
 
 def _heat_map(device: str, axis: str) -> rrb.View:
     x, y = dynamic_heat_map.heat_map_bounds(TYPICAL_TAU_COUNT)
-    name = f"{axis}: Allan deviation over time, divided by its median"
+    name = f"{axis}: Allan deviation over time, relative to its median"
     return drawing_view(f"/{device}/dynamic/{axis}", name, "$origin/**", x, y)
 
 
 def _allan(device: str, kind: Kind, units: UnitSystem, prefix: str = "") -> rrb.View:
     paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
     name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {units.deviation(kind).name}"
-    return drawing_view(f"/{device}/allan", name, paths, (-1.6, WIDTH + 0.6), (-1.3, HEIGHT + 2.5))
+    bottom = HEIGHT + KEY_BELOW + 2.0 * KEY_ROW
+    if prefix:  # small plots have no space for a key
+        paths.append(f"- /{device}/allan/{kind}/key/**")
+        name, bottom = f"{prefix}{KIND_NAMES[kind]}, {units.deviation(kind).name}", HEIGHT + 1.6
+    return drawing_view(f"/{device}/allan", name, paths, (-2.9, WIDTH + 0.9), (-1.5, bottom))
 
 
 def _coefficient(device: str, kind: Kind, symbol: str, units: UnitSystem) -> rrb.View:

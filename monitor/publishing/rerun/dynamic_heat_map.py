@@ -106,7 +106,7 @@ NO_VALUE_INDEX: Final = 2 * SHADES + 1  # palette index of a missing deviation
 MIN_COLUMNS: Final = 4  # smallest number of columns that gives a meaningful median
 BAR_X: Final = COLUMNS + 9.0
 BAR_STEPS: Final = 24
-LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and below the image, for labels
+LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 17.0)  # left, above, right and below the image, for labels
 
 
 def heat_map_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -156,16 +156,16 @@ def encode_heat_map(log_ratio: Floats) -> bytes:
 
 
 def _palette() -> tuple[axis_colours.Colour, ...]:
-    """Return a palette that is blue below the median, vermilion above the median, and black for missing values."""
+    """Return a palette that is blue below the median, vermilion above the median, and grey for missing values."""
     below = [
-        axis_colours.blend_colours(axis_colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, axis_colours.MINOR)
+        axis_colours.blend_colours(axis_colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, axis_colours.PALE)
         for i in range(SHADES)
     ]
     above = [
-        axis_colours.blend_colours(axis_colours.AXIS_COLOURS["gx"], i / SHADES, axis_colours.MINOR)
+        axis_colours.blend_colours(axis_colours.AXIS_COLOURS["gx"], i / SHADES, axis_colours.PALE)
         for i in range(SHADES + 1)
     ]
-    return (*below, *above, axis_colours.BACKGROUND)
+    return (*below, *above, axis_colours.GREY)
 
 
 PALETTE: Final = _palette()
@@ -186,7 +186,7 @@ def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
 
 def _time_labels(surface: AllanHistory, height: int) -> list[tuple[float, float, str]]:
     at = ((12.0, surface.ends_s[0]), (COLUMNS - 1.0, surface.ends_s[-1]))
-    return [(x, height + 6.0, format_utc(t)[-8:]) for x, t in at]
+    return [(x, height + 4.0, format_utc(t)[-8:]) for x, t in at]
 
 
 def _bar_labels(height: int) -> list[tuple[float, float, str]]:

@@ -37,6 +37,7 @@ CONFIRM_PERIOD_S: Final = 1.0  # interval between two checks that the viewer has
 PATIENCE_S: Final = 1.0  # longest duration of such a check
 STALL_TIMEOUT_S: Final = 2.0  # a Rerun call that takes longer shows that the viewer is stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
+LAYOUT_PERIOD_S: Final = 2.0  # shortest interval between two layouts, because a new layout selects the first page
 PLOTS_PER_S: Final = 8.0  # number of Allan plots of all devices that are drawn per second
 MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes earlier does not work on this machine
 MISSING: Final = f"rerun-sdk is not installed: {install_command('imu-monitor[viewer]')}"
@@ -178,15 +179,23 @@ class RerunView:
             self._child = None
             output.close()
 
-    def _send_layout(
-        self, output: "RerunStreamWithSink", scene: "AllDevicesScene", devices: Sequence[ViewerDeviceDescription]
-    ) -> None:
+    def _send_layout_if_changed(
+        self,
+        output: "RerunStreamWithSink",
+        scene: "AllDevicesScene",
+        devices: Sequence[ViewerDeviceDescription],
+        sent: list[tuple[str, str]] | None,
+    ) -> list[tuple[str, str]]:
+        """Send the layout if its views differ from the views that were sent, and return the views."""
         from monitor.publishing.rerun import blueprint
 
-        layout = blueprint.blueprint(devices, self._fleet, scene.units)
-        output.stream.send_blueprint(layout, make_active=True, make_default=True)
-        scene.set_detailed_devices(devices)
-        self._phase = f"ok, but {output.note}" if output.note else "ok"
+        layout = blueprint.blueprint(devices, self._fleet, scene.entities, scene.units)
+        views = [(str(view.origin), str(view.name)) for view in blueprint.list_views(layout.root_container)]
+        if views != sent:
+            for path, text in blueprint.guide_texts(layout.root_container).items():
+                scene.log_static_text(path, text)
+            output.stream.send_blueprint(layout, make_active=True, make_default=True)
+        return views
 
     def _draw_history(self, scene: "AllDevicesScene", device: str) -> None:
         self._inside_since = None  # a slow disk must not count as a stalled viewer
@@ -199,7 +208,9 @@ class RerunView:
         waiting = _WaitingResults()
         shown: tuple[ViewerDeviceDescription, ...] | None = None
         begun: set[str] = set()
-        checked = time.monotonic()
+        views: list[tuple[str, str]] | None = None  # views of the layout that was sent last
+        drawn_entities = 0  # number of entities with data when the layout was checked last
+        checked = laid_out = time.monotonic()
         while True:
             closing = self._closing.is_set()
             waiting.add_results(
@@ -209,12 +220,17 @@ class RerunView:
             if self._devices is not shown:
                 shown = self._devices
                 waiting.period_factor = max(1.0, len(shown) / PLOTS_PER_S)
-                self._send_layout(output, scene, shown)
+                scene.set_detailed_devices(shown)
+                drawn_entities, views = -1, None
+                self._phase = f"ok, but {output.note}" if output.note else "ok"
                 for device in [one.name for one in shown if one.name not in begun]:
                     begun.add(device)
                     self._draw_history(scene, device)
             waiting.draw_due_results(scene, draw_all=closing)
             now = time.monotonic()
+            if views is None or (now - laid_out > LAYOUT_PERIOD_S and len(scene.entities) != drawn_entities):
+                views = self._send_layout_if_changed(output, scene, shown, views)
+                laid_out, drawn_entities = now, len(scene.entities)
             if closing or now - checked > CONFIRM_PERIOD_S:
                 self._confirm(output)
                 checked = time.monotonic()

@@ -6,8 +6,6 @@ from typing import Any, Final
 import rerun as rr
 import rerun.blueprint as rrb
 
-from monitor.publishing.plots import axis_colours
-
 TIMELINE: Final = "sample_time"
 RAW_SAMPLES_S: Final = 30.0
 """Duration of the samples that a view shows [s]."""
@@ -68,7 +66,6 @@ def drawing_view(origin: str, name: str, contents: Any, x_range: Sequence[float]
         origin=origin,
         contents=contents,
         name=name,
-        background=rrb.Background(color=axis_colours.BACKGROUND),
         visual_bounds=rrb.VisualBounds2D(x_range=list(x_range), y_range=list(y_range)),
     )
 

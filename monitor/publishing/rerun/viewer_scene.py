@@ -16,7 +16,7 @@ from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.rerun import panels
 from monitor.publishing.rerun.panels import Panel
-from monitor.publishing.rerun.shared_views import TIMELINE
+from monitor.publishing.rerun.shared_views import TIMELINE, markdown_document
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 from monitor.publishing.result_kinds import RESULT_KINDS, TimedResult
 
@@ -45,6 +45,7 @@ class AllDevicesScene:
         self.units = units
         self.devices: dict[str, ViewerDeviceDescription] = {}  # devices that are shown
         self.healths: dict[str, Health] = {}  # newest health of each shown device
+        self.entities: set[str] = set()  # paths of the entities that have data
         self._stream = stream
         self._panels: dict[tuple[str, type[Panel]], Panel] = {}
 
@@ -117,7 +118,22 @@ class AllDevicesScene:
         static
             True if the components do not change with time.
         """
+        if not static:
+            self.entities.add(f"/{path}")
         self._stream.log(path, *entities, static=static)
+
+    def log_static_text(self, path: str, text: str) -> None:
+        """Log a Markdown text that does not change with time.
+
+        Parameters
+        ----------
+        path
+            Path of the entity in the Rerun recording.
+        text
+            Text in Markdown.
+        """
+        self._stream.log(path, markdown_document(text), static=True)
+        self.entities.add(path if path.startswith("/") else f"/{path}")
 
     def log_scalars(self, path: str, unix_s: Floats, values: Floats) -> None:
         """Log one or several time series under one path.
@@ -132,6 +148,7 @@ class AllDevicesScene:
             Values, shape [n] or [n, series].
         """
         if unix_s.size:
+            self.entities.add(f"/{path}")
             time = rr.TimeColumn(TIMELINE, timestamp=_timestamps(unix_s))
             self._stream.send_columns(path, [time], rr.Scalars.columns(scalars=values))
 

@@ -39,7 +39,7 @@ class DriftPanel(Panel):
                 axis_colours.AXIS_COLOURS[axis],
                 axis_colours.blend_colours(axis_colours.AXIS_COLOURS[axis], 0.45),
             )
-            lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", axis_colours.TEXT, 1.5)]
+            lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", axis_colours.GREY, 1.5)]
             lines += [(f"{axis} 95 % low", colour, 1.0), (f"{axis} 95 % high", colour, 1.0)]
             self._style_lines(f"drift/{axis}", lines)
             self._style_lines(f"innovation/{axis}", [(f"{axis}, σ", colour, 1.0)])
@@ -59,23 +59,23 @@ class DriftPanel(Panel):
         self._log_text("drift", float(unix_s[-1]), drift_text(results[-1], self.scene.units))
 
     @classmethod
-    def tab_layout(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
-        """Return the layout of the Drift tab, or None if the gyroscope drift of the device is not compensated."""
+    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
+        """Return the views of the drift, or None if the gyroscope drift of the device is not compensated."""
         if not device.compensated:
             return None
         name = device.name
         rows = []
         for axis in axes_of("gyro"):
             title = f"{axis}: measured rate, and rate without drift, {SAMPLE_UNITS['gyro'].name}"
-            contents = (f"$origin/samples/{axis}", f"$origin/compensated/{axis}")
+            contents = (f"/{name}/samples/{axis}", f"$origin/{axis}")
             dimmed = {f"/{name}/samples/{axis}": rr.SeriesLines(colors=[axis_colours.FRAME], widths=[0.75])}
-            rates = time_series_view(f"/{name}", title, contents, RAW_SAMPLES_S, styles=dimmed)
+            rates = time_series_view(f"/{name}/compensated", title, contents, RAW_SAMPLES_S, styles=dimmed)
             title = f"{axis}: means at rest, and predicted drift, {units.deviation('gyro').name}"
             drift = time_series_view(f"/{name}/drift/{axis}", title)
             innovation = time_series_view(f"/{name}/innovation/{axis}", f"{axis}: innovation, σ")
             rows.append(rrb.Horizontal(rates, drift, innovation, column_shares=[3, 3, 2]))
         text = rrb.TextDocumentView(origin=f"/{name}/drift", contents="$origin", name="Drift of the gyros")
-        return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 2.5], name="Drift")
+        return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 2.5])
 
 
 class ThermalPredictionPanel(Panel):
@@ -89,7 +89,7 @@ class ThermalPredictionPanel(Panel):
                 axis_colours.blend_colours(axis_colours.AXIS_COLOURS[axis], 0.45),
             )
             unit = self.scene.units.deviation(sensor_kind(axis)).name
-            lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", axis_colours.TEXT, 1.0)]
+            lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", axis_colours.GREY, 1.0)]
             self._style_lines(
                 f"thermal/{axis}", [*lines, (f"{axis} 95 % low", dim, 0.75), (f"{axis} 95 % high", dim, 0.75)]
             )
@@ -110,8 +110,8 @@ class ThermalPredictionPanel(Panel):
         return one.bias, one.one_step.bias, one.one_step.lo, one.one_step.hi
 
     @classmethod
-    def tab_layout(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
-        """Return the layout of the Temperature tab, or None if the bias is not predicted from temperature."""
+    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
+        """Return the views of the bias and the temperature, or None if the bias is not predicted from temperature."""
         if not device.has_thermal:
             return None
         columns = []
@@ -120,4 +120,4 @@ class ThermalPredictionPanel(Panel):
             views = [time_series_view(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
             columns.append(rrb.Vertical(*views))
         temperature = temperature_view(device.name)
-        return rrb.Vertical(rrb.Horizontal(*columns), temperature, row_shares=[4, 1], name="Temperature")
+        return rrb.Vertical(rrb.Horizontal(*columns), temperature, row_shares=[4, 1])

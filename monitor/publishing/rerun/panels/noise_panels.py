@@ -39,7 +39,7 @@ class ModelDifferencePanel(Panel):
         """Log the names, colours and widths of the lines."""
         for axis in AXES:
             self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", axis_colours.AXIS_COLOURS[axis], 1.5)])
-        self._style_lines("gap/threshold", [("threshold", axis_colours.blend_colours(axis_colours.TEXT, 0.6), 1.0)])
+        self._style_lines("gap/threshold", [("threshold", axis_colours.GREY, 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[ModelComparison]) -> None:
         """Draw the differences from the noise model for each axis."""

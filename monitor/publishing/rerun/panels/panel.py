@@ -54,8 +54,8 @@ class Panel:
         """Draw the stored history of the device."""
 
     @classmethod
-    def tab_layout(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
-        """Return the layout of a separate tab for the panel, or None if the panel has no tab.
+    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
+        """Return the views of the panel on the page for temperature and drift, or None if there are none.
 
         Parameters
         ----------

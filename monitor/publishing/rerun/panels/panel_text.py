@@ -155,7 +155,9 @@ def noise_text(estimate: Estimate, units: UnitSystem = DEFAULT_UNITS) -> str:
         return "Too few samples yet."
     seen_s = estimate.curve.n / estimate.rate_hz
     head = f"Last **{format_duration(min(seen_s, estimate.window_s))}**, 95 % intervals; ≤ bound; — too few data"
-    return "\n\n".join([head, *tables])
+    poor = ", ".join(estimate.poorly_fitted_axes)
+    note = [f"**{poor}: the fit does not describe the curve**, so these coefficients are uncertain"] if poor else []
+    return "\n\n".join([head, *note, *tables])
 
 
 def drift_text(update: MeasuredAndSubtractedDrift, units: UnitSystem) -> str:

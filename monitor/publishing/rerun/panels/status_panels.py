@@ -3,6 +3,7 @@
 Importing this module imports Rerun.
 """
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -32,7 +33,12 @@ class HealthPanel(Panel):
         if self.device in devices:
             self.scene.healths[self.device] = health
         about = devices[self.device].about if self.device in devices else ""
-        self._log_text("status", at_s, health_text(self.device, health, about))
+        text = health_text(self.device, health, about)
+        if math.isnan(at_s):  # there is no sample yet, so the time on the axis of the samples is unknown
+            self.scene.log_static_text(self.entity_path("waiting"), text)
+            return
+        self.scene.entities.discard(f"/{self.entity_path('waiting')}")
+        self._log_text("status", at_s, text)
         if len(devices) > 1 and not self.scene.fleet:
             self.scene.get_or_create_panel("", AllDevicesTablePanel).log_table_of_all_devices(
                 at_s, overview_text(self.scene.healths)

@@ -101,6 +101,13 @@ def test_letters_are_at_their_conventional_averaging_times() -> None:
     assert "R" not in letters  # R is only bounded
 
 
+def test_fit_that_does_not_describe_the_curve_is_grey_and_named() -> None:
+    panel = draw_panel(estimate=replace(example_results.make_estimate(), poorly_fitted_axes=("gy",)))
+    assert "gy: fit (grey) does not describe the curve" in [text.get_text() for text in panel.texts]
+    fits = [line.get_color() for line in panel.lines if line.get_zorder() == 3]
+    assert fits == [style.COLOURS[0], style.GREY, style.COLOURS[2]]
+
+
 def test_overlapping_marks_share_a_letter() -> None:
     estimate = example_results.make_estimate()
     value = estimate.coefficients.value.copy()

@@ -1,27 +1,63 @@
 """Tests of the Allan plots in the viewer."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
+from monitor.estimation.estimate import Estimate
+from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.allan_figure import READING_TAU_S
 from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, WIDTH
 from monitor.publishing.rerun.allan_drawing import KEY, AllanPlotPair
-from tests.monitor.publishing.example_results import make_estimate
+from tests.monitor.publishing.example_results import make_comparison, make_estimate
 
 
-def draw_example() -> dict[str, Any]:
+def draw_example(estimate: Estimate | None = None, gap: ModelComparison | None = None) -> dict[str, Any]:
     """Return the Rerun components logged by the plots of an example, by path."""
     logged: dict[str, Any] = {}
-    AllanPlotPair(lambda path, *parts: logged.update({path: parts[0]}), "d").draw(make_estimate(), None)
+    plots = AllanPlotPair(lambda path, *parts: logged.update({path: parts[0]}), "d")
+    plots.draw(estimate or make_estimate(), gap)
     return logged
 
 
-def test_key_explains_every_sign() -> None:
-    logged = draw_example()
-    for kind in ("gyro", "accel"):
-        assert tuple(logged[f"d/{kind}/key/text"].labels.as_arrow_array().to_pylist()) == KEY
-        assert {"d/gyro/key/fit", "d/gyro/key/band", "d/gyro/key/model", "d/gyro/key/ring"} < set(logged)
+def list_labels(points: Any) -> list[str]:
+    return list(points.labels.as_arrow_array().to_pylist()) if points.labels is not None else []
+
+
+def count_lines(lines: Any) -> int:
+    return len(lines.strips.as_arrow_array())
+
+
+def test_key_explains_the_signs_in_use() -> None:
+    shown, gap = draw_example(), make_comparison(make_estimate())
+    assert list_labels(shown["d/gyro/key/text"]) == ["measured", "fit", "95 %", "N, B, K"]
+    assert not count_lines(shown["d/gyro/key/model"])
+    shown = draw_example(gap=gap)
+    assert list_labels(shown["d/accel/key/text"]) == ["measured", "fit", "95 %", "N, B, K", "model"]
+    assert count_lines(shown["d/accel/key/model"]) > 0
+    assert {f"d/gyro/key/{sign}" for sign in KEY if sign != "measured"} < set(shown)
+
+
+def test_fit_that_does_not_describe_the_curve_is_grey_and_named() -> None:
+    shown = draw_example(replace(make_estimate(), poorly_fitted_axes=("gz",)))
+    assert list_labels(shown["d/gyro/note"]) == ["gz: fit does not describe the curve"]
+    assert list_labels(shown["d/accel/note"]) == []
+    assert "poor fit" in list_labels(shown["d/gyro/key/text"])
+    colours = {axis: shown[f"d/{axis}/fit"].colors.as_arrow_array().to_pylist() for axis in ("gx", "gy", "gz")}
+    red, green, blue = axis_colours.GREY
+    assert colours["gz"] == [(red << 24) + (green << 16) + (blue << 8) + 255]
+    assert colours["gx"] != colours["gz"] != colours["gy"]
+
+
+def test_each_axis_has_its_own_marker() -> None:
+    shown = draw_example()
+    points = len(shown["d/gx"].positions)
+    assert len(shown["d/gx/marker"].positions) == points
+    corners = {axis: len(shown[f"d/{axis}/marker"].strips.as_arrow_array()[0]) - 1 for axis in ("gy", "gz")}
+    assert corners == {"gy": 4, "gz": 3}
+    assert count_lines(shown["d/gy/marker"]) == points
 
 
 def test_ring_of_n_is_at_one_second_and_at_the_level_of_n() -> None:
@@ -40,7 +76,7 @@ def test_ring_of_n_is_at_one_second_and_at_the_level_of_n() -> None:
     assert READING_TAU_S["N"] == 1.0
     np.testing.assert_allclose(x, x_of_one_second, atol=1e-4)
     n_degrees_per_hour = np.degrees(estimate.coefficients.value[1, 0]) * 3600.0
-    ticks = [(point[1] + 0.35, float(label)) for point, label in at_tau.items() if point[0] < 0.0]
+    ticks = [(point[1] + 0.5, float(label)) for point, label in at_tau.items() if point[0] < 0.0 and point[1] < HEIGHT]
     heights, levels = np.array(sorted(ticks)).T
     expected = np.interp(np.log10(n_degrees_per_hour), np.log10(levels[::-1]), heights[::-1])
     np.testing.assert_allclose(y, expected, atol=1e-3)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from drivers.data_types import AXES, Event
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.rerun import blueprint, dynamic_heat_map
+from monitor.publishing.rerun import dynamic_heat_map
 from monitor.publishing.rerun.dynamic_heat_map import COLUMNS, AllanHistory
 from monitor.publishing.rerun.viewer_scene import AllDevicesScene
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
@@ -154,46 +154,6 @@ def test_recording_has_surfaces_labels_and_marks(tmp_path: Path) -> None:
     (mark,) = [c for c in cells["/bench-1/coefficients/N/gz/changed Scalars:scalars"] if c]
     assert mark == pytest.approx([np.degrees(3.0e-4) * 60])
     assert not any("floor" in name for name in cells)
-
-
-def test_device_has_tabs_for_the_present_and_the_history() -> None:
-    tabs = blueprint.blueprint([ViewerDeviceDescription("bench-1")]).root_container
-    assert [page.name for page in tabs.contents] == ["Now", "Dynamic"]
-    assert tabs.active_tab == 0
-    fleet = blueprint.blueprint([ViewerDeviceDescription("nose"), ViewerDeviceDescription("tail")]).root_container
-    assert [page.name for page in fleet.contents] == ["Overview", "nose", "tail"]
-
-
-def test_temperature_tab_needs_a_thermal_model() -> None:
-    fleet = blueprint.blueprint(
-        [ViewerDeviceDescription("a"), ViewerDeviceDescription("b", has_thermal=True)]
-    ).root_container
-    (_, first, second) = fleet.contents
-    assert [page.name for page in first.contents] == ["Now", "Dynamic"]
-    assert [page.name for page in second.contents] == ["Now", "Dynamic", "Temperature"]
-    assert second.active_tab == 0
-
-
-def test_gap_panels_need_a_model() -> None:
-    def list_view_names(page: object) -> list[str]:
-        return [getattr(page, "name", None) or ""] + [
-            name for child in getattr(page, "contents", []) for name in list_view_names(child)
-        ]
-
-    assert not [
-        name
-        for name in list_view_names(blueprint.blueprint([ViewerDeviceDescription("a")]).root_container)
-        if "gap" in str(name)
-    ]
-    fleet = blueprint.blueprint(
-        [ViewerDeviceDescription("a"), ViewerDeviceDescription("b", has_model=True)]
-    ).root_container
-    (_, first, second) = fleet.contents
-    assert not [name for name in list_view_names(first) if "gap" in str(name)]
-    assert [name for name in list_view_names(second) if "gap" in str(name)] == [
-        "Gyroscopes: gap to the model, σ, and its threshold",
-        "Accelerometers: gap to the model, σ, and its threshold",
-    ]
 
 
 def test_view_contains_image_and_labels() -> None:

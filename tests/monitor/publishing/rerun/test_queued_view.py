@@ -10,6 +10,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -90,6 +91,18 @@ def test_recording_contains_the_shown_results(tmp_path: Path) -> None:
     assert "RUNNING" in str(rows["/bench-1/status"])
     times = read_column_values(rows["/bench-1/samples/ax"], "sample_time")
     assert times[[0, -1]] / 1e9 == pytest.approx([T0, T0 + 0.99], abs=1e-6)
+
+
+def test_state_before_the_first_sample_has_no_time(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    view = RerunView(ViewerSettings(mode=str(path)), DEVICE)
+    view.start()
+    wait_for(lambda: view.state == "ok")
+    view.put("bench-1", np.nan, replace(example_results.make_health(), state="waiting"))
+    view.close()
+    rows = read_entities(path)
+    assert "WAITING" in str(rows["/bench-1/waiting"])
+    assert not [entity for entity, columns in rows.items() if "sample_time" in columns]
 
 
 def test_gap_and_model_curve_are_recorded(tmp_path: Path) -> None:

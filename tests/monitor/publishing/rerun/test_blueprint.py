@@ -1,0 +1,67 @@
+"""Tests of the layout of the viewer: pages, views without data, and descriptions."""
+
+import re
+
+import pytest
+
+pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+
+from monitor.publishing.rerun.blueprint import DESCRIPTIONS, GUIDE, blueprint, guide_texts, list_views
+from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
+
+FULL = ViewerDeviceDescription("b", has_model=True, has_thermal=True, compensated=True)
+PAGES = ["Device", "What changed", "Temperature and drift", "Model gap"]
+
+
+def list_pages(device: ViewerDeviceDescription, entities: set[str] | None = None) -> list[str]:
+    return [page.name for page in blueprint([device], entities=entities).root_container.contents]
+
+
+def list_origins(*devices: ViewerDeviceDescription, entities: set[str] | None = None) -> list[str]:
+    return [str(view.origin) for view in list_views(blueprint(devices, entities=entities).root_container)]
+
+
+def test_device_has_the_pages_of_its_features() -> None:
+    assert list_pages(ViewerDeviceDescription("a")) == PAGES[:2]
+    assert list_pages(ViewerDeviceDescription("a", has_thermal=True)) == PAGES[:3]
+    assert list_pages(FULL) == PAGES
+    several = blueprint([ViewerDeviceDescription("nose"), ViewerDeviceDescription("tail")]).root_container
+    assert [page.name for page in several.contents] == ["Overview", "nose", "tail"]
+
+
+def test_device_without_data_has_its_state_and_a_guide() -> None:
+    assert list_origins(FULL, entities=set()) == ["/b/status", "b/guide/now"]
+    assert list_origins(FULL, entities={"/b/waiting"}) == ["/b/waiting", "b/guide/now"]
+
+
+def test_views_and_pages_appear_with_their_data() -> None:
+    entities = {"/b/status", "/b/samples/gx", "/b/allan/gx", "/b/coefficients", "/b/coefficients/N/gx"}
+    assert list_pages(FULL, entities) == ["Device", "What changed", "Model gap"]
+    assert list_pages(FULL, entities | {"/b/drift/gx"}) == PAGES
+    origins = list_origins(FULL, entities=entities)
+    assert {"/b/allan", "/b/samples", "/b/coefficients/N"} <= set(origins)
+    assert not {"/b/temperature", "/b/gap", "/b/events", "/b/dynamic/gx", "/b/coefficients/B"} & set(origins)
+    assert "/b/gap" in list_origins(FULL, entities=entities | {"/b/gap/gx"})
+
+
+def test_data_of_another_device_show_no_views() -> None:
+    origins = list_origins(ViewerDeviceDescription("b"), ViewerDeviceDescription("bb"), entities={"/bb/allan/gx"})
+    assert "/bb/allan" in origins
+    assert "/b/allan" not in origins
+
+
+def test_every_panel_has_one_sentence() -> None:
+    for layout in (blueprint([FULL]), blueprint([FULL, ViewerDeviceDescription("c")]), blueprint([], fleet=True)):
+        for view in list_views(layout.root_container):
+            if GUIDE not in str(view.origin):
+                found = [ending for ending in DESCRIPTIONS if re.search(f"/{ending}$", str(view.origin))]
+                assert len(found) == 1, view.origin
+
+
+def test_guide_describes_only_the_panels_of_its_page() -> None:
+    texts = guide_texts(blueprint([FULL]).root_container)
+    assert sorted(texts) == [f"b/guide/{page}" for page in ("changes", "gap", "now", "temperature")]
+    assert "Heat maps" in texts["b/guide/changes"]
+    assert "Heat maps" not in texts["b/guide/now"]
+    drift = guide_texts(blueprint([ViewerDeviceDescription("b", compensated=True)]).root_container)
+    assert "Temperature" not in drift["b/guide/temperature"]
