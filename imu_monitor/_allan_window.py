@@ -10,7 +10,7 @@ from drivers.data_types import AXES, NS_PER_S, make_block
 from drivers.errors import ConfigError
 from drivers.validation.number_ranges import DURATION_S, RATE_HZ
 from imu_monitor._estimates import AllanEstimate
-from imu_monitor._messages import errors_name_arguments
+from imu_monitor._message_wording import errors_name_arguments
 from imu_monitor._recordings import check_axes, check_range, to_tau_grid
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.estimation.estimator import Estimator

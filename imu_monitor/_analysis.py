@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from drivers.data_types import AXES
 from drivers.validation.number_ranges import DURATION_S
 from imu_monitor._estimates import AllanEstimate
-from imu_monitor._messages import errors_name_arguments, name_arguments
+from imu_monitor._message_wording import errors_name_arguments, name_arguments
 from imu_monitor._recordings import Samples, check_range, to_recording, to_tau_grid
 from monitor.commands.analyze import AnalysisResults, analyze_recording, save_plot_or_report
 from monitor.common.unit_formatting import UnitSystem

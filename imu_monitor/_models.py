@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 from drivers.recordings import memory_check
 from drivers.validation.number_ranges import DURATION_S, RATE_HZ, SEED
 from imu_monitor._estimates import AllanEstimate
-from imu_monitor._messages import errors_name_arguments
+from imu_monitor._message_wording import errors_name_arguments
 from imu_monitor._recordings import Recording, check_range
 from monitor.commands.simulate import choose_sample_grid, start_stream
 from monitor.common.shipped_config_paths import list_shipped_models

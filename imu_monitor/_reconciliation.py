@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 from drivers.host.extras import require_extra
 from drivers.validation.number_ranges import SEED
 from imu_monitor._display import build_dataframe, render_html, render_text
-from imu_monitor._messages import errors_name_arguments, name_arguments
+from imu_monitor._message_wording import errors_name_arguments, name_arguments
 from imu_monitor._models import ModelSource, to_model
 from imu_monitor._recordings import Samples, check_range, to_recording
 from monitor.common.unit_formatting import format_duration

@@ -17,7 +17,7 @@ from drivers.recordings.table import ALIASES, COLUMNS, TIME_NS, integers_to_ns
 from drivers.validation.module_lookup import format_suggestion
 from drivers.validation.number_ranges import RATE_HZ, NumberRange
 from imu_monitor._display import build_dataframe, render_html
-from imu_monitor._messages import errors_name_arguments, name_arguments
+from imu_monitor._message_wording import errors_name_arguments, name_arguments
 from monitor.commands.analyze import check_averaging_times
 from monitor.common.unit_formatting import KIND_NAMES, SAMPLE_UNITS, axes_of, format_duration, format_number
 from monitor.estimation.allan.batch import TauGrid

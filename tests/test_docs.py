@@ -292,7 +292,7 @@ def test_every_name_in_the_text_is_defined(page: Path, heading: str) -> None:
 # --- programs
 
 
-def read_first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]", zenoh: ZenohPublisher) -> str:
+def read_first_line(stdout: IO[str], publish: "list[tuple[topics.ZenohTopic, bytes]]", zenoh: ZenohPublisher) -> str:
     """Return the first line that a program prints, while results are published ten times a second."""
     with selectors.DefaultSelector() as selector:
         selector.register(stdout, selectors.EVENT_READ)

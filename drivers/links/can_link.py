@@ -27,8 +27,8 @@ from pydantic import Field, SkipValidation
 from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.host.extras import install_command, require_extra
-from drivers.links.arrival_times import monotonic_arrival_ns
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
+from drivers.links.unix_to_monotonic_arrival import monotonic_arrival_ns
 from drivers.validation.module_lookup import format_choices_by_similarity
 from drivers.validation.number_ranges import BIT_RATE, format_value
 from drivers.validation.settings_model import checked_by

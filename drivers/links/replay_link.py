@@ -34,7 +34,7 @@ from pydantic import Field
 
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.host.extras import require_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, require_packages_of_format, segment_file
@@ -106,7 +106,7 @@ class ReplayLink(PolledLink):
     def __init__(self, settings: Settings, kind: Kind) -> None:
         super().__init__(f"replay of {settings.path}")
         self._settings = settings
-        self._path = file_access.expand_user(settings.path)
+        self._path = safe_file_reading.expand_user(settings.path)
         self._kind: Kind = kind
         self._pace = settings.speed  # seconds of recorded time per second; inf = as fast as possible
         self.carrier: Carrier = _raw_carrier(self._path) if kind == "raw" else CARRIERS[kind]
@@ -320,7 +320,7 @@ def build(settings: Settings) -> Link:
     ConfigError
         If the file cannot be replayed.
     """
-    path = file_access.expand_user(settings.path)
+    path = safe_file_reading.expand_user(settings.path)
     _check_path(path)
     kind = detect_file_kind(path)
     if kind == "log":
@@ -334,7 +334,7 @@ def _check_path(path: Path) -> None:
     if path.is_dir():
         return
     try:
-        file_access.check_regular_file(path)
+        safe_file_reading.check_regular_file(path)
     except FileNotFoundError:
         return
     except OSError as error:

@@ -22,8 +22,8 @@ from pydantic import Field
 
 from drivers.data_types import Chunk
 from drivers.errors import LinkLost, LinkUnavailable, describe_error
-from drivers.links.arrival_times import monotonic_arrival_ns
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
+from drivers.links.unix_to_monotonic_arrival import monotonic_arrival_ns
 from drivers.validation.number_ranges import PORT
 
 DEFAULT_DECODER: Final = ""

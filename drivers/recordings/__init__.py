@@ -20,7 +20,7 @@ from pathlib import Path
 from drivers.data_types import times_to_seconds
 from drivers.errors import ConfigError, RecordingError, describe_error
 from drivers.host.extras import require_extra
-from drivers.host.file_access import check_regular_file
+from drivers.host.safe_file_reading import check_regular_file
 from drivers.recordings import memory_check
 from drivers.recordings.formats import FORMATS, WRITABLE, Format, find_format, is_recording, is_recording_folder
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions

@@ -8,7 +8,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import IO, Any
 
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 
 _listener: ContextVar[Callable[[float], None] | None] = ContextVar("reading_progress", default=None)
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, seconds_to_ns
 from drivers.errors import ImuError, RecordingError
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings.file_formats.arrow_message_sizes import iter_batch_sizes
 from drivers.recordings.file_formats.parquet_and_arrow_format import (
     METADATA_KEY,

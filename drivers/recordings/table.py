@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, NS_PER_S, Floats, Ints, Times, times_to_seconds
 from drivers.errors import RecordingError
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check
 
 COLUMNS: Final = ("t", *AXES, "temperature")

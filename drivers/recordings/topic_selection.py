@@ -28,7 +28,7 @@ HOW_TO_CHOOSE: Final = "choose with --topic (in a configuration file: topic)"
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class RecordedTopic:
     """A topic of a file."""
 
     name: str
@@ -39,7 +39,7 @@ class Topic:
 
 def select_topics(
     path: Path,
-    topics: Sequence[Topic],
+    topics: Sequence[RecordedTopic],
     imus: Sequence[Sequence[str]],
     wanted: str | None,
     expected: str,

@@ -28,7 +28,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from drivers.errors import ConfigError
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.validation.module_lookup import format_choices_by_similarity, format_suggestion
 from drivers.validation.number_ranges import format_value
 
@@ -349,12 +349,12 @@ class KeywordOrType:
 def one_of(words: Sequence[str]) -> AfterValidator:
     """Return a pydantic validator that accepts only the given words."""
 
-    def check_is_allowed_word(value: str) -> str:
+    def check_is_listed_choice(value: str) -> str:
         if value not in words:
             raise ConfigError(f'"{value}"{format_choices_by_similarity(value, words)}')
         return value
 
-    return AfterValidator(check_is_allowed_word)
+    return AfterValidator(check_is_listed_choice)
 
 
 def checked_by(check: Callable[[T], object]) -> AfterValidator:
@@ -383,7 +383,7 @@ def _file_or_name(value: str, info: ValidationInfo) -> str:
 def _beside(value: str, info: ValidationInfo) -> Path | None:
     """Return the path relative to the configuration file, or None if the value is empty or there is no such file."""
     folder = info.context.folder if info.context else None
-    return folder / file_access.expand_user(value) if folder and value else None
+    return folder / safe_file_reading.expand_user(value) if folder and value else None
 
 
 FilePath = Annotated[str, AfterValidator(_existing_file)]

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.host.file_access import check_regular_file
+from drivers.host.safe_file_reading import check_regular_file
 from drivers.zenoh.credential_masking import mask_secrets
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
-from drivers.host.file_access import real_path
+from drivers.host.safe_file_reading import real_path
 from monitor.cli.shared import options, output, service_in_terminal
 
 

@@ -18,7 +18,7 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import Recording, iter_blocks
 from drivers.validation.number_ranges import AVERAGING_TIME_S
-from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
     TemperatureRemovalComparison,

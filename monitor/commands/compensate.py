@@ -17,7 +17,7 @@ from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks
 from drivers.recordings.writing import save_samples
 from drivers.validation.module_lookup import format_suggestion
-from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
 from monitor.drift.compensation.compensation_score import AxisCompensation, DriftCompensationResult, score_at_rest

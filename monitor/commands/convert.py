@@ -8,12 +8,12 @@ import numpy as np
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.host.file_access import real_path
+from drivers.host.safe_file_reading import real_path
 from drivers.recordings import Recording, save_samples
 from drivers.recordings.file_formats.mcap_writer import IMU_TOPIC, TEMPERATURE_TOPIC
 from drivers.recordings.formats import find_writer
 from drivers.recordings.topic_selection import JOIN
-from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 
 

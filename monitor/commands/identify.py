@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, NotReady
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.links import serial_link
 from drivers.validation.settings_model import check_table
 from drivers.wire_format_identification import TEXT_DECODER, UNKNOWN, IdentifiedFormat, identify_wire_format
@@ -41,7 +41,7 @@ def identify_file(path: Path) -> IdentifiedSource:
     NotReady
         If no decoder finds samples.
     """
-    with file_access.open_regular_file(path) as file:
+    with safe_file_reading.open_regular_file(path) as file:
         data = file.read(MAX_BYTES)
     found = identify_wire_format(data)
     if found is None:

@@ -17,17 +17,17 @@ import numpy as np
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady, RecordingError
-from drivers.host.file_access import real_path
+from drivers.host.safe_file_reading import real_path
 from drivers.recordings import FORMATS, iter_blocks
 from drivers.recordings import Recording as Samples
 from drivers.recordings.writing import atomic_write_path
-from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.json_report import COMPARISON_SCHEMA, SCHEMA, encode_comparison, encode_report
-from monitor.reconcile.preparation.reconcile_input import Recording
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings.comparison import NamedResult, RecordingsComparison, compare_results
@@ -285,13 +285,13 @@ def create_report_folder(folder: Path) -> None:
         raise ConfigError(f"--out: {folder}: cannot be created: {error.strerror}") from error
 
 
-def _to_regular_grid(found: Samples) -> tuple[Recording, list[str]]:
+def _to_regular_grid(found: Samples) -> tuple[RecordedAxes, list[str]]:
     """Return the recording on a regular time grid, and notes about the resampling."""
     values, temperature_c, rate_hz, notes = place_samples_and_temperature_on_grid(
         list(iter_blocks(found)), found.rate_hz
     )
     columns = {axis: np.ascontiguousarray(values[:, AXES.index(axis)], np.float64) for axis in found.axes}
-    return Recording(columns, rate_hz, temperature_c), notes
+    return RecordedAxes(columns, rate_hz, temperature_c), notes
 
 
 def _write(path: Path, data: bytes) -> None:

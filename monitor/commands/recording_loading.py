@@ -18,7 +18,7 @@ import drivers.decoders
 from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Times, Timing, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
 from drivers.recordings.file_formats.csv_header import COMMENT_MARKS, parse_number, split_header
@@ -29,7 +29,7 @@ from drivers.recordings.table_layout import names_an_axis
 from drivers.timing.sample_clock import SampleClock
 from drivers.validation import module_lookup
 from drivers.validation.settings_model import TableError
-from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 from monitor.common.unit_formatting import format_count
 from monitor.settings.driver_settings import build_link_and_decoder, list_decoders
 

@@ -18,7 +18,7 @@ from drivers.errors import ConfigError
 from drivers.recordings import Recording, open_recording_writer
 from drivers.recordings.writing import atomic_write_path
 from drivers.validation.number_ranges import SAMPLE_COUNT
-from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.noise.model import NoiseModel
 from monitor.noise.simulation import ModelStream, SimulatedSamples

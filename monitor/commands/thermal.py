@@ -13,10 +13,10 @@ import numpy as np
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.recordings import iter_blocks
 from drivers.validation.number_ranges import DURATION_S, FIT_NUMBER
-from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
@@ -144,7 +144,7 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
         If the file cannot be read, or if its content is invalid.
     """
     try:
-        found = msgspec.json.decode(file_access.read_small_file(path, allow_pipe=True), type=_ModelFile)
+        found = msgspec.json.decode(safe_file_reading.read_small_file(path, allow_pipe=True), type=_ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from drivers.host.file_access import FILE_KINDS, check_folder_or_absent
+from drivers.host.safe_file_reading import FILE_KINDS, check_folder_or_absent
 
 RECORDING_LOCK: Final = "recording.lock"
 HISTORY_LOCK: Final = "history.lock"

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.validation import module_lookup
 
 CONFIG_FOLDER: Final = Path(__file__).resolve().parents[2] / "config"
@@ -33,7 +33,7 @@ def resolve_model_path(name: str, folder: Path) -> Path:
         If no such noise model exists. The message suggests the most similar name.
     """
     shipped = MODELS_FOLDER / f"{name}.toml"
-    path = shipped if file_access.is_file(shipped) else folder / file_access.expand_user(name)
+    path = shipped if safe_file_reading.is_file(shipped) else folder / safe_file_reading.expand_user(name)
     if os.path.exists(path) and not path.is_dir():
         return path
     suggestion = module_lookup.format_suggestion(name, list_shipped_models())

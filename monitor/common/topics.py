@@ -13,7 +13,7 @@ MSGPACK: Final = "application/msgpack"
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class ZenohTopic:
     """Zenoh topic with name, encoding and time of publication."""
 
     name: str
@@ -38,18 +38,18 @@ class Topic:
         return f"imu-monitor/{self.name.split('/')[-1]}/1"
 
 
-SAMPLES: Final = Topic("samples", MSGPACK, "batches")
-COMPENSATED: Final = Topic("compensated", MSGPACK, "batches")
-ALLAN: Final = Topic("allan", JSON, "publish", kept=1)
-COEFFICIENTS: Final = Topic("coefficients", JSON, "publish", kept=1)
-TOTAL: Final = Topic("total", JSON, "rounds")
-GAP: Final = Topic("gap", JSON, "publish", kept=1)
-THERMAL: Final = Topic("thermal", JSON, "intervals", kept=1)
-EVENT: Final = Topic("event", JSON, "event", kept=10)
-STATUS: Final = Topic("status", JSON, "1 Hz", kept=1)
-ALIVE: Final = Topic("alive", "", "presence")
-HISTORY: Final = Topic("history", JSON, "query")
-RESET: Final = Topic("command/reset", JSON, "query")
-RECONCILE: Final = Topic("command/reconcile", JSON, "query")
+SAMPLES: Final = ZenohTopic("samples", MSGPACK, "batches")
+COMPENSATED: Final = ZenohTopic("compensated", MSGPACK, "batches")
+ALLAN: Final = ZenohTopic("allan", JSON, "publish", kept=1)
+COEFFICIENTS: Final = ZenohTopic("coefficients", JSON, "publish", kept=1)
+TOTAL: Final = ZenohTopic("total", JSON, "rounds")
+GAP: Final = ZenohTopic("gap", JSON, "publish", kept=1)
+THERMAL: Final = ZenohTopic("thermal", JSON, "intervals", kept=1)
+EVENT: Final = ZenohTopic("event", JSON, "event", kept=10)
+STATUS: Final = ZenohTopic("status", JSON, "1 Hz", kept=1)
+ALIVE: Final = ZenohTopic("alive", "", "presence")
+HISTORY: Final = ZenohTopic("history", JSON, "query")
+RESET: Final = ZenohTopic("command/reset", JSON, "query")
+RECONCILE: Final = ZenohTopic("command/reconcile", JSON, "query")
 
-TOPICS: Final = tuple(value for value in tuple(vars().values()) if isinstance(value, Topic))
+TOPICS: Final = tuple(value for value in tuple(vars().values()) if isinstance(value, ZenohTopic))

@@ -14,7 +14,7 @@ import structlog
 
 from drivers.links.replay_link import ReplayLink
 from drivers.recordings.segment_file import SegmentMetadata
-from monitor.common.library_pages import LLVM_LIBRARY, release_library_pages
+from monitor.common.shared_library_memory import LLVM_LIBRARY, release_library_pages
 from monitor.daemon import config_changes
 from monitor.daemon.command_handler import CommandHandler
 from monitor.daemon.config_changes import ConfigChange

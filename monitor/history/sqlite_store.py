@@ -24,7 +24,7 @@ from typing import Any, Final
 import msgspec
 
 from drivers.errors import RecordingError
-from drivers.host.file_access import check_folder_or_absent, check_regular_file
+from drivers.host.safe_file_reading import check_folder_or_absent, check_regular_file
 from drivers.validation.number_ranges import DAY_S
 from monitor.history.history_row import (
     MAX_COLUMNS,

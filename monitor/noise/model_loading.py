@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from drivers.errors import ConfigError
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from monitor.common.shipped_config_paths import resolve_model_path
 from monitor.noise.model import NoiseModel
 
@@ -17,7 +17,7 @@ def read_model(path: Path) -> NoiseModel:
         If the file cannot be read or does not contain a valid noise model.
     """
     try:
-        return NoiseModel.from_toml(file_access.read_small_file(path).decode("utf-8"))
+        return NoiseModel.from_toml(safe_file_reading.read_small_file(path).decode("utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

@@ -41,7 +41,7 @@ FORGET_AFTER_S: Final = 600.0
 MAX_KEY_LENGTH: Final = 200
 MAX_EVENTS: Final = 5
 """Number of events of all devices to keep."""
-DECODERS: Final[dict[topics.Topic, Callable[[bytes], Message]]] = {
+DECODERS: Final[dict[topics.ZenohTopic, Callable[[bytes], Message]]] = {
     topics.STATUS: StatusMessage.decode,
     topics.EVENT: EventMessage.decode,
     topics.COEFFICIENTS: partial(decode_message, CoefficientsMessage),
@@ -268,7 +268,7 @@ class RemoteDeviceRegistry:
         return True
 
 
-def split_device_and_topic(key: str) -> tuple[str, topics.Topic] | None:
+def split_device_and_topic(key: str) -> tuple[str, topics.ZenohTopic] | None:
     """Split a zenoh key into the device key and the topic, or return None if the topic is unknown.
 
     >>> split_device_and_topic("imu/bench-1/status")

@@ -39,7 +39,7 @@ from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.effect_roles import is_stationary_gaussian, with_effect_size
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import whiten_axis
-from monitor.reconcile.preparation.reconcile_input import Recording, select_axes_and_smooth_temperature
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes, select_axes_and_smooth_temperature
 from monitor.reconcile.recording_checks.checks import check_recording, sort_findings
 from monitor.reconcile.recording_checks.sample_rate_from_features import (
     describe_sample_rate_error,
@@ -75,7 +75,7 @@ ProgressCallback = Callable[[str, float | None], None]
 class RecordingContext:
     """Recording to compare with a noise model, and the data that all stages share."""
 
-    recording: Recording
+    recording: RecordedAxes
     seed: int
     regressors: RegressorCache
     map_function: MapFunction  # distributes the work on axes
@@ -94,7 +94,7 @@ class _AxesSearchResult:
 
 
 def reconcile(
-    recording: Recording,
+    recording: RecordedAxes,
     model: NoiseModel | None,
     seed: int,
     map_function: MapFunction = map,
@@ -104,7 +104,7 @@ def reconcile(
 
     Parameters
     ----------
-    recording : Recording
+    recording : RecordedAxes
         Recording with at least ``MIN_SAMPLES`` samples for each axis.
     model : NoiseModel or None
         Noise model to test. If None, a model with the five terms Q, N, B, K and R is fitted to the recording.
@@ -195,7 +195,7 @@ def _fit_terms(axis: Axis) -> Effects:
     return best.effects
 
 
-def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
+def _effects_by_axis(model: NoiseModel, recording: RecordedAxes) -> dict[str, Effects]:
     """Return the effects of each recorded axis without constant biases, because the mean is always fitted.
 
     The search may add a floor to a low-pass filter that has none, so such a filter is given a floor of 0.

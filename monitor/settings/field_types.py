@@ -8,7 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 from pydantic import BeforeValidator
 
 from drivers.errors import ConfigError
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.validation.module_lookup import format_choices_by_similarity
 from drivers.validation.number_ranges import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
 from drivers.validation.settings_model import ConvertedFrom, checked_by
@@ -108,7 +108,7 @@ def _parse_duration_text(value: Any) -> Any:
 
 def _path(name: str, folder: Path | None) -> Path:
     """Resolve a path relative to the folder of the configuration file."""
-    return (folder or Path()) / file_access.expand_user(name)
+    return (folder or Path()) / safe_file_reading.expand_user(name)
 
 
 def _check_endpoint(endpoint: str) -> None:

@@ -9,7 +9,7 @@ import stat
 from pathlib import Path
 from typing import Final
 
-from drivers.host.file_access import open_regular_file, real_path
+from drivers.host.safe_file_reading import open_regular_file, real_path
 from drivers.zenoh.credential_masking import has_secret
 
 MAX_SECRET_FILE_BYTES: Final = 1_000_000

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.errors import ConfigError, make_printable_and_shorten
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.validation.settings_model import Problem, TableCheckResult, check_table
 from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_parser
@@ -106,7 +106,7 @@ def load_config(path: Path, *, allow_pipe: bool = False) -> Config:
     path
         Configuration file.
     allow_pipe
-        True to accept a pipe instead of a regular file (``drivers.host.file_access.read_small_file``).
+        True to accept a pipe instead of a regular file (``drivers.host.safe_file_reading.read_small_file``).
 
     Raises
     ------
@@ -131,7 +131,7 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
         True to accept a pipe instead of a regular file.
     """
     try:
-        table = toml_parser.parse_toml(file_access.read_small_file(path, allow_pipe=allow_pipe).decode("utf-8"))
+        table = toml_parser.parse_toml(safe_file_reading.read_small_file(path, allow_pipe=allow_pipe).decode("utf-8"))
     except FileNotFoundError:
         return ConfigReading(
             None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]

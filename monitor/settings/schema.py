@@ -16,7 +16,7 @@ from drivers.data_types import AXES, EVENT_KINDS
 from drivers.decoders.base import Decoder
 from drivers.driver import AxisMap, parse_axis_map
 from drivers.errors import ConfigError
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.links.base import Link
 from drivers.validation import module_lookup, number_ranges
 from drivers.validation.number_ranges import DAY_S, NumberRange
@@ -270,7 +270,7 @@ def _viewer_mode(mode: str, info: ValidationInfo) -> str:
     """Check the viewer mode, and resolve a file name relative to the configuration file."""
     check_viewer_mode(mode)
     folder = info.context.folder if info.context else None
-    return str(folder / file_access.expand_user(mode)) if folder and mode.endswith(".rrd") else mode
+    return str(folder / safe_file_reading.expand_user(mode)) if folder and mode.endswith(".rrd") else mode
 
 
 class ViewerTable(SettingsModel):
@@ -330,8 +330,8 @@ def _program(words: tuple[str, ...], folder: Path | None) -> tuple[str, ...]:
         raise ConfigError(f'"{words[0]}" is not a path; write the path of the program, e.g. "/usr/bin/{words[0]}"')
     if any("\0" in word for word in words):
         raise ConfigError("a word with a NUL character cannot be passed to a program")
-    path = (folder or Path()) / file_access.expand_user(words[0])
-    if not file_access.is_file(path):
+    path = (folder or Path()) / safe_file_reading.expand_user(words[0])
+    if not safe_file_reading.is_file(path):
         raise ConfigError(f"{path}: no such file")
     if not os.access(path, os.X_OK):
         raise ConfigError(f"{path}: not executable; chmod +x it")

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from drivers.errors import ConfigError, describe_error
-from drivers.host.file_access import read_small_file
+from drivers.host.safe_file_reading import read_small_file
 
 
 def read_token(path: Path) -> str:

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import norm
 
 from monitor.reconcile.diagnostics.null_distribution import estimate_null_distributions, run_diagnostics
-from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, WhitenessDeparture
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, inverse_cosine_transform
 from tests.monitor.reconcile.axes import (
@@ -43,7 +43,7 @@ def whiten_by_white_noise(y: np.ndarray) -> WhitenedAxis:
 
 
 @cache
-def simulate_findings(first: int, runs: int) -> list[dict[str, Finding]]:
+def simulate_findings(first: int, runs: int) -> list[dict[str, WhitenessDeparture]]:
     """Return the findings on simulated recordings of one model."""
     found = []
     for seed in range(first, first + runs):

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import ConfigError, ImuError, RecordingError
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.links import replay_link
 from drivers.recordings import FORMATS, load_samples, segment_file
 from drivers.recordings.writing import atomic_write_path
@@ -74,21 +74,25 @@ def get_one_line_text(error: BaseException) -> str:
 def test_error_names_the_kind_of_file(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
     make_irregular_file(kind, path)
-    for read in (file_access.read_small_file, file_access.open_regular_file, file_access.check_regular_file):
+    for read in (
+        safe_file_reading.read_small_file,
+        safe_file_reading.open_regular_file,
+        safe_file_reading.check_regular_file,
+    ):
         with pytest.raises(OSError, match=ERROR_TEXTS[kind]):
             read(path)
 
 
 def test_file_descriptor_is_not_inherited(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1")
-    with file_access.open_regular_file(tmp_path / "a") as file:
+    with safe_file_reading.open_regular_file(tmp_path / "a") as file:
         assert not os.get_inheritable(file.fileno())
         assert file.read() == b"1"
 
 
 def test_name_with_a_nul_character_raises_os_error() -> None:
     with pytest.raises(OSError, match="null byte"):
-        file_access.open_regular_file(Path("a\0b"))
+        safe_file_reading.open_regular_file(Path("a\0b"))
 
 
 @pytest.mark.parametrize("suffix", tuple(FORMATS))

@@ -13,7 +13,7 @@ from drivers.recordings.file_formats.ros_message_arrays import (
     decode_messages,
     iter_message_blocks,
 )
-from drivers.recordings.topic_selection import Topic
+from drivers.recordings.topic_selection import RecordedTopic
 from tests.support.ros_bags import imu_topic, temperature_topic
 
 T_NS = 1_763_700_000_123_456_789 + np.arange(6) * 5_000_001
@@ -84,7 +84,7 @@ def test_blocks_are_bounded() -> None:
 def test_the_index_states_another_number_of_messages(stated: int, tmp_path: object) -> None:
     messages, values = serialize(["a", "bcd", "imu_link_1", "imu_link_1", "x", "y"])
     connection = type("Connection", (), {"topic": "/imu", "msgtype": IMU_TYPE})
-    topic = Topic("/imu", IMU_TYPE, ("gx",), stated)
+    topic = RecordedTopic("/imu", IMU_TYPE, ("gx",), stated)
     bag = ros_bag_format._Bag([connection], [topic], lambda _: ((None, 0, one) for one in messages), cdr=True)
     limit = memory_check.RecordingSizeLimits(tmp_path, 1_000_000, None)  # type: ignore[arg-type]
     columns = ros_bag_format._read_topic(bag, "/imu", limit, [])

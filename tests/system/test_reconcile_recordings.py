@@ -6,7 +6,7 @@ A clearly visible effect must be named, or reported as unexplained at its freque
 import numpy as np
 import pytest
 
-from monitor.reconcile.preparation.reconcile_input import Recording
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.result import AddedOrResizedEffect, Reconciliation
 from monitor.reconcile.summary.ranked_findings import rank_findings
@@ -23,7 +23,7 @@ def reconcile_with_classic_terms(file: str, axis: str, begin: int = 0, end: int 
     """Compare one axis of a part of a recording with the five classic terms."""
     with np.load(recordings() / f"{file}.npz") as columns:
         values = columns[axis][begin:end].astype(np.float64)
-        return reconcile(Recording({axis: values}, float(columns["fs"])), None, seed=1)
+        return reconcile(RecordedAxes({axis: values}, float(columns["fs"])), None, seed=1)
 
 
 def added_effects(result: Reconciliation) -> dict[str, AddedOrResizedEffect]:

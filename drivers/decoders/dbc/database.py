@@ -16,7 +16,7 @@ from drivers.decoders.dbc.sample_assembly import CanMessage, MeasuredSignal
 from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, SignalSettings
 from drivers.decoders.dbc.signal_bits import SignalCodec
 from drivers.errors import ConfigError
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.host.extras import require_extra
 from drivers.validation.module_lookup import format_suggestion
 
@@ -183,9 +183,9 @@ class ConfiguredDbcMessages:
 
 def _locate(file: str) -> Path:
     """Return the path of a DBC file. A name without a folder may refer to a DBC file that is part of the project."""
-    path = file_access.expand_user(file)
+    path = safe_file_reading.expand_user(file)
     name = file.removeprefix(SHIPPED_PREFIX)
-    if name == file and (file_access.is_file(path) or len(path.parts) != 1):
+    if name == file and (safe_file_reading.is_file(path) or len(path.parts) != 1):
         return path
     shipped: Mapping[str, Path] = {p.stem: p for p in sorted(SHIPPED.glob("*.dbc"))}
     stem = name.removesuffix(".dbc")
@@ -201,7 +201,7 @@ def _load(path: Path) -> Any:
 
     try:
         if path.suffix.lower() != ".dbc":
-            file_access.read_small_file(path)  # check that the file is readable, since cantools opens it again
+            safe_file_reading.read_small_file(path)  # check that the file is readable, since cantools opens it again
             return cantools.database.load_file(path, strict=False)
         return cantools.database.load_string(_text(path), "dbc", strict=False)
     except OSError as error:
@@ -212,7 +212,7 @@ def _load(path: Path) -> Any:
 
 def _text(path: Path) -> str:
     """Return the text of a DBC file, which is encoded in UTF-8 or in the Windows code page 1252."""
-    data = file_access.read_small_file(path)
+    data = safe_file_reading.read_small_file(path)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -23,10 +23,10 @@ import numpy as np
 
 from drivers.data_types import AXES, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.topic_selection import BLOCK_ROWS, JOIN, Topic, join_topics, select_topics
+from drivers.recordings.topic_selection import BLOCK_ROWS, JOIN, RecordedTopic, join_topics, select_topics
 
 MAGIC: Final = b"\xa3\x95\x80"
 """First bytes of a log: the start of a message, and the number of the message FMT."""
@@ -195,7 +195,9 @@ def _factors(form: Any) -> dict[str, float]:
 
 def _select(path: Path, messages: Mapping[str, _Messages], topic: str | None, notes: list[str]) -> list[str]:
     """Return the names of the topics to read."""
-    topics = [Topic(name, one.name, tuple(_known_fields(one)), one.offsets.size) for name, one in messages.items()]
+    topics = [
+        RecordedTopic(name, one.name, tuple(_known_fields(one)), one.offsets.size) for name, one in messages.items()
+    ]
     return select_topics(path, topics, _list_imus(messages), topic, EXPECTED, notes)
 
 

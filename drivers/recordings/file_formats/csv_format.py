@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import RecordingError
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.file_formats import csv_header
 from drivers.recordings.file_formats.csv_header import (

@@ -18,7 +18,7 @@ from typing import IO, Final
 
 from drivers.data_types import AXES
 from drivers.errors import ConfigError, RecordingError
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import table
 from drivers.recordings.file_formats.csv_format import (
     CsvSource,
@@ -28,7 +28,7 @@ from drivers.recordings.file_formats.csv_format import (
 from drivers.recordings.file_formats.zip_index import IndexSizeLimitedFile
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import convert_to_si, find_layout
-from drivers.recordings.topic_selection import GYROS, JOIN, Topic, join_topics, select_topics
+from drivers.recordings.topic_selection import GYROS, JOIN, RecordedTopic, join_topics, select_topics
 
 GYROSCOPES: Final = ("Gyroscope", "GyroscopeUncalibrated")
 ACCELEROMETERS: Final = ("TotalAcceleration", "Accelerometer", "AccelerometerUncalibrated", "Linear Acceleration")
@@ -83,7 +83,7 @@ def _by_preference(preferred: tuple[str, ...], names: list[str]) -> list[str]:
     return sorted(names, key=lambda name: preferred.index(name) if name in preferred else len(preferred))
 
 
-def _describe(source: CsvSource, name: str, options: ReadingOptions) -> Topic:
+def _describe(source: CsvSource, name: str, options: ReadingOptions) -> RecordedTopic:
     """Return the sensor of a CSV file. Files of other sensors have no columns."""
     try:
         names = read_csv_column_names(source, options)
@@ -91,8 +91,8 @@ def _describe(source: CsvSource, name: str, options: ReadingOptions) -> Topic:
     except (ConfigError, RecordingError):
         if name in (*GYROSCOPES, *ACCELEROMETERS):
             raise
-        return Topic(name, "other columns", (), 0)
-    return Topic(name, "CSV", columns, 1)
+        return RecordedTopic(name, "other columns", (), 0)
+    return RecordedTopic(name, "CSV", columns, 1)
 
 
 @contextmanager

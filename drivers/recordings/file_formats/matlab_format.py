@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from drivers.errors import RecordingError
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import find_layout

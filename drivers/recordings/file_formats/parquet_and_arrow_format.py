@@ -15,7 +15,7 @@ import numpy as np
 from drivers.data_types import Times
 from drivers.errors import ConfigError, RecordingError
 from drivers.host.extras import install_command
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.file_formats.arrow_message_sizes import (
     check_batch_buffer_sizes,

@@ -21,10 +21,10 @@ import numpy as np
 
 from drivers.data_types import AXES, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import open_file_and_report_position
-from drivers.recordings.topic_selection import JOIN, Topic, join_topics, select_topics
+from drivers.recordings.topic_selection import JOIN, RecordedTopic, join_topics, select_topics
 
 _XYZ: Final = ("x", "y", "z")
 FIELDS: Final[Mapping[str, Mapping[str, str]]] = {
@@ -142,7 +142,9 @@ def _data_by_topic(log: Any) -> dict[str, Any]:
 
 def _select(path: Path, data: Mapping[str, Any], topic: str | None, notes: list[str]) -> list[str]:
     """Return the names of the topics to read. The status of ``vehicle_imu`` adds the temperature."""
-    topics = [Topic(name, one.name, _known_columns(one), one.data[TIMES[-1]].size) for name, one in data.items()]
+    topics = [
+        RecordedTopic(name, one.name, _known_columns(one), one.data[TIMES[-1]].size) for name, one in data.items()
+    ]
     names = select_topics(path, topics, _list_imus(data), topic, EXPECTED, notes)
     status = names[0].replace("vehicle_imu", "vehicle_imu_status")
     if len(names) == 1 and data[names[0]].name == "vehicle_imu" and status in data:

@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
-from drivers.host.file_access import check_regular_file, open_regular_file
+from drivers.host.safe_file_reading import check_regular_file, open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.file_formats.ros_message_arrays import (
     IMU_TYPE,
@@ -28,7 +28,7 @@ from drivers.recordings.file_formats.ros_message_arrays import (
     iter_message_blocks,
 )
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.topic_selection import Topic, join_topics, select_topics
+from drivers.recordings.topic_selection import RecordedTopic, join_topics, select_topics
 
 METADATA: Final = "metadata.yaml"
 """File that identifies a folder as a ROS 2 bag."""
@@ -84,7 +84,7 @@ class _Bag:
     """An open bag."""
 
     connections: Sequence[Any]
-    topics: Sequence[Topic]
+    topics: Sequence[RecordedTopic]
     messages: Callable[[Sequence[Any]], Iterable[tuple[Any, int, bytes]]]
     cdr: bool  # True for messages of ROS 2, False for messages of ROS 1
 
@@ -129,12 +129,14 @@ def _describe_remedy(path: Path, cause: str) -> str:
     )
 
 
-def _list_topics(connections: Iterable[Any], counts: Mapping[int, int]) -> list[Topic]:
+def _list_topics(connections: Iterable[Any], counts: Mapping[int, int]) -> list[RecordedTopic]:
     """Return the topics of a bag. Several connections may publish on the same topic."""
     rows: dict[tuple[str, str], int] = defaultdict(int)
     for connection in connections:
         rows[connection.topic, connection.msgtype] += counts.get(connection.id, 0)
-    return [Topic(name, kind, COLUMNS_OF_TYPES.get(kind, ()), count) for (name, kind), count in sorted(rows.items())]
+    return [
+        RecordedTopic(name, kind, COLUMNS_OF_TYPES.get(kind, ()), count) for (name, kind), count in sorted(rows.items())
+    ]
 
 
 def _check_files(path: Path) -> memory_check.RecordingSizeLimits:

@@ -28,7 +28,7 @@ from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from drivers.errors import RecordingError
-from drivers.host.file_access import open_regular_file
+from drivers.host.safe_file_reading import open_regular_file
 
 if sys.version_info >= (3, 14):
     from compression import zstd

@@ -359,14 +359,14 @@ def read_noise_coefficients(source: str) -> "NoiseCoefficients":
     ConfigError
         If the file cannot be read, or if its content is invalid.
     """
-    from drivers.host import file_access
+    from drivers.host import safe_file_reading
     from monitor.common.shipped_config_paths import resolve_model_path
     from monitor.noise.model import NoiseModel
     from monitor.publishing.exporters import from_analysis_json, from_model
 
     path = Path(source) if source == "-" else resolve_model_path(source, Path.cwd())
     try:
-        text = sys.stdin.buffer.read() if source == "-" else file_access.read_small_file(path, allow_pipe=True)
+        text = sys.stdin.buffer.read() if source == "-" else safe_file_reading.read_small_file(path, allow_pipe=True)
         if text.lstrip().startswith(b"{"):
             return from_analysis_json(text, path.name)
         return from_model(NoiseModel.from_toml(text.decode()), path.name)

@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 
 from drivers.errors import ConfigError
-from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 
 
 def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:

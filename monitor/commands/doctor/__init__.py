@@ -10,7 +10,7 @@ from pathlib import Path
 
 from monitor.commands.check_configuration import check_configuration
 from monitor.commands.doctor.devices import check_device
-from monitor.commands.doctor.finding import Finding, check_permissions, well, wrong
+from monitor.commands.doctor.finding import DoctorFinding, check_permissions, well, wrong
 from monitor.commands.doctor.installation_and_clock import (
     check_clock,
     check_kernels,
@@ -31,7 +31,7 @@ from monitor.common.unit_formatting import format_count
 from monitor.settings.loading import Config
 
 
-def examine_machine(config_path: Path | None = None) -> list[Finding]:
+def examine_machine(config_path: Path | None = None) -> list[DoctorFinding]:
     """Check the machine, and the configuration file if a path is given."""
     machine = [
         *check_library_versions(),
@@ -54,7 +54,7 @@ def examine_machine(config_path: Path | None = None) -> list[Finding]:
     return found
 
 
-def _check_configured(config: Config) -> Iterator[Finding]:
+def _check_configured(config: Config) -> Iterator[DoctorFinding]:
     for one in config.table["device"]:
         yield from check_device(str(one["name"]), one["driver"])
     yield from check_zenoh(config)

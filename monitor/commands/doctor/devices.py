@@ -12,14 +12,14 @@ from typing import Any, Final
 from drivers.errors import LinkUnavailable
 from drivers.links import iio_link, udp_link
 from drivers.links.can_link import describe_missing_package
-from monitor.commands.doctor.finding import Finding, doubt, group_name, user_name, well, wrong
+from monitor.commands.doctor.finding import DoctorFinding, doubt, group_name, user_name, well, wrong
 from monitor.commands.doctor.network import check_reachable
 
 CAN_TYPE: Final = "280"
 """Content of /sys/class/net/NAME/type for a CAN interface (ARPHRD_CAN)."""
 
 
-def check_device(name: str, driver: Mapping[str, Any]) -> Iterator[Finding]:
+def check_device(name: str, driver: Mapping[str, Any]) -> Iterator[DoctorFinding]:
     """Check the port, the interface or the endpoints of one device."""
     about = f"device {name}"
     match driver.get("link"):
@@ -39,7 +39,7 @@ def check_device(name: str, driver: Mapping[str, Any]) -> Iterator[Finding]:
             yield well(about, f"link {other}: nothing to check on this machine")
 
 
-def _check_serial_port(about: str, port: str) -> Finding:
+def _check_serial_port(about: str, port: str) -> DoctorFinding:
     if "://" in port:
         return well(about, f"{port}: network port or pattern, not checked")
     path = Path(port)
@@ -60,7 +60,7 @@ def _check_serial_port(about: str, port: str) -> Finding:
     return well(about, f"{port}: exists, is readable, and no visible program uses it")
 
 
-def _check_udp_port(about: str, keys: Mapping[str, Any]) -> Finding:
+def _check_udp_port(about: str, keys: Mapping[str, Any]) -> DoctorFinding:
     """Check that a UDP port can be opened, by opening it briefly."""
     link = udp_link.build(udp_link.Settings(**keys))
     try:
@@ -83,7 +83,9 @@ def _processes_using(port: Path) -> Iterator[str]:
                 yield f"{(process / 'comm').read_text().strip()} (pid {process.name})"
 
 
-def check_can_interface(subject: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> Finding:
+def check_can_interface(
+    subject: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")
+) -> DoctorFinding:
     """Check that the package for a CAN interface is installed and that the SocketCAN interface is up.
 
     Parameters
@@ -119,7 +121,7 @@ def check_can_interface(subject: str, interface: str, channel: str, sysfs: Path 
     return well(subject, f"{channel}: is up")
 
 
-def check_iio_device(subject: str, device: str, enable: bool, root: Path = iio_link.ROOT) -> Finding:
+def check_iio_device(subject: str, device: str, enable: bool, root: Path = iio_link.ROOT) -> DoctorFinding:
     """Check that an IIO device exists and that the user may read it and, if necessary, enable its buffer.
 
     Parameters

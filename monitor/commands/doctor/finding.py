@@ -14,7 +14,7 @@ Mark = Literal["well", "doubt", "wrong"]
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class DoctorFinding:
     """Result of one check of the machine or the configuration."""
 
     mark: Mark
@@ -23,16 +23,16 @@ class Finding:
     do: str = ""  # advice; empty if no action is needed
 
 
-well, doubt, wrong = partial(Finding, "well"), partial(Finding, "doubt"), partial(Finding, "wrong")
+well, doubt, wrong = partial(DoctorFinding, "well"), partial(DoctorFinding, "doubt"), partial(DoctorFinding, "wrong")
 
 
-def worst_mark(findings: Iterable[Finding]) -> Mark:
+def worst_mark(findings: Iterable[DoctorFinding]) -> Mark:
     """Return the most severe mark among all findings."""
     marks = {one.mark for one in findings}
     return "wrong" if "wrong" in marks else "doubt" if "doubt" in marks else "well"
 
 
-def check_permissions(path: Path, about: str = "permissions", secret: bool | None = None) -> Finding:
+def check_permissions(path: Path, about: str = "permissions", secret: bool | None = None) -> DoctorFinding:
     """Check which users may write a file, and which users may read it if it is secret.
 
     By default, a file is secret if it contains a password.

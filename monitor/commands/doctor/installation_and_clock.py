@@ -13,7 +13,7 @@ from typing import Final
 from packaging.requirements import Requirement
 
 from drivers.host.extras import install_command
-from monitor.commands.doctor.finding import Finding, doubt, well, wrong
+from monitor.commands.doctor.finding import DoctorFinding, doubt, well, wrong
 
 TIME_ERROR: Final = 5
 """Return value of adjtimex(2) if the clock is not synchronized."""
@@ -33,7 +33,7 @@ UNCHECKED_EXTRAS: Final = ("test", "fuzz", "all")
 """Extras for developers, and the extra that includes all others."""
 
 
-def check_library_versions() -> list[Finding]:
+def check_library_versions() -> list[DoctorFinding]:
     """Check whether each installed library has a version that the program supports."""
     about, found, count = "libraries", [], 0
     for required, optional in library_requirements():
@@ -70,7 +70,7 @@ def library_requirements() -> Iterator[tuple[Requirement, bool]]:
             yield required, bool(fitting[0]["extra"])
 
 
-def check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
+def check_shadowed_packages(module_path: Sequence[str]) -> list[DoctorFinding]:
     """Check that no other module on the import path shadows a package of the program."""
     own = Path(__file__).resolve().parents[3]
     found = []
@@ -91,7 +91,7 @@ def check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
     return found or [well("packages", f"{' and '.join(PACKAGES)} are the program's own, in {own}")]
 
 
-def check_kernels() -> Finding:
+def check_kernels() -> DoctorFinding:
     """Check that the numerical kernels are compiled and stored."""
     from monitor.common.compiled import kernel_cache_folder
     from monitor.daemon.kernels.kernel_compilation import is_warm
@@ -107,7 +107,7 @@ def check_kernels() -> Finding:
     return well("kernels", f"compiled, in {folder}")
 
 
-def check_clock() -> Finding:
+def check_clock() -> DoctorFinding:
     """Check that the system clock is synchronized, because the results contain system times."""
     state = _adjtimex()
     if state is None:
@@ -128,7 +128,7 @@ def _adjtimex() -> int | None:
     return state if state >= 0 else None
 
 
-def check_systemd_unit() -> list[Finding]:
+def check_systemd_unit() -> list[DoctorFinding]:
     """Check the state of the systemd unit, if there is one."""
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
         return []
@@ -140,7 +140,7 @@ def check_systemd_unit() -> list[Finding]:
     return check_systemd_unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
 
 
-def check_systemd_unit_state(unit_properties: Mapping[str, str]) -> list[Finding]:
+def check_systemd_unit_state(unit_properties: Mapping[str, str]) -> list[DoctorFinding]:
     """Return the findings about the properties that ``systemctl show`` prints. The list is empty if there is no unit.
 
     Examples

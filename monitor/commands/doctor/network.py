@@ -5,7 +5,7 @@ import re
 import socket
 from typing import Final
 
-from monitor.commands.doctor.finding import Finding, doubt, well, wrong
+from monitor.commands.doctor.finding import DoctorFinding, doubt, well, wrong
 
 CONNECT_TIMEOUT_S: Final = 2.0
 
@@ -20,7 +20,7 @@ TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?"
 LOOPBACK: Final = ("127.", "::1", "localhost")
 
 
-def check_port_free(subject: str, endpoint: str) -> Finding:
+def check_port_free(subject: str, endpoint: str) -> DoctorFinding:
     """Check that a port is free by listening on it briefly.
 
     Parameters
@@ -31,7 +31,7 @@ def check_port_free(subject: str, endpoint: str) -> Finding:
         Zenoh endpoint.
     """
     address = _parse_endpoint(subject, endpoint, "cannot listen")
-    if isinstance(address, Finding):
+    if isinstance(address, DoctorFinding):
         return address
     try:
         with socket.create_server(address, family=socket.AF_INET6 if ":" in address[0] else socket.AF_INET):
@@ -43,10 +43,10 @@ def check_port_free(subject: str, endpoint: str) -> Finding:
         return wrong(subject, f"{endpoint}: cannot listen: {getattr(error, 'strerror', None) or error}")
 
 
-def check_reachable(about: str, endpoint: str) -> Finding:
+def check_reachable(about: str, endpoint: str) -> DoctorFinding:
     """Check that a program answers at an endpoint."""
     address = _parse_endpoint(about, endpoint, "no answer")
-    if isinstance(address, Finding):
+    if isinstance(address, DoctorFinding):
         return address
     try:
         with socket.create_connection(address, timeout=CONNECT_TIMEOUT_S):
@@ -57,7 +57,7 @@ def check_reachable(about: str, endpoint: str) -> Finding:
         return doubt(about, text, do)
 
 
-def _parse_endpoint(about: str, endpoint: str, failure: str) -> tuple[str, int] | Finding:
+def _parse_endpoint(about: str, endpoint: str, failure: str) -> tuple[str, int] | DoctorFinding:
     """Return the host and the port of a TCP endpoint, or a finding if the endpoint cannot be checked."""
     match = TCP_ENDPOINT.fullmatch(endpoint)
     if match is None:

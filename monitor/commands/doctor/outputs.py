@@ -5,12 +5,12 @@ from importlib.util import find_spec
 from urllib.parse import urlsplit
 
 from drivers.host.extras import find_missing_packages, install_command
-from monitor.commands.doctor.finding import Finding, check_permissions, doubt, well, wrong
+from monitor.commands.doctor.finding import DoctorFinding, check_permissions, doubt, well, wrong
 from monitor.commands.doctor.network import LOOPBACK, TCP_ENDPOINT, check_port_free, check_reachable
 from monitor.settings.loading import Config
 
 
-def check_zenoh(config: Config) -> Iterator[Finding]:
+def check_zenoh(config: Config) -> Iterator[DoctorFinding]:
     """Check the ports, the endpoints and the file of the zenoh session."""
     own = config.zenoh
     if own.mode == "none":
@@ -30,7 +30,7 @@ def check_zenoh(config: Config) -> Iterator[Finding]:
             yield doubt("zenoh", text, "listen on 127.0.0.1, or use TLS and access control")
 
 
-def check_viewer(config: Config) -> Iterator[Finding]:
+def check_viewer(config: Config) -> Iterator[DoctorFinding]:
     """Check that the package of the viewer is installed."""
     mode = config.viewer.mode
     if mode == "none":
@@ -42,7 +42,7 @@ def check_viewer(config: Config) -> Iterator[Finding]:
         yield well("viewer", f"rerun-sdk is installed, mode {mode}")
 
 
-def check_metrics(config: Config) -> Iterator[Finding]:
+def check_metrics(config: Config) -> Iterator[DoctorFinding]:
     """Check the package and the port of the metrics."""
     own = config.metrics
     if own is None:
@@ -58,7 +58,7 @@ def check_metrics(config: Config) -> Iterator[Finding]:
         yield doubt("metrics", text, "listen on 127.0.0.1, and let a local collector forward them")
 
 
-def check_influx(config: Config) -> Iterator[Finding]:
+def check_influx(config: Config) -> Iterator[DoctorFinding]:
     """Check the server, the token and the encryption of the output to InfluxDB."""
     own = config.influx
     if own is None or own.url is None:
@@ -74,13 +74,13 @@ def check_influx(config: Config) -> Iterator[Finding]:
         yield doubt("influx", text, "use https")
 
 
-def check_ros2_routers(config: Config) -> Iterator[Finding]:
+def check_ros2_routers(config: Config) -> Iterator[DoctorFinding]:
     """Check that the routers used by the ROS 2 output respond."""
     for endpoint in config.ros2.connect if config.ros2 is not None else ():
         yield check_reachable("ros2", endpoint)
 
 
-def check_reconcile_packages(config: Config) -> Iterator[Finding]:
+def check_reconcile_packages(config: Config) -> Iterator[DoctorFinding]:
     """If a folder for reports is configured, check that the packages for the command ``reconcile`` are installed."""
     missing = " and ".join(find_missing_packages("reconcile"))
     if missing and any(one.reconcile_folder for one in config.devices):

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import Final
 
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from drivers.host.extras import install_command
 from drivers.links.replay_link import ReplayLink
 from drivers.validation.number_ranges import DAY_S
-from monitor.commands.doctor.finding import Finding, doubt, user_name, well, wrong
+from monitor.commands.doctor.finding import DoctorFinding, doubt, user_name, well, wrong
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, describe_lock_holder
 from monitor.settings.loading import Config, Storage
 
@@ -26,7 +26,7 @@ RAW_BYTES: Final = 60.0
 """Approximate number of received bytes per sample. The number depends on the protocol."""
 
 
-def check_storage(config: Config) -> Iterator[Finding]:
+def check_storage(config: Config) -> Iterator[DoctorFinding]:
     """Check the folder of the recordings, other users of the folder, and the disk space."""
     own = config.storage
     if own is None:
@@ -37,7 +37,7 @@ def check_storage(config: Config) -> Iterator[Finding]:
         yield wrong("storage", text, install_command("imu-monitor[arrow]"))
     folder = next(one for one in (own.folder, *own.folder.parents) if os.path.exists(one))
     try:
-        file_access.check_folder_or_absent(folder)
+        safe_file_reading.check_folder_or_absent(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass
         usage = shutil.disk_usage(folder)
@@ -49,7 +49,7 @@ def check_storage(config: Config) -> Iterator[Finding]:
     yield check_disk_space(own, recorded_bytes_per_day(config), usage.total, usage.free)
 
 
-def _check_in_use(own: Storage) -> Iterator[Finding]:
+def _check_in_use(own: Storage) -> Iterator[DoctorFinding]:
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
     do = "no problem if it is this service; otherwise end it, or choose another folder: only one program records"
     for holder in sorted({describe_lock_holder(own.folder, name) for name, on in wanted.items() if on} - {""}):
@@ -79,7 +79,7 @@ def recorded_bytes_per_day(config: Config) -> float | None:
     return None if len(known) < len(rates) else sum(known) * DAY_S * each
 
 
-def check_disk_space(storage: Storage, bytes_per_day: float | None, total_bytes: int, free_bytes: int) -> Finding:
+def check_disk_space(storage: Storage, bytes_per_day: float | None, total_bytes: int, free_bytes: int) -> DoctorFinding:
     """Check that the disk has enough space for the recordings.
 
     Parameters

@@ -28,7 +28,7 @@ class ArmaWorker:
         self._at_once = synchronous
         self._work: _Identification | None = None
 
-    def adopt_and_start_models(self, live: LiveDriftCompensation) -> None:
+    def adopt_results_and_start_next_identification(self, live: LiveDriftCompensation) -> None:
         """Adopt an identified model, and start the next identification that is due."""
         if self._work is not None:
             if self._work.thread.is_alive():

@@ -128,7 +128,7 @@ class DeviceWorker:
         if self.simulated is not None:
             self.simulated.start()
         if self._recorder is not None and not self._replayed:
-            self.restore.resume_from(self._recorder.find_recording_tail(self.name))
+            self.restore.resume_from(self._recorder.find_last_recorded_samples(self.name))
             if self.restore.active:  # the program may restart before a new estimate is available
                 self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
         self._thread.start()

@@ -166,7 +166,7 @@ class DevicePipeline:
         if live is None or not self.ready.all.is_set():  # otherwise, the identification would compile kernels
             return
         if live.compensator.samples_to_interval_end == live.compensator.interval_samples:
-            self.arma_worker.adopt_and_start_models(live)
+            self.arma_worker.adopt_results_and_start_next_identification(live)
 
     def replay_samples(self, samples: SampleBlock, rate_hz: float) -> None:
         """Process recorded samples without reporting events, to rebuild the window after a restart of the program.
@@ -187,7 +187,7 @@ class DevicePipeline:
         if live is not None and np.isfinite(samples.values[:, :3]).any():
             for at in range(0, len(samples), MAX_PIECE_SAMPLES):
                 live.compensate_block(samples[at : at + MAX_PIECE_SAMPLES])
-            self.arma_worker.adopt_and_start_models(live)
+            self.arma_worker.adopt_results_and_start_next_identification(live)
             live.take_drift_updates()
         self.take_events()
         self.take_thermal_intervals()

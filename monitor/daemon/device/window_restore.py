@@ -16,7 +16,7 @@ from drivers.recordings.segment_file import DaemonState
 from drivers.timing.sample_clock import LastSample, SampleClock
 from monitor.daemon.device.pipeline import DevicePipeline
 from monitor.daemon.device.unix_timeline import DeviceTimeline
-from monitor.daemon.storage.recording_tail import RecordingTail
+from monitor.daemon.storage.last_recorded_samples import LastRecordedSamples
 from monitor.settings.loading import Device
 
 MIN_REPLAY_S: Final = 600.0
@@ -43,7 +43,7 @@ class WindowRestore:
         self._pipeline = pipeline
         self._clock = clock
         self._timeline = timeline
-        self._tail: RecordingTail | None = None  # end of the recording, until the window is rebuilt
+        self._tail: LastRecordedSamples | None = None  # end of the recording, until the window is rebuilt
         self._state_before = DaemonState()  # state of the estimate before the restart
 
     @property
@@ -51,7 +51,7 @@ class WindowRestore:
         """True until the window has been rebuilt from the recording."""
         return self._tail is not None
 
-    def resume_from(self, tail: RecordingTail | None) -> None:
+    def resume_from(self, tail: LastRecordedSamples | None) -> None:
         """Prepare to rebuild the window from a recording that ended less than one window ago."""
         if tail is None:
             return
@@ -100,7 +100,7 @@ class WindowRestore:
         parameters = tuple(None if np.isnan(value) else float(value) for value in theta.ravel())
         return DaemonState(estimator.rate_hz, since, tick_step, parameters, tuple(entered.ravel().tolist()))
 
-    def _replay(self, tail: RecordingTail, offset_ns: int) -> str:
+    def _replay(self, tail: LastRecordedSamples, offset_ns: int) -> str:
         pipeline, state = self._pipeline, tail.newest.state
         rate_hz = self._clock.configured_or_measured_rate_hz or state.rate or 0.0
         counted = np.zeros(len(AXES), np.int64)

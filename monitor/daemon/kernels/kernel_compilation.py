@@ -24,7 +24,7 @@ import numba
 from llvmlite import binding
 
 from monitor.common.compiled import hash_module_with_imports, kernel_cache_folder
-from monitor.common.program import PROGRAM
+from monitor.common.program_command_line import PROGRAM
 from monitor.daemon.kernels.kernel_groups import GROUPS, KernelGroup, KernelPart
 
 MAX_PROCESSES: Final = 2

@@ -105,7 +105,7 @@ def _call_analysis() -> None:
 def _call_reconciliation() -> None:
     from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
     from monitor.noise.model import NoiseModel
-    from monitor.reconcile.preparation.reconcile_input import Recording
+    from monitor.reconcile.preparation.reconcile_input import RecordedAxes
     from monitor.reconcile.reconcile import reconcile
 
     model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4), BiasInstability(B=3e-5), RateRandomWalk(K=1e-6))})
@@ -113,7 +113,7 @@ def _call_reconciliation() -> None:
     size = float(np.std(series))
     series += 4.0 * size * (rng.integers(0, 2, 42).repeat(100) + (np.arange(4200) > 2100))
     series[::500] += 20.0 * size
-    reconcile(Recording({"gz": series}, 10.0, np.linspace(20.0, 30.0, 4200)), model, seed=1)
+    reconcile(RecordedAxes({"gz": series}, 10.0, np.linspace(20.0, 30.0, 4200)), model, seed=1)
 
 
 WINDOW: Final = "Allan deviation"

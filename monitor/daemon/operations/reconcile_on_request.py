@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from monitor.common.program import PROGRAM
+from monitor.common.program_command_line import PROGRAM
 from monitor.estimation.window_sample_snapshot import WindowSnapshot
 from monitor.publishing.messages.results import ReconcileReply
 from monitor.publishing.zenoh.publisher import Command

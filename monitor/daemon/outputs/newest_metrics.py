@@ -119,13 +119,15 @@ class NewestMetrics(Output):
 
 
 def _device_metrics(healths: Mapping[str, _TimedHealth]) -> Iterator[NamedMetric]:
-    def read_each(read: Numbers) -> Iterator[tuple[tuple[str, ...], float | None, float | None]]:
+    def read_health_value_of_each_device(read: Numbers) -> Iterator[tuple[tuple[str, ...], float | None, float | None]]:
         return (((device,), read(one.health), one.unix_s) for device, one in healths.items())
 
     for name, (description, read) in COUNTERS.items():
-        yield _metric(f"samples_{name}_total", description, ("device",), read_each(read), is_counter=True)
+        yield _metric(
+            f"samples_{name}_total", description, ("device",), read_health_value_of_each_device(read), is_counter=True
+        )
     for name, (description, read) in GAUGES.items():
-        yield _metric(name, description, ("device",), read_each(read))
+        yield _metric(name, description, ("device",), read_health_value_of_each_device(read))
     states = (
         ((device, state), float(one.health.state == state), one.unix_s)
         for device, one in healths.items()

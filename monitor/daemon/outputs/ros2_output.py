@@ -12,8 +12,8 @@ from monitor.daemon.outputs.newest_metrics import NewestMetrics
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.publishing.ros2.diagnostics import build_device_status, encode_diagnostic_array
-from monitor.publishing.ros2.graph_names import DIAGNOSTICS, RosTopic, imu_topic
 from monitor.publishing.ros2.publisher import Ros2Publisher
+from monitor.publishing.ros2.rmw_zenoh_names import DIAGNOSTICS, RosTopic, imu_topic
 from monitor.settings.loading import Device, Ros2Table
 
 

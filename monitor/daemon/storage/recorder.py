@@ -26,7 +26,7 @@ from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
-from monitor.daemon.storage.recording_tail import RecordingTail, read_recording_tail
+from monitor.daemon.storage.last_recorded_samples import LastRecordedSamples, read_last_recorded_samples
 from monitor.daemon.storage.recording_track import (
     RETRY_S,
     Opening,
@@ -142,7 +142,7 @@ class Recorder:
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
-    def find_recording_tail(self, device: str) -> RecordingTail | None:
+    def find_last_recorded_samples(self, device: str) -> LastRecordedSamples | None:
         """Return the end of the existing recording of a device, or None if there is no recording to continue.
 
         Call this method before the recorder is started.
@@ -152,7 +152,7 @@ class Recorder:
             return None
         if self._thread.ident is None:
             self._acquire_folder()  # the lock prevents another process from adding segments
-        return read_recording_tail(track.origin, track.folder)
+        return read_last_recorded_samples(track.origin, track.folder)
 
     # --- called by the reader threads
 

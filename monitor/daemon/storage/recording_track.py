@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.data_types import NO_TICK, Chunk, SampleBlock
 from drivers.errors import ConfigError, RecordingError
-from drivers.host.file_access import check_folder_or_absent
+from drivers.host.safe_file_reading import check_folder_or_absent
 from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from drivers.recordings.table import PARTIAL_SUFFIX

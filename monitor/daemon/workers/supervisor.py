@@ -20,7 +20,7 @@ import structlog
 
 from drivers.errors import ConfigError, describe_error
 from monitor.common.device_health import Health
-from monitor.common.program import PROGRAM
+from monitor.common.program_command_line import PROGRAM
 from monitor.daemon import config_changes
 from monitor.daemon.config_changes import ConfigChange
 from monitor.daemon.daemon_process import MAX_IDLE_S, DaemonProcess, measure_memory_bytes

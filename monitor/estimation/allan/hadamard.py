@@ -60,12 +60,12 @@ def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factor
     n = len(values)
     factors = octave_cluster_sizes(n // 3) if factors is None else factors
     raw_variance, terms = hadamard_variance(values, factors)
-    return add_intervals_to_hadamard_variance(
+    return compute_hadamard_confidence_intervals(
         [hadamard_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms
     )
 
 
-def add_intervals_to_hadamard_variance(
+def compute_hadamard_confidence_intervals(
     moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
 ) -> VarianceCurve:
     """Compute the degrees of freedom and confidence intervals of given Hadamard variances.

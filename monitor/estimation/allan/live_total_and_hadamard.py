@@ -98,7 +98,7 @@ class LiveTotalAndHadamard:
         totals, hadamards = self._last
         return (
             total.correct_total_variance([one.moments for one in totals], rate_hz, theta, *_stack(totals)),
-            hadamard.add_intervals_to_hadamard_variance(
+            hadamard.compute_hadamard_confidence_intervals(
                 [one.moments for one in hadamards], rate_hz, theta, *_stack(hadamards)
             ),
         )

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from drivers.data_types import Ints
-from monitor.common.topics import Topic
+from monitor.common.topics import ZenohTopic
 
 MAX_PAYLOAD_BYTES: Final = 1_000_000
 """Largest accepted payload. A typical message for six axes is a few kilobytes long."""
@@ -22,7 +22,7 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="schema"):
     """Base class of messages about one device. The library msgspec writes and checks the key ``schema``."""
 
-    topic: ClassVar[Topic]
+    topic: ClassVar[ZenohTopic]
 
     device: str = ""
     t: float | None = None

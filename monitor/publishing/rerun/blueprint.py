@@ -21,7 +21,7 @@ from monitor.common.unit_formatting import (
     UnitSystem,
     axes_of,
 )
-from monitor.publishing.rerun import dynamic_heat_map
+from monitor.publishing.rerun import allan_history_heat_map
 from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, WIDTH
 from monitor.publishing.rerun.allan_drawing import KEY_BELOW, KEY_ROW
 from monitor.publishing.rerun.shared_views import (
@@ -233,7 +233,7 @@ def _event_log(origin: str) -> rrb.View:
 
 
 def _heat_map(device: str, axis: str) -> rrb.View:
-    x, y = dynamic_heat_map.heat_map_bounds(TYPICAL_TAU_COUNT)
+    x, y = allan_history_heat_map.heat_map_bounds(TYPICAL_TAU_COUNT)
     name = f"{axis}: Allan deviation over time, relative to its median"
     return drawing_view(f"/{device}/dynamic/{axis}", name, "$origin/**", x, y)
 

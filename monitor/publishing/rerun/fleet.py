@@ -133,7 +133,7 @@ class FleetView:
             "", wall_s, AllDevicesTableText(fleet_text(devices, now_s, MAX_ROWS, note, self._viewer.units))
         )
 
-    def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
+    def _show(self, device: str, topic: topics.ZenohTopic, payload: bytes) -> None:
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
             unix_s = rows.t_ns / 1e9

@@ -31,7 +31,7 @@ from urllib.parse import quote
 import rerun as rr
 import rerun_cli  # type: ignore[import-untyped]
 
-from drivers.host.file_access import check_regular_file
+from drivers.host.safe_file_reading import check_regular_file
 from monitor.common.folder_lock import LOCKS_UNSUPPORTED_ERRNOS
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerClosed, ViewerError, ViewerSettings
 

@@ -16,7 +16,7 @@ from monitor.common.device_health import Health
 from monitor.common.unit_formatting import UNIT_SYSTEMS, format_number, format_utc, sensor_kind
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 from monitor.publishing.coefficient_cells import format_coefficient
-from monitor.publishing.ros2.graph_names import NODE
+from monitor.publishing.ros2.rmw_zenoh_names import NODE
 
 
 class Level(IntEnum):

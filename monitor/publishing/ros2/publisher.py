@@ -19,7 +19,7 @@ from drivers.zenoh.rmw_attachment import GID_BYTES, encode_attachment
 from drivers.zenoh.session_config import build_session_config, format_zenoh_error, is_unconnected
 from monitor.common.unit_formatting import format_count
 from monitor.publishing.bounded_queue import BoundedQueue
-from monitor.publishing.ros2.graph_names import NODE_ID, RosTopic, node_token, publisher_token
+from monitor.publishing.ros2.rmw_zenoh_names import NODE_ID, RosTopic, node_token, publisher_token
 from monitor.publishing.zenoh.retried_session import RetriedSession, zenoh_errors
 
 if TYPE_CHECKING:

@@ -245,7 +245,7 @@ def json_line(received: ReceivedMessageOrLiveliness) -> str:
     return line.decode() + "\n"
 
 
-def _decode(received: ReceivedMessageOrLiveliness, device: str, topic: topics.Topic) -> dict[str, Any]:
+def _decode(received: ReceivedMessageOrLiveliness, device: str, topic: topics.ZenohTopic) -> dict[str, Any]:
     """Return the payload of a message. Raise an exception if the payload is malformed."""
     if received.payload is None:
         return {"device": device.rpartition("/")[2], "alive": received.token_exists}
@@ -256,7 +256,7 @@ def _decode(received: ReceivedMessageOrLiveliness, device: str, topic: topics.To
     return msgspec.json.decode(received.payload, type=dict[str, Any])
 
 
-def _decode_sample_columns(payload: bytes, topic: topics.Topic) -> dict[str, Any]:
+def _decode_sample_columns(payload: bytes, topic: topics.ZenohTopic) -> dict[str, Any]:
     found = decode_samples(payload)
     block = found.block
     columns = {axis: block.values[:, i] for i, axis in enumerate(AXES)} | {TEMPERATURE: block.temperature_c}

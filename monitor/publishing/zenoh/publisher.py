@@ -117,7 +117,7 @@ class ZenohPublisher(RetriedSession):
         atexit.register(self.close)
         super().start()
 
-    def put(self, topic: topics.Topic, device: str, payload: bytes) -> None:
+    def put(self, topic: topics.ZenohTopic, device: str, payload: bytes) -> None:
         """Publish a message. The message is dropped if no session is open.
 
         Parameters
@@ -274,7 +274,7 @@ class ZenohPublisher(RetriedSession):
         return build_session_config(keys, own.config, defaults)
 
     def _publisher(
-        self, session: "zenoh.Session", topic: topics.Topic, key: str
+        self, session: "zenoh.Session", topic: topics.ZenohTopic, key: str
     ) -> "zenoh.Publisher | AdvancedPublisher":
         """Declare a publisher for a key. It is an advanced publisher if the topic keeps values for late subscribers."""
         import zenoh

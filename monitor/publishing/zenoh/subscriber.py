@@ -89,7 +89,7 @@ class ZenohSubscriber:
         connect: Sequence[str] = (),
         file: Path | None = None,
         detail: Sequence[str] = (),
-        received: Sequence[topics.Topic] = TOPICS,
+        received: Sequence[topics.ZenohTopic] = TOPICS,
     ) -> None:
         keys = {topic: topic_keys(keyexpr, topic) for topic in (*received, topics.ALIVE)}
         _check_keys(keyexpr, keys)
@@ -174,7 +174,7 @@ class _EndpointSession(RetriedSession):
         self,
         endpoint: str,
         config: "zenoh.Config",
-        keys: Mapping[topics.Topic, Sequence[str]],
+        keys: Mapping[topics.ZenohTopic, Sequence[str]],
         push: Callable[[ReceivedMessageOrLiveliness, str], None],
     ) -> None:
         self.endpoint = mask_secrets(endpoint)
@@ -236,7 +236,7 @@ class _EndpointSession(RetriedSession):
         self._push(ReceivedMessageOrLiveliness(key, None, exists), "")
 
 
-def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
+def topic_keys(keyexpr: str, topic: topics.ZenohTopic) -> tuple[str, ...]:
     """Return the patterns of zenoh keys (key expressions) that select the messages of one topic.
 
     If the key expression names a device but no topic, the given topic is appended.
@@ -299,7 +299,7 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     return found
 
 
-def _declare_subscriber(session: "zenoh.Session", topic: topics.Topic, key: str) -> Any:
+def _declare_subscriber(session: "zenoh.Session", topic: topics.ZenohTopic, key: str) -> Any:
     """Subscribe to a key and request the last messages that daemons keep."""
     import zenoh
     from zenoh import ext
@@ -313,7 +313,7 @@ def _declare_subscriber(session: "zenoh.Session", topic: topics.Topic, key: str)
     return ext.declare_advanced_subscriber(session, key, ring, history=history)
 
 
-def _check_keys(keyexpr: str, keys: Mapping[topics.Topic, Sequence[str]]) -> None:
+def _check_keys(keyexpr: str, keys: Mapping[topics.ZenohTopic, Sequence[str]]) -> None:
     """Raise ConfigError if a key expression is invalid or matches no topic."""
     import zenoh
 

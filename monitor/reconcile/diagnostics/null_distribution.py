@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, WhitenessDeparture
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.result import DiagnosticGap
 
@@ -39,7 +39,7 @@ AXIS_MARGIN_NATS: Final = 3.0
 CLEAR_GAIN_RATIO: Final = 2.0
 """Smallest ratio of gain and threshold at which a finding is significant without further simulations."""
 
-Findings = Mapping[str, Finding]
+Findings = Mapping[str, WhitenessDeparture]
 """Findings of all diagnostics on one axis, by the name of the diagnostic."""
 
 
@@ -174,7 +174,7 @@ def _simulated_null_distribution(pooled: Sequence[float], largest: float, chance
     return NullDistribution(max(null95, largest), largest + AXIS_MARGIN_NATS)
 
 
-def _quantile(diagnostic: str, found: Finding, probability: float) -> float:
+def _quantile(diagnostic: str, found: WhitenessDeparture, probability: float) -> float:
     return NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].quantile(found.places, probability)
 
 

@@ -55,7 +55,7 @@ CURVE_PENALTY_NATS: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class WhitenessDeparture:
     """Strongest departure from white noise that a diagnostic finds."""
 
     gain: float  # log-likelihood gain, nats
@@ -63,13 +63,13 @@ class Finding:
     places: float = 1.0  # effective number of independent places that were searched
 
 
-NO_FINDING: Final = Finding(0.0, Location())
+NO_DEPARTURE: Final = WhitenessDeparture(0.0, Location())
 """Finding of a diagnostic that cannot be applied to an axis."""
-Diagnostic = Callable[[WhitenedAxis], Finding]
+Diagnostic = Callable[[WhitenedAxis], WhitenessDeparture]
 """Function that tests a whitened axis for one kind of departure from white noise."""
 
 
-def diagnose_psd(whitened: WhitenedAxis) -> Finding:
+def diagnose_psd(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find the frequency range in which the power differs most from the noise model."""
     bins = build_frequency_bins(
         whitened.axis.n, whitened.axis.rate_hz
@@ -87,7 +87,7 @@ def diagnose_psd(whitened: WhitenedAxis) -> Finding:
             best, place = float(gains[at]), (int(first[at]), int(first[at]) + width)
         width *= 2
     lo, hi = bins.f_hz[place[0]], bins.f_hz[place[1] - 1]
-    return Finding(best, Location(frequency=(float(lo), float(hi))), bins.count.size)
+    return WhitenessDeparture(best, Location(frequency=(float(lo), float(hi))), bins.count.size)
 
 
 def fitted_variance_gain_nats(mean_square: Floats, count: Floats) -> Floats:
@@ -109,13 +109,13 @@ def fitted_variance_gain_nats(mean_square: Floats, count: Floats) -> Floats:
     return np.asarray(0.5 * count * (safe - 1.0 - np.log(safe)))
 
 
-def diagnose_spectral_lines(whitened: WhitenedAxis) -> Finding:
+def diagnose_spectral_lines(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find the strongest line, or the strongest harmonics of one frequency, in the periodogram."""
     gain, f_hz = find_peak_gains_and_frequencies(whitened.periodogram, whitened.axis.rate_hz, 1)[0]
     if whitened.harmonic_series.gain > gain:
         gain, f_hz = whitened.harmonic_series.gain, whitened.harmonic_series.f_hz
     half = whitened.axis.rate_hz / whitened.axis.n
-    return Finding(gain, Location(frequency=(f_hz - half, f_hz + half)), whitened.axis.n)
+    return WhitenessDeparture(gain, Location(frequency=(f_hz - half, f_hz + half)), whitened.axis.n)
 
 
 def find_peak_gains_and_frequencies(periodogram: Floats, rate_hz: float, max_peaks: int) -> list[tuple[float, float]]:
@@ -148,21 +148,21 @@ def find_peak_gains_and_frequencies(periodogram: Floats, rate_hz: float, max_pea
     return found
 
 
-def diagnose_mean_level_change(whitened: WhitenedAxis) -> Finding:
+def diagnose_mean_level_change(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find a change of the mean level: a step, a slope, or a transient at the start.
 
     A model with random jumps is not tested, because whitening does not remove the jumps.
     """
     if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in whitened.effects):
-        return NO_FINDING
+        return NO_DEPARTURE
     axis = whitened.axis
     gains, times_s, places = compute_level_step_gains(whitened)
     at = int(np.argmax(gains))
-    found = [Finding(float(gains[at]), Location(time=(float(times_s[at]), float(times_s[at]))))]
+    found = [WhitenessDeparture(float(gains[at]), Location(time=(float(times_s[at]), float(times_s[at]))))]
     for fraction in TRANSIENT_TIME_FRACTIONS:
         effect = TurnOnTransient(amplitude=1.0, time_constant=float(fraction * axis.length_s))
         found.append(
-            Finding(
+            WhitenessDeparture(
                 _regressor_gain(whitened, [(effect, 0)]),
                 Location(time=(0.0, effect.time_constant)),
             )
@@ -170,9 +170,9 @@ def diagnose_mean_level_change(whitened: WhitenedAxis) -> Finding:
     curve = BiasCurve(slope=1.0, curvature=1.0)
     curved = _regressor_gain(whitened, [(curve, 0), (curve, 1)]) - CURVE_PENALTY_NATS
     ramp = _regressor_gain(whitened, [(RateRamp(R=1.0), 0)])
-    found.append(Finding(max(ramp, curved), Location(time=(0.0, axis.length_s))))
+    found.append(WhitenessDeparture(max(ramp, curved), Location(time=(0.0, axis.length_s))))
     best = max(found, key=lambda one: one.gain)
-    return Finding(best.gain, best.where, places)
+    return WhitenessDeparture(best.gain, best.where, places)
 
 
 def compute_level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats, float]:
@@ -234,12 +234,12 @@ def _gain_of_normal_equations(normal: Floats, right: Floats) -> float:
     return float(0.5 * solved @ (right / scale))
 
 
-def diagnose_autocorrelation(whitened: WhitenedAxis) -> Finding:
+def diagnose_autocorrelation(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find the lag with the strongest autocorrelation of the whitened series."""
     gains = 0.5 * compute_autocorrelation(whitened.periodogram) ** 2 * whitened.axis.n
     at = int(np.argmax(gains))
     lag_s = (at + 1) / whitened.axis.rate_hz
-    return Finding(float(gains[at]), Location(tau=(lag_s, lag_s)))  # the number of lags is constant
+    return WhitenessDeparture(float(gains[at]), Location(tau=(lag_s, lag_s)))  # the number of lags is constant
 
 
 def compute_autocorrelation(periodogram: Floats) -> Floats:
@@ -263,11 +263,11 @@ def compute_autocorrelation(periodogram: Floats) -> Floats:
     return np.asarray(np.cos(np.pi / m * lags[:, None] * centre) @ sums / m)
 
 
-def diagnose_temperature_dependence(whitened: WhitenedAxis) -> Finding:
+def diagnose_temperature_dependence(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find a polynomial, delayed or hysteretic dependence of the sensor output on the temperature."""
     temperature_c = whitened.axis.temperature_c
     if temperature_c is None:
-        return NO_FINDING
+        return NO_DEPARTURE
     reference = float(temperature_c.mean())
 
     def temperature_effect_gain(effect: TemperatureBias | TemperatureLag | TemperatureHysteresis) -> float:
@@ -289,12 +289,14 @@ def diagnose_temperature_dependence(whitened: WhitenedAxis) -> Finding:
             if np.ptp(temperature_c) > 0.0
         ),
     ]
-    return Finding(max(gains), Location(temperature=(float(temperature_c.min()), float(temperature_c.max()))))
+    return WhitenessDeparture(
+        max(gains), Location(temperature=(float(temperature_c.min()), float(temperature_c.max())))
+    )
 
 
-def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> Finding:
+def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find the axis that leaks most strongly into the whitened axis, besides the common vibration of both axes."""
-    best = NO_FINDING
+    best = NO_DEPARTURE
     for name, coefficients in whitened.axis.leak_sources.items():
         common = _common_vibration_columns(whitened, coefficients)
         if common:
@@ -304,7 +306,7 @@ def diagnose_leaks_from_other_axes(whitened: WhitenedAxis) -> Finding:
         else:
             gain = _regressor_gain(whitened, [(CrossAxis(source=name, coefficient=1.0), 0)])
         if gain > best.gain:
-            best = Finding(gain, Location(source=name), len(whitened.axis.leak_sources))
+            best = WhitenessDeparture(gain, Location(source=name), len(whitened.axis.leak_sources))
     return best
 
 
@@ -325,42 +327,44 @@ def _common_vibration_columns(whitened: WhitenedAxis, source: Floats) -> list[Fl
     return [relative * bins.expand_to_coefficients(whitened.fit.noise_variance(at)) for at in vibrations]
 
 
-def diagnose_variance_change(whitened: WhitenedAxis) -> Finding:
+def diagnose_variance_change(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find a change of the noise variance over time."""
     found = whitened.variance_changes
     gain = max(found.step.gain, found.largest_gain_other_than_step)
-    return Finding(
+    return WhitenessDeparture(
         gain, Location(time=(found.step.time.lo, found.step.time.hi)), count_variance_blocks(whitened.axis.n)
     )
 
 
-def diagnose_spectrogram_change(whitened: WhitenedAxis) -> Finding:
+def diagnose_spectrogram_change(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find the part of the spectrogram with the largest change of power over time."""
     found = whitened.unexplained_spectrogram_change
     if found.gain >= found.row_gain:
-        return Finding(found.gain, Location(time=found.time, frequency=found.frequency), whitened.axis.n)
-    return Finding(found.row_gain, Location(frequency=found.row), whitened.axis.n)
+        return WhitenessDeparture(found.gain, Location(time=found.time, frequency=found.frequency), whitened.axis.n)
+    return WhitenessDeparture(found.row_gain, Location(frequency=found.row), whitened.axis.n)
 
 
-def diagnose_outliers(whitened: WhitenedAxis) -> Finding:
+def diagnose_outliers(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find outliers among the samples of the whitened series."""
     found = whitened.outlier_fit
-    return Finding(found.gain if found else 0.0, Location())
+    return WhitenessDeparture(found.gain if found else 0.0, Location())
 
 
-def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> Finding:
+def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> WhitenessDeparture:
     """Find quantization, clipping or repeated samples that the noise model does not contain."""
     statistics = whitened.axis.value_artifacts
-    best = NO_FINDING
+    best = NO_DEPARTURE
     for kind, found in (
         (Resolution, statistics.quantization),
         (Saturation, statistics.clipping),
         (RandomSampleHold, statistics.repeats),
     ):
         if found is not None and kind not in whitened.effect_types and found.gain > best.gain:
-            best = Finding(found.gain, Location())
+            best = WhitenessDeparture(found.gain, Location())
     if best.gain and statistics.clipping is not None and best.gain == statistics.clipping.gain:
-        return Finding(best.gain, Location(value=(statistics.clipping.limit.lo, statistics.clipping.limit.hi)))
+        return WhitenessDeparture(
+            best.gain, Location(value=(statistics.clipping.limit.lo, statistics.clipping.limit.hi))
+        )
     return best
 
 

@@ -19,7 +19,7 @@ TEMPERATURE_SMOOTHING_FRACTION: Final = 0.001
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class RecordedAxes:
     """Recorded samples of several axes, with the sample rate and the temperature."""
 
     values: Mapping[str, Floats]  # axis -> [n] SI; NaN = missing
@@ -33,20 +33,20 @@ class Recording:
 
 
 def select_axes_and_smooth_temperature(
-    recording: Recording, model: NoiseModel | None
-) -> tuple[Recording, tuple[str, ...]]:
+    recording: RecordedAxes, model: NoiseModel | None
+) -> tuple[RecordedAxes, tuple[str, ...]]:
     """Select the axes that can be compared with a noise model, and smooth the temperature.
 
     Parameters
     ----------
-    recording : Recording
+    recording : RecordedAxes
         Recording with all axes.
     model : NoiseModel or None
         Noise model that must contain the axis. If None, no axis is excluded because of the model.
 
     Returns
     -------
-    recording : Recording
+    recording : RecordedAxes
         Recording with the selected axes and the smoothed temperature.
     notes : tuple of str
         Reason for each excluded axis.
@@ -77,7 +77,7 @@ def select_axes_and_smooth_temperature(
     temperature_c = recording.temperature_c
     if temperature_c is not None:
         temperature_c = _smooth_temperature(temperature_c) if np.isfinite(temperature_c).any() else None
-    return Recording(kept, recording.rate_hz, temperature_c), tuple(notes)
+    return RecordedAxes(kept, recording.rate_hz, temperature_c), tuple(notes)
 
 
 def _smooth_temperature(temperature_c: Floats) -> Floats:

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.preparation.reconcile_input import MIN_SAMPLES, Recording
+from monitor.reconcile.preparation.reconcile_input import MIN_SAMPLES, RecordedAxes
 from monitor.reconcile.recording_checks.axis_permutation import (
     TriadOrder,
     compute_resonance_log_power_variances,
@@ -47,16 +47,16 @@ SIMULATION_SEED_OFFSET: Final = 1_000_003
 class CheckedRecording:
     """Corrected recording, and the faults that were found."""
 
-    recording: Recording
+    recording: RecordedAxes
     findings: tuple[RecordingFinding, ...]  # the most serious fault first
 
 
-def check_recording(recording: Recording, model: NoiseModel | None, seed: int) -> CheckedRecording:
+def check_recording(recording: RecordedAxes, model: NoiseModel | None, seed: int) -> CheckedRecording:
     """Check a recording, and correct the faults that can be corrected.
 
     Parameters
     ----------
-    recording : Recording
+    recording : RecordedAxes
         Recording to check.
     model : NoiseModel or None
         Model under test. If None, only the checks that do not need a model are run.
@@ -122,7 +122,7 @@ def _check_triad(recording: RecordingUnderTest, triad: tuple[str, ...]) -> Check
     return corrected, findings
 
 
-def _simulate(recording: Recording, model: NoiseModel, seed: int) -> dict[str, Floats]:
+def _simulate(recording: RecordedAxes, model: NoiseModel, seed: int) -> dict[str, Floats]:
     """Simulate the model with the axes, length and temperature of the recording."""
     temperature_c = recording.temperature_c
     if temperature_c is not None:

@@ -30,7 +30,7 @@ from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.preparation.cosine_bins import cosine_transform
-from monitor.reconcile.preparation.reconcile_input import Recording
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.result import ParameterInterval, RecordingFinding
 from monitor.reconcile.search.sample_rate_from_spectrum import SampleRateErrorEstimate
 from monitor.reconcile.search.sample_repair import fill_missing_samples
@@ -121,8 +121,8 @@ def estimate_sample_rate_error(
 
 
 def correct_impossible_sample_rate(
-    recording: Recording, model: NoiseModel
-) -> tuple[Recording, RecordingFinding] | None:
+    recording: RecordedAxes, model: NoiseModel
+) -> tuple[RecordedAxes, RecordingFinding] | None:
     """Correct a stated sample rate at which the features of the model are impossible.
 
     A feature above half the stated sample rate is impossible. The model may state a higher rate. If the features match
@@ -130,7 +130,7 @@ def correct_impossible_sample_rate(
 
     Parameters
     ----------
-    recording : Recording
+    recording : RecordedAxes
         Recording to check.
     model : NoiseModel
         Model under test.
@@ -155,7 +155,7 @@ def correct_impossible_sample_rate(
         ratio, ratio * exp(-MAX_STATED_FREQUENCY_DRIFT), ratio * exp(MAX_STATED_FREQUENCY_DRIFT)
     )
     found = SampleRateErrorEstimate(interval, gain, strongest.axis, (strongest.f_hz, strongest.f_hz / ratio))
-    changed = Recording(recording.values, rate_hz, recording.temperature_c)
+    changed = RecordedAxes(recording.values, rate_hz, recording.temperature_c)
     return changed, describe_sample_rate_error(found, recording.rate_hz)
 
 

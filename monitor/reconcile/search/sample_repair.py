@@ -27,7 +27,7 @@ from monitor.reconcile.preparation.cosine_bins import (
     cosine_transform,
     inverse_cosine_transform,
 )
-from monitor.reconcile.preparation.reconcile_input import Recording
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.preparation.value_artifacts import Mask, ValueArtifacts
 
 NEIGHBOURHOOD_WIDTHS: Final = (1024, 256, 64, 16, 4)
@@ -259,13 +259,13 @@ def _draw_missing(
 
 
 def build_repaired_axes(
-    recording: Recording, effects: Mapping[str, Effects], regressors: RegressorCache, rng: np.random.Generator
+    recording: RecordedAxes, effects: Mapping[str, Effects], regressors: RegressorCache, rng: np.random.Generator
 ) -> dict[str, Axis]:
     """Build the axes of one recording with repaired samples.
 
     Parameters
     ----------
-    recording : Recording
+    recording : RecordedAxes
         Measured or simulated recording without missing temperatures.
     effects : mapping of str to tuple of Effect
         Effects of each axis in the model.

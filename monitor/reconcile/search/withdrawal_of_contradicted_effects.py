@@ -32,7 +32,7 @@ from monitor.noise.effects import (
     WanderingLine,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
-from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, WhitenessDeparture
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.search.trials import MAX_BAND_FRACTION
@@ -141,7 +141,7 @@ def difference_remains_near_line(line: WanderingLine, before: Findings, whitened
     return False
 
 
-def _resolved_frequency(diagnostic: str, finding: Finding, rate_hz: float) -> tuple[float, float] | None:
+def _resolved_frequency(diagnostic: str, finding: WhitenessDeparture, rate_hz: float) -> tuple[float, float] | None:
     """Return the frequency range of a difference, or None if the diagnostic does not resolve its frequency.
 
     If the power changes in time over a wide band, such as during a knock, the spectrogram does not contradict an effect

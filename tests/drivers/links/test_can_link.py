@@ -23,7 +23,7 @@ from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_block
 from drivers.decoders import dbc
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.host.extras import install_command
-from drivers.links import arrival_times, can_link
+from drivers.links import can_link, unix_to_monotonic_arrival
 from drivers.links.can_link import CanLink
 from tests.support.settings import read_settings
 
@@ -84,7 +84,9 @@ def test_number_of_frames_per_read_is_limited(peer: can.BusABC, channel: str) ->
 
 
 def test_late_read_keeps_the_arrival_time(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arrival_times, "MAX_AGE_S", 3600.0)  # a loaded machine may take seconds between the frames
+    monkeypatch.setattr(
+        unix_to_monotonic_arrival, "MAX_AGE_S", 3600.0
+    )  # a loaded machine may take seconds between the frames
     with can.Bus(interface="virtual", channel=channel, preserve_timestamps=True) as peer:
         link = build(interface="virtual", channel=channel)
         link.open()
@@ -109,7 +111,7 @@ def test_interruption_between_reading_two_clocks_does_not_change_the_time(monkey
 
     link = build(interface="virtual", channel="none")
     monkeypatch.setattr(
-        arrival_times,
+        unix_to_monotonic_arrival,
         "time",
         SimpleNamespace(monotonic_ns=lambda: now_ns[0], time_ns=time_ns, time=lambda: time_ns() / 1e9),
     )

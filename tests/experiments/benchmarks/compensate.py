@@ -379,7 +379,7 @@ def alarms(seeds: int) -> None:
             t_ns = np.round(np.arange(len(values)) / rate_hz * 1e9).astype(np.int64)
             for start in range(0, len(values), 100):
                 one.compensate_block(make_block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))
-                worker.adopt_and_start_models(one)
+                worker.adopt_results_and_start_next_identification(one)
             event_texts += [event.text for event in one.take_events()]
         hours = sum(len(values) for values in records) / rate_hz / 3600.0
         table.add_row(

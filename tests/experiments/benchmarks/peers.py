@@ -32,7 +32,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.preparation.reconcile_input import Recording
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.reconcile import reconcile
 from tests.experiments.benchmarks import five_terms, gmwm
 from tests.experiments.blind import run
@@ -98,7 +98,7 @@ def fit_five_terms(
 def run_reconcile(columns: Mapping[str, Floats], rate_hz: float, model: NoiseModel, seed: int) -> Iterable[FoundEffect]:
     """Yield the effects of ``reconcile``."""
     shown = {axis: columns[axis] for axis in _axes(columns)}
-    found = reconcile(Recording(shown, rate_hz, columns.get("temperature")), model, seed)
+    found = reconcile(RecordedAxes(shown, rate_hz, columns.get("temperature")), model, seed)
     for axis, result in found.axes.items():
         for step in result.steps:
             if step.kind == "added":

@@ -33,7 +33,7 @@ from drivers.data_types import AXES, Floats  # noqa: E402
 from monitor.noise.effects import ConstantBias  # noqa: E402
 from monitor.noise.model import NoiseModel  # noqa: E402
 from monitor.reconcile.likelihood.axis_fit import RegressorCache  # noqa: E402
-from monitor.reconcile.preparation.reconcile_input import Recording, select_axes_and_smooth_temperature  # noqa: E402
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes, select_axes_and_smooth_temperature  # noqa: E402
 from monitor.reconcile.reconcile import reconcile  # noqa: E402
 from monitor.reconcile.recording_checks.checks import check_recording, sort_findings  # noqa: E402
 from monitor.reconcile.recording_checks.sample_rate_from_features import (  # noqa: E402
@@ -90,7 +90,7 @@ class Case:
     sensor: str
     fault: str
     detail: str
-    recording: Recording
+    recording: RecordedAxes
     kinds: tuple[str, ...]  # kinds of findings that are right
     axes: tuple[str, ...] = ()  # axes that the finding must name; empty = any
     expected: dict[str, tuple[float, float]] = field(default_factory=dict)  # parameter -> value, relative tolerance
@@ -119,18 +119,18 @@ class Answer:
         )
 
 
-def load_part(data: Path, place: tuple[str, int, int]) -> Recording:
+def load_part(data: Path, place: tuple[str, int, int]) -> RecordedAxes:
     """Return one part of a recording."""
     file, begin, end = place
     with np.load(data / file) as columns:
         values = {axis: columns[axis][begin:end].astype(np.float64) for axis in AXES}
         temperature_c = columns["temp"][begin:end].astype(np.float64) if "temp" in columns else None
-        return Recording(values, float(columns["fs"]), temperature_c)
+        return RecordedAxes(values, float(columns["fs"]), temperature_c)
 
 
-def replace_values(recording: Recording, values: dict[str, Floats]) -> Recording:
+def replace_values(recording: RecordedAxes, values: dict[str, Floats]) -> RecordedAxes:
     """Return the recording with other values on some axes."""
-    return Recording({**recording.values, **values}, recording.rate_hz, recording.temperature_c)
+    return RecordedAxes({**recording.values, **values}, recording.rate_hz, recording.temperature_c)
 
 
 def noise_deviation(y: Floats) -> float:
@@ -138,7 +138,7 @@ def noise_deviation(y: Floats) -> float:
     return float(np.std(np.diff(y))) / 2.0**0.5
 
 
-def with_unit(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
+def with_unit(sensor: str, second: RecordedAxes, rng: np.random.Generator) -> Case:
     """Multiply one triad by a wrong conversion."""
     triad = TRIADS[int(rng.integers(2))]
     factor = float(rng.choice(UNITS[triad[0][0]]))
@@ -155,7 +155,7 @@ def with_unit(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
     )
 
 
-def with_swap(sensor: str, first: Recording, second: Recording, rng: np.random.Generator) -> Case | None:
+def with_swap(sensor: str, first: RecordedAxes, second: RecordedAxes, rng: np.random.Generator) -> Case | None:
     """Swap two axes of a triad with different spectra, or return None without such axes."""
     pairs = [
         (one, other)
@@ -171,7 +171,7 @@ def with_swap(sensor: str, first: Recording, second: Recording, rng: np.random.G
     return Case(sensor, "swap", f"{one} and {other}", replace_values(second, values), ("axes_permuted",), (one, other))
 
 
-def _have_different_spectra(first: Recording, second: Recording, one: str, other: str) -> bool:
+def _have_different_spectra(first: RecordedAxes, second: RecordedAxes, one: str, other: str) -> bool:
     """Return True if a swap of two axes changes the spectra far more than the spectra differ between the parts."""
     spectra = {
         (part, axis): np.log(welch(recording.values[axis], nperseg=256)[1][2:])
@@ -185,16 +185,16 @@ def _have_different_spectra(first: Recording, second: Recording, one: str, other
     return distance(one, other) + distance(other, one) > 3.0 * (distance(one, one) + distance(other, other))
 
 
-def with_rate(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
+def with_rate(sensor: str, second: RecordedAxes, rng: np.random.Generator) -> Case:
     """State a sample rate that is wrong by 0.5 to 20 %."""
     size = float(np.exp(rng.uniform(np.log(0.005), np.log(0.2))))
     ratio = (1.0 + size) ** float(rng.choice([-1.0, 1.0]))  # true over stated
-    recording = Recording(second.values, second.rate_hz / ratio, second.temperature_c)
+    recording = RecordedAxes(second.values, second.rate_hz / ratio, second.temperature_c)
     detail = f"true over stated {ratio:.4f}"
     return Case(sensor, "rate", detail, recording, ("sample_rate_error",), (), {"ratio": (ratio, 0.003)})
 
 
-def with_knocks(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
+def with_knocks(sensor: str, second: RecordedAxes, rng: np.random.Generator) -> Case:
     """Add one to three knocks: decaying oscillations of all axes."""
     n, rate_hz = second.sample_count, second.rate_hz
     values = {axis: y.copy() for axis, y in second.values.items()}
@@ -209,7 +209,7 @@ def with_knocks(sensor: str, second: Recording, rng: np.random.Generator) -> Cas
     return Case(sensor, "knocks", f"{count}", replace_values(second, values), ("motion",))
 
 
-def with_hole(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
+def with_hole(sensor: str, second: RecordedAxes, rng: np.random.Generator) -> Case:
     """Remove successive rows, or replace successive rows by copies of the previous row."""
     n = second.sample_count
     begin, length = int(rng.integers(n // 10, n // 2)), int(rng.integers(n // 200, n // 20))
@@ -222,14 +222,14 @@ def with_hole(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
     return Case(sensor, "drop-out", f"{length} rows {kind}", replace_values(second, values), (kind,), (), at)
 
 
-def with_spike(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
+def with_spike(sensor: str, second: RecordedAxes, rng: np.random.Generator) -> Case:
     """Add a spike to one row on one axis or on all axes."""
     at = int(rng.integers(second.sample_count // 10, second.sample_count - 10))
     axes = AXES if rng.integers(2) else (AXES[int(rng.integers(6))],)
     return _corrupt_row(sensor, "spike row", second, at, axes, rng)
 
 
-def with_first_row(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
+def with_first_row(sensor: str, second: RecordedAxes, rng: np.random.Generator) -> Case:
     """Add a spike to the first or last row, or set the first row to zero."""
     at = 0 if rng.integers(3) else second.sample_count - 1
     if at == 0 and rng.integers(2):
@@ -241,7 +241,7 @@ def with_first_row(sensor: str, second: Recording, rng: np.random.Generator) -> 
 
 
 def _corrupt_row(
-    sensor: str, fault: str, second: Recording, at: int, axes: Sequence[str], rng: np.random.Generator
+    sensor: str, fault: str, second: RecordedAxes, at: int, axes: Sequence[str], rng: np.random.Generator
 ) -> Case:
     """Add a spike of 30 to 1000 standard deviations to one row."""
     values = {axis: y.copy() for axis, y in second.values.items()}
@@ -253,7 +253,7 @@ def _corrupt_row(
     return Case(sensor, fault, detail, replace_values(second, values), ("corrupt_rows",), (), expected)
 
 
-def with_stuck_axis(sensor: str, second: Recording, rng: np.random.Generator) -> Case:
+def with_stuck_axis(sensor: str, second: RecordedAxes, rng: np.random.Generator) -> Case:
     """Keep one axis at a constant value for some time, or until the end of the recording."""
     n, axis = second.sample_count, AXES[int(rng.integers(6))]
     begin = int(rng.integers(n // 10, n // 2))
@@ -319,7 +319,7 @@ def run_case(case: Case, model: NoiseModel, with_search: bool) -> Answer:
     return Answer(case, run_checks_before_search(case.recording, model), "", time.perf_counter() - begin)
 
 
-def run_checks_before_search(recording: Recording, model: NoiseModel) -> tuple[RecordingFinding, ...]:
+def run_checks_before_search(recording: RecordedAxes, model: NoiseModel) -> tuple[RecordingFinding, ...]:
     """Return the findings of ``reconcile`` without the search for effects."""
     checked = check_recording(recording, model, 1)
     usable, _ = select_axes_and_smooth_temperature(checked.recording, model)

@@ -39,7 +39,7 @@ from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS  # noqa: E
 from monitor.reconcile.likelihood.axis_fit import RegressorCache  # noqa: E402
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise  # noqa: E402
 from monitor.reconcile.likelihood.whitening import whiten_axis  # noqa: E402
-from monitor.reconcile.preparation.reconcile_input import Recording  # noqa: E402
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes  # noqa: E402
 from monitor.reconcile.reconcile import SIMULATED_RECORDINGS  # noqa: E402
 from monitor.reconcile.search.sample_repair import build_repaired_axes  # noqa: E402
 from tests.experiments.blind.tables import format_share, format_table  # noqa: E402
@@ -67,7 +67,7 @@ def diagnose(model: NoiseModel, n: int, seeds: Sequence[int]) -> Round:
     found: Round = {axis: [] for axis in effects}
     for seed in seeds:
         drawn = model.simulate(n, RATE_HZ, seed, temperature_c)
-        recording = Recording({axis: drawn[:, AXES.index(axis)] for axis in effects}, RATE_HZ, temperature_c)
+        recording = RecordedAxes({axis: drawn[:, AXES.index(axis)] for axis in effects}, RATE_HZ, temperature_c)
         axes = build_repaired_axes(recording, effects, regressors, np.random.default_rng(seed))
         for axis, own in effects.items():
             found[axis].append(run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[axis], own).fit)))

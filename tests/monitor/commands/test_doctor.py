@@ -20,7 +20,7 @@ from drivers.host.extras import install_command
 from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter
 from monitor.commands.doctor import devices, examine_machine, installation_and_clock, network
-from monitor.commands.doctor.finding import Finding, worst_mark
+from monitor.commands.doctor.finding import DoctorFinding, worst_mark
 from monitor.commands.doctor.storage import SAMPLE_BYTES, check_disk_space, recorded_bytes_per_day
 from monitor.common.compiled import kernel_cache_folder
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
@@ -37,18 +37,18 @@ DEVICE = '[[device]]\nname = "a"\nrate = 100.0\ndriver = {{ {} }}\n'
 VIRTUAL = DEVICE.format('link = "virtual"')
 
 
-def examine_config(folder: Path, text: str, mode: int = 0o600) -> list[Finding]:
+def examine_config(folder: Path, text: str, mode: int = 0o600) -> list[DoctorFinding]:
     path = folder / "c.toml"
     path.write_text(text)
     path.chmod(mode)
     return examine_machine(path)
 
 
-def select_findings(findings: list[Finding], about: str) -> list[Finding]:
+def select_findings(findings: list[DoctorFinding], about: str) -> list[DoctorFinding]:
     return [finding for finding in findings if finding.about == about]
 
 
-def require_one_finding(findings: list[Finding], about: str) -> Finding:
+def require_one_finding(findings: list[DoctorFinding], about: str) -> DoctorFinding:
     (found,) = select_findings(findings, about)
     return found
 
@@ -125,7 +125,7 @@ def port() -> Iterator[str]:
     os.close(master)
 
 
-def examine_serial_port(folder: Path, port: str) -> Finding:
+def examine_serial_port(folder: Path, port: str) -> DoctorFinding:
     driver = f'link = "serial", port = "{port}", decoder = "stim300"'
     return require_one_finding(examine_config(folder, DEVICE.format(driver) + QUIET), "device a")
 
@@ -162,7 +162,7 @@ def test_unreadable_port_names_the_group_to_join(tmp_path: Path, port: str) -> N
     assert pwd.getpwuid(os.geteuid()).pw_name in found.do
 
 
-def examine_udp_port(folder: Path, port: int, host: str = "127.0.0.1") -> Finding:
+def examine_udp_port(folder: Path, port: int, host: str = "127.0.0.1") -> DoctorFinding:
     driver = f'link = "udp", host = "{host}", port = {port}, decoder = "mavlink"'
     return require_one_finding(examine_config(folder, DEVICE.format(driver) + QUIET), "device a")
 
@@ -270,7 +270,7 @@ def test_unprotected_listening_beyond_this_machine_is_found(tmp_path: Path) -> N
 
 
 def test_router_of_ros2_is_checked(tmp_path: Path) -> None:
-    def check(port: int) -> list[Finding]:
+    def check(port: int) -> list[DoctorFinding]:
         text = VIRTUAL + QUIET + f'[ros2]\ndomain = 0\nconnect = ["tcp/127.0.0.1:{port}"]\n'
         return select_findings(examine_config(tmp_path, text), "ros2")
 
@@ -285,7 +285,7 @@ def test_influx_server_and_token_are_checked(tmp_path: Path) -> None:
     token.write_text("s3cret")
     token.chmod(0o644)
 
-    def check(url: str) -> list[Finding]:
+    def check(url: str) -> list[DoctorFinding]:
         text = VIRTUAL + QUIET + f'[influx]\nurl = "{url}"\ntoken_file = "token"\n'
         return select_findings(examine_config(tmp_path, text), "influx")
 

@@ -16,7 +16,7 @@ from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 from monitor.reconcile.likelihood.axis_fit import Axis, RegressorCache
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
-from monitor.reconcile.preparation.reconcile_input import Recording
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.search.sample_repair import build_repaired_axes
 
 RATE_HZ = 100.0
@@ -72,7 +72,7 @@ def axes(
     """Prepare the axes of a recording for the search."""
     n = next(iter(values.values())).size
     each = effects if isinstance(effects, Mapping) else dict.fromkeys(values, effects)
-    given = Recording(values, RATE_HZ, temperature_c)
+    given = RecordedAxes(values, RATE_HZ, temperature_c)
     return build_repaired_axes(given, each, RegressorCache(n, RATE_HZ, temperature_c), np.random.default_rng(seed))
 
 
@@ -88,10 +88,10 @@ def whiten(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
 
 def recording(
     model: NoiseModel, n: int, seed: int, temperature_c: Floats | None = None, names: tuple[str, ...] = GYRO_AXES
-) -> Recording:
+) -> RecordedAxes:
     """Return a recording that the simulator has drawn."""
     drawn = model.simulate(n, RATE_HZ, seed, temperature_c)
-    return Recording({name: drawn[:, AXES.index(name)].copy() for name in names}, RATE_HZ, temperature_c)
+    return RecordedAxes({name: drawn[:, AXES.index(name)].copy() for name in names}, RATE_HZ, temperature_c)
 
 
 # --- the contract of report.json

@@ -26,7 +26,7 @@ from monitor.reconcile.json_report import encode_report
 from monitor.reconcile.likelihood.axis_fit import RegressorCache
 from monitor.reconcile.preparation.reconcile_input import (
     MIN_SAMPLES,
-    Recording,
+    RecordedAxes,
     _smooth_temperature,
     select_axes_and_smooth_temperature,
 )
@@ -193,7 +193,7 @@ def test_only_terms_that_the_data_support_are_fitted():
         "gz": white(n, rng) + 1e-5 * time_s(n),
         "ax": NoiseModel({"ax": (WHITE, QuantizationNoise(Q=5e-6))}).simulate(n, RATE_HZ, 1)[:, 3].copy(),
     }
-    found = fit_five_terms(RecordingContext(Recording(values, RATE_HZ), 1, RegressorCache(n, RATE_HZ, None), map))
+    found = fit_five_terms(RecordingContext(RecordedAxes(values, RATE_HZ), 1, RegressorCache(n, RATE_HZ, None), map))
     kinds = {axis: {type(effect) for effect in effects} for axis, effects in found.effects.items()}
     assert kinds["gx"] == {AngleRandomWalk}
     assert kinds["gy"] >= {AngleRandomWalk, RateRandomWalk}
@@ -209,7 +209,7 @@ def test_only_terms_that_the_data_support_are_fitted():
 
 def draw_recording(**changed):
     small = recording(MODEL, MIN_SAMPLES, 1)
-    return Recording({**small.values, **changed}, RATE_HZ)
+    return RecordedAxes({**small.values, **changed}, RATE_HZ)
 
 
 def test_error_for_too_few_samples_states_the_minimum():
@@ -229,7 +229,7 @@ def test_axes_that_cannot_be_compared_are_left_out_with_a_note():
     assert [note.split(":")[0] for note in notes] == ["gx", "gy", "ax"]
     assert all(note.endswith("left out") for note in notes)
     with pytest.raises(NotReady, match=r"no axis to compare: gx: .*; gy: "):
-        select_axes_and_smooth_temperature(Recording({"gx": holed, "gy": holed}, RATE_HZ), MODEL)
+        select_axes_and_smooth_temperature(RecordedAxes({"gx": holed, "gy": holed}, RATE_HZ), MODEL)
 
 
 def test_constant_bias_is_no_part_of_the_comparison():

@@ -17,8 +17,8 @@ from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.style import omit_wide_intervals
-from monitor.publishing.rerun import allan_drawing, dynamic_heat_map
-from monitor.publishing.rerun.dynamic_heat_map import AllanHistory
+from monitor.publishing.rerun import allan_drawing, allan_history_heat_map
+from monitor.publishing.rerun.allan_history_heat_map import AllanHistory
 from monitor.publishing.rerun.panels import history_points
 from monitor.publishing.rerun.panels.panel import Panel
 from monitor.publishing.rerun.panels.panel_text import noise_text
@@ -66,7 +66,7 @@ class AllanAndCoefficientPanel(Panel):
         self._log_text("coefficients", at_s, noise_text(estimate, self.scene.units))
         self._plot.draw(estimate, self.scene.get_or_create_panel(self.device, ModelDifferencePanel).newest)
         if self._history.add_estimate_and_check_column_complete(at_s, estimate):
-            dynamic_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._history)
+            allan_history_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._history)
 
 
 class CoefficientsPanel(Panel):

@@ -12,7 +12,7 @@ import zenoh
 from drivers.data_types import AXES, Event, make_block
 from monitor.daemon.outputs.ros2_output import Ros2Output, white_noise_variances
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
-from monitor.publishing.ros2.graph_names import DIAGNOSTICS, imu_topic
+from monitor.publishing.ros2.rmw_zenoh_names import DIAGNOSTICS, imu_topic
 from monitor.settings.loading import Device, Ros2Table
 from tests.monitor.publishing.example_results import make_estimate, make_health
 from tests.support.ports import free_endpoint

@@ -368,7 +368,7 @@ def test_window_after_a_restart_equals_the_window_before(tmp_path: Path) -> None
     before = record_until_abrupt_end(tmp_path)
     sample_recorder = Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())])
     after = make_worker(tmp_path, sample_recorder)
-    after.restore.resume_from(sample_recorder.find_recording_tail("bench"))
+    after.restore.resume_from(sample_recorder.find_last_recorded_samples("bench"))
     assert not after._can_take()  # new samples have to wait
     after.refill_window_from_recording()
     assert after._can_take()
@@ -404,7 +404,7 @@ def test_restarted_axis_keeps_its_sample_count_after_a_restart(tmp_path: Path) -
     wait_for(lambda: sum(len(piece.samples) for piece in read_written_parts(tmp_path / "bench")) == 6000)
     sample_recorder.close(PATIENCE_S)
     after = make_worker(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())]))
-    after.restore.resume_from(after._recorder.find_recording_tail("bench"))
+    after.restore.resume_from(after._recorder.find_last_recorded_samples("bench"))
     after.refill_window_from_recording()
     old, new = before.pipeline.estimator.get_estimate(), after.pipeline.estimator.get_estimate()
     assert old.curve.terms[0, 2] < old.curve.terms[0, 0]
@@ -458,7 +458,7 @@ def test_unsuitable_recording_starts_an_empty_window(tmp_path, axes, older_s: fl
     sample_recorder.queue_samples("bench", make_rows(0, 3000, start_ns=time.time_ns() - int((older_s + 30.0) * 1e9)), 0)
     sample_recorder.close(PATIENCE_S)
     after = make_worker(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", axes)]), axes=axes)
-    after.restore.resume_from(after._recorder.find_recording_tail("bench"))
+    after.restore.resume_from(after._recorder.find_last_recorded_samples("bench"))
     after.refill_window_from_recording()
     assert after.pipeline.estimator is None
     assert after._can_take() is False or after.ring.free_capacity == after.ring.capacity
@@ -471,7 +471,7 @@ def test_invalid_segment_files_are_ignored(tmp_path: Path) -> None:
     (tmp_path / "bench" / segment_file.format_segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
     (tmp_path / "bench" / segment_file.format_segment_name(901, 1.8e9)).write_bytes(b"")
     after = make_worker(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())]))
-    after.restore.resume_from(after._recorder.find_recording_tail("bench"))
+    after.restore.resume_from(after._recorder.find_last_recorded_samples("bench"))
     after.refill_window_from_recording()
     assert after.pipeline.estimator.samples_in_window == 3000
 
@@ -684,7 +684,7 @@ def test_other_file_types_in_place_of_segments_are_ignored(tmp_path: Path, kind:
             case _:
                 path.symlink_to(path.name)
     again = Recorder(Storage.model_construct(folder=tmp_path, keep_s=1.0, segment_s=1.0), [SAMPLES])
-    tail = again.find_recording_tail("bench")
+    tail = again.find_last_recorded_samples("bench")
     assert tail is not None
     assert tail.newest.samples.ticks[-1] == 99
     assert len(list(tail.read_pieces(10.0))) == 1

@@ -73,7 +73,7 @@ PAYLOADS = {
 
 
 @pytest.mark.parametrize("topic", PAYLOADS, ids=lambda topic: topic.name)
-def test_each_payload_starts_with_schema_device_time_and_samples(topic: topics.Topic) -> None:
+def test_each_payload_starts_with_schema_device_time_and_samples(topic: topics.ZenohTopic) -> None:
     found = parse_json(PAYLOADS[topic])
     assert list(found)[:4] == ["schema", "device", "t", "samples"]
     assert found["schema"] == f"imu-monitor/{topic.name.rpartition('/')[2]}/1"

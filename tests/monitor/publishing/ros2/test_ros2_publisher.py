@@ -10,8 +10,8 @@ import pytest
 import zenoh
 
 from monitor.publishing.ros2 import publisher as ros2_publisher
-from monitor.publishing.ros2.graph_names import DIAGNOSTICS, imu_topic, node_token, publisher_token
 from monitor.publishing.ros2.publisher import Ros2Publisher
+from monitor.publishing.ros2.rmw_zenoh_names import DIAGNOSTICS, imu_topic, node_token, publisher_token
 from tests.support.ports import free_endpoint
 from tests.support.waiting import FOREVER_S, wait_for
 from tests.support.zenoh_sessions import open_router, open_session

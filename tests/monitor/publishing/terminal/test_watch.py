@@ -76,7 +76,7 @@ def test_every_published_topic_is_printed() -> None:
 
 
 @contextlib.contextmanager
-def run_daemon(endpoint: str, *messages: tuple[topics.Topic, bytes], period_s: float = 0.1) -> Iterator[None]:
+def run_daemon(endpoint: str, *messages: tuple[topics.ZenohTopic, bytes], period_s: float = 0.1) -> Iterator[None]:
     """Run a session that repeats messages."""
     publisher, ending = ZenohPublisher(ZenohTable(listen=(endpoint,)), ["a"]), threading.Event()
 

@@ -16,7 +16,7 @@ from monitor.reconcile.diagnostics.null_distribution import (
     is_significance_clear,
     run_diagnostics,
 )
-from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, Finding
+from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS, WhitenessDeparture
 from monitor.reconcile.likelihood.effect_roles import is_stationary_gaussian
 from monitor.reconcile.result import Location
 from tests.monitor.reconcile.axes import WALK, WHITE, axis, make_temperature, walk, white, whiten
@@ -38,7 +38,7 @@ def draw_findings(count, rng, shift=0.0):
             diagnostic: upper_quartile(diagnostic) + NULL_GAIN_QUANTILE_PARAMETERS[diagnostic].scale * e
             for diagnostic, e in zip(DIAGNOSTICS, excess, strict=True)
         }
-        found.append({diagnostic: Finding(float(g), Location(), PLACES) for diagnostic, g in gains.items()})
+        found.append({diagnostic: WhitenessDeparture(float(g), Location(), PLACES) for diagnostic, g in gains.items()})
     return found
 
 
@@ -110,10 +110,10 @@ def test_improbable_gain_is_discarded_if_the_next_simulation_is_probable():
 def test_simulations_continue_while_the_significance_of_a_finding_is_unclear():
     simulated = draw_findings(1, np.random.default_rng(6))
     threshold = estimate_null_distributions({"gz": simulated})["gz"]["psd"].threshold
-    odd = [{**simulated[0], "psd": Finding(3.0 * threshold, Location(), PLACES)}]
+    odd = [{**simulated[0], "psd": WhitenessDeparture(3.0 * threshold, Location(), PLACES)}]
 
     def is_clear(gain, simulations):
-        recorded = {**simulated[0], "psd": Finding(gain, Location(), PLACES)}
+        recorded = {**simulated[0], "psd": WhitenessDeparture(gain, Location(), PLACES)}
         return is_significance_clear(recorded, simulations, 1)
 
     assert is_clear(0.99 * threshold, simulated)
@@ -125,7 +125,7 @@ def test_simulations_continue_while_the_significance_of_a_finding_is_unclear():
 
 
 def test_diagnostic_without_gains_has_a_threshold():
-    nothing = [{diagnostic: Finding(0.0, Location()) for diagnostic in DIAGNOSTICS}] * SIMULATED_RECORDINGS
+    nothing = [{diagnostic: WhitenessDeparture(0.0, Location()) for diagnostic in DIAGNOSTICS}] * SIMULATED_RECORDINGS
     for one in estimate_null_distributions({"gz": nothing})["gz"].values():
         assert 0.0 < one.null95 < one.threshold < np.inf
 
@@ -159,7 +159,9 @@ def test_gains_of_true_models_follow_the_expected_distribution(model, n):
 
 
 def test_gap_is_in_standard_deviations():
-    seen = {diagnostic: Finding(0.5 * k**2, Location(tau=(1.0, 2.0))) for k, diagnostic in enumerate(DIAGNOSTICS)}
+    seen = {
+        diagnostic: WhitenessDeparture(0.5 * k**2, Location(tau=(1.0, 2.0))) for k, diagnostic in enumerate(DIAGNOSTICS)
+    }
     found = compute_diagnostic_gaps(seen, dict.fromkeys(DIAGNOSTICS, NullDistribution(2.0, 8.0)))
     assert [score.diagnostic for score in found] == list(DIAGNOSTICS)
     assert [score.gap for score in found] == pytest.approx(np.arange(len(DIAGNOSTICS)))

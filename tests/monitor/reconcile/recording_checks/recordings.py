@@ -5,7 +5,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, ConstantBias, Narrowband, Resolution
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.preparation.reconcile_input import Recording
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 
 RATE_HZ = 100.0
 SAMPLES = 16_000
@@ -31,12 +31,12 @@ def make_model(gravity: bool = False, step: float = 0.0) -> NoiseModel:
     return NoiseModel(effects, RATE_HZ)
 
 
-def draw(model: NoiseModel, seed: int, samples: int = SAMPLES) -> Recording:
+def draw(model: NoiseModel, seed: int, samples: int = SAMPLES) -> RecordedAxes:
     """Simulate a recording of six axes."""
     drawn = model.simulate(samples, RATE_HZ, seed)
-    return Recording({axis: np.ascontiguousarray(drawn[:, k]) for k, axis in enumerate(AXES)}, RATE_HZ)
+    return RecordedAxes({axis: np.ascontiguousarray(drawn[:, k]) for k, axis in enumerate(AXES)}, RATE_HZ)
 
 
-def changed(recording: Recording, **values: Floats) -> Recording:
+def changed(recording: RecordedAxes, **values: Floats) -> RecordedAxes:
     """Return the recording with other values on some axes."""
-    return Recording({**recording.values, **values}, recording.rate_hz, recording.temperature_c)
+    return RecordedAxes({**recording.values, **values}, recording.rate_hz, recording.temperature_c)

@@ -7,7 +7,7 @@ from drivers.data_types import AXES
 from monitor.noise.effects import AngleRandomWalk, Narrowband, SampleRateError
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.preparation.cosine_bins import cosine_transform
-from monitor.reconcile.preparation.reconcile_input import Recording
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.recording_checks.sample_rate_from_features import (
     correct_impossible_sample_rate,
     estimate_sample_rate_error,
@@ -78,13 +78,13 @@ def test_feature_above_half_the_stated_rate_needs_the_rate_of_the_model():
         {"gx": (AngleRandomWalk(N=1e-4), Narrowband(sigma=1e-3, frequency=45.0, bandwidth=0.1))}, RATE_HZ
     )
     recording = draw(model, 3)
-    stated = Recording(recording.values, 85.0)
+    stated = RecordedAxes(recording.values, 85.0)
     corrected, finding = correct_impossible_sample_rate(stated, model)
     assert corrected.rate_hz == RATE_HZ
     assert finding.kind == "sample_rate_error"
     assert log(finding.parameters["ratio"].value) == pytest.approx(log(100.0 / 85.0))
     assert correct_impossible_sample_rate(recording, model) is None
-    white = Recording({axis: np.random.default_rng(0).standard_normal(16_000) for axis in AXES}, 85.0)
+    white = RecordedAxes({axis: np.random.default_rng(0).standard_normal(16_000) for axis in AXES}, 85.0)
     assert correct_impossible_sample_rate(white, model) is None
 
 

@@ -11,7 +11,7 @@ from drivers.recordings.segment_file import GapFreeSegmentPart, SegmentMetadata
 
 
 @dataclass(frozen=True, slots=True)
-class RecordingTail:
+class LastRecordedSamples:
     """End of the recording of one device."""
 
     origin: SegmentMetadata
@@ -44,7 +44,7 @@ class RecordingTail:
         return list(chosen)
 
 
-def read_recording_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail | None:
+def read_last_recorded_samples(origin: SegmentMetadata, folder: Path) -> LastRecordedSamples | None:
     """Read the end of the recording in a folder, or return None if there is no recording to continue.
 
     Files that are not valid segments are ignored.
@@ -66,6 +66,6 @@ def read_recording_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail 
         except (RecordingError, ConfigError, OSError):
             newest = None
         if newest is not None:
-            return RecordingTail(origin, tuple(paths), newest)
+            return LastRecordedSamples(origin, tuple(paths), newest)
         paths.pop()
     return None

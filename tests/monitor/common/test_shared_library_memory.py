@@ -7,7 +7,7 @@ import sys
 PROGRAM = """
 import re
 from pathlib import Path
-from monitor.common import library_pages
+from monitor.common import shared_library_memory
 from monitor.estimation.estimator import Estimator
 from drivers.data_types import make_block
 import numpy as np
@@ -23,7 +23,7 @@ def estimate():
     return estimator.get_estimate().curve.avar.tobytes()
 
 first, before = estimate(), resident_kb()
-library_pages.release_library_pages(library_pages.LLVM_LIBRARY)
+shared_library_memory.release_library_pages(shared_library_memory.LLVM_LIBRARY)
 after = resident_kb()
 assert estimate() == first
 import numba

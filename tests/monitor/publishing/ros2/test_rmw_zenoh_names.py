@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import pytest
 from rosbags.typesys import get_typestore
 
-from monitor.publishing.ros2 import graph_names
-from monitor.publishing.ros2.graph_names import DIAGNOSTICS, RosTopic, imu_topic, node_token, publisher_token
+from monitor.publishing.ros2 import rmw_zenoh_names
+from monitor.publishing.ros2.rmw_zenoh_names import DIAGNOSTICS, RosTopic, imu_topic, node_token, publisher_token
 from tests.support import ros2_messages
 
 SESSION = "8a1f2c"
@@ -51,8 +51,8 @@ def parse_qos(text: str) -> dict[str, int]:
 def test_type_hashes_are_those_of_the_release(store: object) -> None:
     types = get_typestore(store)
     for known, name in (
-        (graph_names.IMU, ros2_messages.IMU),
-        (graph_names.DIAGNOSTIC_ARRAY, ros2_messages.DIAGNOSTIC_ARRAY),
+        (rmw_zenoh_names.IMU, ros2_messages.IMU),
+        (rmw_zenoh_names.DIAGNOSTIC_ARRAY, ros2_messages.DIAGNOSTIC_ARRAY),
     ):
         package, _, message = name.split("/")
         assert known.name == f"{package}::msg::dds_::{message}_"
@@ -65,7 +65,7 @@ def test_type_hashes_are_those_of_the_release(store: object) -> None:
 def test_topic_and_key_of_the_samples(namespace: str, name: str) -> None:
     topic = imu_topic(namespace, "bench-1")
     assert topic.name == name
-    assert topic.zenoh_key(7) == f"7{name}/sensor_msgs::msg::dds_::Imu_/{graph_names.IMU.type_hash}"
+    assert topic.zenoh_key(7) == f"7{name}/sensor_msgs::msg::dds_::Imu_/{rmw_zenoh_names.IMU.type_hash}"
 
 
 @pytest.mark.parametrize("namespace", ["/", "/robot1", "/robot1/arm"])

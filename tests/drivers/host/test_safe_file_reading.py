@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import ConfigError
-from drivers.host import file_access
+from drivers.host import safe_file_reading
 from monitor.commands import thermal
 from monitor.noise.model_loading import read_model
 from monitor.settings import loading
@@ -13,15 +13,15 @@ from monitor.settings import loading
 
 def test_small_file_is_read_completely(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1\r\n2")
-    assert file_access.read_small_file(tmp_path / "a") == b"1\r\n2"
+    assert safe_file_reading.read_small_file(tmp_path / "a") == b"1\r\n2"
 
 
 def test_every_reader_refuses_a_file_that_is_too_large(tmp_path: Path) -> None:
     path = tmp_path / "big"
     with path.open("wb") as file:
-        file.truncate(file_access.MAX_BYTES + 1)
+        file.truncate(safe_file_reading.MAX_BYTES + 1)
     with pytest.raises(OSError, match="more than 32 MB"):
-        file_access.read_small_file(path)
+        safe_file_reading.read_small_file(path)
     reading = loading.examine_config_file(path)
     config, wrong = reading.config, reading.wrong
     assert config is None

@@ -15,8 +15,8 @@ from PIL import Image
 
 from drivers.data_types import AXES, Event
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.rerun import dynamic_heat_map
-from monitor.publishing.rerun.dynamic_heat_map import COLUMNS, AllanHistory
+from monitor.publishing.rerun import allan_history_heat_map
+from monitor.publishing.rerun.allan_history_heat_map import COLUMNS, AllanHistory
 from monitor.publishing.rerun.viewer_scene import AllDevicesScene
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 from tests.monitor.publishing import example_results
@@ -100,20 +100,22 @@ def test_time_is_to_the_right_and_tau_upwards() -> None:
     relative[0, 0] = np.log(5.0)  # the oldest, shortest τ is at the bottom left
     relative[5, 14] = -np.log(5.0)  # the newest, longest τ is at the top right
     relative[2, 7] = np.nan
-    image = decode_pixels(dynamic_heat_map.encode_heat_map(relative))
-    rows = round(dynamic_heat_map.HEIGHT / 15)
+    image = decode_pixels(allan_history_heat_map.encode_heat_map(relative))
+    rows = round(allan_history_heat_map.HEIGHT / 15)
     assert image.shape == (15 * rows, COLUMNS, 3)
-    palette = dynamic_heat_map.PALETTE
-    assert (image[-rows:, 0] == palette[2 * dynamic_heat_map.SHADES]).all()
+    palette = allan_history_heat_map.PALETTE
+    assert (image[-rows:, 0] == palette[2 * allan_history_heat_map.SHADES]).all()
     assert (image[:rows, -1] == palette[0]).all()
     sixth = COLUMNS // 6  # few columns are drawn wide to fill the image
-    assert (image[7 * rows : 8 * rows, 2 * sixth + 2 : 3 * sixth - 2] == palette[dynamic_heat_map.NO_VALUE_INDEX]).all()
-    assert (image[: 7 * rows, : 5 * sixth - 2] == palette[dynamic_heat_map.SHADES]).all()
+    assert (
+        image[7 * rows : 8 * rows, 2 * sixth + 2 : 3 * sixth - 2] == palette[allan_history_heat_map.NO_VALUE_INDEX]
+    ).all()
+    assert (image[: 7 * rows, : 5 * sixth - 2] == palette[allan_history_heat_map.SHADES]).all()
     assert (image[:rows, 5 * sixth + 6 :] == palette[0]).all()
 
 
 def test_colour_scale_ends_at_twice_and_half_the_median() -> None:
-    image = decode_pixels(dynamic_heat_map.encode_heat_map(np.log([[2.0, 4.0], [0.5, 0.1], [1.4, 0.7]])))
+    image = decode_pixels(allan_history_heat_map.encode_heat_map(np.log([[2.0, 4.0], [0.5, 0.1], [1.4, 0.7]])))
     bottom, top = image[-1, [0, COLUMNS // 2, COLUMNS - 1]], image[0, [0, COLUMNS // 2, COLUMNS - 1]]
     assert (bottom[0] == top[0]).all()
     assert (bottom[1] == top[1]).all()
@@ -157,8 +159,8 @@ def test_recording_has_surfaces_labels_and_marks(tmp_path: Path) -> None:
 
 
 def test_view_contains_image_and_labels() -> None:
-    (left, right), (top, bottom) = dynamic_heat_map.heat_map_bounds(17)
+    (left, right), (top, bottom) = allan_history_heat_map.heat_map_bounds(17)
     assert left < -11.0
-    assert right > dynamic_heat_map.BAR_X + 11.0
+    assert right > allan_history_heat_map.BAR_X + 11.0
     assert top < -4.0
-    assert bottom > 17 * round(dynamic_heat_map.HEIGHT / 17) + 6.0
+    assert bottom > 17 * round(allan_history_heat_map.HEIGHT / 17) + 6.0
