@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from drivers.data_types import AXES
 from drivers.validation.number_ranges import DURATION_S
 from imu_monitor._estimates import AllanEstimate
-from imu_monitor._message_wording import errors_name_arguments, name_arguments
+from imu_monitor._message_wording import errors_name_arguments, replace_options_by_argument_names
 from imu_monitor._recordings import Samples, check_range, to_recording, to_tau_grid
 from monitor.commands.analyze import AnalysisResults, analyze_recording, save_plot_or_report
 from monitor.common.unit_formatting import UnitSystem
@@ -33,7 +33,7 @@ class Analysis(AllanEstimate):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes about the recording and the results, such as motion, spectral lines and missing samples."""
-        return tuple(map(name_arguments, self._results.analysis.notes))
+        return tuple(map(replace_options_by_argument_names, self._results.analysis.notes))
 
     @errors_name_arguments()
     def save_report(self, path: str | PathLike[str], title: str = "") -> None:

@@ -31,10 +31,10 @@ ARGUMENTS: Final = {
 _OPTIONS: Final = re.compile("|".join(map(re.escape, ARGUMENTS)))
 
 
-def name_arguments(text: str) -> str:
+def replace_options_by_argument_names(text: str) -> str:
     """Replace options of the command line by arguments of the Python functions.
 
-    >>> name_arguments("run.csv: its rate is not known; give it with --rate HZ")
+    >>> replace_options_by_argument_names("run.csv: its rate is not known; give it with --rate HZ")
     'run.csv: its rate is not known; give it with rate_hz'
     """
     return _OPTIONS.sub(lambda option: ARGUMENTS[option[0]], text)
@@ -52,10 +52,10 @@ def errors_name_arguments() -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        raise ConfigError(*map(name_arguments, error.mistake_lines)) from error
+        raise ConfigError(*map(replace_options_by_argument_names, error.mistake_lines)) from error
     except NotReady as error:  # subclasses have other arguments
-        raise NotReady(name_arguments(str(error))) from error
+        raise NotReady(replace_options_by_argument_names(str(error))) from error
     except ImuError as error:
-        raise type(error)(name_arguments(str(error))) from error
+        raise type(error)(replace_options_by_argument_names(str(error))) from error
     except MemoryError as error:
         raise ConfigError("there is not enough free memory for so many samples") from error

@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 from drivers.host.extras import require_extra
 from drivers.validation.number_ranges import SEED
 from imu_monitor._display import build_dataframe, render_html, render_text
-from imu_monitor._message_wording import errors_name_arguments, name_arguments
+from imu_monitor._message_wording import errors_name_arguments, replace_options_by_argument_names
 from imu_monitor._models import ModelSource, to_model
 from imu_monitor._recordings import Samples, check_range, to_recording
 from monitor.common.unit_formatting import format_duration
@@ -65,7 +65,7 @@ class Reconciliation:
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes about the recording."""
-        return tuple(map(name_arguments, self._result.notes))
+        return tuple(map(replace_options_by_argument_names, self._result.notes))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``report.json`` as plain Python objects (docs/explanation/reconcile.md)."""
@@ -115,7 +115,9 @@ class Reconciliation:
     def __str__(self) -> str:
         from monitor.publishing.terminal.reconcile_text import print_reconciliation
 
-        return name_arguments(render_text(lambda console: print_reconciliation(self._result, console, details=True)))
+        return replace_options_by_argument_names(
+            render_text(lambda console: print_reconciliation(self._result, console, details=True))
+        )
 
     def _repr_html_(self) -> str:
         """Return the text, and the Allan plot of each axis that differs if matplotlib is installed."""

@@ -17,7 +17,7 @@ from drivers.recordings.table import ALIASES, COLUMNS, TIME_NS, integers_to_ns
 from drivers.validation.module_lookup import format_suggestion
 from drivers.validation.number_ranges import RATE_HZ, NumberRange
 from imu_monitor._display import build_dataframe, render_html
-from imu_monitor._message_wording import errors_name_arguments, name_arguments
+from imu_monitor._message_wording import errors_name_arguments, replace_options_by_argument_names
 from monitor.commands.analyze import check_averaging_times
 from monitor.common.unit_formatting import KIND_NAMES, SAMPLE_UNITS, axes_of, format_duration, format_number
 from monitor.estimation.allan.batch import TauGrid
@@ -222,7 +222,7 @@ def read_recording(
 def to_public(recording: recordings.Recording) -> Recording:
     """Return a recording of the class ``Recording`` with the same samples."""
     parts = {field.name: getattr(recording, field.name) for field in fields(recording)}
-    return Recording(**parts | {"notes": tuple(map(name_arguments, recording.notes))})
+    return Recording(**parts | {"notes": tuple(map(replace_options_by_argument_names, recording.notes))})
 
 
 def to_recording(values: Samples, rate_hz: float | None = None, axes: str | Sequence[str] | None = None) -> Recording:

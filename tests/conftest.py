@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 
 # This must be set before NumPy is imported. As in the program, the matrices are too small for parallel linear algebra.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ.get("OPENBLAS_NUM_THREADS", "1")
-# The module path may begin with foreign packages named monitor, drivers or config. Tests and the programs that they
+# Foreign packages named monitor, drivers or config may come first on the module path. Tests and the programs that they
 # start import the packages of this project.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
 

@@ -118,7 +118,8 @@ class UnitSystem:
         return self.coefficients[kind]["B"]
 
     def single(self, kind: Kind, symbol: str) -> Unit:
-        """Return the unit of a coefficient where there is only one: the noise density rather than the random walk."""
+        """Return the unit of a coefficient for places that show only one unit: that of the noise density rather than
+        the random walk."""
         return self.columns(kind, symbol)[-1].unit
 
     def columns(self, kind: Kind, symbols: Sequence[str] = "QNBKR") -> list[CoefficientColumn]:

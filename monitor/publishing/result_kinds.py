@@ -97,7 +97,7 @@ def keep_newest_and_spaced(waiting: list[TimedResult], new: TimedResult) -> None
 
 
 @dataclass(frozen=True, slots=True)
-class DrawingRule:
+class DrawingSchedule:
     """Rule for drawing one kind of result in one panel of the viewer."""
 
     panel: str
@@ -116,7 +116,7 @@ class ResultKind:
     result: type
     """Class of the results of this kind."""
     messages: tuple[type[Message], ...] = ()
-    drawings: tuple[DrawingRule, ...] = ()
+    drawings: tuple[DrawingSchedule, ...] = ()
     size_bytes: Callable[[Any], int] = lambda _result: SMALL_RESULT_BYTES
     """Function that returns the approximate memory size of a result, for the limit of the viewer's queue."""
 
@@ -124,36 +124,36 @@ class ResultKind:
 RESULT_KINDS: Final = (
     ResultKind(
         SampleBatch,
-        drawings=(DrawingRule("SamplesAndTemperaturePanel"),),
+        drawings=(DrawingSchedule("SamplesAndTemperaturePanel"),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes + one.temperature_c.nbytes,
     ),
-    ResultKind(Event, (EventMessage,), (DrawingRule("EventsPanel"),)),
-    ResultKind(Health, (StatusMessage,), (DrawingRule("HealthPanel", keep_newest),)),
+    ResultKind(Event, (EventMessage,), (DrawingSchedule("EventsPanel"),)),
+    ResultKind(Health, (StatusMessage,), (DrawingSchedule("HealthPanel", keep_newest),)),
     ResultKind(
         AllDevicesTableText,
-        drawings=(DrawingRule("AllDevicesTablePanel", keep_newest),),
+        drawings=(DrawingSchedule("AllDevicesTablePanel", keep_newest),),
         size_bytes=lambda one: len(one.text),
     ),
     ResultKind(
         CompensatedRateBatch,
-        drawings=(DrawingRule("CompensatedPanel"),),
+        drawings=(DrawingSchedule("CompensatedPanel"),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes,
     ),
-    ResultKind(ThermalIntervalResult, (ThermalPredictionMessage,), (DrawingRule("ThermalPredictionPanel"),)),
-    ResultKind(MeasuredAndSubtractedDrift, drawings=(DrawingRule("DriftPanel"),)),
+    ResultKind(ThermalIntervalResult, (ThermalPredictionMessage,), (DrawingSchedule("ThermalPredictionPanel"),)),
+    ResultKind(MeasuredAndSubtractedDrift, drawings=(DrawingSchedule("DriftPanel"),)),
     ResultKind(TotalAndHadamardCurves, (TotalAndHadamardMessage,)),
     ResultKind(
         ModelComparison,  # precedes the estimate, because the Allan plot also shows the model
         (ModelGapMessage,),
-        (DrawingRule("ModelDifferencePanel", keep_newest_and_spaced, period_s=1.0),),
+        (DrawingSchedule("ModelDifferencePanel", keep_newest_and_spaced, period_s=1.0),),
         size_bytes=lambda one: 6 * 4 * int(one.tau_s.nbytes),
     ),
     ResultKind(
         Estimate,
         (AllanMessage, CoefficientsMessage),
         (
-            DrawingRule("AllanAndCoefficientPanel", keep_newest, period_s=1.0, shares_rate=True),
-            DrawingRule("CoefficientsPanel", keep_newest_and_spaced, period_s=5.0),
+            DrawingSchedule("AllanAndCoefficientPanel", keep_newest, period_s=1.0, shares_rate=True),
+            DrawingSchedule("CoefficientsPanel", keep_newest_and_spaced, period_s=5.0),
         ),
         size_bytes=lambda one: 8 * int(one.curve.avar.nbytes),
     ),

@@ -169,7 +169,7 @@ def native(out: Path, folder: Path) -> Path:
 
 
 def surfaces(out: Path, folder: Path) -> Path:
-    """Show the page What changed of a device whose noise has changed."""
+    """Show the "What changed" page for a device whose noise has changed."""
     path = out / "viewer-dynamic.png"
     with window() as (port, shoot):
         with serving(folder, replay(folder, changed=True), port) as service:
@@ -181,7 +181,7 @@ def surfaces(out: Path, folder: Path) -> Path:
 
 
 def temperature(out: Path, folder: Path) -> Path:
-    """Show the page Temperature and drift of two days in which the bias of gz stepped once."""
+    """Show the "Temperature and drift" page for two days of data in which the bias of gz stepped once."""
     path = out / "viewer-temperature.png"
     source = folder / "warm.npz"
     model = read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
@@ -199,7 +199,7 @@ def temperature(out: Path, folder: Path) -> Path:
 
 
 def drift(out: Path, folder: Path) -> Path:
-    """Show the page Temperature and drift of a sensor that is turned three times."""
+    """Show the page "Temperature and drift" for a sensor that is turned three times."""
     path = out / "viewer-drift.png"
     source = folder / "turned.npz"
     n = round(TURNED_RECORDING_S * 100.0)

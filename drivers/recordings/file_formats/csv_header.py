@@ -22,7 +22,7 @@ MAX_PREAMBLE_BYTES: Final = 1 << 20
 """Maximum total size of the blank lines and comments before the header."""
 COMMENT_MARKS: Final = ("#", "%")
 UNKNOWN_COMMENT_MARKS: Final = ("//", ";", "--", "!", "*")
-"""Comment marks of other programs, which the error message about a missing header names."""
+"""Comment markers used by other programs; the error message about a missing header mentions them."""
 BOM: Final = "\N{ZERO WIDTH NO-BREAK SPACE}"
 BLANKS: Final = ""
 """Separator of files whose fields are separated by any number of blanks."""

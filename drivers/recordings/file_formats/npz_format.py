@@ -165,8 +165,9 @@ def _read_header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
             f"{path}: {key} is packed by method {method} of zip, expected stored or deflated as written by NumPy"
         )
     with _member_errors(path, key), archive.open(_find_member(archive, key)) as member:
-        if np.lib.format.read_magic(member) != (1, 0):  # other versions are written only for structured arrays
-            raise ValueError("it is not an array in version 1.0 of the format .npy")
+        magic = np.lib.format.magic(1, 0)  # other versions are written only for structured arrays
+        if member.read(len(magic)) != magic:
+            raise ValueError("it is not an array in the format .npy, version 1.0")
         shape, _, dtype = np.lib.format.read_array_header_1_0(member)
         if min(shape, default=0) < 0:
             raise ValueError(f"its shape is {shape}")

@@ -42,5 +42,5 @@ class ViewerOutput(Output):
         self._view.put(device, unix_s, event)
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Show the status of a device, at the present time if it is known."""
+        """Show the status of a device, as of the current time if that is known."""
         self._view.put(device, math.nan if unix_s is None else unix_s, health)

@@ -193,7 +193,7 @@ class OnlineThermalModel:
             without = yield from fit_thermal_model_stepwise(means, always_try_lags=True)
             stepped = yield from fit_thermal_model_stepwise(means, since, always_try_lags=True)
         except NotReady:
-            # Nothing is lost: the suspected size is reported below, and the current model remains.
+            # Nothing is lost: the suspected size is reported below, and the current model stays in use.
             pass
         else:
             if without.aicc - stepped.aicc < STEP_AICC_MARGIN:

@@ -192,8 +192,8 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
     quantization noise is nonzero only if phase points coincide, so each coinciding pair represents ``step`` pairs. The
     two ends of the recording are exceptions, because all reflected second differences contain an end point.
 
-    The autocovariances at ``step`` times the lag are linear functions of the autocovariances at the lag, apart from a
-    term t² ln(step) of the flicker noise, which cancels in second differences.
+    The autocovariances at a lag multiplied by ``step`` are linear functions of those at the original lag, except for a
+    flicker-noise term t² ln(step), which cancels in second differences.
     """
     scale = np.diag([1.0, step, step**2, step**3, step**4, 1.0])
     scale[3, 1] = (step - step**3) / 6.0
@@ -210,7 +210,7 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
 
 @lru_cache(maxsize=2048)  # one computation takes about 12 ms, and a growing recording needs the same sizes again
 def _unit_step_products(n: int, m: int) -> Floats:
-    """Return the sums [6, 6] of products over all pairs for Q, N, B, K, R and the ends, with one point per sample."""
+    """Return the 6 × 6 sums of products over all pairs, for Q, N, B, K, R and the ends, with one point per sample."""
     at = np.arange(n + 1)
     lags = phase_autocovariance(np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
     points, signs = _points(np.arange(1.0, n), n, m)

@@ -115,7 +115,7 @@ def append_staged_samples(memory: Ints, taus: int, start: int, n: int) -> None:
     n : int
         Number of samples.
     """
-    # All fields are unpacked at once, because an access to a field of a named tuple takes time.
+    # All fields are unpacked at once, because each field access on a named tuple takes time.
     state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = compiled_view_window_arrays(
         without_reference_count(memory), taus
     )

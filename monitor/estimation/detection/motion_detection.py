@@ -159,7 +159,7 @@ def _read_only(values: Floats) -> Floats:
 def _decide_blocks(
     values: Floats, first_index: int, size: int, stream_ends: bool, state: MotionState
 ) -> tuple[Ints, Ints, Floats]:
-    """Return the numbers of the newly decided blocks, 1 for each block in motion, and the completed episodes."""
+    """Return the numbers of the newly decided blocks, a flag for each (1 if in motion), and the completed episodes."""
     n = len(values) // size + 4
     blocks, moving, episodes = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 5))
     decided, ended = advance_motion_detection(values, first_index, size, stream_ends, state, blocks, moving, episodes)

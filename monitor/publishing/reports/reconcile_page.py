@@ -2,8 +2,8 @@
 
 The pages are self-contained. The report of one recording begins with the summary, the ranked findings, and the Allan
 deviation of each axis that differs. A collapsible section contains each step and all diagnostics of these axes. An axis
-that agrees is one collapsible line. The comparison contains a summary, the results of each recording, and the noise
-effects that were found. If an effect was not found in a recording, the page states why it may be absent.
+that agrees is shown as one collapsible line. The comparison contains a summary, the results of each recording, and the
+noise effects that were found. If an effect was not found in a recording, the page states why it may be absent.
 """
 
 from dataclasses import replace
@@ -150,8 +150,8 @@ def _gaps_by_diagnostic(result: AxisResult) -> list[list[DiagnosticGap | None]]:
 def _draw_other_diagnostics(result: AxisResult, units: UnitSystem) -> list[tuple[int, str]]:
     """Draw the significant diagnostics before and after the search, without the panels that the page already shows.
 
-    The page shows the Allan deviation of an axis that differs, and the diagnostic that led to each step or remains.
-    Return the number of panels and the SVG element of each figure.
+    For each axis that differs, the page shows the Allan deviation, the diagnostic that led to each step, and any
+    diagnostic that is still significant. Return the number of panels and the SVG element of each figure.
     """
     if result.verdict == "agrees":
         views = [view for view in result.start.plots if view.diagnostic == "allan"]

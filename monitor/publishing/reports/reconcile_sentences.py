@@ -286,7 +286,7 @@ def describe_result(result: AxisResult) -> str:
 
 
 def describe_largest_gap(result: AxisResult) -> str:
-    """Describe the gap of an axis that is closest to its threshold."""
+    """Describe the gap that is closest to its threshold on an axis."""
     return describe_gap(max(result.start.gaps, key=gap_to_threshold_ratio), result.axis)
 
 

@@ -39,7 +39,7 @@ KEY: Final = {
     "model": "model",
     "poor": "poor fit",
 }
-"""Text beside each sign of the key, by the end of the path of the sign."""
+"""Text shown next to each symbol in the key, indexed by the last part of the symbol's path."""
 FIT_COLOURS: Final = (axis_colours.VERMILION, axis_colours.GREEN, axis_colours.BLUE)
 KEY_COLUMNS: Final = 3
 KEY_SPACING: Final = 6.0
@@ -51,7 +51,7 @@ GRID_DASH: Final = 0.15
 RING_LETTERS: Final = "NBK"
 LETTER_OFFSET: Final = (0.9, -0.45)
 MARKER_CORNERS: Final = {"y": 4, "z": 3}
-"""Number of corners of the markers of each axis. The marker of an x axis is a dot."""
+"""Number of corners of each axis's marker. The marker of an x axis is a dot."""
 POOR_FIT_TEXT: Final = "fit does not describe the curve"
 
 Log = Callable[..., Any]

@@ -44,7 +44,7 @@ MAX_DEVICES_WITH_ACCEL: Final = 4
 MAX_GRID_COLUMNS: Final = 4
 SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
 ALWAYS_SHOWN: Final = ("/status", "/waiting", "/overview")
-"""Ends of the paths of views that are shown before their first data arrive."""
+"""Path suffixes of views that are shown before their first data arrive."""
 GUIDE: Final = "/guide/"
 """Part of the path of the text that describes the panels of a page."""
 DESCRIPTIONS: Final = {
@@ -66,7 +66,7 @@ DESCRIPTIONS: Final = {
     "innovation/g.": "**Innovation:** differences of the means from their predictions, mostly within ±2 σ.",
     "drift": "**Drift models:** model and predicted drift of each gyroscope.",
 }
-"""Sentence about each kind of panel, by the end of the path of its view as a regular expression."""
+"""Sentence that describes each kind of panel; the keys are regular expressions for the end of the path of its view."""
 
 
 def blueprint(
@@ -100,7 +100,7 @@ def blueprint(
 
 
 def guide_texts(part: rrb.Container) -> dict[str, str]:
-    """Return the text of each guide in a layout by its path, with one sentence for each kind of panel of the page."""
+    """Return the text of each guide by its path in the layout, with one sentence for each kind of panel of the page."""
     texts: dict[str, str] = {}
     for one in part.contents:
         if isinstance(one, rrb.Container):

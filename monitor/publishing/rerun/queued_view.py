@@ -26,7 +26,7 @@ from monitor.publishing.rerun.viewer_settings_and_errors import (
     ViewerError,
     ViewerSettings,
 )
-from monitor.publishing.result_kinds import RESULT_KINDS, DrawingRule, TimedResult, kind_of
+from monitor.publishing.result_kinds import RESULT_KINDS, DrawingSchedule, TimedResult, kind_of
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.sinks import RerunStreamWithSink, ViewerProcess
@@ -253,10 +253,12 @@ class RerunView:
 class _WaitingResults:
     def __init__(self) -> None:
         self.period_factor = 1.0  # factor for the drawing periods of plots whose rate the devices share
-        self._waiting: dict[DrawingRule, dict[str, list[TimedResult]]] = {
+        self._waiting: dict[DrawingSchedule, dict[str, list[TimedResult]]] = {
             drawing: {} for kind in RESULT_KINDS for drawing in kind.drawings
         }
-        self._drawn_s: dict[tuple[DrawingRule, str], float] = {}  # monotonic time of the last drawing of a device [s]
+        self._drawn_s: dict[
+            tuple[DrawingSchedule, str], float
+        ] = {}  # monotonic time of the last drawing of a device [s]
 
     def add_results(self, results: Sequence[tuple[str, float, Any]]) -> None:
         for device, unix_s, result in results:

@@ -35,7 +35,8 @@ MIN_DECADES: Final = 2
 
 
 def allan_charts(curve: AllanCurve, units: UnitSystem, width: int, lines: int) -> RenderableType | None:
-    """Return charts of the gyroscopes and the accelerometers, side by side if they fit, or None without enough space.
+    """Return charts of the gyroscopes and the accelerometers, side by side if they fit, or None if there is not enough
+    space.
 
     Parameters
     ----------
@@ -101,7 +102,7 @@ def _draw_chart(tau_s: Floats, deviation: Floats, kind: Kind, units: UnitSystem,
 
 
 def _draw_line(across: Floats, down: Floats, axis: int, bits: np.ndarray, colours: np.ndarray) -> None:
-    """Set the dots of the straight lines between points, which are given in dots from the top left corner."""
+    """Draw straight lines between points, whose coordinates are in dots from the top left corner."""
     steps = np.maximum(np.abs(np.diff(across)), np.abs(np.diff(down))).astype(int) + 2
     for i, count in enumerate(steps):
         for share in np.linspace(0.0, 1.0, count):
@@ -112,7 +113,7 @@ def _draw_line(across: Floats, down: Floats, axis: int, bits: np.ndarray, colour
 
 
 def _free_row(names: dict[int, str], row: int, rows: int) -> int:
-    """Return the row without a name that is nearest to a row."""
+    """Return the unnamed row nearest to the given row."""
     return min((one for one in range(rows) if one not in names), key=lambda one: abs(one - row))
 
 

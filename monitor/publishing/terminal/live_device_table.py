@@ -76,7 +76,7 @@ class DeviceTableLayout:
     full_counts: bool
     stacked: bool  # True if each axis has a separate line
     gap: int  # number of blanks between columns
-    brief: bool = False  # True to omit the counts except lost samples, the latency and the age
+    brief: bool = False  # True to omit the latency, the age and all counts except the lost samples
 
 
 LAYOUTS: Final = (

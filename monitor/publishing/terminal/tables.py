@@ -32,7 +32,8 @@ def plain_table(*headers: str, wrapped_headers: Sequence[str] = (), gap: int = 2
 
 
 def print_line(line: str | Text, console: Console) -> None:
-    """Print a line without markup. A terminal wraps the line at words, and a file receives one line."""
+    """Print a line without markup. On a terminal, the line is wrapped at word boundaries; in a file, it is written as a
+    single line."""
     console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
 
 

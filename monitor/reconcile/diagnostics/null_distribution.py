@@ -113,7 +113,8 @@ def is_significance_clear(recorded: Findings, simulated: Sequence[Findings], axi
     """Return True if further simulations can hardly change which findings of an axis are significant.
 
     A simulation can only raise a threshold. A finding below the known threshold or below a simulated gain is therefore
-    not significant. A finding is clearly significant if its gain is ``CLEAR_GAIN_RATIO`` times the threshold so far.
+    not significant. A finding is clearly significant if its gain is at least ``CLEAR_GAIN_RATIO`` times the current
+    threshold.
 
     Parameters
     ----------
@@ -139,8 +140,9 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
     Parameters
     ----------
     simulated : mapping of str to sequence of Findings
-        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. If an axis has all recordings, or
-        if all its recordings have an improbably large gain, its thresholds are raised above the gains if necessary.
+        Findings on 1 to ``SIMULATED_RECORDINGS`` simulated recordings of each axis. If all recordings of an axis are
+        simulated, or if all its recordings have an improbably large gain, its thresholds are raised above the gains if
+        necessary.
     """
     chance = _false_alarm_probability_of_one_diagnostic(len(simulated))
     complete = [

@@ -77,7 +77,7 @@ LOG_RATIOS: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class FeatureGroup:
+class FeaturesOfOneCause:
     """Features with the same cause, and the total gain of these features for each ratio of ``LOG_RATIOS``."""
 
     axis: str  # axis with the strongest feature
@@ -185,7 +185,7 @@ def describe_sample_rate_error(error: SampleRateErrorEstimate, rate_hz: float) -
 
 def group_features_with_gains(
     coefficients: Mapping[str, Floats], rate_hz: float, effects: Mapping[str, Effects]
-) -> list[FeatureGroup]:
+) -> list[FeaturesOfOneCause]:
     """Group the lines and resonances of the model, and compute the gains of the groups in the recording.
 
     Parameters
@@ -215,7 +215,9 @@ def group_features_with_gains(
     for group in groups:
         f_hz, axis, _ = max(group, key=lambda one: float(one[2].max()))
         gains = np.sum([one[2] for one in group], axis=0)
-        found.append(FeatureGroup(axis, f_hz, gains * min(MAX_GROUP_GAIN_NATS / max(float(gains.max()), 1e-9), 1.0)))
+        found.append(
+            FeaturesOfOneCause(axis, f_hz, gains * min(MAX_GROUP_GAIN_NATS / max(float(gains.max()), 1e-9), 1.0))
+        )
     return found
 
 
@@ -273,7 +275,7 @@ def _max_gain_near(gains: Floats, x: float, reach: float) -> float:
     return float(gains[near].max(initial=0.0))
 
 
-def _estimate_stated_ratio(groups: Sequence[FeatureGroup], x: float) -> SampleRateErrorEstimate | None:
+def _estimate_stated_ratio(groups: Sequence[FeaturesOfOneCause], x: float) -> SampleRateErrorEstimate | None:
     """Estimate the ratio near the stated log ratio ``x``, or return None if the features do not move by this ratio."""
     if not 10.0 * LOG_RATIO_STEP < abs(x) <= MAX_LOG_RATIO:
         return None
@@ -287,7 +289,7 @@ def _estimate_stated_ratio(groups: Sequence[FeatureGroup], x: float) -> SampleRa
     return _build_estimate(groups, moves, x, reach)
 
 
-def _estimate_common_ratio(groups: Sequence[FeatureGroup]) -> SampleRateErrorEstimate | None:
+def _estimate_common_ratio(groups: Sequence[FeaturesOfOneCause]) -> SampleRateErrorEstimate | None:
     """Estimate the common ratio by which the frequencies of the groups have moved.
 
     The result is None if fewer than two groups have moved, if their ratios differ, or if a group remains at the stated
@@ -310,7 +312,7 @@ def _estimate_common_ratio(groups: Sequence[FeatureGroup]) -> SampleRateErrorEst
     return _build_estimate(groups, moves, x, 2.0 * spread + LOG_RATIO_STEP)
 
 
-def _is_supported(groups: Sequence[FeatureGroup], x: float) -> bool:
+def _is_supported(groups: Sequence[FeaturesOfOneCause], x: float) -> bool:
     """Return True if groups move by nearly the given log ratio and no group remains at the stated frequency."""
     moves = [
         _max_gain_near(one.gains, x, MAX_FREQUENCY_DRIFT) - _max_gain_near(one.gains, 0.0, 0.25 * MAX_FREQUENCY_DRIFT)
@@ -324,7 +326,7 @@ def _is_supported(groups: Sequence[FeatureGroup], x: float) -> bool:
 
 
 def _build_estimate(
-    groups: Sequence[FeatureGroup], moves: Sequence[float], x: float, error: float
+    groups: Sequence[FeaturesOfOneCause], moves: Sequence[float], x: float, error: float
 ) -> SampleRateErrorEstimate:
     strongest = groups[int(np.argmax(moves))]
     ratio = ParameterInterval(exp(x), exp(x - error), exp(x + error))

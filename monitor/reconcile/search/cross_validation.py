@@ -141,7 +141,7 @@ def _exchange_halves(
 
 
 def _half_axis(axis: Axis, part: slice, sources: Collection[str]) -> Axis:
-    """Return a half of an axis, with the repaired samples of the whole axis."""
+    """Return one half of the samples of an axis, as repaired on the whole axis."""
     raw, y = axis.raw[part], axis.repaired[part]
     temperature_c = None if axis.temperature_c is None else axis.temperature_c[part]
     others = {

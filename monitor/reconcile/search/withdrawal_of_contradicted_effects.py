@@ -144,8 +144,8 @@ def difference_remains_near_line(line: WanderingLine, before: Findings, whitened
 def _resolved_frequency(diagnostic: str, finding: WhitenessDeparture, rate_hz: float) -> tuple[float, float] | None:
     """Return the frequency range of a difference, or None if the diagnostic does not resolve its frequency.
 
-    If the power changes in time over a wide band, such as during a knock, the spectrogram does not contradict an effect
-    at one frequency.
+    If the power changes over time in a wide band, as it does during a knock, the spectrogram is still consistent with
+    an effect at one frequency.
     """
     place = finding.where.frequency
     is_wide = place is not None and np.ptp(place) >= MAX_BAND_FRACTION * rate_hz

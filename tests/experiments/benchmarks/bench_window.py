@@ -1,4 +1,4 @@
-"""Cost of the sliding window compared with allantools and a NumPy loop, of a fit, and of the first use.
+"""Cost of the sliding window (compared with allantools and a NumPy loop), of a fit and of the first use.
 
     python -m tests.experiments.benchmarks.bench_window [--rounds 15]
 

@@ -9,8 +9,9 @@ A cell is a noise and a length of record at 100 Hz. The tables contain these num
 
 - the coverage of the two-sided 95 % intervals of deviations, for all τ up to an eighth of the record. The errors at
   neighbouring τ are correlated, so the number of independent intervals is estimated from the scatter between records.
-- for each present term: the share of true results, which are two-sided 95 % intervals or one-sided 95 % bounds. Both
-  count together: a term is estimated if its estimate is large, so the rare intervals of a term are a biased sample.
+- for each present term: the share of true results, which are two-sided 95 % intervals or one-sided 95 % bounds. The two
+  are counted together: a term is estimated only if its estimate is large, so the intervals of a rarely estimated term
+  are a biased sample.
 - for each term: the share of records in which it is estimated.
 
 Each record is analysed once by ``analyze``, in one process and one thread. An interrupted run can be continued.

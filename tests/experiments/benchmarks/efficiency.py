@@ -5,9 +5,9 @@
 
 With ``--records 0 --page docs/measurements/statistics.md``, the program only writes the tables into the page.
 
-A cell is a noise and a length of record at 100 Hz. For each cell, estimator and term, the table contains the rms of the
-relative error of the coefficient over its Cramér–Rao limit. If the limit is above 15 %, the ratio is in parentheses. An
-estimator that is clipped at zero can then be better than any unbiased estimator.
+A cell is a noise and a length of record at 100 Hz. For each cell, estimator and term, the table contains the rms
+relative error of the coefficient divided by its Cramér–Rao limit. If the limit is above 15 %, the ratio is in
+parentheses. An estimator that is clipped at zero can then be better than any unbiased estimator.
 
 ``ESTIMATORS`` maps a name to a function of values [n, 6] and rate that returns Q N B K R [5, 6]. The methods of the
 other programs are implemented here after their sources:
@@ -210,7 +210,7 @@ def _rows(key: tuple[int, str], group: list[Chunk]) -> list[tuple[str, ...]]:
 
 
 def _ratio(limit: float, moments: Floats, records: int, target: float | None) -> str:
-    """Return the rms error over the limit, in bold if its 95 % interval is above the target."""
+    """Return the ratio of the rms error to the limit, in bold if its 95 % interval is above the target."""
     square, fourth = moments  # of the relative error: mean square, mean fourth power
     if np.isnan(square):
         return "–"
