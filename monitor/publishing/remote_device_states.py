@@ -272,7 +272,7 @@ def split_device_and_topic(key: str) -> tuple[str, topics.ZenohTopic] | None:
     """Split a zenoh key into the device key and the topic, or return None if the topic is unknown.
 
     >>> split_device_and_topic("imu/bench-1/status")
-    ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
+    ('imu/bench-1', ZenohTopic(name='status', encoding='application/json', when='1 Hz', kept=1))
     >>> split_device_and_topic("imu/bench-1/mood")
     """
     for topic in topics.TOPICS:
