@@ -6,6 +6,7 @@ A short delay of the arrivals is attributed to the scheduler of the host. A dela
 samples are missing.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -30,6 +31,10 @@ MAX_RATE_HZ: Final = 32_000.0
 """Highest plausible sample rate of an inertial sensor, which limits the number of missing samples."""
 MAX_GAP_SAMPLES: Final = 10**10
 """Maximum number of consecutive missing samples (116 days at 1 kHz)."""
+BATCH_NS: Final = 100_000_000
+"""Duration in ns of the arrivals that become one point of the regression."""
+SINGLE_NS: Final = 2_000_000_000
+"""Time in ns after the first sample during which each arrival becomes a point, because the rate is not known yet."""
 MAX_OFFSET_S: Final = 4.6e9
 """Largest time in s since the first sample. The value is half of the range of int64 nanoseconds."""
 
@@ -82,8 +87,8 @@ class ArrivalTimeline:
             return 1.0 / found[0]
         return None if self.earliest_time.period_s or not self.assumed_hz else 1.0 / self.assumed_hz
 
-    def add_arrival_and_assign_times(self, samples: SampleBlock, missing: Ints) -> list[SampleBlock]:
-        """Add the newest arrival to the regression, and assign times on the fitted line to the samples.
+    def add_arrival_and_assign_times(self, samples: SampleBlock, missing: Ints) -> Ints:
+        """Add the newest arrival to the regression, and return the times [n] in ns of the samples on the fitted line.
 
         Parameters
         ----------
@@ -107,13 +112,13 @@ class ArrivalTimeline:
         t_s = newest_s - (self.index - index) * period_s
         if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # the times must fit into int64 nanoseconds
             t_s = np.clip(t_s, -MAX_OFFSET_S, MAX_OFFSET_S)
-        t_ns = np.rint(t_s * NS_PER_S).astype(np.int64) + (self.origin_ns or 0)
+        t_ns: Ints = np.rint(t_s * NS_PER_S).astype(np.int64) + (self.origin_ns or 0)
         if t_ns[0] <= self.last_t_ns or (t_ns[1:] <= t_ns[:-1]).any():
             # The line has moved backwards, or float64 is too coarse. Keep the sample times increasing.
             order = np.arange(len(samples))
             t_ns = np.maximum.accumulate(np.maximum(t_ns - order, self.last_t_ns + 1)) + order
         self.last_t_ns = int(t_ns[-1])
-        return retime_and_split_at_gaps(samples, t_ns, missing)
+        return t_ns
 
     def count_missing_since_arrival(self, arrived_ns: int, arrived: int) -> int:
         """Estimate the number of missing samples from the time since the previous arrival.
@@ -188,6 +193,23 @@ class _Delay:
     since_ns: int  # time of the first delayed arrival, or of the last reported gap
     least_s: float  # minimum delay of the arrivals since ``since_ns`` relative to the fitted line
     line: ArrivalRegression  # line fitted to the arrivals since the first delayed arrival
+
+
+def split_by_arrival_time(samples: SampleBlock, origin_ns: int) -> Iterator[SampleBlock]:
+    """Yield the samples in batches of up to BATCH_NS, because only the newest arrival of a batch is used.
+
+    Parameters
+    ----------
+    samples : SampleBlock
+        Samples with arrival times.
+    origin_ns : int
+        Arrival time of the first sample of the device in ns.
+    """
+    t_ns = samples.t_ns
+    batch = np.where(t_ns - origin_ns < SINGLE_NS, t_ns, t_ns // BATCH_NS)
+    edges = [0, *(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(samples)]
+    for first, last in pairwise(edges):
+        yield samples[first:last]
 
 
 def retime_and_split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[SampleBlock]:

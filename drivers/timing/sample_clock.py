@@ -17,7 +17,12 @@ import numpy as np
 
 from drivers.data_types import NO_TICK, CounterTimedFormat, Event, Ints, SampleBlock, SenderTimedFormat, Timing
 from drivers.timing.arrival_regression import MIN_SAMPLES, MIN_SPAN_S, snap_to_standard_rate
-from drivers.timing.arrival_timeline import MAX_RATE_HZ, ArrivalTimeline
+from drivers.timing.arrival_timeline import (
+    MAX_RATE_HZ,
+    ArrivalTimeline,
+    retime_and_split_at_gaps,
+    split_by_arrival_time,
+)
 from drivers.timing.counter_gaps import CounterGaps
 from drivers.timing.duplicate_rows import RowFilter
 from drivers.timing.event_rate_limiter import EventRateLimiter
@@ -213,6 +218,18 @@ class SampleClock:
         """Assign sample times and count missing samples according to the timing of the wire format."""
         if self._sender is not None:
             return self._sender.split_at_missing_samples(samples)
+        timeline = self._timeline
+        # A counter needs the whole block, which shows its typical step.
+        by_arrival = self._arrivals_are_timed and (samples.ticks == NO_TICK).all()
+        batches = split_by_arrival_time(samples, timeline.origin_ns or 0) if by_arrival else [samples]
+        t_ns, missing = [], []
+        for batch in batches:
+            missing.append(self._count_missing(batch))
+            t_ns.append(timeline.add_arrival_and_assign_times(batch, missing[-1]))
+        return retime_and_split_at_gaps(samples, np.concatenate(t_ns), np.concatenate(missing))
+
+    def _count_missing(self, samples: SampleBlock) -> Ints:
+        """Return the number of missing samples before each sample [n], from the counter or from arrival times."""
         if self._paused and self.configured_or_measured_rate_hz is None:
             self._timeline.restart_line()  # the number of missing samples is unknown
         if self._counter is not None and (samples.ticks != NO_TICK).all():
@@ -222,7 +239,7 @@ class SampleClock:
                 self._counter.forget_last_tick()
             missing = self._missing_by_arrival(samples)
         self._paused = False
-        return self._timeline.add_arrival_and_assign_times(samples, missing)
+        return missing
 
     def _missing_by_arrival(self, samples: SampleBlock) -> Ints:
         """Estimate the number of missing samples before each sample [n] from arrival times."""

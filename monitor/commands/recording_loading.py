@@ -8,7 +8,6 @@ of the device counter, or even spacing at the stated sample rate.
 import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +25,7 @@ from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.reading_progress import listen_to_reading_progress
 from drivers.recordings.table import TIME_NS
 from drivers.recordings.table_layout import names_an_axis
+from drivers.timing.arrival_timeline import split_by_arrival_time
 from drivers.timing.sample_clock import SampleClock
 from drivers.validation import module_lookup
 from drivers.validation.settings_model import TableError
@@ -37,11 +37,7 @@ LINK_KEYS: Final = ("bytes_per_second", "channel")
 """Keys of the link ``replay`` that can be set in addition to the keys of the decoder."""
 CONTENTS: Final = {"log": "CAN frames", "capture": "captured bytes", "raw": "raw data"}
 """Description of each kind of file that needs a decoder."""
-BATCH_NS: Final = 100_000_000
-"""Duration in ns of the samples that are passed to the sample clock at once. A live link returns similar batches."""
 MAX_HEADER_BYTES: Final = 1000
-SINGLE_NS: Final = 2_000_000_000
-"""Time in ns after the first sample during which samples are passed singly, because the rate is not known yet."""
 READ_TIMEOUT_S: Final = 1.0
 MIN_STEP_BACK_S: Final = 60.0
 """Minimum duration in s of half the range of a counter for the detection of steps back.
@@ -140,7 +136,7 @@ def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Re
             for samples in decoder.feed(chunks) if chunks else ():
                 timed = samples if capture_times is None else capture_times.assign_device_times(samples)
                 start_ns = int(timed.t_ns[0]) if start_ns is None else start_ns
-                for batch in _split_by_time(timed, start_ns):
+                for batch in split_by_arrival_time(timed, start_ns):
                     blocks += clock.assign_times(batch)
                 rows += len(timed)
             limit.check_row_count(rows)
@@ -189,23 +185,6 @@ def _name_option(key_path: str, text: str) -> str:
 def _size_bytes(path: Path) -> int:
     files = path.iterdir() if path.is_dir() else [path]
     return sum(one.stat().st_size for one in files if one.is_file())
-
-
-def _split_by_time(samples: SampleBlock, start_ns: int) -> Iterator[SampleBlock]:
-    """Yield the samples in batches as a live link would return them, because the sample clock uses one time per batch.
-
-    Parameters
-    ----------
-    samples
-        Samples with arrival times.
-    start_ns
-        Arrival time of the first sample of the file in ns.
-    """
-    t_ns = samples.t_ns
-    batch = np.where(t_ns - start_ns < SINGLE_NS, t_ns, t_ns // BATCH_NS)
-    edges = [0, *(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(samples)]
-    for first, last in pairwise(edges):
-        yield samples[first:last]
 
 
 def _describe_losses(blocks: list[SampleBlock], decoder: Decoder, clock: SampleClock) -> Iterator[str]:

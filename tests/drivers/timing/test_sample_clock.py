@@ -10,6 +10,7 @@ import pytest
 
 from drivers.data_types import NO_TICK, ArrivalTimedFormat, CounterTimedFormat, SenderTimedFormat, make_block
 from drivers.timing.arrival_regression import FORGET_S, ArrivalRegression, snap_to_standard_rate
+from drivers.timing.arrival_timeline import CATCH_UP_S
 from drivers.timing.sample_clock import LastSample, SampleClock
 from tests.support.recordings import recordings
 
@@ -324,6 +325,21 @@ class TestArrival:
         if configured or at_s > 5.0:
             assert count_lost(out) == pytest.approx(n, abs=2)
         assert clock.configured_or_measured_rate_hz == pytest.approx(rate, rel=1e-3)
+
+
+@pytest.mark.parametrize("rows", [1, 500])
+@pytest.mark.parametrize("configured", [True, False])
+def test_gap_is_counted_if_one_block_contains_many_arrivals(rows, configured):
+    index = np.delete(np.arange(3000), np.s_[300:500])
+    t_ns = np.rint((START_S + index / 100.0) * NS_PER_S).astype(np.int64)
+    clock = SampleClock(ArrivalTimedFormat(), 100.0 if configured else None)
+    out = []
+    for a in range(0, index.size, rows):
+        out += clock.assign_times(make_block(t_ns[a : a + rows], make_values(index.size)[a : a + rows], None))
+    assert count_lost(out) == 200
+    assert join_times(out)[-1] == pytest.approx(t_ns[-1], abs=1e6)
+    at_ns = next(block.t_ns[0] for block in out if block.lost)
+    assert 0 <= at_ns - t_ns[300] < (CATCH_UP_S + 0.2) * NS_PER_S
 
 
 @pytest.mark.parametrize("rate", [20.0, 100.0, 400.0])
