@@ -81,7 +81,9 @@ class _Worker:
                 break
             try:
                 calls += self.pipe.recv()
-            except OSError as error:  # the process was killed
+            except (EOFError, OSError) as error:  # an OSError means that the process was killed
+                if calls:
+                    break  # the next call reports the end
                 raise EOFError from error
         return calls
 

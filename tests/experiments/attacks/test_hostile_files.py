@@ -80,7 +80,7 @@ QUICK_CASES: Final[Sequence[Case]] = (
     (hostile.gz_bad_lines, ".csv.gz", "lines are not samples"),
     (hostile.npz_zeros, ".npz", MEMORY_OR_ROWS),
     (hostile.npz_shape_claims, ".npz", MEMORY_OR_ROWS),
-    (hostile.npz_header_without_end, ".npz", "not an array in version 1.0"),
+    (hostile.npz_header_without_end, ".npz", "not an array in the format .npy"),
     (hostile.npz_objects, ".npz", "gx contains Python objects"),
     (hostile.arrow_nulls, ".arrow", MEMORY_OR_ROWS),
     (hostile.arrow_run_ends, ".arrows", "gx contains run_end_encoded"),

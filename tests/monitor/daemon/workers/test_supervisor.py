@@ -4,6 +4,7 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from multiprocessing import Pipe
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from structlog.testing import capture_logs
 from drivers.errors import ConfigError
 from monitor.daemon.workers import supervisor
 from monitor.daemon.workers.supervisor import WorkerSupervisor
+from monitor.daemon.workers.worker_service import Call
 from monitor.settings import loading
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -70,6 +72,17 @@ def test_reload_and_commands_reach_the_worker_of_a_device(tmp_path: Path) -> Non
     assert replies["removed"] == []
     assert {name: health.state for name, health in output.healths.items()}["kept"] == "running"
     assert [worker.process.returncode for worker in running._workers if worker.process is not None] == [0, 0]
+
+
+def test_calls_before_the_end_of_a_worker_are_not_lost() -> None:
+    worker = supervisor._Worker(0)
+    worker.pipe, theirs = Pipe()
+    last = [Call("set_progress", ({"a": 1},))]
+    theirs.send(last)
+    theirs.close()
+    assert worker.receive() == last
+    with pytest.raises(EOFError):
+        worker.receive()
 
 
 @pytest.mark.long
