@@ -104,7 +104,7 @@ class ReplayLink(PolledLink):
     """Link that replays one file. Each call of ``open`` starts the replay from the beginning."""
 
     def __init__(self, settings: Settings, kind: Kind) -> None:
-        super().__init__(f"replay of {settings.path}")
+        super().__init__(f"replay of {Path(settings.path).name}")
         self._settings = settings
         self._path = safe_file_reading.expand_user(settings.path)
         self._kind: Kind = kind

@@ -29,6 +29,10 @@ from monitor.publishing.messages.results import (
 
 POINT_INTERVAL_S: Final = 1.0
 """Shortest interval between two estimates in a time series of the viewer [s]."""
+SAMPLES_PERIOD_S: Final = 0.5
+"""Interval between two batches of samples in the viewer [s]. Each batch of an axis costs more than its samples."""
+SERIES_PERIOD_S: Final = 5.0
+"""Interval between two batches of a slow time series in the viewer [s]."""
 SMALL_RESULT_BYTES: Final = 1000
 """Approximate memory size of a result without large arrays."""
 
@@ -124,7 +128,7 @@ class ResultKind:
 RESULT_KINDS: Final = (
     ResultKind(
         SampleBatch,
-        drawings=(DrawingSchedule("SamplesAndTemperaturePanel"),),
+        drawings=(DrawingSchedule("SamplesAndTemperaturePanel", period_s=SAMPLES_PERIOD_S),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes + one.temperature_c.nbytes,
     ),
     ResultKind(Event, (EventMessage,), (DrawingSchedule("EventsPanel"),)),
@@ -136,11 +140,11 @@ RESULT_KINDS: Final = (
     ),
     ResultKind(
         CompensatedRateBatch,
-        drawings=(DrawingSchedule("CompensatedPanel"),),
+        drawings=(DrawingSchedule("CompensatedPanel", period_s=SAMPLES_PERIOD_S),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes,
     ),
     ResultKind(ThermalIntervalResult, (ThermalPredictionMessage,), (DrawingSchedule("ThermalPredictionPanel"),)),
-    ResultKind(MeasuredAndSubtractedDrift, drawings=(DrawingSchedule("DriftPanel"),)),
+    ResultKind(MeasuredAndSubtractedDrift, drawings=(DrawingSchedule("DriftPanel", period_s=SERIES_PERIOD_S),)),
     ResultKind(TotalAndHadamardCurves, (TotalAndHadamardMessage,)),
     ResultKind(
         ModelComparison,  # precedes the estimate, because the Allan plot also shows the model
@@ -153,7 +157,7 @@ RESULT_KINDS: Final = (
         (AllanMessage, CoefficientsMessage),
         (
             DrawingSchedule("AllanAndCoefficientPanel", keep_newest, period_s=1.0, shares_rate=True),
-            DrawingSchedule("CoefficientsPanel", keep_newest_and_spaced, period_s=5.0),
+            DrawingSchedule("CoefficientsPanel", keep_newest_and_spaced, period_s=SERIES_PERIOD_S),
         ),
         size_bytes=lambda one: 8 * int(one.curve.avar.nbytes),
     ),

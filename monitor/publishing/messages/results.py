@@ -99,6 +99,8 @@ class AllanMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.A
     tau_s: Floats
     """Averaging times [s]."""
     axes: dict[str, AllanAxis]
+    poorly_fitted_axes: list[str] | UnsetType = UNSET
+    """Axes whose fitted coefficients do not describe the deviations. Unset if there are none."""
 
     @classmethod
     def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
@@ -110,7 +112,12 @@ class AllanMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.A
             )
             for i, axis in measured_axes(result.curve)
         }
-        return {"filled_s": result.curve.n / result.rate_hz, "tau_s": result.curve.tau_s, "axes": axes}
+        return {
+            "filled_s": result.curve.n / result.rate_hz,
+            "tau_s": result.curve.tau_s,
+            "axes": axes,
+            "poorly_fitted_axes": list(result.poorly_fitted_axes) or UNSET,
+        }
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
         """Convert the message to an estimate whose degrees of freedom are unknown.
@@ -150,6 +157,7 @@ class AllanMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.A
             fitted=fitted_allan_variance(tau_s, rate_hz, coefficients),
             coefficients=coefficients,
             k_or_r=np.array([axis in k_or_r for axis in AXES]),
+            poorly_fitted_axes=tuple(axis for axis in AXES if axis in (self.poorly_fitted_axes or ())),
         )
 
 

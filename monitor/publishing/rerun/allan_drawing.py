@@ -47,9 +47,16 @@ KEY_ROW: Final = 1.25
 KEY_BELOW: Final = 2.15
 """Distance of the first row of the key below the plot [chart units]."""
 KEY_TEXT: Final = 3.3
+GRID_PERIOD_NS: Final = 30_000_000_000
+"""Interval at which an unchanged grid is drawn again, because a viewer that joins late may not receive old data."""
 GRID_DASH: Final = 0.15
 RING_LETTERS: Final = "NBK"
 LETTER_OFFSET: Final = (0.9, -0.45)
+FIT_WIDTH: Final = 1.25  # half of the line width [points of the screen]
+MODEL_WIDTH: Final = 0.75
+RING_WIDTH: Final = 0.9
+MARKER_WIDTH: Final = 0.8
+DOT_RADIUS: Final = 2.5
 MARKER_CORNERS: Final = {"y": 4, "z": 3}
 """Number of corners of each axis's marker. The marker of an x axis is a dot."""
 POOR_FIT_TEXT: Final = "fit does not describe the curve"
@@ -74,9 +81,8 @@ class AllanPlotPair:
     def __init__(self, log: Log, path: str, units: UnitSystem = DEFAULT_UNITS) -> None:
         self._log = log
         self._path = path
-        self._drawn: dict[
-            Kind, tuple[ChartDecadeRange, list[str], list[str]]
-        ] = {}  # grid, signs and poorly fitted axes
+        # Time interval, grid, signs and poorly fitted axes
+        self._drawn: dict[Kind, tuple[int, ChartDecadeRange, list[str], list[str]]] = {}
         self._units = units
 
     def draw(self, estimate: Estimate, gap: ModelComparison | None) -> None:
@@ -101,13 +107,24 @@ class AllanPlotPair:
             )
             poor = [one.axis for one in curves if one.poorly_fitted]
             signs = _signs_in_use(curves)
-            if self._drawn.get(kind) != (scale, signs, poor):
-                self._drawn[kind] = scale, signs, poor
+            frame = estimate.t_ns // GRID_PERIOD_NS, scale, signs, poor
+            if self._drawn.get(kind) != frame:
+                self._drawn[kind] = frame
                 self._draw_grid(kind, scale, [one.axis for one in curves])
                 self._draw_key(kind, signs, poor)
-            for curve in curves:
-                self._draw_curve(scale, curve)
-            self._draw_rings(kind, scale, estimate)
+            lines = [line for curve in curves for line in self._draw_points_and_list_lines(scale, curve)]
+            rings, letters = self._rings_and_letters(kind, scale, estimate)
+            lines += rings
+            self._log(
+                f"{self._path}/{kind}/curves",
+                rr.LineStrips2D(
+                    [line.points for line in lines],
+                    colors=[line.colour for line in lines],
+                    radii=rr.Radius.ui_points([line.radius for line in lines]),
+                    draw_order=10.0,
+                ),
+                letters,
+            )
 
     def _draw_grid(self, kind: Kind, scale: ChartDecadeRange, axes: Sequence[str]) -> None:
         path = f"{self._path}/{kind}"
@@ -146,10 +163,13 @@ class AllanPlotPair:
         note = [(WIDTH / 2, 0.2, f"{', '.join(poor)}: {POOR_FIT_TEXT}")] if poor else []
         self._log(f"{self._path}/{kind}/note", label_points(note))
 
-    def _draw_rings(self, kind: Kind, scale: ChartDecadeRange, estimate: Estimate) -> None:
-        """Draw a ring at the averaging time at which N, B or K is read, and a letter at the rings of all axes."""
+    def _rings_and_letters(
+        self, kind: Kind, scale: ChartDecadeRange, estimate: Estimate
+    ) -> "tuple[list[_Line], rr.Points2D]":
+        """Return rings where N, B or K is read, and one label for the rings of all axes."""
         factor, minimum_tau_s = self._units.deviation(kind).factor, tau_of_minimum_s(estimate, kind)
         letters: dict[str, list[Floats]] = {}
+        lines: list[_Line] = []
         for axis in axes_of(kind):
             i = AXES.index(axis)
             rings = coefficient_rings(estimate, i, factor, minimum_tau_s, 0.0)
@@ -159,27 +179,41 @@ class AllanPlotPair:
                 if one.letter in RING_LETTERS
             }
             inside = {letter: xy for letter, xy in at.items() if 0.0 <= xy[0] <= WIDTH and 0.0 <= xy[1] <= HEIGHT}
-            outlines = [ring_outline(*xy) for xy in inside.values()]
-            log_lines(self._log, f"{self._path}/{axis}/rings", outlines, [axis_colours.AXIS_COLOURS[axis]], 0.9, 25.0)
             for letter, xy in inside.items():
+                lines.append(_Line(ring_outline(*xy), axis_colours.AXIS_COLOURS[axis], RING_WIDTH))
                 letters.setdefault(letter, []).append(xy)
         labels = [(*(np.mean(xy, axis=0) + LETTER_OFFSET), letter) for letter, xy in letters.items()]
-        self._log(f"{self._path}/{kind}/letters", label_points(labels))
+        return lines, label_points(labels)
 
-    def _draw_curve(self, scale: ChartDecadeRange, curve: "_Curve") -> None:
-        path, colour = f"{self._path}/{curve.axis}", axis_colours.AXIS_COLOURS[curve.axis]
+    def _draw_points_and_list_lines(self, scale: ChartDecadeRange, curve: "_Curve") -> "list[_Line]":
+        """Draw the measured deviations of one axis, and return its confidence band, fit, model and markers as lines."""
+        colour, grey = axis_colours.AXIS_COLOURS[curve.axis], axis_colours.GREY
         low, high, fitted, model, deviation = (
             scale.to_chart_positions(curve.tau, part)
             for part in (curve.lo, curve.hi, curve.fitted, curve.model, curve.deviation)
         )
-        log_lines(self._log, f"{path}/band", band_outline(low, high), [colour], 0.4, 5.0)
-        fit_colour = axis_colours.GREY if curve.poorly_fitted else colour
-        log_lines(self._log, f"{path}/fit", finite_sections(fitted), [fit_colour], 1.25, 10.0)
+        corners = MARKER_CORNERS.get(curve.axis[-1])
+        dot = rr.Radius.ui_points(DOT_RADIUS if corners is None else 0.0)
+        points = rr.Points2D(deviation, colors=[colour], radii=dot, draw_order=20.0)
+        self._log(f"{self._path}/{curve.axis}", points, rr.AnyValues(drop_untyped_nones=True, **curve.si))
         dashes = [stroke for section in finite_sections(model) for stroke in dash_line(section)]
-        log_lines(self._log, f"{path}/model", dashes, [axis_colours.GREY], 0.75, 15.0)
-        log_markers(self._log, f"{path}/marker", deviation, curve.axis)
-        points = rr.Points2D(deviation, colors=[colour], radii=rr.Radius.ui_points(0.0), draw_order=20.0)
-        self._log(path, points, rr.AnyValues(drop_untyped_nones=True, **curve.si))
+        markers = [] if corners is None else marker_outlines(deviation, corners)
+        styles = (
+            (band_outline(low, high), colour, 0.4),
+            (finite_sections(fitted), grey if curve.poorly_fitted else colour, FIT_WIDTH),
+            (dashes, grey, MODEL_WIDTH),
+            (markers, colour, MARKER_WIDTH),
+        )
+        return [_Line(strip, tint, width) for strips, tint, width in styles for strip in strips]
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """Line with its colour and half of its width in points of the screen."""
+
+    points: Floats  # [n, 2]
+    colour: Colour
+    radius: float
 
 
 @dataclass(frozen=True)
@@ -294,9 +328,9 @@ def log_markers(log: Log, path: str, positions: Floats, axis: str) -> None:
     """
     colours, corners = [axis_colours.AXIS_COLOURS[axis]], MARKER_CORNERS.get(axis[-1])
     if corners is None:
-        log(path, rr.Points2D(positions, colors=colours, radii=rr.Radius.ui_points(2.5), draw_order=20.0))
+        log(path, rr.Points2D(positions, colors=colours, radii=rr.Radius.ui_points(DOT_RADIUS), draw_order=20.0))
     else:
-        log_lines(log, path, marker_outlines(positions, corners), colours, 0.75, 20.0)
+        log_lines(log, path, marker_outlines(positions, corners), colours, MARKER_WIDTH, 20.0)
 
 
 def label_points(labels: Sequence[tuple[float, float, str]]) -> rr.Points2D:

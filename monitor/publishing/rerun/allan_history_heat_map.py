@@ -134,13 +134,11 @@ def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
         if not np.isfinite(whole[:, :, i]).any():
             continue
         height = _rows(allan_history.tau_s.size) * allan_history.tau_s.size
-        log(
-            f"{path}/{axis}",
-            rr.EncodedImage(contents=encode_heat_map(whole[:, :, i]), media_type="image/png", draw_order=-20.0),
-        )
         labels = _tau_labels(allan_history.tau_s, height) + _time_labels(allan_history, height) + _bar_labels(height)
-        log(f"{path}/{axis}/labels", label_points(labels))
-        log(f"{path}/{axis}/scale", _bar(height))
+        picture = rr.EncodedImage(contents=encode_heat_map(whole[:, :, i]), media_type="image/png", draw_order=-20.0)
+        log(f"{path}/{axis}", picture, label_points(labels))
+        if len(whole) == MIN_COLUMNS:  # the height is constant for the following columns
+            log(f"{path}/{axis}/scale", _bar(height), static=True)
 
 
 def encode_heat_map(log_ratio: Floats) -> bytes:

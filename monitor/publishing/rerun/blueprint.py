@@ -261,5 +261,4 @@ def _raw(device: str, kind: Kind) -> rrb.View:
 
 def _gap(device: str, kind: Kind) -> rrb.View:
     name = f"{KIND_NAMES[kind]}: gap to the model, σ, and its threshold"
-    contents = ["$origin/threshold", *(f"$origin/{axis}" for axis in axes_of(kind))]
-    return time_series_view(f"/{device}/gap", name, contents)
+    return time_series_view(f"/{device}/gap", name, [f"$origin/{kind}"])

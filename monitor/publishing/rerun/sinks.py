@@ -309,7 +309,8 @@ def _open_web(settings: ViewerSettings, recording_id: str, should_stop: Callable
     web_port = find_free_port(settings.web_port, skipped_port=port)
     child = ViewerProcess([
         *("--serve-web", "--bind", LOOPBACK, "--port", str(port), "--web-viewer-port", str(web_port)),
-        *("--server-memory-limit", settings.memory),
+        # A page that is opened late shows the present results first, instead of the results since the start.
+        *("--server-memory-limit", settings.memory, "--newest-first"),
     ])  # fmt: skip
     _wait_for(port, child, should_stop)
     output = _connected(port, recording_id, child=child)

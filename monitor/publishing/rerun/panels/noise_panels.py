@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from drivers.data_types import AXES, Floats
-from monitor.common.unit_formatting import sensor_kind
+from monitor.common.unit_formatting import KINDS, axes_of, sensor_kind
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
@@ -37,19 +37,18 @@ class ModelDifferencePanel(Panel):
 
     def log_styles(self) -> None:
         """Log the names, colours and widths of the lines."""
-        for axis in AXES:
-            self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", axis_colours.AXIS_COLOURS[axis], 1.5)])
-        self._style_lines("gap/threshold", [("threshold", axis_colours.GREY, 1.0)])
+        for kind in KINDS:
+            lines = [(f"{axis}, σ from its model", axis_colours.AXIS_COLOURS[axis], 1.5) for axis in axes_of(kind)]
+            self._style_lines(f"gap/{kind}", [*lines, ("threshold", axis_colours.GREY, 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[ModelComparison]) -> None:
-        """Draw the differences from the noise model for each axis."""
+        """Draw the differences from the noise model for each axis, and the threshold."""
         self.newest = results[-1]
         highest = [max((axis.threshold for axis in one.axes.values()), default=np.nan) for one in results]
-        self.scene.log_scalars(self.entity_path("gap/threshold"), unix_s, np.array(highest))
-        for axis in AXES:
-            gap = np.array([one.axes[axis].gap if axis in one.axes else np.nan for one in results])
-            if np.isfinite(gap).any():
-                self.scene.log_scalars(self.entity_path(f"gap/{axis}"), unix_s, gap)
+        for kind in KINDS:
+            gaps = [[one.axes[axis].gap if axis in one.axes else np.nan for axis in axes_of(kind)] for one in results]
+            if np.isfinite(gaps).any():
+                self.scene.log_scalars(self.entity_path(f"gap/{kind}"), unix_s, np.column_stack([gaps, highest]))
 
 
 class AllanAndCoefficientPanel(Panel):

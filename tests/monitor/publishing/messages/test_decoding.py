@@ -1,6 +1,7 @@
 """Tests that results survive encoding and decoding as messages, and that invalid results are refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -36,6 +37,17 @@ def test_decoded_estimate_equals_the_original() -> None:
         ), name
     assert (got.rate_hz, got.window_s, got.samples) == (sent.rate_hz, sent.window_s, sent.samples)
     assert got.fitted == pytest.approx(sent.fitted, rel=0.02)
+
+
+def test_poorly_fitted_axes_are_kept_and_absent_in_older_messages() -> None:
+    assert encode_and_decode(
+        replace(example_results.make_estimate(), poorly_fitted_axes=("gz",))
+    ).poorly_fitted_axes == ("gz",)
+    older = AllanMessage.from_result("a", 1.76e9, 0, example_results.make_estimate()).encode()
+    assert b"poorly" not in older
+    assert encode_and_decode(example_results.make_estimate(), poorly_fitted_axes=["gx", "roll"]).poorly_fitted_axes == (
+        "gx",
+    )
 
 
 def test_fitted_curve_follows_the_standard() -> None:

@@ -4,13 +4,21 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.allan_figure import READING_TAU_S
 from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, WIDTH
-from monitor.publishing.rerun.allan_drawing import KEY, AllanPlotPair
+from monitor.publishing.rerun.allan_drawing import (
+    DOT_RADIUS,
+    FIT_WIDTH,
+    KEY,
+    MARKER_WIDTH,
+    RING_WIDTH,
+    AllanPlotPair,
+)
 from tests.monitor.publishing.example_results import make_comparison, make_estimate
 
 
@@ -30,6 +38,14 @@ def count_lines(lines: Any) -> int:
     return len(lines.strips.as_arrow_array())
 
 
+def select_lines(lines: Any, colour: axis_colours.Colour, radius: float) -> list[Any]:
+    """Return the lines with a colour and a width."""
+    red, green, blue = colour
+    wanted = (red << 24) + (green << 16) + (blue << 8) + 255, pytest.approx(-radius)  # negative: points of the screen
+    parts = [part.as_arrow_array().to_pylist() for part in (lines.strips, lines.colors, lines.radii)]
+    return [strip for strip, *style in zip(*parts, strict=True) if tuple(style) == wanted]
+
+
 def test_key_explains_the_signs_in_use() -> None:
     shown, gap = draw_example(), make_comparison(make_estimate())
     assert list_labels(shown["d/gyro/key/text"]) == ["measured", "fit", "95 %", "N, B, K"]
@@ -45,24 +61,25 @@ def test_fit_that_does_not_describe_the_curve_is_grey_and_named() -> None:
     assert list_labels(shown["d/gyro/note"]) == ["gz: fit does not describe the curve"]
     assert list_labels(shown["d/accel/note"]) == []
     assert "poor fit" in list_labels(shown["d/gyro/key/text"])
-    colours = {axis: shown[f"d/{axis}/fit"].colors.as_arrow_array().to_pylist() for axis in ("gx", "gy", "gz")}
-    red, green, blue = axis_colours.GREY
-    assert colours["gz"] == [(red << 24) + (green << 16) + (blue << 8) + 255]
-    assert colours["gx"] != colours["gz"] != colours["gy"]
+    assert len(select_lines(shown["d/gyro/curves"], axis_colours.GREY, FIT_WIDTH)) == 1
+    assert len(select_lines(shown["d/gyro/curves"], axis_colours.AXIS_COLOURS["gx"], FIT_WIDTH)) == 1
+    assert not select_lines(shown["d/gyro/curves"], axis_colours.AXIS_COLOURS["gz"], FIT_WIDTH)
+    assert not select_lines(shown["d/accel/curves"], axis_colours.GREY, FIT_WIDTH)
 
 
 def test_each_axis_has_its_own_marker() -> None:
     shown = draw_example()
     points = len(shown["d/gx"].positions)
-    assert len(shown["d/gx/marker"].positions) == points
-    corners = {axis: len(shown[f"d/{axis}/marker"].strips.as_arrow_array()[0]) - 1 for axis in ("gy", "gz")}
-    assert corners == {"gy": 4, "gz": 3}
-    assert count_lines(shown["d/gy/marker"]) == points
+    assert shown["d/gx"].radii.as_arrow_array().to_pylist() == [-DOT_RADIUS]  # negative: points of the screen
+    for axis, corners in (("gy", 4), ("gz", 3)):
+        assert not any(shown[f"d/{axis}"].radii.as_arrow_array().to_pylist())
+        markers = select_lines(shown["d/gyro/curves"], axis_colours.AXIS_COLOURS[axis], MARKER_WIDTH)
+        assert [len(one) - 1 for one in markers] == [corners] * points
 
 
 def test_ring_of_n_is_at_one_second_and_at_the_level_of_n() -> None:
     logged, estimate = draw_example(), make_estimate()
-    (outline, *_) = logged["d/gx/rings"].strips.as_arrow_array().to_pylist()
+    (outline, *_) = select_lines(logged["d/gyro/curves"], axis_colours.AXIS_COLOURS["gx"], RING_WIDTH)
     x, y = np.mean(outline[:-1], axis=0)
     at_tau = {
         tuple(point): label

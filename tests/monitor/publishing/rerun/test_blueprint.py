@@ -41,7 +41,7 @@ def test_views_and_pages_appear_with_their_data() -> None:
     origins = list_origins(FULL, entities=entities)
     assert {"/b/allan", "/b/samples", "/b/coefficients/N"} <= set(origins)
     assert not {"/b/temperature", "/b/gap", "/b/events", "/b/dynamic/gx", "/b/coefficients/B"} & set(origins)
-    assert "/b/gap" in list_origins(FULL, entities=entities | {"/b/gap/gx"})
+    assert "/b/gap" in list_origins(FULL, entities=entities | {"/b/gap/gyro"})
 
 
 def test_data_of_another_device_show_no_views() -> None:

@@ -1,6 +1,8 @@
 """Tests of the live view: recorded content, and viewers that block, end or are missing."""
 
+import contextlib
 import fcntl
+import http.client
 import os
 import shutil
 import signal
@@ -123,14 +125,14 @@ def test_gap_and_model_curve_are_recorded(tmp_path: Path) -> None:
     view.close()
     rows = read_entities(path)
     # Within one second, only the newest comparison is kept.
-    gz = read_column_values(rows["/bench-1/gap/gz"], "Scalars:scalars")
-    assert gz.tolist() == [comparisons[0].axes["gz"].gap, comparisons[2].axes["gz"].gap]
-    threshold = read_column_values(rows["/bench-1/gap/threshold"], "Scalars:scalars")
-    assert threshold.tolist() == [comparisons[0].axes["gz"].threshold] * 2
-    assert (gz > threshold).all()
-    strokes = [cell for cell in rows["/bench-1/allan/gz/model"]["LineStrips2D:strips"] if cell]
-    assert len(strokes[-1]) > 10
-    assert not [cell for cell in rows["/plain/allan/gz/model"]["LineStrips2D:strips"] if cell]
+    gaps = read_column_values(rows["/bench-1/gap/gyro"], "Scalars:scalars").reshape(-1, 4)  # gx, gy, gz, threshold
+    assert gaps[:, 2].tolist() == [comparisons[0].axes["gz"].gap, comparisons[2].axes["gz"].gap]
+    assert gaps[:, 3].tolist() == [comparisons[0].axes["gz"].threshold] * 2
+    assert (gaps[:, 2] > gaps[:, 3]).all()
+    with_model, without_model = (
+        len(rows[f"/{device}/allan/gyro/curves"]["LineStrips2D:strips"][-1]) for device in ("bench-1", "plain")
+    )
+    assert with_model > without_model + 10
     assert not [entity for entity in rows if entity.startswith("/plain/gap/") and "Scalars:scalars" in rows[entity]]
 
 
@@ -286,6 +288,37 @@ with socket.create_server(("127.0.0.1", port)) as server:
     assert stays_true(lambda: view.state == sinks.CLOSED)  # for the duration of ten more attempts
     assert starts.read_text() == "started\n"
     view.close()
+
+
+def test_page_that_is_opened_late_receives_the_newest_results_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    import rerun as rr
+
+    monkeypatch.setattr(sinks, "has_desktop", lambda: False)
+    output = sinks.open_output(ViewerSettings("web", free_port(), free_port()), "late", lambda: False)
+    try:
+        names = ["walnut", "pumpkin", "kohlrabi"]  # distinct words, because the server compresses messages
+        for i, name in enumerate(names):
+            output.stream.set_time("sample_time", duration=float(i))
+            output.stream.log(name, rr.Scalars(1.0))
+            assert output.confirm_delivery(PATIENCE_S)
+        assert read_entity_order(output.port or 0, names) == names[::-1]
+    finally:
+        output.close()
+
+
+def read_entity_order(port: int, names: list[str]) -> list[str]:
+    """Return the names in the order in which a Rerun server sends their first messages to a new viewer."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+    headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
+    service = sinks.PROBE_METHOD.rpartition("/")[0]
+    connection.request("POST", f"{service}/ReadMessages", bytes(5), headers)
+    found: list[str] = []
+    with contextlib.closing(connection), connection.getresponse() as reply:
+        while len(found) < len(names):
+            size = int.from_bytes(reply.read(5)[1:], "big")
+            message = reply.read(size)
+            found += [name for name in names if name not in found and name.encode() in message]
+    return found
 
 
 def test_web_viewer_uses_the_next_free_port_and_releases_it(monkeypatch: pytest.MonkeyPatch) -> None:
