@@ -62,6 +62,7 @@ SOURCES: Final[dict[str, Callable[[], object]]] = {
         (
             "viewer",
             "viewer-dynamic",
+            "viewer-gap",
             "viewer-temperature",
             "viewer-drift",
             "viewer-history",

@@ -170,11 +170,21 @@ def native(out: Path, folder: Path) -> Path:
 
 def surfaces(out: Path, folder: Path) -> Path:
     """Show the "What changed" page for a device whose noise has changed."""
-    path = out / "viewer-dynamic.png"
+    return show_changed_device(out / "viewer-dynamic.png", replay(folder, changed=True), folder, tab=1)
+
+
+def gap(out: Path, folder: Path) -> Path:
+    """Show the "Model gap" page for a device whose noise has changed."""
+    devices = f'{replay(folder, changed=True)}model = "{MODEL}"\n'
+    return show_changed_device(out / "viewer-gap.png", devices, folder, tab=3)
+
+
+def show_changed_device(path: Path, devices: str, folder: Path, tab: int) -> Path:
+    """Show a page of a device after its noise has changed."""
     with window() as (port, shoot):
-        with serving(folder, replay(folder, changed=True), port) as service:
+        with serving(folder, devices, port) as service:
             wait_until(lambda: has_replayed(service, HOUR_S), 300.0)
-        select_tab(port, 1)
+        select_tab(port, tab)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
@@ -517,6 +527,7 @@ def run_analyze(source: Path, plot: Path, *more: str) -> Path:
 PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "native": native,
     "surfaces": surfaces,
+    "gap": gap,
     "temperature": temperature,
     "drift": drift,
     "compensation": compensation,

@@ -167,7 +167,7 @@ def _diagnostic_view(result: AxisResult, diagnostic: str, when: str) -> rrb.View
     what = what[0].upper() + what[1:]
     names = {"before": f"{what}: first model", "after": f"{what}: after the steps"}
     origin = f"/{result.axis}/{diagnostic}/{when}"
-    return drawing_view(origin, names[when], "$origin/**", (-2.6, WIDTH + 0.7), (-1.5, HEIGHT + 1.9))
+    return drawing_view(origin, names[when], "$origin/**", (-2.8, WIDTH + 0.7), (-1.5, HEIGHT + 1.9))
 
 
 def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult, units: UnitSystem) -> None:

@@ -20,6 +20,8 @@ MIN_DECADES: Final = 2.0
 RING_RADIUS: Final = 0.28
 MARKER_RADIUS: Final = 0.2
 MINOR_TICK: Final = 0.16  # length of the ticks between powers of ten
+LABEL_ABOVE: Final = 0.6
+"""Distance of the point of a label above the sign that it names, because Rerun draws a label below its point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,16 +148,25 @@ class ChartGrid:
     ticks: list[tuple[float, float, str]]  # x, y, label
 
 
-def chart_grid(scale: ChartDecadeRange) -> ChartGrid:
-    """Return grid lines at powers of ten, ticks at their multiples, and labels outside the box of the chart."""
+def chart_grid(scale: ChartDecadeRange, x_unit: str = "") -> ChartGrid:
+    """Return grid lines at powers of ten, ticks at their multiples, and labels outside the box of the chart.
+
+    Parameters
+    ----------
+    scale
+        Range of averaging times and Allan deviations.
+    x_unit
+        Text after the last number of the x axis.
+    """
     x_at, x_minor = _line_positions(scale.x, WIDTH)
     y_at, y_minor = _line_positions(scale.y, HEIGHT)
     flip = HEIGHT
     ticks = [
-        (x, HEIGHT + 0.15, format_tick(10.0**p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)
+        (x, HEIGHT + 0.15, format_tick(10.0**p) + (x_unit if p == scale.x[1] else ""))
+        for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)
     ]
     ticks += [
-        (-1.25, flip - y - 0.5, format_tick(10.0**p))
+        (-1.5, flip - y - LABEL_ABOVE, format_tick(10.0**p))
         for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)
     ]
     return ChartGrid(

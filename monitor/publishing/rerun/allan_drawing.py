@@ -20,6 +20,7 @@ from monitor.publishing.plots.allan_figure import coefficient_rings, tau_of_mini
 from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.rerun.allan_chart_geometry import (
     HEIGHT,
+    LABEL_ABOVE,
     WIDTH,
     ChartDecadeRange,
     band_outline,
@@ -50,8 +51,8 @@ KEY_TEXT: Final = 3.3
 GRID_PERIOD_NS: Final = 30_000_000_000
 """Interval at which an unchanged grid is drawn again, because a viewer that joins late may not receive old data."""
 GRID_DASH: Final = 0.15
-RING_LETTERS: Final = "NBK"
-LETTER_OFFSET: Final = (0.9, -0.45)
+LETTER_OFFSETS: Final = {"N": (-0.9, -0.3), "B": (0.9, -0.3), "K": (0.9, -0.3)}
+"""Position of each letter relative to its rings, on the side where the curve leaves space."""
 FIT_WIDTH: Final = 1.25  # half of the line width [points of the screen]
 MODEL_WIDTH: Final = 0.75
 RING_WIDTH: Final = 0.9
@@ -128,16 +129,15 @@ class AllanPlotPair:
 
     def _draw_grid(self, kind: Kind, scale: ChartDecadeRange, axes: Sequence[str]) -> None:
         path = f"{self._path}/{kind}"
-        unit = [(WIDTH + 0.75, HEIGHT - 1.0, "s")]
-        log_grid(self._log, path, scale, f"{path}/ticks", unit)
-        at = {axis: np.array([4.0 * i + 4.6, -0.55]) for i, axis in enumerate(axes)}
+        log_grid(self._log, path, scale, f"{path}/ticks", x_unit=" s")
+        at = {axis: np.array([4.0 * i + 4.6, -0.9]) for i, axis in enumerate(axes)}
         strokes = [position + np.array([[-0.7, 0.0], [0.7, 0.0]]) for position in at.values()]
         log_lines(
             self._log, f"{path}/legend/strokes", strokes, [axis_colours.AXIS_COLOURS[axis] for axis in at], 1.25, 30.0
         )
         for axis, position in at.items():
             log_markers(self._log, f"{path}/legend/{axis}", position[None], axis)
-        self._log(f"{path}/legend", label_points([(x + 1.6, y - 0.5, axis) for axis, (x, y) in at.items()]))
+        self._log(f"{path}/legend", label_points([(x + 1.6, y - LABEL_ABOVE, axis) for axis, (x, y) in at.items()]))
 
     def _draw_key(self, kind: Kind, signs: Sequence[str], poor: Sequence[str]) -> None:
         """Draw a key of the signs below the plot, and name the axes with a poor fit inside the plot."""
@@ -159,7 +159,9 @@ class AllanPlotPair:
             log_lines(self._log, f"{path}/{sign}", draw(at[sign]) if sign in at else [], colours, 1.0, 10.0)
         dot = at["measured"] + [0.6, 0.0]
         self._log(path, rr.Points2D([dot], colors=[grey], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
-        self._log(f"{path}/text", label_points([(x + KEY_TEXT, y - 0.5, KEY[sign]) for sign, (x, y) in at.items()]))
+        self._log(
+            f"{path}/text", label_points([(x + KEY_TEXT, y - LABEL_ABOVE, KEY[sign]) for sign, (x, y) in at.items()])
+        )
         note = [(WIDTH / 2, 0.2, f"{', '.join(poor)}: {POOR_FIT_TEXT}")] if poor else []
         self._log(f"{self._path}/{kind}/note", label_points(note))
 
@@ -176,13 +178,13 @@ class AllanPlotPair:
             at = {
                 one.letter: scale.to_chart_positions(np.array([one.tau_s]), np.array([one.sigma]))[0]
                 for one in rings
-                if one.letter in RING_LETTERS
+                if one.letter in LETTER_OFFSETS
             }
             inside = {letter: xy for letter, xy in at.items() if 0.0 <= xy[0] <= WIDTH and 0.0 <= xy[1] <= HEIGHT}
             for letter, xy in inside.items():
                 lines.append(_Line(ring_outline(*xy), axis_colours.AXIS_COLOURS[axis], RING_WIDTH))
                 letters.setdefault(letter, []).append(xy)
-        labels = [(*(np.mean(xy, axis=0) + LETTER_OFFSET), letter) for letter, xy in letters.items()]
+        labels = [(*(np.mean(xy, axis=0) + LETTER_OFFSETS[letter]), letter) for letter, xy in letters.items()]
         return lines, label_points(labels)
 
     def _draw_points_and_list_lines(self, scale: ChartDecadeRange, curve: "_Curve") -> "list[_Line]":
@@ -263,7 +265,12 @@ def _signs_in_use(curves: Sequence[_Curve]) -> list[str]:
 
 
 def log_grid(
-    log: Log, path: str, scale: ChartDecadeRange, labels_path: str, labels: Sequence[tuple[float, float, str]]
+    log: Log,
+    path: str,
+    scale: ChartDecadeRange,
+    labels_path: str,
+    labels: Sequence[tuple[float, float, str]] = (),
+    x_unit: str = "",
 ) -> None:
     """Log the grid lines, tick labels and further labels of a plot.
 
@@ -279,8 +286,10 @@ def log_grid(
         Path of the entity with the labels.
     labels
         Further labels, each given by x, y and text.
+    x_unit
+        Text after the last number of the x axis.
     """
-    lines = chart_grid(scale)
+    lines = chart_grid(scale, x_unit)
     log_lines(log, f"{path}/minor", lines.minor, [axis_colours.FRAME], 0.5, -30.0)
     dots = [dash for line in lines.major for dash in dash_line(line, GRID_DASH)]
     log_lines(log, f"{path}/major", dots, [axis_colours.FRAME], 0.2, -29.0)

@@ -99,14 +99,16 @@ class AllanHistory:
         return np.asarray(whole - median)
 
 
-HEIGHT: Final = 60  # approximate height of a heat map [pixels]; three heat maps fit into a tab
+HEIGHT: Final = 50  # approximate height of a heat map [pixels]; three heat maps fit into a tab
 COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median
 SHADES: Final = 127  # shades on either side of the median
 NO_VALUE_INDEX: Final = 2 * SHADES + 1  # palette index of a missing deviation
 MIN_COLUMNS: Final = 4  # smallest number of columns that gives a meaningful median
+LABEL_ABOVE_PX: Final = 6.0  # distance of the point of a label above the centre of the text
+TIME_INSET_PX: Final = 20.0  # distance of the time labels from the ends of the image
 BAR_X: Final = COLUMNS + 9.0
 BAR_STEPS: Final = 24
-LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 17.0)  # left, above, right and below the image, for labels
+LABEL_MARGINS_PX: Final = (34.0, 7.0, 32.0, 20.0)  # left, above, right and below the image, for labels
 
 
 def heat_map_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -176,15 +178,17 @@ def _rows(taus: int) -> int:
 
 def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
     log = np.log10(tau_s)
-    powers = range(int(np.ceil(log[0])), int(np.floor(log[-1])) + 1)
+    powers = range(int(np.ceil(log[0])), int(np.floor(log[-1])) + 1, 2)  # more labels would overlap in a small window
     rows = np.interp(list(powers), log, (np.arange(log.size) + 0.5) / log.size)
-    labels = [(-11.0, height * (1.0 - float(row)), f"{10.0**power:g}") for power, row in zip(powers, rows, strict=True)]
-    return [*labels, (-11.0, -4.0, "τ, s")]
+    return [
+        (-14.0, height * (1.0 - float(row)) - LABEL_ABOVE_PX, f"{10.0**power:g}{' s' if power == powers[-1] else ''}")
+        for power, row in zip(powers, rows, strict=True)
+    ]
 
 
 def _time_labels(surface: AllanHistory, height: int) -> list[tuple[float, float, str]]:
-    at = ((12.0, surface.ends_s[0]), (COLUMNS - 1.0, surface.ends_s[-1]))
-    return [(x, height + 4.0, format_utc(t)[-8:]) for x, t in at]
+    at = ((TIME_INSET_PX, surface.ends_s[0]), (COLUMNS - TIME_INSET_PX, surface.ends_s[-1]))
+    return [(x, height + 1.0, format_utc(t)[-8:]) for x, t in at]
 
 
 def _bar_labels(height: int) -> list[tuple[float, float, str]]:
@@ -193,7 +197,7 @@ def _bar_labels(height: int) -> list[tuple[float, float, str]]:
         (f"× {COLOUR_SCALE_RATIO:g}", "× 1", f"× {1 / COLOUR_SCALE_RATIO:g}"),
         strict=True,
     )
-    return [(BAR_X + 11.0, y, text) for y, text in ends]
+    return [(BAR_X + 14.0, y - LABEL_ABOVE_PX, text) for y, text in ends]
 
 
 def _bar(height: int) -> rr.LineStrips2D:

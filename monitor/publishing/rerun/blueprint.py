@@ -41,7 +41,6 @@ TYPICAL_TAU_COUNT: Final = 17
 """Number of averaging times of a sliding window of one hour at 100 Hz."""
 MAX_DEVICES_WITH_ACCEL: Final = 4
 """Largest number of devices for which the overview shows accelerometers as well as gyroscopes."""
-MAX_GRID_COLUMNS: Final = 4
 SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
 ALWAYS_SHOWN: Final = ("/status", "/waiting", "/overview")
 """Path suffixes of views that are shown before their first data arrive."""
@@ -50,15 +49,16 @@ GUIDE: Final = "/guide/"
 DESCRIPTIONS: Final = {
     "(status|waiting)": "**Is it healthy?** State of the device, its rate, and its samples since the start.",
     "overview": "**Are they healthy?** One row for each device, with its state and its lost and bad samples.",
-    "coefficients": "**What is its noise now?** Noise coefficients with 95 % intervals, from the newest window.",
+    "coefficients": "**What is its noise now?** Q quantization, N white noise, B bias instability, K random walk and R "
+    "ramp, with 95 % intervals.",
     "events": "**Has it changed?** Changes of the noise, losses of samples and faults of the link, with UTC times.",
     "allan": "**Allan deviation:** noise (up) that remains after averaging for a time (right); lower is better. Signs: "
     "● x, □ y, △ z measured, line fit, thin lines 95 %, ring N, B or K, dashes model, grey line poor fit.",
     "coefficients/[NBK]": "**N, B, K over time:** a step is a change of the noise, and thin lines are 95 % intervals.",
     "samples": "**Samples:** the last 30 seconds as measured.",
     "temperature": "**Temperature:** as the sensor reports it.",
-    "dynamic/..": "**Heat maps:** Allan deviation divided by its median over time. Vermilion is noisier and blue is "
-    "quieter than usual.",
+    "dynamic/..": "**Heat maps:** time runs to the right and averaging time upwards; vermilion is noisier, and blue is "
+    "quieter, than the median.",
     "gap": "**Gap to the model:** above the grey threshold, the model does not describe the device.",
     "thermal/..": "**Bias:** the grey line is the prediction from temperature, and thin lines are its 95 % interval.",
     "compensated": "**Rates:** measured rate in grey, and rate without the predicted drift in colour.",
@@ -90,10 +90,7 @@ def blueprint(
     """
     waiting = {one.name for one in devices if entities is not None and f"/{one.name}/waiting" in entities}
     pages, names = [_device(one, one.name in waiting, units) for one in devices], [one.name for one in devices]
-    if fleet:
-        root: rrb.Container = rrb.Tabs(_fleet(names, units), *pages, active_tab=0)
-    else:
-        root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(names, units), *pages, active_tab=0)
+    root = pages[0] if len(pages) == 1 and not fleet else rrb.Tabs(_overview(names, units, fleet), *pages, active_tab=0)
     if entities is not None:
         _remove_views_without_data(root, entities)
     return collapsed_blueprint(root, TIMELINE)
@@ -159,7 +156,7 @@ def _now(name: str, waiting: bool, units: UnitSystem) -> rrb.Container:
         ),
         rrb.TextDocumentView(origin=f"/{name}/coefficients", contents="$origin", name="What is its noise now?"),
         rrb.Tabs(_event_log(f"/{name}/events"), _guide(name, "now"), active_tab=0),
-        row_shares=[2.35, 6.0, 1.65],
+        row_shares=[1.9, 6.5, 1.6],
     )
     right = rrb.Vertical(
         rrb.Horizontal(*(_allan(name, kind, units) for kind in KINDS)),
@@ -175,12 +172,12 @@ def _changes(device: str, units: UnitSystem) -> rrb.Container:
         rrb.Vertical(
             *(_heat_map(device, axis) for axis in axes_of(kind)),
             rrb.Horizontal(*(_coefficient(device, kind, symbol, units) for symbol in DYNAMIC_COEFFICIENTS)),
-            row_shares=[3, 3, 3, 2.6],
+            row_shares=[3, 3, 3, 2.7],
         )
         for kind in KINDS
     ]
     texts = rrb.Horizontal(_event_log(f"/{device}/events"), _guide(device, "changes"))
-    return rrb.Vertical(rrb.Horizontal(*columns), texts, row_shares=[6, 1], name="What changed")
+    return rrb.Vertical(rrb.Horizontal(*columns), texts, row_shares=[5, 1], name="What changed")
 
 
 def _model_gap(device: str, units: UnitSystem) -> rrb.Container:
@@ -193,28 +190,23 @@ def _model_gap(device: str, units: UnitSystem) -> rrb.Container:
 
 def _temperature_and_drift(device: str, parts: Sequence[rrb.Container]) -> rrb.Container:
     return rrb.Vertical(
-        rrb.Horizontal(*parts), _guide(device, "temperature"), row_shares=[8, 1], name="Temperature and drift"
+        rrb.Horizontal(*parts), _guide(device, "temperature"), row_shares=[5, 1], name="Temperature and drift"
     )
 
 
-def _overview(devices: Sequence[str], units: UnitSystem) -> rrb.Container:
-    kinds = KINDS if len(devices) <= MAX_DEVICES_WITH_ACCEL else KINDS[:1]
-    charts = [_allan(device, kind, units, f"{device}: ") for kind in kinds for device in devices]
-    return rrb.Vertical(
-        rrb.Horizontal(*_overview_texts(), column_shares=[11, 9]),
-        rrb.Grid(*charts, grid_columns=min(len(devices), MAX_GRID_COLUMNS)),
-        row_shares=[1, 4],
-        name="Overview",
-    )
-
-
-def _fleet(devices: Sequence[str], units: UnitSystem) -> rrb.Container:
-    charts = [_allan(device, kind, units, f"{device}: ") for device in devices for kind in KINDS]
+def _overview(devices: Sequence[str], units: UnitSystem, fleet: bool) -> rrb.Container:
+    many, name = len(devices) > MAX_DEVICES_WITH_ACCEL, "Fleet" if fleet else "Overview"
+    if not fleet and not many:
+        charts = [_allan(device, kind, units, f"{device}: ") for kind in KINDS for device in devices]
+        above = rrb.Horizontal(*_overview_texts(), column_shares=[11, 9])
+        return rrb.Vertical(above, rrb.Grid(*charts, grid_columns=len(devices)), row_shares=[1, 4], name=name)
+    beside = rrb.Vertical(*_overview_texts(), row_shares=[4, 1])
+    kinds = KINDS[:1] if many else KINDS
+    charts = [_allan(device, kind, units, f"{device}: ") for device in devices for kind in kinds]
     if not charts:
-        return rrb.Vertical(*_overview_texts(), row_shares=[4, 1], name="Fleet")
-    left = rrb.Vertical(*_overview_texts(), row_shares=[4, 1])
-    right = rrb.Grid(*charts, grid_columns=1 if len(devices) == 1 else 2)
-    return rrb.Horizontal(left, right, column_shares=[6, 5], name="Fleet")
+        return rrb.Vertical(beside, name=name)
+    columns = 3 if many else min(len(devices), 2)
+    return rrb.Horizontal(beside, rrb.Grid(*charts, grid_columns=columns), column_shares=[1, 1], name=name)
 
 
 def _overview_texts() -> tuple[rrb.View, rrb.Container]:
@@ -244,8 +236,8 @@ def _allan(device: str, kind: Kind, units: UnitSystem, prefix: str = "") -> rrb.
     bottom = HEIGHT + KEY_BELOW + 2.0 * KEY_ROW
     if prefix:  # small plots have no space for a key
         paths.append(f"- /{device}/allan/{kind}/key/**")
-        name, bottom = f"{prefix}{KIND_NAMES[kind]}, {units.deviation(kind).name}", HEIGHT + 1.6
-    return drawing_view(f"/{device}/allan", name, paths, (-2.9, WIDTH + 0.9), (-1.5, bottom))
+        name, bottom = f"{prefix}{SHORT_KIND_NAMES[kind]}, {units.deviation(kind).name}", HEIGHT + 1.6
+    return drawing_view(f"/{device}/allan", name, paths, (-3.1, WIDTH + 1.8), (-1.8, bottom))
 
 
 def _coefficient(device: str, kind: Kind, symbol: str, units: UnitSystem) -> rrb.View:

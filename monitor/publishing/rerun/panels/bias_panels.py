@@ -66,16 +66,16 @@ class DriftPanel(Panel):
         name = device.name
         rows = []
         for axis in axes_of("gyro"):
-            title = f"{axis}: measured rate, and rate without drift, {SAMPLE_UNITS['gyro'].name}"
+            title = f"{axis}: rate, {SAMPLE_UNITS['gyro'].name}"
             contents = (f"/{name}/samples/{axis}", f"$origin/{axis}")
             dimmed = {f"/{name}/samples/{axis}": rr.SeriesLines(colors=[axis_colours.FRAME], widths=[0.75])}
             rates = time_series_view(f"/{name}/compensated", title, contents, RAW_SAMPLES_S, styles=dimmed)
-            title = f"{axis}: means at rest, and predicted drift, {units.deviation('gyro').name}"
+            title = f"{axis}: drift, {units.deviation('gyro').name}"
             drift = time_series_view(f"/{name}/drift/{axis}", title)
             innovation = time_series_view(f"/{name}/innovation/{axis}", f"{axis}: innovation, σ")
-            rows.append(rrb.Horizontal(rates, drift, innovation, column_shares=[3, 3, 2]))
+            rows.append(rrb.Horizontal(rates, drift, innovation))
         text = rrb.TextDocumentView(origin=f"/{name}/drift", contents="$origin", name="Drift of the gyros")
-        return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 2.5])
+        return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 3.2])
 
 
 class ThermalPredictionPanel(Panel):
@@ -116,7 +116,7 @@ class ThermalPredictionPanel(Panel):
             return None
         columns = []
         for kind in KINDS:
-            title = f"bias, and prediction from temperature, {units.deviation(kind).name}"
+            title = f"bias, {units.deviation(kind).name}"
             views = [time_series_view(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
             columns.append(rrb.Vertical(*views))
         temperature = temperature_view(device.name)

@@ -31,10 +31,12 @@ from monitor.publishing.remote_device_states import RemoteDevice
 
 FLEET_AXES: Final = ("gx", "gy", "gz")
 """Axes whose angle random walk N is shown in the table of all devices."""
+LINE_BREAK: Final = "  \n"
+"""Line break of Markdown, which needs less space than a new paragraph."""
 STATE_TEXTS: Final = {
     "running": "RUNNING",
     "waiting": "WAITING for the device",
-    "lost": "LOST: no connection to the device, trying again",
+    "lost": "LOST: no connection",
     "ended": "ENDED: the end of the recording was reached",
 }
 
@@ -51,13 +53,13 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     about
         Short description of the device.
     """
-    lines = [f"## {STATE_TEXTS.get(health.state, health.state)}"]
+    unknown = "no samples" if health.state == "lost" else "rate not known yet"
+    rate = unknown if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
+    lines = [f"**{device}** {about}".rstrip() + f", **{rate}**", f"## {STATE_TEXTS.get(health.state, health.state)}"]
     if health.text:
         lines.append(f"**{health.text}**")
     if health.crossed:
         lines.append(f"limits exceeded: **{', '.join(health.crossed)}**")
-    rate = "rate not known yet" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
-    lines.append(f"**{device}** {about}".rstrip() + f", **{rate}**")
     lines.append(
         f"received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
         f"overflowed **{health.overflowed:,}**"
@@ -68,7 +70,7 @@ def health_text(device: str, health: Health, about: str = "") -> str:
         f"latency **{format_milliseconds(health.latency_p50_s)}** median, "
         f"**{format_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
     )
-    return "\n\n".join(line for line in lines if line)
+    return "\n".join([*lines[:2], LINE_BREAK.join(lines[2:])])
 
 
 def overview_text(healths: Mapping[str, Health]) -> str:

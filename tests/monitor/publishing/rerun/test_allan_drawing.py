@@ -10,7 +10,7 @@ from monitor.estimation.detection.comparison_with_noise_model import ModelCompar
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.allan_figure import READING_TAU_S
-from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, WIDTH
+from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, LABEL_ABOVE, WIDTH
 from monitor.publishing.rerun.allan_drawing import (
     DOT_RADIUS,
     FIT_WIDTH,
@@ -93,7 +93,11 @@ def test_ring_of_n_is_at_one_second_and_at_the_level_of_n() -> None:
     assert READING_TAU_S["N"] == 1.0
     np.testing.assert_allclose(x, x_of_one_second, atol=1e-4)
     n_degrees_per_hour = np.degrees(estimate.coefficients.value[1, 0]) * 3600.0
-    ticks = [(point[1] + 0.5, float(label)) for point, label in at_tau.items() if point[0] < 0.0 and point[1] < HEIGHT]
+    ticks = [
+        (point[1] + LABEL_ABOVE, float(label))
+        for point, label in at_tau.items()
+        if point[0] < 0.0 and point[1] < HEIGHT
+    ]
     heights, levels = np.array(sorted(ticks)).T
     expected = np.interp(np.log10(n_degrees_per_hour), np.log10(levels[::-1]), heights[::-1])
     np.testing.assert_allclose(y, expected, atol=1e-3)
