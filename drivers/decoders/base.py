@@ -171,14 +171,15 @@ class BlockBuilder:
             Number of frames that were rejected after the last sample. The next block counts these frames as missing.
         """
         n = t_ns.size
-        bad_before = np.zeros(n, np.int64) if bad_before is None else bad_before
-        ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
-        temperature_c = np.full(n, np.nan) if temperature_c is None else _valid_temperatures(temperature_c)
+        temperature_c = None if temperature_c is None else _valid_temperatures(temperature_c)
         good = _find_plausible(values)
         carried, self._missing = self._missing, bad_after
-        if n and good.all() and not bad_before.any():  # usually every sample is plausible
+        if n and good.all() and (bad_before is None or not bad_before.any()):  # usually every sample is plausible
             self.bad += bad_after
             return [make_block(t_ns, values, temperature_c, ticks, carried)]
+        bad_before = np.zeros(n, np.int64) if bad_before is None else bad_before
+        ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
+        temperature_c = np.full(n, np.nan) if temperature_c is None else temperature_c
         kept = np.flatnonzero(good)
         # number of rejected frames and implausible samples up to and including each sample
         dropped = np.cumsum(bad_before + ~good)
@@ -202,9 +203,12 @@ def _find_plausible(values: Floats) -> NDArray[np.bool_]:
 
     A plausible sample has at least one measured axis, and every measured value is within the range of MEMS IMUs.
     """
-    too_large: NDArray[np.bool_] = np.any(np.abs(values) > VALUE_LIMITS, axis=1)
-    unmeasured: NDArray[np.bool_] = np.all(np.isnan(values), axis=1)
-    return ~(too_large | unmeasured)
+    within_limits = np.abs(values) <= VALUE_LIMITS
+    if within_limits.all():  # usually every axis is measured
+        return np.ones(len(values), np.bool_)
+    unmeasured = np.isnan(values)
+    plausible: NDArray[np.bool_] = np.all(within_limits | unmeasured, axis=1) & ~np.all(unmeasured, axis=1)
+    return plausible
 
 
 def _valid_temperatures(temperature_c: Floats) -> Floats:
@@ -319,11 +323,11 @@ class FrameBuffer:
         """Return all frames that are complete after the given chunks."""
         buffer = self._append_chunks(chunks)
         found: list[bytes] = []
-        ends: list[int] = []  # offset in the buffer after each frame
+        t_ns: list[int] = []
         bad_before: list[int] = []
         adjacent: list[bool] = []
         at = 0
-        while True:
+        while at < len(buffer):
             # Usually, the next frame follows without a gap.
             start, length = at, self._match(buffer, at) if buffer.startswith(self.sync, at) else NEED_MORE
             if length <= 0:
@@ -337,17 +341,19 @@ class FrameBuffer:
                 at = start + 1
                 continue
             found.append(buffer[start:at])
-            ends.append(at)
+            while self._arrivals[0][0] < self._buffer_offset + at:
+                self._arrivals.popleft()
+            t_ns.append(self._arrivals[0][1])
             adjacent.append(not self._skipped_bytes)
             bad_before.append(self._take_lost_frames() if self._skipped_bytes else 0)
             self._frame_length = length
             self._synchronized = True
         frames = RawFrames(
-            found, self._arrival_times(ends), np.array(bad_before, np.int64), np.array(adjacent, np.bool_)
+            found, np.array(t_ns, np.int64), np.array(bad_before, np.int64), np.array(adjacent, np.bool_)
         )
         self._buffer = buffer[at:]
         self._buffer_offset += at
-        while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._buffer_offset:
+        while self._arrivals and self._arrivals[0][0] <= self._buffer_offset:
             self._arrivals.popleft()
         self._rejection.add_good_frames(len(found))
         return frames
@@ -396,15 +402,6 @@ class FrameBuffer:
         if count:
             self._rejection.note_rejection("frames fail their check: bytes are lost or damaged on the line")
         return count
-
-    def _arrival_times(self, ends: list[int]) -> Ints:
-        if not ends:
-            return np.empty(0, np.int64)
-        if len(self._arrivals) == 1:
-            return np.full(len(ends), self._arrivals[0][1], np.int64)
-        offsets, t_ns = np.array(self._arrivals, np.int64).T
-        arrived: Ints = t_ns[np.searchsorted(offsets, np.array(ends) + self._buffer_offset)]
-        return arrived
 
 
 class RejectingDecoder:
@@ -462,7 +459,7 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
     def _build_measured_blocks(
         self, frames: RawFrames, values: Floats, temperature_c: Floats, ticks: Ints
     ) -> tuple[list[SampleBlock], int | None]:
-        rows = np.flatnonzero(~np.isnan(values).all(axis=1))
+        rows = np.nonzero(~np.isnan(values).all(axis=1))[0]
         earlier = 0 if rows.size else self._frames_without_sample
         self._frames_without_sample = earlier + len(values) - 1 - (int(rows[-1]) if rows.size else -1)
         if rows.size < len(values):

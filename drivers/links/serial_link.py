@@ -1,7 +1,7 @@
 """Link to local or networked serial ports, which are addressed by any URL that pyserial supports.
 
-A read waits for the first byte, then up to ``read_timeout`` for more bytes, and returns all bytes received. Waiting for
-more bytes takes much less processor time than one read per frame. The wait delays bytes by at most ``read_timeout``. If
+A read waits for ``read_timeout`` and returns all bytes received. If there are none, it waits for the next byte. Waiting
+for more bytes takes much less processor time than one read per frame, and delays bytes by at most ``read_timeout``. If
 the configuration states no ``read_timeout``, the daemon sets it according to the interval at which results are
 published. If a URL handler has no file descriptor, a read returns as soon as bytes arrive.
 
@@ -157,15 +157,15 @@ class SerialLink(PolledLink):
             if not _has_file_number(port):
                 data: bytes = port.read(READ_BYTES)
                 return data
-            until_s = time.monotonic() + self._read_timeout_s
-            data = port.read(1)
-            if data:
-                if not self._buffer_filling:
-                    self._closing.wait(max(0.0, until_s - time.monotonic()))
-                with contextlib.suppress(BlockingIOError):  # no more bytes have arrived
-                    while len(data) <= MAX_WAITING_BYTES and (more := os.read(port.fileno(), READ_BYTES)):
-                        data += more
+            if not self._buffer_filling and self._closing.wait(self._read_timeout_s):
+                return b""
+            data = b""
+            with contextlib.suppress(BlockingIOError):  # no more bytes have arrived
+                while len(data) <= MAX_WAITING_BYTES and (more := os.read(port.fileno(), READ_BYTES)):
+                    data += more
             self._buffer_filling = len(data) > MAX_WAITING_BYTES
+            if not data:
+                data = port.read(1)
         except OSError as error:
             self._close_source()
             raise LinkLost(

@@ -71,39 +71,45 @@ def select_topics(
         If the file contains no samples of an IMU.
     """
     readable = [topic.name for topic in topics if topic.columns and topic.rows]
-    every = [name for group in imus for name in group]
     if wanted is None:
         if not any(set(topic.columns) & {*AXES} for topic in topics if topic.rows):
             found = [f"{topic.name} ({topic.message_type})" for topic in topics]
             has = f"found {format_name_list(found)}" if found else "found no messages"
             raise RecordingError(f"{path}: contains no samples of an IMU; expected {expected}, {has}")
-        if not every or max(map(len, imus)) > 1:
-            among = every or readable
-            listed = f"contains {len(among)} IMU topics: {format_name_list(among)}"
-            raise ConfigError(f"{path}: {listed}; {HOW_TO_CHOOSE}, such as {among[0]}")
-        if len(every) > 1:
-            notes.append(f"Topic {every[0]} is read; the file also contains {format_name_list(every[1:])}.")
-        wanted = every[0]
+        wanted = _select_only_imu(path, imus, readable, notes)
     known = {topic.name: topic for topic in topics}
-    chosen = [known.get(name) or known.get(name.removesuffix(":0")) for name in wanted.split(JOIN)]
-    for name, topic in zip(wanted.split(JOIN), chosen, strict=True):
-        if topic is None:
-            choices = format_choices_by_similarity(name, readable) if readable else f"; it contains no {expected}"
-            raise ConfigError(f'{path}: contains no topic "{name}"{choices}')
-        if not topic.columns:
-            raise ConfigError(
-                f'{path}: topic "{name}" contains {topic.message_type}, expected {expected}'
-                f"{format_choices_by_similarity(name, readable) if readable else ''}"
-            )
-        if not topic.rows:
-            raise RecordingError(f'{path}: topic "{name}" contains no messages')
-    names = list(dict.fromkeys(topic.name for topic in chosen if topic is not None))
-    if not any(axis in known[name].columns for name in names for axis in AXES):
+    chosen = [_find_topic(path, known, name, readable, expected) for name in wanted.split(JOIN)]
+    if not any(axis in topic.columns for topic in chosen for axis in AXES):
         raise ConfigError(
             f'{path}: topic "{wanted}" contains no gyroscope and no accelerometer; '
             f"add one, as in --topic {readable[0]}{JOIN}{wanted}"
         )
-    return names
+    return list(dict.fromkeys(topic.name for topic in chosen))
+
+
+def _select_only_imu(path: Path, imus: Sequence[Sequence[str]], readable: Sequence[str], notes: list[str]) -> str:
+    every = [name for group in imus for name in group]
+    if not every or max(map(len, imus)) > 1:
+        among = every or readable
+        listed = f"contains {len(among)} IMU topics: {format_name_list(among)}"
+        raise ConfigError(f"{path}: {listed}; {HOW_TO_CHOOSE}, such as {among[0]}")
+    if len(every) > 1:
+        notes.append(f"Topic {every[0]} is read; the file also contains {format_name_list(every[1:])}.")
+    return every[0]
+
+
+def _find_topic(
+    path: Path, topics: Mapping[str, RecordedTopic], name: str, readable: Sequence[str], expected: str
+) -> RecordedTopic:
+    topic = topics.get(name) or topics.get(name.removesuffix(":0"))
+    choices = format_choices_by_similarity(name, readable) if readable else ""
+    if topic is None:
+        raise ConfigError(f'{path}: contains no topic "{name}"{choices or f"; it contains no {expected}"}')
+    if not topic.columns:
+        raise ConfigError(f'{path}: topic "{name}" contains {topic.message_type}, expected {expected}{choices}')
+    if not topic.rows:
+        raise RecordingError(f'{path}: topic "{name}" contains no messages')
+    return topic
 
 
 def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Times]:

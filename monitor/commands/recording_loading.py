@@ -16,7 +16,7 @@ import numpy as np
 import drivers.decoders
 from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Times, Timing, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
-from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
+from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
@@ -113,8 +113,11 @@ def load_recording(
 
 def _is_table(path: Path) -> bool:
     """Return True if the first line that is not a comment contains column names such as ``t,gx,gy,gz``."""
-    with open_regular_file(path) as file:
-        lines = file.read(MAX_HEADER_BYTES).decode("ascii", "replace").splitlines()
+    try:
+        with open_regular_file(path) as file:
+            lines = file.read(MAX_HEADER_BYTES).decode("ascii", "replace").splitlines()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {describe_error(error)}") from error
     names = split_header(next((line for line in lines if line and not line.startswith(COMMENT_MARKS)), ""))
     return names_an_axis(names) and all(parse_number(name, ",") is None for name in names)
 

@@ -104,8 +104,9 @@ class Service(DaemonProcess):
     def _wait(self, round_start_s: float) -> None:
         self._wake.wait(MAX_IDLE_S)
         self._wake.clear()
-        if not any(worker.device.publish_s == 0.0 for worker in self.workers):
-            self._stop.wait(max(0.0, round_start_s + ROUND_PAUSE_S - time.monotonic()))
+        pause_s = round_start_s + ROUND_PAUSE_S - time.monotonic()
+        if pause_s > 0.0 and not any(worker.device.publish_s == 0.0 for worker in self.workers):
+            self._stop.wait(pause_s)
 
     def _has_ended(self) -> bool:
         return all(worker.replay_finished for worker in self.workers)

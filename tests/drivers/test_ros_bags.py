@@ -215,6 +215,13 @@ class TestDamage:
         file.write_bytes(file.read_bytes()[:50_000])
         assert remedy in load_refused(file)
 
+    def test_the_remedy_names_the_damaged_file_of_several(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "sqlite", {"/imu": imu_topic(times_ns(2000), noise(2000))})
+        (bag / "run_1.db3").write_bytes((bag / "run.db3").read_bytes()[:50_000])
+        metadata = bag / "metadata.yaml"
+        metadata.write_text(metadata.read_text().replace("- run.db3", "- run.db3\n  - run_1.db3"))
+        assert "`sqlite3 run_1.db3 .recover" in load_refused(bag)
+
     def test_a_ros_1_bag_without_an_index(self, tmp_path: Path) -> None:
         bag = write_bag(tmp_path, "ros1", {"/imu": imu_topic(times_ns(20), noise(20))})
         data = bag.read_bytes()

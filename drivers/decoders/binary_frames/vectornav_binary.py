@@ -20,10 +20,9 @@ from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
+from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.validation.settings_model import SettingsModel
 
@@ -178,12 +177,13 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
             messages = frames.stack_frames(rows).view(layout)[:, 0]
             fields = layout.names or ()
             self._reads_compensated_gyro = _contains_compensated_gyro(header, self._compensated)
-            if "gyro" in fields:
-                values[rows, :3] = base.nan_to_infinity(_as_float64(messages["gyro"]))
-            if "accel" in fields:
-                values[rows, 3:] = base.nan_to_infinity(_as_float64(messages["accel"]))
-            if "temperature" in fields:
-                temperature_c[rows] = _as_float64(messages["temperature"])
+            with np.errstate(invalid="ignore"):  # converting a signalling NaN causes a warning
+                if "gyro" in fields:
+                    values[rows, :3] = base.nan_to_infinity(messages["gyro"])
+                if "accel" in fields:
+                    values[rows, 3:] = base.nan_to_infinity(messages["accel"])
+                if "temperature" in fields:
+                    temperature_c[rows] = messages["temperature"]
             if "time" in fields and self._uses_device_time:
                 ticks[rows] = messages["time"] & np.uint64(TICKS - 1)
         blocks, last = self._build_measured_blocks(frames, values, temperature_c, ticks)
@@ -224,11 +224,6 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         inner = [header + row.tobytes()[1 + len(header) : -2] for row in rows]
         frames = [b"\xfa" + part + binascii.crc_hqx(part, 0).to_bytes(2, "big") for part in inner]
         return base.make_chunks(frames, samples.t_ns)
-
-
-def _as_float64(numbers: NDArray[np.float32]) -> Floats:
-    with np.errstate(invalid="ignore"):  # converting a signalling NaN causes a warning
-        return numbers.astype(np.float64)
 
 
 def build(settings: Settings) -> base.Decoder:

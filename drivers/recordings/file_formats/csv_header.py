@@ -7,6 +7,7 @@ gives the numbers of its columns.
 """
 
 import csv
+import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -75,36 +76,46 @@ def find_header(path: Path, label: Path, texts: Iterator[bytes], options: Readin
     """
     number = size = 0
     comment: _Line | None = None
-    header: _Line | None = None
     for text in texts:
-        first_number = number + 1
         for line in _iter_lines(text, number):
-            number = line.number
-            if header is not None and line.text and not line.text.startswith(COMMENT_MARKS):
-                # The header is in an earlier piece of text without samples, so the samples begin in this piece.
-                return _build_header(path, label, header, line.text, text, first_number)
+            number, size = line.number, size + line.end - line.begin
             if line.text.startswith(COMMENT_MARKS):
-                comment = line if header is None else comment
+                comment = line
             elif line.text and not EXCEL_SEPARATOR.fullmatch(line.text):
-                if comment is not None and _is_header_comment(comment.text, line.text):
-                    return _build_header(path, label, comment, line.text, text[line.begin :], number)
-                if _consists_of_numbers(line.text):
-                    return _build_numbered(label, line, options, text[line.begin :])
-                header, rest = line, text[line.end :]
-                sample = _first_sample(rest)
-                if sample is not None:
-                    return _build_header(path, label, header, sample, rest, number + 1)
-            size += line.end - line.begin
-            if header is None and size > MAX_PREAMBLE_BYTES:
+                return _header_at_first_line(path, label, comment, line, text, texts, options)
+            if size > MAX_PREAMBLE_BYTES:
                 raise RecordingError(
                     f"{label}: has no header line within its first {number} lines, only comments and blank lines; "
                     f"expected {table.EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
                 )
-    if header is None and comment is not None and names_an_axis(split_header(comment.text)):
-        header = comment
-    if header is None and number:
-        header = _Line("", number, 0, 0)
-    return None if header is None else _build_header(path, label, header, None, b"", number + 1)
+    if not number:
+        return None
+    if comment is None or not names_an_axis(split_header(comment.text)):
+        comment = _Line("", number, 0, 0)
+    return _build_header(path, label, comment, None, b"", number + 1)
+
+
+def _header_at_first_line(
+    path: Path,
+    label: Path,
+    comment: _Line | None,
+    line: _Line,
+    text: bytes,
+    later_texts: Iterator[bytes],
+    options: ReadingOptions,
+) -> CsvHeader:
+    """Return the header, given the first line of ``text`` that is no comment, and the last comment before this line."""
+    if comment is not None and _is_header_comment(comment.text, line.text):
+        return _build_header(path, label, comment, line.text, text[line.begin :], line.number)
+    if _consists_of_numbers(line.text):
+        return _build_numbered(label, line, options, text[line.begin :])
+    number = line.number + 1
+    for rest in itertools.chain([text[line.end :]], later_texts):
+        sample = _first_sample(rest)
+        if sample is not None:
+            return _build_header(path, label, line, sample, rest, number)
+        number += rest.count(b"\n")
+    return _build_header(path, label, line, None, b"", number)
 
 
 def split_fields(line: str, separator: str) -> list[str]:

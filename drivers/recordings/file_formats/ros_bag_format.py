@@ -123,7 +123,9 @@ def _describe_remedy(path: Path, cause: str) -> str:
     if path.is_file() and is_bag_folder(path.parent) and "malformed" not in cause:
         return f"; read the folder {path.parent}, whose {METADATA} states how the messages are compressed"
     mismatch = table.describe_suffix_mismatch(path) if path.is_file() else ""
-    damaged = sorted(path.glob("*.db3"))[:1] if path.is_dir() and "malformed" in cause else [path]
+    damaged = [path]
+    if path.is_dir() and "malformed" in cause:  # of several files, the cause names the damaged one
+        damaged = sorted(path.glob("*.db3"), key=lambda one: str(one) not in cause)[:1]
     return mismatch or "; " + REPAIRS.get("".join(one.suffix.lower() for one in damaged), REINDEX).format(
         *(one.name for one in damaged)
     )

@@ -49,7 +49,7 @@ TABLE_STEP: Final = 1.1
 """Factor by which the number of samples must grow before the covariance table is recomputed."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class CovarianceTable:
     """Covariances of Allan variances for one window length and unit coefficients, in read-only arrays."""
 

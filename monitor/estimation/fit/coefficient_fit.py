@@ -26,8 +26,8 @@ If an axis has no noise or too few τ, the status of all its coefficients is UNE
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,15 +126,23 @@ def make_shared_inputs(
     return inputs if may_drop_short_taus else inputs._replace(may_drop_short_taus=False)
 
 
-@lru_cache(maxsize=64)  # a sensor repeats the fit with the same tables
+# a sensor repeats the fit with the same table, and the inputs are as large as the table
+_inputs_of_tables: WeakKeyDictionary[CovarianceTable, tuple[DesignMatrix, SharedInputs]] = WeakKeyDictionary()
+
+
 def _make_default_inputs(design: DesignMatrix, table: CovarianceTable) -> SharedInputs:
+    known_design, known_inputs = _inputs_of_tables.get(table, (None, None))
+    if known_inputs is not None and known_design is design:
+        return known_inputs
     flat = design.columns.copy()
     # The measured slope includes noise, so its subtraction reduces the expected contribution of each noise term.
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
     flat[:, ~design.columns.any(axis=0)] = 0.0  # zero columns represent terms that are not fitted
     nothing_ignored = np.zeros(design.factors.size)
     whole = table.terms.astype(np.float64)
-    return SharedInputs(design.columns, flat, table.covariance, whole, table.slope, nothing_ignored, True)
+    inputs = SharedInputs(design.columns, flat, table.covariance, whole, table.slope, nothing_ignored, True)
+    _inputs_of_tables[table] = design, inputs
+    return inputs
 
 
 @dataclass(frozen=True, slots=True)

@@ -285,9 +285,9 @@ def describe_result(result: AxisResult) -> str:
             return "Model and measurement differ. No known effect explains the difference, so no effect is named."
 
 
-def describe_largest_gap(result: AxisResult) -> str:
-    """Describe the gap that is closest to its threshold on an axis."""
-    return describe_gap(max(result.start.gaps, key=gap_to_threshold_ratio), result.axis)
+def describe_largest_gap(result: AxisResult, units: UnitSystem = DEFAULT_UNITS) -> str:
+    """Describe the gap of an axis that is largest relative to its threshold, in the given unit system."""
+    return describe_gap(max(result.start.gaps, key=gap_to_threshold_ratio), result.axis, units)
 
 
 def describe_alternatives(step: AddedOrResizedEffect) -> str:

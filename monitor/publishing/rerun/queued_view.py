@@ -209,7 +209,7 @@ class RerunView:
         shown: tuple[ViewerDeviceDescription, ...] | None = None
         begun: set[str] = set()
         views: list[tuple[str, str]] | None = None  # views of the layout that was sent last
-        drawn_entities = 0  # number of entities with data when the layout was checked last
+        laid_out_entities: set[str] = set()  # entities with data when the layout was checked last
         checked = laid_out = time.monotonic()
         while True:
             closing = self._closing.is_set()
@@ -221,16 +221,16 @@ class RerunView:
                 shown = self._devices
                 waiting.period_factor = max(1.0, len(shown) / PLOTS_PER_S)
                 scene.set_detailed_devices(shown)
-                drawn_entities, views = -1, None
+                views = None
                 self._phase = f"ok, but {output.note}" if output.note else "ok"
                 for device in [one.name for one in shown if one.name not in begun]:
                     begun.add(device)
                     self._draw_history(scene, device)
             waiting.draw_due_results(scene, draw_all=closing)
             now = time.monotonic()
-            if views is None or (now - laid_out > LAYOUT_PERIOD_S and len(scene.entities) != drawn_entities):
+            if views is None or (now - laid_out > LAYOUT_PERIOD_S and scene.entities != laid_out_entities):
                 views = self._send_layout_if_changed(output, scene, shown, views)
-                laid_out, drawn_entities = now, len(scene.entities)
+                laid_out, laid_out_entities = now, set(scene.entities)
             if closing or now - checked > CONFIRM_PERIOD_S:
                 self._confirm(output)
                 checked = time.monotonic()

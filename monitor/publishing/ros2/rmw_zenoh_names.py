@@ -80,16 +80,10 @@ def node_token(domain: int, session_id: str, namespace: str) -> str:
 
 
 def publisher_token(domain: int, session_id: str, namespace: str, publisher_id: int, topic: RosTopic) -> str:
-    """Return the liveliness token of a publisher.
+    """Return the liveliness token of a publisher. The other parameters are those of ``node_token``.
 
     Parameters
     ----------
-    domain
-        Domain of ROS 2.
-    session_id
-        Identifier of the zenoh session.
-    namespace
-        Namespace of the node, such as "/robot1", or "/".
     publisher_id
         Number of the publisher, unique in the session and different from NODE_ID.
     topic

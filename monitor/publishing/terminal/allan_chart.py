@@ -47,8 +47,7 @@ def allan_charts(curve: AllanCurve, units: UnitSystem, width: int, lines: int) -
     width, lines
         Space for all charts, in characters and lines.
     """
-    with np.errstate(invalid="ignore"):
-        deviation = np.sqrt(curve.avar)
+    deviation = np.sqrt(np.where(curve.avar > 0.0, curve.avar, np.nan))
     kinds = [kind for kind in KINDS if np.isfinite(_select_axes(deviation, kind)).sum() > 1]
     if not kinds:
         return None
@@ -72,7 +71,6 @@ def _select_axes(deviation: Floats, kind: Kind) -> Floats:
 def _draw_chart(tau_s: Floats, deviation: Floats, kind: Kind, units: UnitSystem, width: int, lines: int) -> Text:
     unit = units.deviation(kind)
     values = _select_axes(deviation, kind) * unit.factor
-    values[~(values > 0.0)] = np.nan
     shown = np.isfinite(values).any(axis=1)
     x, y = np.log10(tau_s[shown]), np.log10(values[shown])
     rows, columns = lines - FRAME_LINES, width - LABEL_WIDTH - NAME_WIDTH

@@ -112,9 +112,9 @@ def all_simulations_have_improbable_gain(findings: Sequence[Findings]) -> bool:
 def is_significance_clear(recorded: Findings, simulated: Sequence[Findings], axis_count: int) -> bool:
     """Return True if further simulations can hardly change which findings of an axis are significant.
 
-    A simulation can only raise a threshold. A finding below the known threshold or below a simulated gain is therefore
-    not significant. A finding is clearly significant if its gain is at least ``CLEAR_GAIN_RATIO`` times the current
-    threshold.
+    A simulation can only raise a threshold. A finding below the known threshold is therefore not significant, nor is a
+    finding below a simulated gain if the thresholds will be raised. A finding is clearly significant if its gain is at
+    least ``CLEAR_GAIN_RATIO`` times the current threshold.
 
     Parameters
     ----------
@@ -129,7 +129,8 @@ def is_significance_clear(recorded: Findings, simulated: Sequence[Findings], axi
     for diagnostic, one in recorded.items():
         known = _quantile(diagnostic, one, chance)
         largest = max(findings[diagnostic].gain for findings in simulated)
-        if max(known, largest) < one.gain < CLEAR_GAIN_RATIO * max(known, largest + AXIS_MARGIN_NATS):
+        lower = max(known, largest) if _raises_thresholds(simulated) else known
+        if lower < one.gain < CLEAR_GAIN_RATIO * max(known, largest + AXIS_MARGIN_NATS):
             return False
     return True
 
@@ -145,11 +146,7 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
         necessary.
     """
     chance = _false_alarm_probability_of_one_diagnostic(len(simulated))
-    complete = [
-        axis
-        for axis, of in simulated.items()
-        if len(of) >= SIMULATED_RECORDINGS or all_simulations_have_improbable_gain(of)
-    ]
+    complete = [axis for axis, of in simulated.items() if _raises_thresholds(of)]
     null: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
     for diagnostic in DIAGNOSTICS:
         pooled = [one[diagnostic].gain for axis in complete for one in simulated[axis]]
@@ -160,6 +157,11 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
                 expected = [max(expected[0], own.null95), max(expected[1], own.threshold)]
             null[axis][diagnostic] = NullDistribution(*expected)
     return dict(null)
+
+
+def _raises_thresholds(findings: Sequence[Findings]) -> bool:
+    """Return True if the simulated gains of an axis raise its thresholds."""
+    return len(findings) >= SIMULATED_RECORDINGS or all_simulations_have_improbable_gain(findings)
 
 
 def _simulated_null_distribution(pooled: Sequence[float], largest: float, chance: float) -> NullDistribution:

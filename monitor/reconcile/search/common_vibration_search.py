@@ -44,6 +44,10 @@ LOW_PASS_BANDWIDTHS: Final = 14
 """Number of bandwidths of low-pass vibration in the first search."""
 MIN_CYCLES: Final = 40.0
 """Smallest bandwidth of a low-pass vibration, in cycles per recording."""
+FREQUENCY_PENALTY_NATS: Final = PENALTY_NATS["narrowband"] - PENALTY_NATS["exponentially_correlated"]
+"""Penalty for the frequency of a vibration, in nats. The search compares all frequency bands."""
+MIN_BAND_BINS: Final = 2
+"""Smallest number of bins in a band that is searched for correlation."""
 MAX_CORRELATION: Final = 0.995
 MAX_DEVIATION: Final = 1e100
 """Largest standard deviation of a coefficient. A larger value marks a stop band, which is not compared."""
@@ -97,7 +101,9 @@ class _Vibration:
     @property
     def penalty_nats(self) -> float:
         """Smallest gain of the correlations of a true vibration."""
-        return PENALTY_NATS[CommonVibration.name] + RESIZE_PENALTY_NATS * max(int(np.count_nonzero(self.gains)) - 2, 0)
+        axes_penalty = RESIZE_PENALTY_NATS * max(int(np.count_nonzero(self.gains)) - 2, 0)
+        frequency_penalty = 0.0 if self.shape[0] is None else FREQUENCY_PENALTY_NATS
+        return PENALTY_NATS[CommonVibration.name] + axes_penalty + frequency_penalty
 
 
 def correlation_gain(correlation: Floats, products: Floats, count: Floats) -> float:
@@ -156,6 +162,8 @@ def _with_strongest_vibration(
     spectra = build_cross_spectra(whitened, shapes)
     if not spectra.used.any():
         return {}
+    shapes.append(_strongest_band(spectra))
+    spectra = build_cross_spectra(whitened, shapes)
     best = _fit_shape(spectra, shapes)
     if best.gain_nats < best.penalty_nats:
         return {}
@@ -262,6 +270,24 @@ def _candidate_shapes(hypotheses: Sequence[Hypothesis]) -> list[Shape]:
         elif isinstance(effect, ExponentiallyCorrelated):
             shapes.append((None, 1.0 / (pi * effect.correlation_time)))
     return shapes
+
+
+def _strongest_band(spectra: CrossSpectra) -> Shape:
+    """Return the centre and the width of the frequency band with the largest unexplained correlation of two axes."""
+    bins = spectra.bins
+    excess = np.cumsum(np.pad(spectra.products - bins.count * spectra.known, [(0, 0), (0, 0), (1, 0)]), axis=2)
+    count = np.concatenate([[0.0], np.cumsum(bins.count)])
+    best, first, last, width = 0.0, 0, 0, MIN_BAND_BINS
+    while width < bins.count.size:
+        gains = (excess[..., width:] - excess[..., :-width]) ** 2 / (count[width:] - count[:-width])
+        gains = (gains * spectra.used[..., None]).max(axis=(0, 1))
+        at = int(np.argmax(gains))
+        if gains[at] > best:
+            best, first, last = float(gains[at]), at, at + width - 1
+        width *= 2
+    lo_hz, hi_hz = float(bins.f_hz[first]), float(bins.f_hz[last])
+    length_s = float(bins.count.sum()) / bins.rate_hz
+    return 0.5 * (lo_hz + hi_hz), max(hi_hz - lo_hz, MIN_CYCLES / length_s)
 
 
 def build_cross_spectra(
@@ -372,14 +398,13 @@ def fit_correlations(spectra: CrossSpectra, shape: Shape) -> _Vibration:
 
 
 def _fit_shape(spectra: CrossSpectra, shapes: Sequence[Shape]) -> _Vibration:
-    """Return the strongest vibration with a fitted bandwidth. The frequency of a resonance needs a larger gain."""
+    """Return the strongest vibration with a fitted bandwidth."""
     found = []
     for resonance in (False, True):
         fits = [fit_correlations(spectra, shape) for shape in shapes if (shape[0] is not None) == resonance]
         if fits:
-            best = _with_fitted_bandwidth(spectra, max(fits, key=lambda one: one.gain_nats))
-            found.append((best.gain_nats - RESIZE_PENALTY_NATS * resonance, best))
-    return max(found, key=lambda one: one[0])[1]
+            found.append(_with_fitted_bandwidth(spectra, max(fits, key=lambda one: one.gain_nats)))
+    return max(found, key=lambda one: one.gain_nats - one.penalty_nats)
 
 
 def _with_fitted_bandwidth(spectra: CrossSpectra, vibration: _Vibration) -> _Vibration:

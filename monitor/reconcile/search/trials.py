@@ -85,7 +85,7 @@ MAX_OUTLIER_Z: Final = 4.0
 """Largest accepted z value, both for the clustering of large samples and for the misfit."""
 MIN_DISTANT_SCALE: Final = 3.5
 """Smallest standard deviation of distant outliers, relative to the noise. Other heavy tails have a smaller ratio."""
-MAX_MISFIT_SHARE: Final = 0.2
+MAX_MISFIT_SHARE: Final = 0.25
 """Largest accepted misfit of distant outliers, as a fraction of the gain from fitting the outliers."""
 MAX_BAND_SHARE: Final = 0.5
 """Largest share of one frequency band in the gain of a variance change of white noise."""

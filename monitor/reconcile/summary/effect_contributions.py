@@ -99,7 +99,8 @@ def decompose_explained_gain(search: AxisSearchResult, fitted_first: bool) -> di
 def fit_without(hypothesis: Hypothesis, removed: Collection[int]) -> AxisFit:
     """Fit a hypothesis without some of its changes.
 
-    An effect of the model is reset to its old size, and an added effect is left out.
+    An effect of the model is reset to its old size, and an added effect is left out. The other changed sizes are
+    fitted again, even if they were set to zero.
 
     Parameters
     ----------
@@ -110,10 +111,11 @@ def fit_without(hypothesis: Hypothesis, removed: Collection[int]) -> AxisFit:
     """
     effects: list[Effect] = []
     fixed: set[int] = set()
+    unchanged = hypothesis.fit.fixed_noise.difference(changed_sizes(hypothesis))
     for at, effect in enumerate(hypothesis.effects):
         if at in removed and at >= hypothesis.model_effect_count:
             continue
-        if at in removed or at in hypothesis.fit.fixed_noise:
+        if at in removed or at in unchanged:
             fixed.add(len(effects))
         effects.append(hypothesis.model[at] if at in removed else effect)
     return hypothesis.axis.fit(effects, frozenset(fixed))

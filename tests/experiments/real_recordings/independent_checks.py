@@ -104,7 +104,8 @@ def _check_resolution(recording: CheckedRecording, axis: str, p: Parameters) -> 
 
 def _check_peak(recording: CheckedRecording, axis: str, p: Parameters) -> Check:
     x, rate_hz, f0 = recording.values[axis], recording.rate_hz, p["frequency"]
-    width_hz = max(p.get("bandwidth", 0.0), 4.0 / recording.duration_s)
+    # the power of a wandering line lies mostly within one standard deviation of its frequency
+    width_hz = max(p.get("bandwidth", 0.0), 2.0 * p.get("frequency_deviation", 0.0), 4.0 / recording.duration_s)
     size = int(min(x.size, max(256, 2.0 * rate_hz / width_hz)))
     f_hz, density = signal.welch(signal.detrend(x), rate_hz, nperseg=size)
     inside = np.abs(f_hz - f0) <= max(0.5 * width_hz, 0.75 * f_hz[1])

@@ -237,6 +237,10 @@ class TestRefusals:
         path.write_text("gx 0.01 gy 0.02\n")  # labelled text of a sensor
         assert "name the decoder" in refusal(path)
 
+    def test_folder_with_the_suffix_of_a_capture_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "bench.bin").mkdir()
+        assert refusal(tmp_path / "bench.bin") == "cannot be read: is a directory, not a regular file"
+
     def test_wrong_decoder_and_options(self, tmp_path: Path) -> None:
         log, capture = tmp_path / "drive.blf", tmp_path / "capture.raw"
         write_can_log(log)

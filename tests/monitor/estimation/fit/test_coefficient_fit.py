@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from weakref import ref
 
 import numpy as np
 import pytest
@@ -11,7 +12,13 @@ from scipy.stats import binom
 from drivers.data_types import AXES
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_from_thirds
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
+from monitor.estimation.fit.coefficient_fit import (
+    Fit,
+    MeasuredVariancesAndSlopes,
+    fit_coefficients,
+    make_design_matrix,
+    make_shared_inputs,
+)
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
@@ -269,3 +276,14 @@ def test_coefficients_stay_below_the_curve_for_an_unsuitable_model():
             assert c.hi[letter, axis] <= upper_limit * 1.01
             if c.status[letter, axis] == Status.ESTIMATED:
                 assert 0.0 < c.lo[letter, axis] < c.value[letter, axis] < c.hi[letter, axis]
+
+
+def test_inputs_of_a_repeated_fit_are_kept_as_long_as_their_table():
+    factors = cluster_sizes(1000, RATE_HZ)
+    design, other = make_design_matrix(factors, RATE_HZ), make_design_matrix(factors, 2.0 * RATE_HZ)
+    table = covariance_table(1000, factors)
+    assert make_shared_inputs(design, table).flat is make_shared_inputs(design, table).flat
+    assert make_shared_inputs(other, table).columns is other.columns
+    covariance = ref(table.covariance)
+    del table
+    assert covariance() is None

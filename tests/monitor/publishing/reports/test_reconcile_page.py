@@ -15,7 +15,7 @@ from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.reports import reconcile_page
 from monitor.publishing.reports.reconcile_page import render_comparison_page, render_page
-from monitor.reconcile.result import DiagnosticPlotData
+from monitor.reconcile.result import AxisModelDiagnostics, DiagnosticGap, DiagnosticPlotData, Location
 from monitor.reconcile.several_recordings.comparison import RecordingsComparison, compare_results
 from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import DIAGNOSTIC, line, run, step, with_axes
@@ -184,6 +184,14 @@ def test_tables_and_figures_have_the_chosen_units() -> None:
         assert "°/h" in default
         assert "°/h" not in page
         assert "rad/s</" in page
+
+
+def test_largest_gap_of_an_agreeing_axis_has_the_chosen_unit() -> None:
+    r = samples.agrees()
+    gap = DiagnosticGap("values", Location(value=(-5.0, 5.0)), 2.5, 1.0, 2.6)
+    gx = replace(r.axes["gx"], start=AxisModelDiagnostics((gap,), ()))
+    page = render_page(replace(r, axes={"gx": gx}), "", UNIT_SYSTEMS["si"])
+    assert "largest gap: values, −5 … 5 rad/s" in page
 
 
 def test_same_reconciliation_gives_the_same_page() -> None:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from tests.support.waiting import FOREVER_S, PATIENCE_S, stays_true, wait_for
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from monitor.publishing.rerun import sinks
+from monitor.publishing.rerun import blueprint, sinks
 
 DEVICE = [ViewerDeviceDescription("bench-1", "stim300 on a test")]
 T0 = 1.76e9
@@ -103,6 +104,25 @@ def test_state_before_the_first_sample_has_no_time(tmp_path: Path) -> None:
     rows = read_entities(path)
     assert "WAITING" in str(rows["/bench-1/waiting"])
     assert not [entity for entity, columns in rows.items() if "sample_time" in columns]
+
+
+def test_layout_shows_the_state_once_its_time_is_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    shown: list[set[str]] = []
+
+    def build(*arguments: Any) -> Any:
+        layout = build_layout(*arguments)
+        shown.append({str(view.origin) for view in blueprint.list_views(layout.root_container)})
+        return layout
+
+    build_layout = blueprint.blueprint
+    monkeypatch.setattr(blueprint, "blueprint", build)
+    monkeypatch.setattr(rerun_view, "LAYOUT_PERIOD_S", 0.0)
+    view = RerunView(ViewerSettings(mode=str(tmp_path / "run.rrd")), DEVICE)
+    view.start()
+    for at_s, entity in ((np.nan, "/bench-1/waiting"), (T0, "/bench-1/status")):
+        view.put("bench-1", at_s, example_results.make_health())
+        wait_for(lambda entity=entity: shown and entity in shown[-1])
+    view.close()
 
 
 def test_gap_and_model_curve_are_recorded(tmp_path: Path) -> None:

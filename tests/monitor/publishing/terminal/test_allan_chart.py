@@ -80,3 +80,12 @@ def test_nothing_is_drawn_without_space(width: int, lines: int) -> None:
 
 def test_curve_without_values_is_not_drawn() -> None:
     assert allan_charts(white_noise(1e-3, ()), DEFAULT_UNITS, 120, 15) is None
+
+
+def test_constant_axes_are_not_drawn() -> None:
+    """The variance of a constant signal is 0, which has no logarithm."""
+    assert allan_charts(white_noise(0.0), DEFAULT_UNITS, 120, 15) is None
+    curve = white_noise(1e-3, (0, 1, 2, 3, 4, 5))
+    curve.avar[:, :3] = 0.0
+    chart = "\n".join(draw(curve, 120))
+    assert sorted(re.findall(r"\b[ag][xyz]\b", chart)) == ["ax", "ay", "az"]

@@ -122,6 +122,9 @@ def test_simulations_continue_while_the_significance_of_a_finding_is_unclear():
     assert is_clear(2.1 * threshold, odd)  # below a simulated gain
     assert not is_clear(4.0 * threshold, odd)
     assert estimate_null_distributions({"gz": odd})["gz"]["psd"].threshold > 2.1 * threshold
+    mixed = [*simulated, *odd]  # one of the two does not raise the threshold, so more simulations are needed
+    assert estimate_null_distributions({"gz": mixed})["gz"]["psd"].threshold == threshold
+    assert not is_clear(2.1 * threshold, mixed)
 
 
 def test_diagnostic_without_gains_has_a_threshold():

@@ -88,6 +88,17 @@ def test_common_vibration_without_a_peak_is_found():
         assert one.bandwidth == pytest.approx(1.0 / (np.pi * 0.1), rel=0.3)
 
 
+def test_common_vibration_whose_strength_varies_is_found_without_a_resonance_on_an_axis():
+    unit = draw_resonance(n, np.random.default_rng(5), 1.0, 17.0, 4.0)
+    vibration = 4e-4 * np.repeat([0.4, 1.4] * 5, n // 10) * unit
+    noise = draw_noise(0)
+    found = search_all_axes(noise | {"gx": noise["gx"] + vibration, "gy": noise["gy"] - vibration})
+    assert set(list_vibrations(found)) == {"gx", "gy"}
+    for one in list_vibrations(found).values():
+        assert one.frequency == pytest.approx(17.0, abs=1.0)
+        assert one.bandwidth == pytest.approx(4.0, rel=0.5)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_equal_but_independent_resonances_are_no_common_vibration(seed):
     rng = np.random.default_rng(seed + 50)

@@ -15,6 +15,7 @@ from monitor.noise.effects import (
     Resolution,
     Sinusoidal,
 )
+from monitor.reconcile.likelihood.effect_roles import with_effect_size
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fixed_noise
 from monitor.reconcile.result import DiagnosticGap, Location
 from monitor.reconcile.search.backward_elimination import changed_sizes
@@ -77,6 +78,15 @@ def test_removed_effect_has_its_old_size_or_is_left_out():
     assert [type(effect) for effect in free.effects] == [AngleRandomWalk, type(WALK), Narrowband]
     assert free.effects[0] != WHITE
     assert free.effects[1] == WALK
+
+
+def test_size_that_was_set_to_zero_is_fitted_without_the_effect_that_replaced_it():
+    rng = np.random.default_rng(4)
+    one, absent = axis(white(n, rng), WHITE_MODEL), with_effect_size(WHITE, 0.0)
+    hypothesis = Hypothesis(WHITE_MODEL, one.fit((absent, WHITE), frozenset({0})))
+    without = fit_without(hypothesis, {1})
+    assert [effect.N for effect in without.effects] == [pytest.approx(N, rel=0.02)]
+    assert hypothesis.fit.log_likelihood - without.log_likelihood < 1.0
 
 
 def test_outliers_have_the_gain_of_their_test():
