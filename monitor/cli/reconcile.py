@@ -38,6 +38,7 @@ def reconcile(
     from rich.console import Console
 
     from monitor.commands import reconcile as reconciling
+    from monitor.common.heap_memory import keep_freed_memory
     from monitor.noise.model_loading import load_model
     from monitor.publishing.terminal import reconcile_text as text
     from monitor.reconcile import json_report
@@ -46,6 +47,7 @@ def reconcile(
     tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
     service_in_terminal.exit_on_sigterm()
+    keep_freed_memory()
     try:
         with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
