@@ -237,12 +237,12 @@ def _fill_edf(
             shape[:] = 0.0
             shape[N] = 1.0
         for i in range(whole.size):
-            level, variance = 0.0, 0.0
+            level, variance, pair = 0.0, 0.0, 0
             for a in range(NOISES):
                 level += columns[i, a] * shape[a]
-            for pair in range(len(PAIRS)):
-                a, b = PAIRS[pair]
-                variance += covariance[i, pair] * shape[a] * shape[b] * (1.0 if a == b else 2.0)
+                for b in range(a, NOISES):  # in the order of ``PAIRS``
+                    variance += covariance[i, pair] * shape[a] * shape[b] * (1.0 if a == b else 2.0)
+                    pair += 1
             edf[i, axis] = 2.0 * level * level / variance * terms[i, axis] / whole[i] if terms[i, axis] > 0 else np.nan
 
 
