@@ -62,7 +62,9 @@ class SampleBlock:
 
     def __getitem__(self, rows: slice) -> "SampleBlock":
         """Return a range of samples. ``lost`` is kept if the range includes the first sample and is 0 otherwise."""
-        first = rows.indices(len(self))[0]
+        first, last, step = rows.indices(len(self))
+        if (first, last, step) == (0, len(self), 1):
+            return self
         return SampleBlock(
             self.t_ns[rows],
             self.values[rows],

@@ -238,10 +238,11 @@ class AllanEstimate(Mapping[str, AxisEstimate]):
 
     def _message(self) -> AnalysisMessage:
         estimate = self._estimate
+        coefficients = coefficient_values(estimate.coefficients, estimate.k_or_r)
         axes = {
             axis: AxisAnalysis(
                 allan=AxisDeviations.from_curve(estimate.curve, i),
-                coefficients=coefficient_values(estimate.coefficients, i, bool(estimate.k_or_r[i])),
+                coefficients=coefficients[i],
                 bandwidth=None,
             )
             for i, axis in measured_axes(estimate.curve)

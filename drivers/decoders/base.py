@@ -244,8 +244,14 @@ class RawFrames:
 
     def stack_frames(self, indices: Ints) -> Bytes:
         """Return frames of equal length as a uint8 array [n, length]."""
-        data = self.data if indices.size == len(self.data) else [self.data[i] for i in indices.tolist()]
-        return np.frombuffer(b"".join(data), np.uint8).reshape(indices.size, -1)
+        return np.frombuffer(self._join_frames(indices), np.uint8).reshape(indices.size, -1)
+
+    def stack_records(self, indices: Ints, layout: np.dtype[np.void]) -> NDArray[np.void]:
+        """Return frames of equal length as a structured array [n]."""
+        return np.frombuffer(self._join_frames(indices), layout)
+
+    def _join_frames(self, indices: Ints) -> bytes:
+        return b"".join(self.data if indices.size == len(self.data) else [self.data[i] for i in indices.tolist()])
 
 
 NEED_MORE: Final = 0

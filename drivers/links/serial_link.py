@@ -163,6 +163,8 @@ class SerialLink(PolledLink):
             with contextlib.suppress(BlockingIOError):  # no more bytes have arrived
                 while len(data) <= MAX_WAITING_BYTES and (more := os.read(port.fileno(), READ_BYTES)):
                     data += more
+                    if len(more) < READ_BYTES // 2:  # the buffer of the terminal is empty
+                        break
             self._buffer_filling = len(data) > MAX_WAITING_BYTES
             if not data:
                 data = port.read(1)

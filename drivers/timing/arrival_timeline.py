@@ -225,9 +225,8 @@ def retime_and_split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) ->
         Number of missing samples before each sample.
     """
     edges = [0, *(np.flatnonzero(missing[1:]) + 1).tolist(), len(samples)]
+    parts = ((a, samples[a:b]) for a, b in pairwise(edges))
     return [
-        make_block(
-            t_ns[a:b].copy(), samples.values[a:b], samples.temperature_c[a:b], samples.ticks[a:b], int(missing[a])
-        )
-        for a, b in pairwise(edges)
+        make_block(t_ns[a : a + len(one)].copy(), one.values, one.temperature_c, one.ticks, int(missing[a]))
+        for a, one in parts
     ]

@@ -11,11 +11,10 @@ sizes are inconsistent or too large raises ``DecodeError``.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Ints, SampleBlock, make_block, ns_to_seconds, seconds_to_ns
 from drivers.errors import DecodeError
@@ -86,18 +85,18 @@ def encode_samples(
     schema
         Name of the message schema.
     """
-    table = np.column_stack((block.values, block.temperature_c))
-    measured: NDArray[np.bool_] = ~np.all(np.isnan(table), axis=0)
-    if not measured.any():
-        measured[: len(AXES)] = True
+    table = np.empty((len(block), len(COLUMNS)), "<f8")
+    table[:, : len(AXES)], table[:, len(AXES)] = block.values, block.temperature_c
+    missing: Any = np.isnan(table).all(axis=0)
+    measured = [column for column in range(len(COLUMNS)) if not missing[column]] or [*range(len(AXES))]
     t: float | bytes
     t, t0, rate = _encode_times(block.t_ns + unix_offset_ns)
     return _ENCODER.encode(
         _Payload(
             schema=schema,
             device=device,
-            axes=[name for name, there in zip(COLUMNS, measured, strict=True) if there],
-            data=np.ascontiguousarray(table[:, measured], "<f8").tobytes(),
+            axes=[COLUMNS[column] for column in measured],
+            data=table[:, measured].tobytes(),
             t=t,
             samples=total_samples,
             lost=block.lost,

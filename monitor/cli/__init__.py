@@ -76,8 +76,8 @@ def _options_of_all_commands(
 
 
 for _command, _summary, _example in (
-    (demo.demo, "Run the service with a simulated IMU.", "demo --effect gz.sinusoidal:amplitude=4e-3,frequency=17"),
-    (run.run, "Run the service with the devices of a configuration file.", "run bench.toml"),
+    (demo.demo, "Run the daemon with a simulated IMU.", "demo --effect gz.sinusoidal:amplitude=4e-3,frequency=17"),
+    (run.run, "Run the daemon with the devices of a configuration file.", "run bench.toml"),
     (check.check, "Report all mistakes in a configuration file.", "check bench.toml"),
     (doctor.doctor, "Check this machine: ports, permissions, clock, disk.", "doctor bench.toml"),
     (identify.identify, "Find the baud rate and the decoder of a sensor.", "identify /dev/ttyUSB0"),
@@ -98,7 +98,7 @@ for _command, _summary, _example in (
     (compensate.compensate, "Remove the gyro drift from a recording.", "compensate run.csv --out compensated.csv"),
     (convert.convert, "Write a recording in another format.", "convert flight.ulg flight.mcap"),
     (history.history, "Print, plot or export past results.", "history bench.toml --from -7d --plot week.png"),
-    (export.export, "Write noise parameters for other programs.", "export mpu-6050 --format kalibr --out imu.yaml"),
+    (export.export, "Write noise parameters for other programs.", "export run.json --format kalibr --out imu.yaml"),
 ):
     app.command(cls=PlainHelpCommand, short_help=_summary, epilog=f"Example: imu-monitor {_example}")(_command)
 app.command(hidden=True)(worker.worker)
@@ -107,11 +107,17 @@ _thermal = typer.Typer(
     short_help="Fit bias against temperature, and predict it.",
     rich_markup_mode=None,
 )
-_thermal.command("fit", cls=PlainHelpCommand, epilog="Example: imu-monitor thermal fit run.csv --out thermal.json")(
-    thermal.thermal_fit
-)
 _thermal.command(
-    "predict", cls=PlainHelpCommand, epilog="Example: imu-monitor thermal predict new.csv --model thermal.json"
+    "fit",
+    cls=PlainHelpCommand,
+    short_help="Fit a model to a recording.",
+    epilog="Example: imu-monitor thermal fit run.csv --out thermal.json",
+)(thermal.thermal_fit)
+_thermal.command(
+    "predict",
+    cls=PlainHelpCommand,
+    short_help="Predict another recording.",
+    epilog="Example: imu-monitor thermal predict new.csv --model thermal.json",
 )(thermal.thermal_predict)
 app.add_typer(_thermal, name="thermal")
 

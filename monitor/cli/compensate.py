@@ -17,7 +17,7 @@ def compensate(
     method: Annotated[
         str,
         typer.Option(
-            metavar="M", help="adaptive, as in the service; for comparison: fixed, ar, emd, wavelet (extra: denoise)."
+            metavar="M", help="adaptive, as in the daemon; for comparison: fixed, ar, emd, wavelet (extra: denoise)."
         ),
     ] = "adaptive",
     order: Annotated[

@@ -1,4 +1,4 @@
-"""Command ``demo``: runs the service on a simulated sensor."""
+"""Command ``demo``: runs the daemon on a simulated sensor."""
 
 from typing import Annotated
 
@@ -26,7 +26,7 @@ def demo(
     viewer: options.Viewer = None,
     units: options.ConfiguredUnits = None,
 ) -> None:
-    """Run the service on a simulated MEMS IMU that sends a real wire format over a pseudo-terminal."""
+    """Run the daemon on a simulated MEMS IMU that sends a real wire format over a pseudo-terminal."""
     from monitor.simulator.demo_config import build_demo_config as configuration
 
     service_in_terminal.run_service(

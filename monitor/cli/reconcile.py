@@ -30,7 +30,7 @@ def reconcile(
     seed: options.ReportSeed = 1,
     units: options.Units = "imu",
     json: options.JsonFile = None,
-    details: Annotated[bool, typer.Option("--details", help="List all findings, axes and steps.")] = False,
+    details: Annotated[bool, typer.Option("--details", help="Print all findings, axes and steps.")] = False,
     loading: options.Loading = None,
 ) -> None:
     """Compare recordings with a noise model, and find the effects that are missing from the model."""
@@ -38,6 +38,7 @@ def reconcile(
     from rich.console import Console
 
     from monitor.commands import reconcile as reconciling
+    from monitor.common.heap_memory import keep_freed_memory
     from monitor.noise.model_loading import load_model
     from monitor.publishing.terminal import reconcile_text as text
     from monitor.reconcile import json_report
@@ -46,15 +47,14 @@ def reconcile(
     tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
     service_in_terminal.exit_on_sigterm()
+    keep_freed_memory()
     try:
         with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
             if several:
                 runs = reconciling.compare_recordings(recordings, tested, out, seed, loading, tell, unit_system)
-                data, show = (
-                    json_report.encode_comparison(runs),
-                    partial(text.print_comparison, runs, units=unit_system),
-                )
+                data = json_report.encode_comparison(runs)
+                show = partial(text.print_comparison, runs, details=details, units=unit_system)
             else:
                 one = reconciling.reconcile_and_write_report(
                     recordings[0], tested, out, seed, loading, report_progress=tell, units=unit_system

@@ -1,4 +1,4 @@
-"""Command ``run``: runs the service."""
+"""Command ``run``: runs the daemon."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ def run(
         typer.Option(metavar="S", help="Show the last part of the history in the live view: 1d, 12h; needs [storage]."),
     ] = None,
 ) -> None:
-    """Run the service for all devices of a configuration file until the process is interrupted."""
+    """Run the daemon for all devices of a configuration file until the process is interrupted."""
     from monitor.settings import loading
 
     found = service_in_terminal.with_viewer_history_length(

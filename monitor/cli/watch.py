@@ -17,7 +17,10 @@ def watch(
     units: options.Units = "imu",
     json: Annotated[bool, typer.Option("--json", help="Print each message as one line of JSON.")] = False,
 ) -> None:
-    """Show a live table of several daemons, whose results are received over zenoh."""
+    """Show a live table of several daemons, whose results are received over zenoh.
+
+    The Allan deviations of a single device are drawn if KEYEXPR names it.
+    """
     unit_system = options.parse_units(units)
     stop = threading.Event()
     service_in_terminal.install_signal_handlers(stop.set)

@@ -7,7 +7,7 @@ from SciPy is at most 1e-12.
 from functools import lru_cache
 from math import exp, inf, lgamma, log, log1p, pi, sqrt
 from statistics import NormalDist
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,37 +64,19 @@ def normal_quantile(probability: float) -> float:
 # --- χ²
 
 
-def chi2_quantile(edf: Floats, probability: float) -> Floats:
-    """Return the quantile of the χ² distribution.
+class Chi2Level(NamedTuple):
+    """Lower tail probability of the χ² distribution, with the expansion of its quantile (``expand_chi2_quantile``)."""
 
-    The quantile x solves P(edf/2, x/2) = probability, where P is the regularised incomplete gamma function. The
-    function uses Halley's iteration, and a Cornish-Fisher expansion for many degrees of freedom.
-
-    Parameters
-    ----------
-    edf : float64 [...]
-        Degrees of freedom, at least 0.01, not necessarily integers. The result is NaN for NaN, zero and negative
-        values.
-    probability : float
-        Lower tail probability, from 0.001 to 0.975. The accuracy decreases above 0.975.
-
-    Returns
-    -------
-    float64 [...]
-        Quantile.
-
-    Examples
-    --------
-    >>> chi2_quantile(np.array([1.0, 10.0, 1e6]), 0.975).round(3).tolist()
-    [5.024, 20.483, 1002773.701]
-    """
-    flat = np.ascontiguousarray(edf, np.float64).ravel()
-    return _chi2_quantiles(flat, probability, *_expansion(probability)).reshape(edf.shape)
+    probability: float
+    z: float
+    coefficients: Floats
 
 
 @lru_cache(maxsize=16)
-def _expansion(probability: float) -> tuple[float, Floats]:
+def expand_chi2_quantile(probability: float) -> Chi2Level:
     """Return the normal quantile z and the coefficients y_k(z) of the Cornish-Fisher expansion of a gamma quantile.
+
+    The probability must be from 0.001 to 0.975. The accuracy of ``chi2_quantile`` decreases above 0.975.
 
     With shape a, normal quantile z and ε = 1/√a, the expansion is x = a (1 + ε Σ y_k ε^k). For the normal density φ and
     the gamma density f, the differential equation x' = φ(z)/f(x) gives y_0 = z and y_k'' − z y_k' − y_k = r_k. The
@@ -116,22 +98,36 @@ def _expansion(probability: float) -> tuple[float, Floats]:
         first.append(y[k].deriv())
         second.append(first[k].deriv())
         squares.append(square + 2.0 * first[k])
-    return z, np.array([float(one(z)) for one in y])
+    return Chi2Level(probability, z, np.array([float(one(z)) for one in y]))
 
 
 @compiled
-def _chi2_quantiles(edf: Floats, probability: float, z: float, coefficients: Floats) -> Floats:
-    quantiles = np.empty(edf.size)
-    for i in range(edf.size):
-        a = 0.5 * edf[i]
-        if not a > 0.0:
-            quantiles[i] = np.nan
-        elif edf[i] < MIN_EXPANDED_EDF:
-            quantiles[i] = 2.0 * _refined(a, _start(a, z, probability), probability)
-        else:
-            x = _expanded(a, coefficients)
-            quantiles[i] = 2.0 * (_refined(a, x, probability) if edf[i] < MIN_ASYMPTOTIC_EDF else x)
-    return quantiles
+def chi2_quantile(edf: float, level: Chi2Level) -> float:
+    """Return the quantile of the χ² distribution.
+
+    The quantile x solves P(edf/2, x/2) = probability, where P is the regularised incomplete gamma function. The
+    function uses Halley's iteration, and a Cornish-Fisher expansion for many degrees of freedom.
+
+    Parameters
+    ----------
+    edf : float
+        Degrees of freedom, at least 0.01, not necessarily an integer. The result is NaN for NaN, zero and negative
+        values.
+    level : Chi2Level
+        Result of ``expand_chi2_quantile``.
+
+    Examples
+    --------
+    >>> [round(chi2_quantile(edf, expand_chi2_quantile(0.975)), 3) for edf in (1.0, 10.0, 1e6)]
+    [5.024, 20.483, 1002773.701]
+    """
+    a = 0.5 * edf
+    if not a > 0.0:
+        return float(np.nan)
+    if edf < MIN_EXPANDED_EDF:
+        return 2.0 * _refined(a, _start(a, level.z, level.probability), level.probability)
+    x = _expanded(a, level.coefficients)
+    return 2.0 * (_refined(a, x, level.probability) if edf < MIN_ASYMPTOTIC_EDF else x)
 
 
 @compiled

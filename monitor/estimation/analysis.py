@@ -37,7 +37,7 @@ from monitor.estimation.fit.coefficient_fit import Fit, MeasuredVariancesAndSlop
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
-    curve_contradicts_five_terms,
+    axes_contradicting_five_terms,
     find_low_pass,
     power_spectrum,
     refit_with_low_passes,
@@ -192,9 +192,9 @@ def _fit_curve(
     found = fit_coefficients(columns, covariances, measured)
     filters = [
         find_low_pass(columns, covariances, measured.select_axis(axis), power_spectrum(values[:, axis]))
-        if curve_contradicts_five_terms(found, axis)
+        if contradicts
         else None
-        for axis in range(values.shape[1])
+        for axis, contradicts in enumerate(axes_contradicting_five_terms(found))
     ]
     found, filters = refit_with_low_passes(columns, covariances, measured, found, filters)
     lo, hi = deviation_intervals(avar, found.edf)

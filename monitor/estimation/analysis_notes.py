@@ -185,7 +185,7 @@ def describe_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
     notes += _count_omitted(len(changes), "changes")
     if any(change.kind != "outlier_burst" for change in changes):
         notes.append(
-            "the curve of the whole recording mixes the noise before and after; --window S shows the noise over time"
+            "the curve of the whole recording mixes both noise levels; curves over time (--window S) separate them"
         )
     return notes
 

@@ -34,7 +34,7 @@ from monitor.estimation.fit.coefficient_fit import (
 )
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
-    curve_contradicts_five_terms,
+    axes_contradicting_five_terms,
     power_spectrum,
     refit_with_low_passes,
     search_low_pass_in_steps,
@@ -266,30 +266,29 @@ class Estimator:
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
         """Fit all axes together, except for restarted axes, which have fewer samples and are fitted separately."""
-        lengths = np.minimum(self._lengths, self._window.samples_in_window)
-        slope, slopes = self._window.drift_slopes_by_axis_and_tau(lengths)
+        filled = self._window.samples_in_window
+        np.minimum(self._lengths, filled, out=self._lengths)
+        lengths = self._lengths.tolist()
+        slope, slopes = self._window.drift_slopes_by_axis_and_tau(self._lengths)
+        slope, slopes = slope * self.rate_hz, slopes[: self._m] * self.rate_hz
         before = self._entered if self._refit is None else self._refit.terms_in_fit
-        shorter = [axis for axis in range(len(lengths)) if lengths[axis] < self._window.samples_in_window]
-        groups = [np.flatnonzero(lengths == self._window.samples_in_window), *(np.array([axis]) for axis in shorter)]
-        groups = [axes for axes in groups if axes.size]
+        whole = [axis for axis, n in enumerate(lengths) if n == filled]
+        groups = [axes for axes in (whole, *([axis] for axis, n in enumerate(lengths) if n < filled)) if axes]
         fits = []
         for axes in groups:
-            n = int(lengths[axes[0]])
-            table = self._tables.table_of_axis(int(axes[0]), n, self._window.samples_in_window)
+            table = self._tables.table_of_axis(axes[0], lengths[axes[0]], filled)
+            columns = slice(None) if len(groups) == 1 else axes  # usually all axes, which need not be copied
             measured = MeasuredVariancesAndSlopes(
-                avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[: self._m, axes] * self.rate_hz,
-                before[:, axes],
-            )  # fmt: skip
-            one = fit_coefficients(self._design, table, measured, start_theta=self._theta[:, axes])
-            self._theta[:, axes] = one.theta
-            for column, axis in enumerate(axes.tolist()):
-                self._contradicting[axis] = (
-                    (table, measured.select_axis(column)) if curve_contradicts_five_terms(one, column) else None
-                )
+                avar[:, columns], terms[:, columns], slope[columns], slopes[:, columns], before[:, columns]
+            )
+            one = fit_coefficients(self._design, table, measured, start_theta=self._theta[:, columns])
+            self._theta[:, columns] = one.theta
+            for column, (axis, contradicts) in enumerate(zip(axes, axes_contradicting_five_terms(one), strict=True)):
+                self._contradicting[axis] = (table, measured.select_axis(column)) if contradicts else None
             fits.append(
                 refit_with_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
             )
-        result = fits[0] if len(fits) == 1 else concatenate_fits(fits, np.concatenate(groups))
+        result = fits[0] if len(fits) == 1 else concatenate_fits(fits, [axis for axes in groups for axis in axes])
         self._entered = result.entered
         return result
 

@@ -63,6 +63,7 @@ from monitor.reconcile.search.sample_rate_from_spectrum import (
     detect_sample_rate_error,
 )
 from monitor.reconcile.search.sample_repair import build_repaired_axes
+from monitor.reconcile.search.scale_factor_vs_sample_rate import add_sample_rate_as_alternative
 from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
 
 MIN_TERM_GAIN_NATS: Final = 3.0
@@ -141,7 +142,8 @@ def reconcile(
     report_stage("looking for common vibration", None)
     found = replace(found, searches=name_common_vibrations(found.searches, null))
     report_stage("looking for a simpler explanation", None)
-    found = replace(found, searches=eliminate_unneeded_effects(found.searches, null, model is None, map_function))
+    simpler = eliminate_unneeded_effects(found.searches, null, model is None, map_function)
+    found = replace(found, searches=add_sample_rate_as_alternative(simpler))
     extended = _add_found_effects(tested, found)
     final = null
     if found.searches_that_changed_model or found.sample_rate_error:

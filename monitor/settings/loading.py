@@ -136,8 +136,11 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
         return ConfigReading(
             None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]
         )
-    except (OSError, UnicodeDecodeError) as error:
-        return ConfigReading(None, [f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"])
+    except OSError as error:
+        return ConfigReading(None, [f"{path}: cannot be read: {error.strerror or error}"])
+    except UnicodeDecodeError as error:
+        line = f"{path}: cannot be read: byte {error.start} is not text; expected a TOML file"
+        return ConfigReading(None, [f"{line}; imu-monitor analyze reads recordings"])
     except ConfigError as error:
         hint = "" if path.suffix in ("", ".toml") else "; imu-monitor analyze reads recordings"
         return ConfigReading(None, [f"{path}: {error}{hint}"])

@@ -112,7 +112,7 @@ class SbgEcomDecoder(base.FrameStreamDecoder):
         ticks = np.zeros(n, np.int64)
         rows = np.array([i for i, frame in enumerate(frames.data) if frame[2:4] == self._header], np.int64)
         if rows.size:
-            messages = frames.stack_frames(rows).view(self._layout)[:, 0]
+            messages = frames.stack_records(rows, self._layout)
             values[rows], temperature_c[rows] = self._read_measurements(messages)
             ticks[rows] = messages["time"]
             self._failed_bits = ~int(messages["status"][-1]) & VALID

@@ -174,7 +174,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         for header, rows in base.group_indices([f[1 : HEADER_END[f[1]]] for f in frames.data]):
             layout = build_message_dtype(header, self._compensated)
             assert layout is not None, "the buffer accepts only messages with a known layout"
-            messages = frames.stack_frames(rows).view(layout)[:, 0]
+            messages = frames.stack_records(rows, layout)
             fields = layout.names or ()
             self._reads_compensated_gyro = _contains_compensated_gyro(header, self._compensated)
             with np.errstate(invalid="ignore"):  # converting a signalling NaN causes a warning

@@ -65,7 +65,7 @@ JsonFile = Annotated[
 Viewer = Annotated[
     str | None, typer.Option(metavar="auto|native|web|none|FILE.rrd", help="Where to show the live view.")
 ]
-KeyExpr = Annotated[str, typer.Argument(metavar="KEYEXPR", help="Keys to show.")]
+KeyExpr = Annotated[str, typer.Argument(metavar="KEYEXPR", help="Keys to show; imu/NAME for one device.")]
 Connect = Annotated[
     list[str] | None, typer.Option(metavar="ENDPOINT", help="Daemon or router, e.g. tcp/127.0.0.1:7450; repeatable.")
 ]
@@ -370,8 +370,13 @@ def read_noise_coefficients(source: str) -> "NoiseCoefficients":
         if text.lstrip().startswith(b"{"):
             return from_analysis_json(text, path.name)
         return from_model(NoiseModel.from_toml(text.decode()), path.name)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{source}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except OSError as error:
+        raise ConfigError(f"{source}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"{source}: cannot be read: byte {error.start} is not text; expected a model, or the JSON that "
+            "imu-monitor analyze RECORDING --json FILE writes"
+        ) from error
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from error
 

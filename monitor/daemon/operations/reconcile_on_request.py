@@ -110,9 +110,8 @@ class Reconciler:
     def take_finished_reconciliations(self) -> list[ReconciliationOutcomeText]:
         """Return the reconciliations that have finished since the last call."""
         found = []
-        with contextlib.suppress(queue.Empty):
-            while True:
-                found.append(self._finished.get_nowait())
+        while not self._finished.empty():  # this method is the only reader
+            found.append(self._finished.get_nowait())
         return found
 
     def abort_reconciliations(self) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.common.distributions import chi2_quantile
+from monitor.common.distributions import Chi2Level, chi2_quantile, expand_chi2_quantile
 from monitor.noise.effects.ieee952.bias_instability import FLICKER_AVAR, BiasInstability
 
 Q, N, B, K, R = range(5)
@@ -199,7 +199,7 @@ class DegreesOfFreedomWithSpanPerTau:
     def __init__(self, factors: Ints, spans: Ints, columns: Floats) -> None:
         tables = [covariance_table(int(span), np.array([m])) for m, span in zip(factors, spans, strict=True)]
         self._covariance = np.array([one.covariance[0, 0] for one in tables])  # [m, 10]
-        self._columns = columns[:, :NOISES]
+        self._columns = columns
         self._terms = np.array([one.terms[0] for one in tables])
 
     def edf(self, theta: Floats, rate_hz: float, terms: Ints) -> Floats:
@@ -216,13 +216,34 @@ class DegreesOfFreedomWithSpanPerTau:
         terms : ndarray of int64, shape (m, k)
             Number of averaged second differences.
         """
-        shape = np.maximum(theta[:NOISES], 0.0) * (rate_hz ** np.array([2.0, 1.0, 0.0, -1.0]))[:, None]
-        shape = np.where(np.isnan(shape).any(axis=0) | (shape.sum(axis=0) == 0.0), np.eye(NOISES)[1][:, None], shape)
-        level = self._columns @ shape
-        pairs = np.array([shape[a] * shape[b] * (1.0 if a == b else 2.0) for a, b in PAIRS])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            whole = 2.0 * level**2 / (self._covariance @ pairs)
-            return np.where(terms > 0, whole * terms / self._terms[:, None], np.nan)
+        edf = np.empty(terms.shape)
+        # the kernel is compiled only for contiguous arrays
+        theta, terms = np.ascontiguousarray(theta), np.ascontiguousarray(terms)
+        _fill_edf(theta, rate_hz, self._columns, self._covariance, self._terms, terms, edf)
+        return edf
+
+
+@compiled
+def _fill_edf(
+    theta: Floats, rate_hz: float, columns: Floats, covariance: Floats, whole: Ints, terms: Ints, edf: Floats
+) -> None:
+    shape = np.empty(NOISES)
+    for axis in range(theta.shape[1]):
+        total = 0.0
+        for a in range(NOISES):
+            shape[a] = max(theta[a, axis], 0.0) * rate_hz ** (2.0 - a)
+            total += shape[a] if theta[a, axis] == theta[a, axis] else np.nan
+        if not total > 0.0:
+            shape[:] = 0.0
+            shape[N] = 1.0
+        for i in range(whole.size):
+            level, variance, pair = 0.0, 0.0, 0
+            for a in range(NOISES):
+                level += columns[i, a] * shape[a]
+                for b in range(a, NOISES):  # in the order of ``PAIRS``
+                    variance += covariance[i, pair] * shape[a] * shape[b] * (1.0 if a == b else 2.0)
+                    pair += 1
+            edf[i, axis] = 2.0 * level * level / variance * terms[i, axis] / whole[i] if terms[i, axis] > 0 else np.nan
 
 
 def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:
@@ -247,12 +268,20 @@ def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) ->
     0.699 1.755
     """
     tail = (1.0 - probability) / 2.0
-    safe = np.where(edf > 0.0, edf, np.nan)
-    low, high = chi2_quantile(safe, tail), chi2_quantile(safe, 1.0 - tail)
-    # With less than one degree of freedom, the upper end of the interval may be infinite.
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        lo, hi = np.sqrt(avar * safe / high), np.sqrt(avar * safe / low)
-    return lo, np.where((low == 0.0) & (avar >= 0.0), np.inf, hi)
+    lo, hi = np.empty((2, avar.size))
+    levels = expand_chi2_quantile(tail), expand_chi2_quantile(1.0 - tail)
+    # the kernel is compiled only for contiguous arrays that can be written
+    _fill_intervals(np.array(avar).ravel(), np.array(edf).ravel(), *levels, lo, hi)
+    return lo.reshape(avar.shape), hi.reshape(avar.shape)
+
+
+@compiled
+def _fill_intervals(avar: Floats, edf: Floats, low: Chi2Level, high: Chi2Level, lo: Floats, hi: Floats) -> None:
+    for i in range(avar.size):
+        lower, upper = chi2_quantile(edf[i], low), chi2_quantile(edf[i], high)
+        lo[i], hi[i] = np.sqrt(avar[i] * edf[i] / upper), np.sqrt(avar[i] * edf[i] / lower)
+        if lower == 0.0 and avar[i] >= 0.0:  # with less than one degree of freedom, the upper end may be infinite
+            hi[i] = np.inf
 
 
 @compiled

@@ -253,14 +253,14 @@ def replace_axis_results(all_axes: Fit, axis: int, axis_fit: Fit) -> Fit:
     return _combine((all_axes, axis_fit), replace_axis_column)
 
 
-def concatenate_fits(fits: Sequence[Fit], axes: Ints) -> Fit:
+def concatenate_fits(fits: Sequence[Fit], axes: Sequence[int]) -> Fit:
     """Concatenate fits of different axes in the order of the axes.
 
     Parameters
     ----------
     fits : sequence of Fit
         Fits of one or more axes.
-    axes : ndarray of int64, shape (k,)
+    axes : sequence of int
         Axis index of each column of the fits.
     """
     order = np.argsort(axes)

@@ -196,8 +196,9 @@ def refit_with_low_passes(
         Accepted filter of each axis, or None.
     """
     used: list[LowPass | None] = [None] * len(filters)
+    contradicts = axes_contradicting_five_terms(five_term_fit)
     for axis, low_pass in enumerate(filters):
-        if low_pass is not None and curve_contradicts_five_terms(five_term_fit, axis):
+        if low_pass is not None and contradicts[axis]:
             better = _fit_low_pass(design, table, measured.select_axis(axis), low_pass)
             if better.scatter[0] < MAX_SCATTER:
                 _bound_q(design, better, measured.select_axis(axis))
@@ -214,19 +215,11 @@ def _bound_q(design: DesignMatrix, fit: Fit, measured: MeasuredVariancesAndSlope
         c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 
 
-def curve_contradicts_five_terms(five_term_fit: Fit, axis: int) -> bool:
-    """Return True if the Allan variances of an axis contradict the five noise terms.
-
-    Parameters
-    ----------
-    five_term_fit : Fit
-        Fit without a low-pass filter.
-    axis : int
-        Index of the axis in the fit.
-    """
-    return bool(
-        five_term_fit.left_out[axis] > 0 or five_term_fit.theta[0, axis] < 0.0 or five_term_fit.misfit[axis] > 1.0
-    )
+def axes_contradicting_five_terms(five_term_fit: Fit) -> list[bool]:
+    """Return True for each axis of a fit without low-pass filter whose Allan variances contradict the five terms."""
+    fit = five_term_fit
+    found: list[bool] = ((fit.left_out > 0) | (fit.theta[0] < 0.0) | (fit.misfit > 1.0)).tolist()
+    return found
 
 
 def find_low_pass(

@@ -214,7 +214,9 @@ def missing_coefficient_error(noise: NoiseCoefficients, message: str) -> ImuErro
     message
         Text of the exception.
     """
-    return NotReady(f"{message}: a longer recording is needed") if noise.measured else ConfigError(message)
+    if noise.measured:
+        return NotReady(f"{message}: a longer recording is needed")
+    return ConfigError(f"{message}, and the model has none; add it to the model, or export the JSON of analyze")
 
 
 def choose_time_step_s(noise: NoiseCoefficients, dt_s: float | None, format_name: str) -> float:

@@ -60,7 +60,7 @@ class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
     def coefficients_from_temperature_removal(cls, removal: TemperatureRemovalComparison, axis: str) -> Self:
         """Build the coefficients of one axis from the fits with and without the temperature-correlated bias."""
         i = AXES.index(axis)
-        values = coefficient_values(removal.coefficients, i, removal.k_or_r[i])
+        values = coefficient_values(removal.coefficients, removal.k_or_r)[i]
         return cls(
             removal.models[axis],
             {symbol: values[symbol] for symbol in SLOW_LETTERS},
@@ -187,12 +187,13 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
         """
         estimate = result.estimate
         measured = measured_axes(estimate.curve)
+        coefficients = coefficient_values(estimate.coefficients, estimate.k_or_r)
         axes = {
             axis: AxisAnalysis(
                 allan=AxisDeviations.from_curve(estimate.curve, i),
                 total=UNSET if total is None else AxisDeviations.from_curve(total, i),
                 hadamard=UNSET if hadamard is None else AxisDeviations.from_curve(hadamard, i),
-                coefficients=coefficient_values(estimate.coefficients, i, bool(estimate.k_or_r[i])),
+                coefficients=coefficients[i],
                 bandwidth=float(result.bandwidth_hz[i]),
                 temperature=_temperature_values(result, temperature, axis),
                 without_temperature=UNSET

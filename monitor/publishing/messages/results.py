@@ -1,12 +1,13 @@
 """Messages with the results, events and status of a device."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Final, NamedTuple, Self
 
 import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
+from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Event, Floats
 from drivers.zenoh.credential_masking import mask_secrets
@@ -34,6 +35,8 @@ MAX_TEXT_LENGTH: Final = 400
 MAX_OUTPUTS: Final = 16
 STATUSES: Final = {status.name.lower(): status for status in Status}
 STATUS_NAMES: Final = tuple(STATUSES)
+OTHERS: Final = {"K": "R", "R": "K"}
+"""Coefficients that the data may not distinguish from each other."""
 
 
 class TotalAndHadamardCurves(NamedTuple):
@@ -104,18 +107,15 @@ class AllanMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.A
 
     @classmethod
     def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
-        recent = result.display_curve
-        axes = {
-            axis: AllanAxis(
-                *deviations_with_interval_ends(result.curve, i),
-                recent=UNSET if recent is None else DeviationCurve(*deviations_with_interval_ends(recent, i)),
-            )
-            for i, axis in measured_axes(result.curve)
-        }
+        recent = [UNSET] * len(AXES) if result.display_curve is None else _deviation_curves(result.display_curve)
+        own = _deviation_curves(result.curve)
         return {
             "filled_s": result.curve.n / result.rate_hz,
             "tau_s": result.curve.tau_s,
-            "axes": axes,
+            "axes": {
+                axis: AllanAxis(own[i].deviation, own[i].lo, own[i].hi, recent[i])
+                for i, axis in measured_axes(result.curve)
+            },
             "poorly_fitted_axes": list(result.poorly_fitted_axes) or UNSET,
         }
 
@@ -169,10 +169,8 @@ class CoefficientsMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=t
 
     @classmethod
     def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
-        axes = {
-            axis: coefficient_values(result.coefficients, i, bool(result.k_or_r[i]))
-            for i, axis in measured_axes(result.curve)
-        }
+        values = coefficient_values(result.coefficients, result.k_or_r)
+        axes = {axis: values[i] for i, axis in measured_axes(result.curve)}
         return {"filled_s": result.curve.n / result.rate_hz, "axes": axes}
 
     def to_coefficients(self) -> Coefficients:
@@ -302,8 +300,8 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
     @classmethod
     def from_curve(cls, curve: VarianceCurve) -> Self:
         """Build the table from the variances of all axes, and omit axes without values."""
-        curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
-        return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
+        known: Any = np.isfinite(curve.variance).any(axis=0)
+        return cls(curve.tau_s, {AXES[i]: one for i, one in enumerate(_deviation_curves(curve)) if known[i]})
 
 
 class TotalAndHadamardMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema_name()):
@@ -488,26 +486,26 @@ class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.sc
 
 
 def coefficient_values(
-    coefficients: Coefficients, axis: int, k_r_ambiguous: bool = False
-) -> dict[str, CoefficientValue]:
-    """Return the noise coefficients of one axis by symbol.
+    coefficients: Coefficients, k_or_r: NDArray[np.bool_] | Sequence[bool]
+) -> list[dict[str, CoefficientValue]]:
+    """Return the noise coefficients of each axis by symbol.
 
     Parameters
     ----------
     coefficients
         Noise coefficients of all axes.
-    axis
-        Column of the axis.
-    k_r_ambiguous
-        True if the data cannot distinguish K from R.
+    k_or_r
+        True for axes [6] on which the data cannot distinguish K from R.
     """
-    other = {"K": "R", "R": "K"} if k_r_ambiguous else {}
-    c = coefficients
-    columns = [array[:, axis].tolist() for array in (c.value, c.lo, c.hi, c.status)]
-    return {
-        symbol: CoefficientValue(value, lo, hi, STATUS_NAMES[status], other.get(symbol, UNSET))
-        for symbol, value, lo, hi, status in zip(SYMBOLS, *columns, strict=True)
-    }
+    arrays = (coefficients.value, coefficients.lo, coefficients.hi, coefficients.status)
+    value, lo, hi, status = (array.T.tolist() for array in arrays)
+    return [
+        {
+            symbol: CoefficientValue(a, b, c, STATUS_NAMES[d], OTHERS.get(symbol, UNSET) if either else UNSET)
+            for symbol, a, b, c, d in zip(SYMBOLS, value[i], lo[i], hi[i], status[i], strict=True)
+        }
+        for i, either in enumerate(k_or_r)
+    ]
 
 
 def event_start_s(unix_s: float, event: Event) -> float | None:
@@ -556,7 +554,15 @@ def deviations_with_interval_ends(curve: AllanCurve | VarianceCurve, axis: int) 
 
 def measured_axes(curve: AllanCurve) -> list[tuple[int, str]]:
     """Return the column index and the name of each axis with Allan variances."""
-    return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(curve.avar[:, i]).all()]
+    unmeasured: Any = np.isnan(curve.avar).all(axis=0)
+    return [(i, axis) for i, axis in enumerate(AXES) if not unmeasured[i]]
+
+
+def _deviation_curves(curve: AllanCurve | VarianceCurve) -> list[DeviationCurve]:
+    """Return the curve of each axis. The curves contain lists, which are encoded much faster than arrays."""
+    variance = curve.avar if isinstance(curve, AllanCurve) else curve.variance
+    lists: Any = (array.T.tolist() for array in (np.sqrt(variance), curve.lo, curve.hi))
+    return [DeviationCurve(*axis) for axis in zip(*lists, strict=True)]
 
 
 def _clean(text: str) -> str:

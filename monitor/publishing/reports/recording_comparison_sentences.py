@@ -1,5 +1,6 @@
 """Sentences about the comparison of several recordings, for the HTML report and the terminal."""
 
+from collections.abc import Iterable
 from typing import Final
 
 from monitor.common.unit_formatting import format_number
@@ -11,7 +12,7 @@ ABSENCE_TEXTS: Final = {
     "contradiction": "contradicts it",
     "too_faint": "too faint to say",
     "other_name": "another name there",
-    "unnamed": "unnamed there",
+    "unnamed": "unexplained there",
     "may_differ": "may differ",
 }
 """Text for each reason why an effect was not found in a recording."""
@@ -23,12 +24,17 @@ def summarize(c: RecordingsComparison) -> str:
     compared = f"{len(c.runs)} recordings were compared with {model}."
     if c.verdict == "agrees":
         return f"{compared} None differs by more than chance."
-    common = [f"{_name_effect(seen)} ({axis})" for axis, one in c.axes.items() for seen in one.common]
-    single = [
-        f"{_name_effect(seen)} ({axis}, {', '.join(seen.steps)})" for axis, one in c.axes.items() for seen in one.single
-    ]
-    lists = (f"Common to all: {'; '.join(common) or 'nothing'}.", f"In some only: {'; '.join(single) or 'nothing'}.")
-    return " ".join([compared, *lists])
+    common = _list_effects((axis, seen) for axis, one in c.axes.items() for seen in one.common)
+    single = _list_effects((axis, seen) for axis, one in c.axes.items() for seen in one.single)
+    return f"{compared} Common to all: {common}. In some only: {single}."
+
+
+def describe_absences(effect: EffectInRecordings) -> list[tuple[str, str, str]]:
+    """Return the recordings that share a reason why they do not show an effect, the kind of reason, and the reason."""
+    recordings: dict[tuple[str, str], list[str]] = {}
+    for absence in effect.absent:
+        recordings.setdefault((absence.meaning, absence.because), []).append(absence.run)
+    return [(", ".join(names), meaning, because) for (meaning, because), names in recordings.items()]
 
 
 def describe_size_agreement(effect: EffectInRecordings) -> str:
@@ -54,6 +60,14 @@ def describe_finding_counts(result: AxisResult | None) -> str:
     effects = f"{len(result.steps)} effect{'' if len(result.steps) == 1 else 's'}" if result.steps else ""
     left_over = f"{len(result.left_over)} left over" if result.left_over else ""
     return ", ".join(part for part in (effects, left_over) if part)
+
+
+def _list_effects(found: Iterable[tuple[str, EffectInRecordings]]) -> str:
+    """Return each effect once, followed by its axes, or ``nothing`` if there is no effect."""
+    axes: dict[str, dict[str, None]] = {}
+    for axis, seen in found:
+        axes.setdefault(_name_effect(seen), {})[axis] = None
+    return "; ".join(f"{name} ({', '.join(names)})" for name, names in axes.items()) or "nothing"
 
 
 def _name_effect(seen: EffectInRecordings) -> str:

@@ -92,7 +92,7 @@ FILE_CHART_LINES: Final = 12
 class LiveTable:
     """Renderer of the device table for a ``QueuedWriter``.
 
-        If the output is a terminal, the table is redrawn in place. Otherwise, the table is printed once.
+    If the output is a terminal, the table is redrawn in place. Otherwise, the table is printed once.
 
     Parameters
     ----------
@@ -144,7 +144,9 @@ class LiveTable:
             if log_lines:
                 self._console.print(Text.from_ansi("".join(log_lines)))
             if not is_last and self._live is not None and self.states is not None:
-                self._live.update(device_overview(self.states, time.monotonic(), self._units), refresh=True)
+                overview = device_overview(self.states, time.monotonic(), self._units)
+                # The blank line receives the ^C that the terminal prints, which would wrap after a full last line.
+                self._live.update(Group(overview, Text()), refresh=True)
             if is_last and not self._ended:
                 self._ended = True
                 if self._live is not None:

@@ -117,7 +117,9 @@ def _verdict(verdict: str) -> Text:
     return Text(f"{sign} {words.RESULT_TEXTS[verdict]}", style=style)
 
 
-def print_comparison(c: RecordingsComparison, console: Console, units: UnitSystem = DEFAULT_UNITS) -> None:
+def print_comparison(
+    c: RecordingsComparison, console: Console, *, details: bool = False, units: UnitSystem = DEFAULT_UNITS
+) -> None:
     """Print the comparison of several recordings.
 
     Parameters
@@ -126,13 +128,15 @@ def print_comparison(c: RecordingsComparison, console: Console, units: UnitSyste
         Comparison of several recordings.
     console
         Console that receives the output.
+    details
+        If True, the effects with their parameters are listed too.
     units
         Unit system.
     """
     console.print(_verdict(c.verdict), Text(recording_comparison_sentences.summarize(c)))
     console.print(Padding(_axes_by_runs(c), (1, 0)))
     for title, found in (("common to all", _common(c, units)), ("in some only", _single(c, units))):
-        if found:
+        if details and found:
             console.print(Text(title, style="bold"))
             console.print(Padding(_lines(found), (0, 0, 1, 2)))
     print_notes([f"{name} is left out: {why}" for name, why in c.without_result.items()], console)
@@ -186,11 +190,10 @@ def _single(c: RecordingsComparison, units: UnitSystem) -> list[tuple[str, Text]
         said = _effect(c, axis, seen, units)
         said.append(f"; in {', '.join(seen.steps)}")
         found.append((axis, said))
-        for absence in seen.absent:
-            style = "yellow" if absence.meaning == "contradiction" else "dim"
-            meaning = recording_comparison_sentences.ABSENCE_TEXTS[absence.meaning]
-            meaning = f"not in {absence.run}: {meaning}: {absence.because}"
-            found.append(("", Text(meaning, style=style)))
+        for recordings, meaning, because in recording_comparison_sentences.describe_absences(seen):
+            style = "yellow" if meaning == "contradiction" else "dim"
+            text = f"not in {recordings}: {recording_comparison_sentences.ABSENCE_TEXTS[meaning]}: {because}"
+            found.append(("", Text(text, style=style)))
     return found
 
 

@@ -206,7 +206,7 @@ def _fit_row(axis: str, one: ThermalFit, units: UnitSystem) -> tuple[str, ...]:
         ", ".join(format_duration(each) for each in model.shape.constants_s) or "—",
         "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis, units),
         _format_deviation(axis, best.rms, units),
-        f"{100.0 * one.explained:.0f} %",
+        f"{100.0 * one.explained:z.0f} %",
         _format_deviation(axis, best.validated, units) + (f" ({best.validated / cubic:.2g})" if cubic else ""),
     )
 

@@ -21,13 +21,15 @@ from drivers.errors import DecodeError
 from drivers.zenoh.sample_message import TEMPERATURE, decode_samples
 from monitor.common import topics
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
-from monitor.publishing.messages.message import MAX_PAYLOAD_BYTES, encode_json
+from monitor.publishing.messages.message import MAX_PAYLOAD_BYTES, decode_message, encode_json
+from monitor.publishing.messages.results import AllanMessage
 from monitor.publishing.remote_device_states import RemoteDeviceRegistry, split_device_and_topic
 from monitor.publishing.terminal.live_device_table import LiveTable, device_overview
 from monitor.publishing.terminal.queued_writer import QueuedWriter, reader_is_gone
 from monitor.publishing.zenoh.subscriber import (
     BACKLOG_BYTES,
     KEYEXPR,
+    TOPICS,
     ReceivedMessageOrLiveliness,
     ZenohSubscriber,
 )
@@ -50,6 +52,9 @@ def watch(
     units: UnitSystem = DEFAULT_UNITS,
 ) -> None:
     """Show the table of devices until ``stop`` is set or Ctrl-C is pressed.
+
+    If the key expression has no wildcard, the Allan deviations of the device are drawn below the table. They are the
+    largest results, and are therefore not received from many devices.
 
     A separate thread writes the table, so that a blocked terminal or pipe delays neither messages nor the exit.
 
@@ -79,8 +84,9 @@ def watch(
     """
     stop, console = stop or threading.Event(), console or Console()
     stream, states = cast("TextIO", console.file), RemoteDeviceRegistry()
+    received = TOPICS if "*" in keyexpr else (*TOPICS, topics.ALLAN)
     with (
-        contextlib.closing(ZenohSubscriber(keyexpr, connect, file)) as subscriber,
+        contextlib.closing(ZenohSubscriber(keyexpr, connect, file, received=received)) as subscriber,
         contextlib.suppress(KeyboardInterrupt),
     ):
         subscriber.start()
@@ -107,9 +113,23 @@ def _receive_messages(states: RemoteDeviceRegistry, subscriber: ZenohSubscriber)
     for message in subscriber.take(0.0):
         if message.payload is None:
             states.set_liveliness_token(message.key, message.token_exists)
+        elif (split := split_device_and_topic(message.key)) and split[1] is topics.ALLAN:
+            _store_allan_curve(states, split[0], message.payload)
         else:
             states.process_message(message.key, message.payload)
     states.note = connection_note(states, subscriber)
+
+
+def _store_allan_curve(states: RemoteDeviceRegistry, device: str, payload: bytes) -> None:
+    known = states.device_coefficients(device)
+    if known is None:
+        return
+    try:
+        estimate = decode_message(AllanMessage, payload).to_estimate(known.coefficients, known.k_or_r)
+    except ValueError:
+        states.malformed += 1
+    else:
+        states.set_allan_curve(device, estimate.curve)
 
 
 def connection_note(states: RemoteDeviceRegistry, subscriber: ZenohSubscriber) -> str:

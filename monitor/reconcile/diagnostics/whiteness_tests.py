@@ -6,6 +6,7 @@ departure. If the noise model is true, the gain has nearly the same distribution
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil
 from typing import Final
 
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.fft import rfft
 
 from drivers.data_types import Floats
+from monitor.common.compiled import compiled
 from monitor.noise.effects import (
     BiasCurve,
     CommonVibration,
@@ -197,28 +199,42 @@ def compute_level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats, fl
     axis = whitened.axis
     n = axis.n
     weighted = inverse_cosine_transform(whitened.coefficients * whitened.weights)
-    product = np.cumsum(weighted[::-1])[::-1]  # [n] product of the data with a step at each sample
     margin = ceil(STEP_MARGIN_FRACTION * n)
-    inside = slice(margin, n - margin)
     squares = whitened.weights**2
-    square = np.maximum(_sum_squares_of_steps(squares * axis.regressors.step_power)[inside], 1e-300)
-    gains = 0.5 * product[inside] ** 2 / square
-    places = float(np.minimum(squares.mean() / square, 1.0).sum())
-    return gains, np.arange(n)[inside] / axis.rate_hz, places
+    step_power = 0.25 / n / axis.regressors.half_sines**2  # mean square of each coefficient of a step over all times
+    gains, places = _step_gains(weighted, _sum_squares_of_steps(squares * step_power), squares.mean(), margin)
+    return gains, np.arange(margin, n - margin) / axis.rate_hz, places
+
+
+@compiled
+def _step_gains(weighted: Floats, grid: Floats, mean_square: float, margin: int) -> tuple[Floats, float]:
+    """Return the gains at all times inside the margins, and the effective number of independent times.
+
+    The sums of squares are interpolated from ``grid``, which has the first time at both ends.
+    """
+    n = weighted.size
+    gains, places, product = np.empty(n - 2 * margin), 0.0, 0.0
+    for s in range(n - 1, margin - 1, -1):
+        product += weighted[s]  # of the data with a step at sample s
+        if s < n - margin:
+            at = s * ((grid.size - 1) / n)
+            low = int(at)
+            square = max(grid[low] + (at - low) * (grid[low + 1] - grid[low]), 1e-300)
+            gains[s - margin] = 0.5 * product * product / square
+            places += min(mean_square / square, 1.0)
+    return gains, places
 
 
 def _sum_squares_of_steps(power: Floats) -> Floats:
-    """Return Σ_k p_k (1 − cos(2πks/n)) at each sample s, shape (n,), for the powers p_k, k = 1 … n − 1.
+    """Return Σ_k p_k (1 − cos(2πks/n)) at the times s = jn/m, j = 0 … m, for the powers p_k, k = 1 … n − 1.
 
-    In a long recording, the sum is computed at the times jn/m of a coarser grid and interpolated. On this grid, the
-    cosines of k and k + m are equal.
+    In a long recording, m is smaller than n. On this grid, the cosines of k and k + m are equal.
     """
     n = power.size + 1
     m = n if n <= 2 * MAX_STEP_GRID else MAX_STEP_GRID
     folded = np.pad(power, (1, -n % m)).reshape(-1, m).sum(axis=0)
     cosines = rfft(folded).real  # for the first half of the times; the values beyond are the mirror image
-    sums = power.sum() - np.concatenate([cosines, cosines[: m - cosines.size + 1][::-1]])
-    return np.asarray(sums[:n] if m == n else np.interp(np.arange(n) * (m / n), np.arange(m + 1), sums))
+    return np.asarray(power.sum() - np.concatenate([cosines, cosines[: m - cosines.size + 1][::-1]]))
 
 
 def _regressor_gain(whitened: WhitenedAxis, regressors: Sequence[Regressor]) -> float:
@@ -258,9 +274,16 @@ def compute_autocorrelation(periodogram: Floats) -> Floats:
     sums = np.add.reduceat(periodogram, first, dtype=np.float64)
     sums[0] -= 0.5 * periodogram[0]
     sums[-1] -= 0.5 * periodogram[-1]
+    return np.asarray(_lag_cosines(m) @ sums / m)
+
+
+@lru_cache(2)
+def _lag_cosines(m: int) -> Floats:
+    """Return the cosine of each lag at the centre of each frequency band."""
+    first = np.arange(0, m + 1, -(-m // AUTOCORRELATION_BANDS))
     centre = 0.5 * (first + np.append(first[1:] - 1, m))
     lags = np.arange(1, MAX_LAG_SAMPLES + 1)
-    return np.asarray(np.cos(np.pi / m * lags[:, None] * centre) @ sums / m)
+    return np.asarray(np.cos(np.pi / m * lags[:, None] * centre))
 
 
 def diagnose_temperature_dependence(whitened: WhitenedAxis) -> WhitenessDeparture:

@@ -6,7 +6,7 @@ so the regressors and the sums over frequency bins are cached.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -44,6 +44,7 @@ from monitor.reconcile.preparation.cosine_bins import (
     FrequencyBins,
     cosine_transform,
     low_frequency_cosine_transform,
+    sinusoid_cosine_transforms,
 )
 from monitor.reconcile.preparation.value_artifacts import ValueArtifacts
 
@@ -53,6 +54,8 @@ MIN_BIN_POWER_RATIO: Final = 1e-4
 MIN_STOP_BAND_FRACTION: Final = 0.02
 """Lowest frequency of a stop band, as a fraction of the sample rate.
 """
+MIN_REGRESSOR_SIZE: Final = 1e-30
+"""Smallest absolute size of an effect. Smaller sizes are rounding errors and become zero."""
 MAX_CACHE_BYTES: Final = 1 << 26
 MIN_CACHED_EFFECTS: Final = 8
 """Smallest number of cached effects that are not smooth. An effect has one or two series of 8 bytes per sample."""
@@ -93,6 +96,8 @@ class RegressorCache:
             return [series[part] for series in build_unit_regressors(effect, n, rate_hz, temperature_c)]
 
         def compute_transforms(effect: Effect) -> list[Floats]:
+            if isinstance(effect, Sinusoidal):
+                return sinusoid_cosine_transforms(effect.frequency / rate_hz, self.first_sample, self.half_sines)
             return [cosine_transform(column) for column in build_columns(effect)]
 
         def compute_smooth_transforms(effect: Effect) -> list[Floats]:
@@ -104,8 +109,8 @@ class RegressorCache:
         size = end - self.first_sample
         self._parts: dict[tuple[int, int], RegressorCache] = {}
         self._min_time_constant_s = MIN_BLOCKS_PER_TIME_CONSTANT * size / MAX_SMOOTH_COEFFICIENTS / rate_hz
-        self.step_power = 0.25 / size / np.sin(0.5 * np.pi * np.arange(1, size) / size) ** 2
-        """Mean square of each coefficient of a unit step over all step times, shape (n − 1,)."""
+        self.half_sines = np.sin(0.5 * np.pi * np.arange(1, size) / size)
+        """Values sin(πk/2n) of the n samples of the axes for k = 1 … n − 1."""
         self._transform = lru_cache(max(MIN_CACHED_EFFECTS, MAX_CACHE_BYTES // (16 * size)))(compute_transforms)
         self._transform_smooth = lru_cache(MAX_CACHED_SMOOTH_SERIES)(compute_smooth_transforms)
 
@@ -154,6 +159,8 @@ class Axis:
     is_model_fitted: bool = False  # True if the model under test was fitted to this recording
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     cosine_transform_rms: float = field(init=False)  # root mean square of the coefficients, in the unit of the axis
+    used_count: Floats = field(init=False)  # [m] number of coefficients, or 0 for bins that are not used
+    _used_power: float = field(init=False)  # sum of squares of the coefficients in the bins that are used
     _products: dict[frozenset[Regressor | None], Floats] = field(init=False, default_factory=dict)
     _bases: dict[tuple[object, ...], Floats] = field(init=False, default_factory=dict)
 
@@ -163,6 +170,8 @@ class Axis:
         power = sums / self.bins.count
         slow = self.bins.f_hz < MIN_STOP_BAND_FRACTION * self.bins.rate_hz
         self.used_bins = ((power > MIN_BIN_POWER_RATIO * np.median(power)) | slow).astype(np.float64)
+        self.used_count = self.bins.count * self.used_bins
+        self._used_power = float(sums @ self.used_bins)
 
     @property
     def n(self) -> int:
@@ -235,21 +244,13 @@ class Axis:
         noise = self._noise_variances(effects, fixed_noise, transforms)
         slices, columns = self._regressors_of(effects)
         fitted = maximise_whittle_likelihood(
-            self.bins.count * self.used_bins,
+            self.used_count,
             self.sum_products_over_bins(columns),
             np.asarray(noise.bases).reshape(len(noise.bases), self.bins.count.size),
             noise.constant,
             np.asarray(noise.start, np.float64),
         )
-        return AxisFit(
-            self,
-            _with_fitted_sizes(effects, noise.fitted, slices, fitted),
-            fixed_noise,
-            fitted.log_likelihood,
-            fitted,
-            tuple(noise.fitted),
-            slices,
-        )
+        return AxisFit(self, tuple(effects), fixed_noise, fitted.log_likelihood, fitted, tuple(noise.fitted), slices)
 
     def _noise_variances(
         self, effects: Sequence[Effect], fixed_noise: frozenset[int], transforms: Sequence[Transform]
@@ -329,8 +330,7 @@ class Axis:
 
     def _full_power_theta(self, basis: Floats) -> float:
         """Return the squared size for which a noise effect alone would explain the total power of the axis."""
-        power = self._binned_product(None, None).sum()
-        return float(power / max((self.bins.count * self.used_bins * basis).sum(), 1e-300))
+        return self._used_power / max(float(self.used_count @ basis), 1e-300)
 
     def _binned_product(self, a: Regressor | None, b: Regressor | None) -> Floats:
         """Return the sums of products of two regressors of size one, shape (m,). None stands for the axis."""
@@ -349,17 +349,22 @@ class Axis:
         return self.regressor_cosine_transforms(regressor[0])[regressor[1]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class AxisFit:
     """Effects fitted to an axis by maximum likelihood."""
 
     axis: Axis
-    effects: Effects  # with fitted sizes
+    start_effects: Effects  # with the starting values of the sizes
     fixed_noise: frozenset[int]  # indices of effects whose size was not fitted
     log_likelihood: float
     whittle: WhittleFit
     fitted_noise: tuple[int, ...]  # index in ``effects`` of each fitted θ
     regressor_slices: tuple[tuple[int, slice], ...]  # index in ``effects`` and slice of β of each deterministic effect
+
+    @cached_property
+    def effects(self) -> Effects:
+        """Effects with the fitted sizes."""
+        return _with_fitted_sizes(self.start_effects, self.fitted_noise, self.regressor_slices, self.whittle)
 
     def size_standard_error(self, effect_index: int) -> float:
         """Return the standard error of the size of an effect, or NaN if the size was not fitted."""
@@ -385,12 +390,12 @@ class AxisFit:
     def with_regressor_sizes(self, beta: Floats) -> "AxisFit":
         """Return a copy of the fit with new regressor sizes, shape (q,), and the same noise."""
         axis, whittle = self.axis, self.whittle
+        beta = np.where(np.abs(beta) < MIN_REGRESSOR_SIZE, 0.0, beta)
         sums = axis.sum_products_over_bins(
-            [(self.effects[at], i) for at, p in self.regressor_slices for i in range(p.stop - p.start)]
+            [(self.start_effects[at], i) for at, p in self.regressor_slices for i in range(p.stop - p.start)]
         )
         residual = sums.power - 2.0 * beta @ sums.cross + np.einsum("i,j,ijb->b", beta, beta, sums.gram)
-        count = axis.bins.count * axis.used_bins
-        value = -0.5 * float((count * np.log(whittle.variance) + residual / whittle.variance).sum())
+        value = -0.5 * float((axis.used_count * np.log(whittle.variance) + residual / whittle.variance).sum())
         changed = replace(whittle, beta=beta, residual=np.maximum(residual, 0.0), log_likelihood=value)
         return replace(self, whittle=changed, log_likelihood=value)
 
@@ -409,7 +414,7 @@ class AxisFit:
         gram : ndarray of float64, shape (q, q, m)
             Products of each pair of regressors.
         """
-        fitted = [(self.effects[at], i) for at, p in self.regressor_slices for i in range(p.stop - p.start)]
+        fitted = [(self.start_effects[at], i) for at, p in self.regressor_slices for i in range(p.stop - p.start)]
         sums = self.axis.sum_products_over_bins([*regressors, *fitted])
         q = len(regressors)
         cross = sums.cross[:q] - np.einsum("j,ijb->ib", self.whittle.beta, sums.gram[:q, q:])

@@ -15,7 +15,7 @@ from monitor.noise.effect import Effect, WhiteNoiseGain
 from monitor.noise.effects import HeavyTails
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.outlier_fit import OutlierFit, convert_student_to_gaussian, fit_outliers
-from monitor.reconcile.likelihood.periodic_pulse_search import HarmonicSeries, find_harmonic_series
+from monitor.reconcile.likelihood.periodic_pulse_search import HarmonicSeries, Pulses, find_harmonic_series, fit_pulses
 from monitor.reconcile.likelihood.variance_change_tests import (
     SpectrogramChange,
     VarianceChangeGains,
@@ -75,6 +75,11 @@ class WhitenedAxis:
     def harmonic_series(self) -> HarmonicSeries:
         """Strongest harmonics of one frequency in the periodogram."""
         return find_harmonic_series(self.periodogram, self.axis.n, self.axis.rate_hz)
+
+    @cached_property
+    def pulses(self) -> Pulses | None:
+        """Rectangular pulses near the frequency of the strongest harmonics."""
+        return fit_pulses(self.series, self.axis.rate_hz, self.harmonic_series)
 
     @cached_property
     def variance_changes(self) -> VarianceChangeGains:

@@ -14,6 +14,7 @@ Fisher scoring for θ and generalised least squares for β alternate until ln L 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -37,7 +38,7 @@ class BinnedRegressionSums:
     gram: Floats  # [q, q, m] Σ R_i R_j
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WhittleFit:
     """Maximum of the Whittle likelihood."""
 
@@ -47,7 +48,12 @@ class WhittleFit:
     residual: Floats  # [m] sum of squares in each bin after the regressors are removed
     log_likelihood: float
     theta_information: Floats  # [p, p] Fisher information of θ
-    beta_covariance: Floats  # [q, q] covariance of β
+    beta_information: Floats  # [q, q] Fisher information of β
+
+    @cached_property
+    def beta_covariance(self) -> Floats:
+        """Covariance of β, shape (q, q)."""
+        return np.asarray(np.linalg.pinv(self.beta_information)) if self.beta.size else np.zeros((0, 0))
 
 
 def maximise_whittle_likelihood(
@@ -78,8 +84,7 @@ def maximise_whittle_likelihood(
         fixed_variance + floor,
         np.maximum(start_theta, 0.0),
     )
-    covariance = np.linalg.pinv(normal) if beta.size else np.zeros((0, 0))
-    return WhittleFit(theta, beta, variance, residual, float(likelihood), information, covariance)
+    return WhittleFit(theta, beta, variance, residual, float(likelihood), information, normal)
 
 
 @compiled
@@ -159,7 +164,9 @@ def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Flo
     scaled = np.zeros((q, q))
     scale = np.zeros(q)
     for i in range(q):
-        scale[i] = np.sqrt(normal[i, i]) if normal[i, i] > 0.0 else 1.0
+        scale[i] = np.sqrt(normal[i, i])
+        if normal[i, i] <= 0.0:  # a regressor without values in this recording, whose product is a rounding error
+            scale[i], right[i] = 1.0, 0.0
     for i in range(q):
         for j in range(q):
             scaled[i, j] = normal[i, j] / (scale[i] * scale[j])

@@ -157,6 +157,62 @@ def low_frequency_cosine_transform(y: Floats) -> Floats:
     return np.asarray((y.size / MAX_SMOOTH_COEFFICIENTS) ** 0.5 * cosine_transform(means))
 
 
+def sinusoid_cosine_transforms(turns_per_sample: float, first_sample: int, half_sines: Floats) -> list[Floats]:
+    """Compute the cosine transforms of a sine and a cosine from the closed form of the sums.
+
+    Let θ = πk/n and ω the phase advance of a sample. The transform of exp(iωj) is proportional to
+    (1 − (−1)ᵏ exp(iωn)) cos(θ/2)/(cos ω − cos θ), except at θ = ω, where it is the sum of two Dirichlet kernels.
+
+    Parameters
+    ----------
+    turns_per_sample : float
+        Frequency as a fraction of the sample rate, between 0 and 1/2.
+    first_sample : int
+        Index of the first sample. The phase is zero at the index 0.
+    half_sines : ndarray of float64, shape (n − 1,)
+        Values sin(πk/2n) for k = 1 … n − 1.
+
+    Returns
+    -------
+    list of ndarray of float64, shape (n − 1,)
+        Results of ``cosine_transform`` for the sine and the cosine.
+
+    Examples
+    --------
+    >>> sines = np.sin(0.5 * np.pi * np.arange(1, 1000) / 1000)
+    >>> exact = cosine_transform(np.sin(2.0 * np.pi * 0.12345 * np.arange(5, 1005)))
+    >>> bool(np.allclose(sinusoid_cosine_transforms(0.12345, 5, sines)[0], exact))
+    True
+    """
+    n = half_sines.size + 1
+    omega, half_cosines = 2.0 * np.pi * turns_per_sample, half_sines[::-1]
+    # two equal forms of (cos ω − cos θ)/2, of which the one with the smaller rounding error is used
+    if turns_per_sample < 0.25:
+        ratio = half_sines**2 - np.sin(0.5 * omega) ** 2
+    else:
+        ratio = np.cos(0.5 * omega) ** 2 - half_cosines**2
+    nearest = min(max(round(2.0 * turns_per_sample * n), 1), n - 1)
+    ratio[nearest - 1] = 1.0
+    np.divide(half_cosines, ratio, out=ratio)
+    start = np.exp(2j * np.pi * np.mod(turns_per_sample * first_sample, 1.0)) * (2.0 / n) ** 0.5
+    factor = 0.25 * start * (np.exp(-1j * omega) - 1.0)
+    turned = np.exp(2j * np.pi * np.mod(turns_per_sample * n, 1.0))
+    factors = factor * (1.0 + turned), factor * (1.0 - turned)  # for odd and even k
+    theta = np.pi * nearest / n
+    at_nearest = start * sum(
+        0.5 * np.exp(0.5j * (side * theta + (n - 1) * x)) * n * np.sinc(0.5 * n * x / np.pi) / np.sinc(0.5 * x / np.pi)
+        for side, x in ((1.0, omega + theta), (-1.0, omega - theta))
+    )
+    transforms = []
+    for part in (np.imag, np.real):
+        found = np.empty(n - 1)
+        for parity, one in enumerate(factors):
+            np.multiply(ratio[parity::2], part(one), out=found[parity::2])
+        found[nearest - 1] = part(at_nearest)
+        transforms.append(found)
+    return transforms
+
+
 def inverse_cosine_transform(coefficients: Floats) -> Floats:
     """Compute the zero-mean series, shape (n,), from the cosine transform, shape (n − 1,).
 

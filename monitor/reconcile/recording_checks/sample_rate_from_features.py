@@ -11,10 +11,13 @@ therefore tests each feature separately, relative to the surrounding spectrum.
 - Otherwise, at least two groups must move by the same ratio, and no group may remain at the stated frequency.
 - The estimate of ``search.sample_rate_from_spectrum`` is accepted if the groups move by nearly this ratio and no
   group remains at the stated frequency.
+- If the groups are too weak for this test, the estimate is also accepted if the likelihood of the moved frequencies
+  alone is clearly larger, and if the same ratio also describes the noise of each axis at least as well.
 
-The noise level is no evidence for a wrong sample rate. An error of 20 % changes the level by 10 %, and the noise of
-many sensors varies as much from run to run. The cutoff of a low-pass filter is not sharp enough to count as evidence.
-For a sample rate that is wrong by 5 %, the gain of the cutoff is at most 7 nats in 60 000 samples of a real sensor.
+The noise level alone is no evidence for a wrong sample rate. An error of 20 % changes the level by 10 %, and the
+noise of many sensors varies as much from run to run. The cutoff of a low-pass filter is not sharp enough to count as
+evidence. For a sample rate that is wrong by 5 %, the gain of the cutoff is at most 7 nats in 60 000 samples of a real
+sensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,6 +56,8 @@ MIN_GAIN_NATS: Final = 25.0
 """Smallest total gain in nats of all groups for a ratio from the search over 5000 ratios."""
 MIN_STATED_GAIN_NATS: Final = 12.0
 """Smallest total gain in nats for the single ratio that the model states."""
+MIN_FEATURE_GAIN_NATS: Final = 20.0
+"""Smallest gain in nats of weak features, if the noise of each axis agrees with the ratio."""
 MAX_SPREAD: Final = 0.25
 """Largest deviation of a group from the common log ratio, as a fraction of the common log ratio."""
 MAX_PEAK_LOG_DISTANCE: Final = 0.02
@@ -117,7 +122,7 @@ def estimate_sample_rate_error(
     common = _estimate_common_ratio(groups)
     if common is not None:
         return common
-    return by_likelihood if by_likelihood and _is_supported(groups, log(float(by_likelihood.ratio.value))) else None
+    return by_likelihood if by_likelihood and _is_supported(groups, by_likelihood) else None
 
 
 def correct_impossible_sample_rate(
@@ -312,13 +317,18 @@ def _estimate_common_ratio(groups: Sequence[FeaturesOfOneCause]) -> SampleRateEr
     return _build_estimate(groups, moves, x, 2.0 * spread + LOG_RATIO_STEP)
 
 
-def _is_supported(groups: Sequence[FeaturesOfOneCause], x: float) -> bool:
-    """Return True if groups move by nearly the given log ratio and no group remains at the stated frequency."""
+def _is_supported(groups: Sequence[FeaturesOfOneCause], estimate: SampleRateErrorEstimate) -> bool:
+    """Return True if groups move by nearly the estimated ratio and no group remains at the stated frequency."""
+    x = log(float(estimate.ratio.value))
+    every_axis_agrees = estimate.smallest_axis_gain >= 0.0 and abs(x) > MAX_FREQUENCY_DRIFT
     moves = [
         _max_gain_near(one.gains, x, MAX_FREQUENCY_DRIFT) - _max_gain_near(one.gains, 0.0, 0.25 * MAX_FREQUENCY_DRIFT)
         for one in groups
     ]
-    if sum(moves) < MIN_STATED_GAIN_NATS or min(moves) < -MAX_GROUP_LOSS_NATS:
+    is_clear = sum(moves) >= MIN_STATED_GAIN_NATS or (
+        every_axis_agrees and estimate.feature_gain >= MIN_FEATURE_GAIN_NATS
+    )
+    if not is_clear or min(moves) < -MAX_GROUP_LOSS_NATS:
         return False
     near = np.abs(LOG_RATIOS - x) <= MAX_PEAK_LOG_DISTANCE
     own = [LOG_RATIOS[near][one.gains[near].argmax()] for one in groups if one.gains[near].max() >= MIN_GROUP_GAIN_NATS]

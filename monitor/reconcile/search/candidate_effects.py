@@ -7,6 +7,7 @@ many frequencies or times have larger penalties.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import log
 from typing import Final
 
 import numpy as np
@@ -38,13 +39,11 @@ from monitor.noise.effects import (
 from monitor.reconcile.diagnostics.whiteness_tests import (
     compute_level_step_gains,
     find_peak_gains_and_frequencies,
-    fitted_variance_gain_nats,
 )
 from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.effect_roles import linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import find_maximum_by_golden_section, fit_shape_parameter
-from monitor.reconcile.likelihood.periodic_pulse_search import fit_pulses
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 
 SHAPES_PER_DECADE: Final = 4
@@ -166,14 +165,14 @@ def find_broad_spectral_peaks(whitened: WhitenedAxis, max_peaks: int = MAX_PEAKS
     found: list[tuple[float, float, float]] = []
     width = 8
     while width < n // 8:
-        first = np.arange(width, n - 1 - width, max(1, width // 4))
-        power = np.maximum((running[first + width] - running[first]) / width, 1.0)
-        gains = fitted_variance_gain_nats(power, np.full(first.size, width))
+        step = max(1, width // 4)
+        power = running[2 * width : n - 1 : step] - running[width : n - 1 - width : step]
         for _ in range(max_peaks):
-            at = int(np.argmax(gains))
-            middle = (first[at] + 0.5 * width) * step_hz
-            found.append((float(gains[at]), float(middle), float(width * step_hz)))
-            gains[max(at - PEAK_SEPARATION_STEPS, 0) : at + PEAK_SEPARATION_STEPS + 1] = 0.0
+            at = int(np.argmax(power))
+            ratio = max(float(power[at]) / width, 1.0)
+            middle = (width + at * step + 0.5 * width) * step_hz
+            found.append((0.5 * width * (ratio - 1.0 - log(ratio)), middle, width * step_hz))
+            power[max(at - PEAK_SEPARATION_STEPS, 0) : at + PEAK_SEPARATION_STEPS + 1] = 0.0
         width *= 2
     chosen: list[tuple[float, float]] = []
     for gain, middle, wide in sorted(found, reverse=True):
@@ -217,7 +216,7 @@ def propose_pulse_trains(whitened: WhitenedAxis) -> list[Effect]:
     """Propose periodic pulses, unless a shape other than a rectangle fits clearly better."""
     if PulseTrain in whitened.effect_types or whitened.harmonic_series.gain < PENALTY_NATS["pulse_train"] / 4.0:
         return []
-    found = fit_pulses(whitened.series, whitened.axis.rate_hz, whitened.harmonic_series)
+    found = whitened.pulses
     if found is None or not found.is_rectangular or found.gain < PENALTY_NATS["pulse_train"] / 2.0:
         return []
     return [PulseTrain(height=1.0, period=found.period_s, width=found.width_s, delay=found.delay_s)]

@@ -67,6 +67,8 @@ class SampleRateErrorEstimate:
     gain: float  # log-likelihood gain summed over all axes, nats
     axis: str  # axis with the largest gain
     frequency: tuple[float, float]  # frequency of the feature in the model and in the recording, Hz
+    smallest_axis_gain: float = 0.0  # log-likelihood gain of the axis with the smallest gain, nats
+    feature_gain: float = 0.0  # log-likelihood gain of the moved frequencies alone, nats
 
 
 def convert_effect_to_stated_time(effect: Effect, rate_ratio: float) -> Effect:
@@ -140,7 +142,12 @@ def detect_sample_rate_error(
     features = _features(effects[strongest])
     stated = features[0].frequency if features else 0.0
     return SampleRateErrorEstimate(
-        ParameterInterval(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x))
+        ParameterInterval(exp(x), exp(ends[0]), exp(ends[1])),
+        top,
+        strongest,
+        (stated, stated / exp(x)),
+        min(of_axes.values()),
+        sum(alone),
     )
 
 

@@ -5,8 +5,7 @@ sensors. It opens a pseudo-terminal FOLDER/tty<i> for each device, encodes all f
 input. It then writes a burst of BURST frames to each device every BURST/RATE/SPEED s. A USB adapter sends such bursts
 as well. A SPEED above 1 fills long windows quickly. The numbers and times of the frames are stored in FOLDER, with
 times in monotonic nanoseconds. If a pseudo-terminal is full, the process waits and counts the event. A real port would
-lose
-bytes.
+lose bytes.
 """
 
 import contextlib
@@ -142,9 +141,13 @@ class Daemon:
         return [self.process, *self.process.children(recursive=True)]
 
     def cpu_s(self) -> float:
-        """Return the processor time of all processes so far in seconds."""
-        times = [process.cpu_times() for process in self.processes()]
-        return float(sum(t.user + t.system for t in times))
+        """Return the processor time of all processes so far in seconds, including processes that have ended."""
+        total_s = 0.0
+        for process in reversed(self.processes()):  # the time of a child that ends now is added to its parent
+            with contextlib.suppress(psutil.NoSuchProcess):
+                times = process.cpu_times()
+                total_s += times.user + times.system + times.children_user + times.children_system
+        return total_s
 
     def memory_bytes(self) -> int:
         """Return the memory of all processes in bytes, in which shared pages count once."""

@@ -4,9 +4,19 @@ import numpy as np
 import pytest
 from scipy.special import betainc, chdtri, ndtri, stdtrit
 
-from monitor.common.distributions import chi2_quantile, incomplete_beta, normal_quantile, student_quantile
+from monitor.common.distributions import (
+    chi2_quantile,
+    expand_chi2_quantile,
+    incomplete_beta,
+    normal_quantile,
+    student_quantile,
+)
 
 TOLERANCE = 1e-12
+
+
+def chi2_quantiles(edf, probability):
+    return np.array([chi2_quantile(one, expand_chi2_quantile(probability)) for one in edf])
 
 
 @pytest.mark.parametrize("probability", [0.001, 0.025, 0.5, 0.95, 0.975])
@@ -14,18 +24,17 @@ def test_chi2_quantile(probability: float) -> None:
     edf = np.concatenate([np.geomspace(0.01, 1e12, 20_001), np.arange(1.0, 2001.0)])
     expected = chdtri(edf, 1.0 - probability)
     comparable = expected > 1e-290  # smaller numbers have fewer digits
-    np.testing.assert_allclose(chi2_quantile(edf, probability)[comparable], expected[comparable], rtol=TOLERANCE)
+    np.testing.assert_allclose(chi2_quantiles(edf, probability)[comparable], expected[comparable], rtol=TOLERANCE)
 
 
 def test_chi2_quantile_underflows_to_zero() -> None:
-    assert chi2_quantile(np.array([0.001]), 0.025)[0] == chdtri(0.001, 0.975) == 0.0
+    assert chi2_quantiles([0.001], 0.025)[0] == chdtri(0.001, 0.975) == 0.0
 
 
 def test_chi2_quantile_of_no_degrees_of_freedom_is_nan() -> None:
-    edf = np.array([[np.nan, 0.0], [-1.0, 2.0]])
-    found = chi2_quantile(edf, 0.975)
-    assert np.isnan(found).tolist() == [[True, True], [True, False]]
-    assert found[1, 1] == pytest.approx(-2.0 * np.log(0.025), rel=TOLERANCE)
+    found = chi2_quantiles([np.nan, 0.0, -1.0, 2.0], 0.975)
+    assert np.isnan(found).tolist() == [True, True, True, False]
+    assert found[3] == pytest.approx(-2.0 * np.log(0.025), rel=TOLERANCE)
 
 
 def test_normal_quantile() -> None:

@@ -186,7 +186,7 @@ def test_change_of_noise_is_reported_with_time_and_size():
     [note] = [note for note in found.notes if "angle random walk" in note]
     assert re.fullmatch(r"at (399|400)\.\d s: gz angle random walk rose by [78]\d % \(\d+\.\d σ\)", note)
     assert (
-        "the curve of the whole recording mixes the noise before and after; --window S shows the noise over time"
+        "the curve of the whole recording mixes both noise levels; curves over time (--window S) separate them"
         in found.notes
     )
 

@@ -158,6 +158,18 @@ def test_wrong_sample_rate_is_one_step_for_all_axes():
     assert added.frequency == pytest.approx(31.0, abs=4e-3)
 
 
+def test_equal_factors_on_all_axes_may_come_from_the_sample_rate():
+    plain = NoiseModel(dict.fromkeys(AXES, (WHITE,)))
+    drawn = recording(plain + NoiseModel({"gy": (SampleRateError(ratio=1.2),)}), 24_000, 6, names=AXES)
+    found = reconcile(drawn, plain, 1)
+    steps = [step for one in found.axes.values() for step in one.steps]
+    assert [step.effect for step in steps] == ["scale_factor"] * 6
+    for step in steps:
+        assert step.parameters["factor"].value == pytest.approx(1.2**0.5, rel=0.01)
+        assert step.confidence == pytest.approx(0.5, abs=0.01)
+        assert [other.effect for other in step.runners_up] == ["sample_rate_error"]
+
+
 def test_leak_between_correlated_axes_has_one_direction():
     loud = (AngleRandomWalk(N=20 * N),)
     plain = NoiseModel({"gx": (WHITE,), "gy": loud, "gz": (WHITE,)})

@@ -250,7 +250,7 @@ def test_common_effect_has_a_value_per_recording_and_a_pooled_value() -> None:
 def test_single_effect_has_a_reason_why_it_is_not_in_other_recordings() -> None:
     (row,) = (row for row in PageText(render_comparison_page(make_comparison())).rows if "bias step" in " ".join(row))
     assert row[2] == "warm"
-    assert "cold <1>: may differ an effect that happens once need not happen in another recording" in row[3]
+    assert "cold <1>, c: may differ an effect that happens once need not happen in another recording" in row[3]
     assert "c: may differ" in row[3]
 
 

@@ -1,4 +1,4 @@
-"""Tests of ``watch --json``: the lines of all kinds of messages, and the end of the program."""
+"""Tests of ``watch``: the lines of all kinds of messages, Allan deviations, and the end of the program."""
 
 import contextlib
 import json
@@ -19,11 +19,12 @@ import pytest
 from drivers.data_types import AXES, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
-from monitor.publishing.messages.results import EventMessage
+from monitor.publishing.messages.results import AllanMessage, CoefficientsMessage, EventMessage, StatusMessage
 from monitor.publishing.terminal.watch import RESULT_TOPICS, SAMPLE_TOPICS, json_line
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import ReceivedMessageOrLiveliness
 from monitor.settings.loading import ZenohTable
+from tests.monitor.publishing.example_results import make_estimate, make_health
 from tests.monitor.publishing.messages.example_messages import EXAMPLES
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S
@@ -99,7 +100,7 @@ def run_daemon(endpoint: str, *messages: tuple[topics.ZenohTopic, bytes], period
 
 @contextlib.contextmanager
 def run_watch(*arguments: str) -> Iterator["subprocess.Popen[str]"]:
-    command = [*PROGRAM, "--json", *arguments]
+    command = [*PROGRAM, *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process
@@ -114,7 +115,7 @@ def test_messages_arrive_line_by_line_until_an_interrupt() -> None:
     endpoint = free_endpoint()
     sent = [(topics.EVENT, EVENT), (topics.SAMPLES, make_samples())]
     sent += [(one, b'{"schema": 1}') for one in RESULT_TOPICS if one is not topics.EVENT]
-    with run_daemon(endpoint, *sent), run_watch("imu/**", "--connect", endpoint) as process:
+    with run_daemon(endpoint, *sent), run_watch("--json", "imu/**", "--connect", endpoint) as process:
         assert process.stdout is not None
         seen: dict[str, object] = {}
         while seen.keys() < {
@@ -136,18 +137,38 @@ def test_messages_arrive_line_by_line_until_an_interrupt() -> None:
 def test_samples_are_printed_if_the_key_expression_names_them(topic: str) -> None:
     endpoint = free_endpoint()
     sent = [(one, make_samples()) for one in SAMPLE_TOPICS]
-    with run_daemon(endpoint, *sent), run_watch(f"imu/*/{topic}", "--connect", endpoint) as process:
+    with run_daemon(endpoint, *sent), run_watch("--json", f"imu/*/{topic}", "--connect", endpoint) as process:
         assert process.stdout is not None
         found = json.loads(process.stdout.readline())
         assert found["topic"] == topic
         assert found["message"]["gz"] == [1e-3, -0.1 - 0.2]
 
 
+@pytest.mark.parametrize(("keyexpr", "drawn"), [("imu/a", True), ("imu/**", False)])
+def test_allan_deviations_are_drawn_if_the_key_expression_names_the_device(keyexpr: str, drawn: bool) -> None:
+    endpoint = free_endpoint()
+    sent = [
+        (topics.STATUS, StatusMessage.from_result("a", 1.0, 100, make_health()).encode()),
+        (topics.COEFFICIENTS, CoefficientsMessage.from_result("a", 1.0, 100, make_estimate()).encode()),
+        (topics.ALLAN, AllanMessage.from_result("a", 1.0, 100, make_estimate()).encode()),
+    ]
+    with run_daemon(endpoint, *sent), run_watch(keyexpr, "--connect", endpoint) as process:
+        assert process.stdout is not None
+        tables = 0
+        while tables < 3:  # the first table with coefficients may precede the first Allan deviations
+            line = process.stdout.readline()
+            tables += line.startswith("gx ")
+            if drawn and line.startswith("Gyroscopes: Allan deviation"):
+                return
+            assert "Allan" not in line
+        assert not drawn
+
+
 def test_program_ends_when_the_reader_closes_the_pipe() -> None:
     endpoint = free_endpoint()
     with (
         run_daemon(endpoint, (topics.EVENT, EVENT), period_s=0.3),
-        run_watch("imu/*/event", "--connect", endpoint) as process,
+        run_watch("--json", "imu/*/event", "--connect", endpoint) as process,
     ):
         assert process.stdout is not None
         assert json.loads(process.stdout.readline())["topic"] == "event"
@@ -170,7 +191,7 @@ def test_program_notices_a_closed_pipe_without_further_messages() -> None:
 
 def test_connection_problem_and_duration() -> None:
     endpoint = free_endpoint()
-    with run_watch("--connect", endpoint, "--seconds", "1") as process:
+    with run_watch("--json", "--connect", endpoint, "--seconds", "1") as process:
         out, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert out == ""

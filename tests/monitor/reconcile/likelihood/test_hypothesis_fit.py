@@ -156,7 +156,7 @@ def test_intervals_of_sizes_contain_the_true_sizes():
 @pytest.mark.parametrize("size", [1e-3, 1e-9])
 def test_interval_of_an_insignificant_size_begins_at_zero(size):
     fit = fit_with_fewest_changes(axis(white(n, np.random.default_rng(1))), (WHITE, RateRandomWalk(K=K)), ()).fit
-    tiny = replace(fit, effects=(WHITE, RateRandomWalk(K=size * K)))
+    tiny = replace(fit, start_effects=(WHITE, RateRandomWalk(K=size * K)))
     whittle = replace(fit.whittle, theta=np.array([fit.whittle.theta[0], (size * K) ** 2]))
     tiny = replace(tiny, whittle=whittle, fitted_noise=(0, 1))
     found = compute_size_interval(tiny, 1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES
-from monitor.noise.effects import AngleRandomWalk, Narrowband, SampleRateError
+from monitor.noise.effects import AngleRandomWalk, Narrowband, SampleRateError, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.preparation.cosine_bins import cosine_transform
 from monitor.reconcile.preparation.reconcile_input import RecordedAxes
@@ -13,6 +13,8 @@ from monitor.reconcile.recording_checks.sample_rate_from_features import (
     estimate_sample_rate_error,
     group_features_with_gains,
 )
+from monitor.reconcile.result import ParameterInterval
+from monitor.reconcile.search.sample_rate_from_spectrum import SampleRateErrorEstimate
 from tests.monitor.reconcile.recording_checks.recordings import RATE_HZ, draw, make_model
 
 MODEL = make_model()
@@ -94,3 +96,16 @@ def test_simulated_sample_rate_error_is_estimated():
     coefficients = {axis: cosine_transform(y) for axis, y in recording.values.items()}
     found = estimate_sample_rate_error(coefficients, RATE_HZ, MODEL.effects, RATE_HZ, None)
     assert found.ratio.value == pytest.approx(1.04, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("smallest_axis_gain", "feature_gain", "accepted"), [(1.0, 25.0, True), (-1.0, 25.0, False), (1.0, 15.0, False)]
+)
+def test_weak_lines_need_the_noise_of_every_axis(smallest_axis_gain, feature_gain, accepted):
+    line = NoiseModel({"gx": (Sinusoidal(amplitude=1e-9, frequency=17.0),)})
+    model = NoiseModel(dict.fromkeys(AXES, (AngleRandomWalk(N=1e-3),))) + line
+    coefficients = {axis: cosine_transform(y) for axis, y in draw(model, 3).values.items()}
+    ratio = ParameterInterval(1.01, 1.0099, 1.0101)
+    estimate = SampleRateErrorEstimate(ratio, 60.0, "gx", (17.0, 17.0 / 1.01), smallest_axis_gain, feature_gain)
+    found = estimate_sample_rate_error(coefficients, RATE_HZ, model.effects, None, estimate)
+    assert found == (estimate if accepted else None)
