@@ -81,7 +81,7 @@ def make_block(
     ticks: Ints | None = None,
     lost: int = 0,
 ) -> SampleBlock:
-    """Return a ``SampleBlock`` and make its arrays read-only.
+    """Return a ``SampleBlock`` with read-only contiguous arrays.
 
     Parameters
     ----------
@@ -99,6 +99,9 @@ def make_block(
     n = int(t_ns.size)
     temperature_c = np.full(n, np.nan) if temperature_c is None else temperature_c
     ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
+    # the kernels are compiled for contiguous arrays only, and another layout would be compiled while samples wait
+    t_ns, ticks = np.ascontiguousarray(t_ns), np.ascontiguousarray(ticks)
+    values, temperature_c = np.ascontiguousarray(values), np.ascontiguousarray(temperature_c)
     for array in (t_ns, values, temperature_c, ticks):
         array.flags.writeable = False
     return SampleBlock(t_ns, values, temperature_c, ticks, lost)

@@ -18,6 +18,14 @@ def test_axes_have_the_documented_order():
     assert AXES == ("gx", "gy", "gz", "ax", "ay", "az")
 
 
+def test_block_has_contiguous_arrays_whatever_the_layout_of_its_parts():
+    table = np.arange(24.0).reshape(3, 8)
+    block = make_block(np.arange(6)[::2], np.asfortranarray(table[:, :6]), table[:, 6], np.arange(6)[::2])
+    arrays = (block.t_ns, block.values, block.temperature_c, block.ticks)
+    assert all(one.flags.c_contiguous and not one.flags.writeable for one in arrays)
+    np.testing.assert_array_equal(block.values, table[:, :6])
+
+
 def test_temperature_and_ticks_are_absent_by_default():
     block = make_block(np.arange(3), np.zeros((3, 6)))
     assert np.isnan(block.temperature_c).all()

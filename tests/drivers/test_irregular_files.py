@@ -3,6 +3,7 @@
 Every reader refuses it with an error of one line and does not wait for data.
 """
 
+import contextlib
 import os
 import socket
 import subprocess
@@ -262,12 +263,21 @@ def test_program_waits_for_a_silent_pipe_until_a_signal(number: int, tmp_path: P
     writer = -1
     try:
         writer = open_for_writing(path)
-        process.send_signal(number)
-        process.communicate(timeout=PATIENCE_S)
+        end_with_signal(process, number)
     finally:
         process.kill()
         os.close(writer)
     assert process.returncode in (-number, 128 + number)
+
+
+def end_with_signal(process: "subprocess.Popen[bytes]", number: int) -> None:
+    """Send a signal until the process ends, because Python does not notice a signal just before it begins to read."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while process.poll() is None:
+        assert time.monotonic() < deadline_s, "the process does not end"
+        process.send_signal(number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.communicate(timeout=2.0)
 
 
 def open_for_writing(path: Path) -> int:
