@@ -35,9 +35,8 @@ def add_sample_rate_as_alternative(found: Mapping[str, AxisSearchResult]) -> dic
     sizes_saved = len({f"{factor:.9f}" for factor in factors}) - 1
     ratio = exp(2.0 * fsum(map(log, factors)) / len(factors))
     advantage = fsum(_gain_of_sample_rate(search.hypothesis, ratio) for search in found.values())
-    advantage = min(
-        advantage + RESIZE_PENALTY_NATS * sizes_saved, 0.0
-    )  # the noise level alone decides for neither cause
+    # the noise level alone decides for neither cause
+    advantage = min(advantage + RESIZE_PENALTY_NATS * sizes_saved, 0.0)
     return {name: _with_alternative(search, advantage) for name, search in found.items()}
 
 
