@@ -41,7 +41,7 @@ from monitor.reconcile.diagnostics.whiteness_tests import (
     find_peak_gains_and_frequencies,
 )
 from monitor.reconcile.effect_properties import PENALTY_NATS
-from monitor.reconcile.likelihood.axis_fit import Axis, Effects
+from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import find_maximum_by_golden_section, fit_shape_parameter
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
@@ -70,6 +70,10 @@ FILTERS: Final = (
     *(("fir", order) for order in (1, 2)),
 )
 """Kind and order of each filter that is tried."""
+HIGHEST_FREQUENCIES: Final = (0.42, 0.5)
+"""Frequency range in which quantization noise is strongest, as fractions of the sample rate."""
+MIDDLE_FREQUENCIES: Final = (0.2, 0.3)
+"""Frequency range in the middle of the spectrum, as fractions of the sample rate."""
 FLOOR_PENALTY_NATS: Final = 2.0
 """Smallest log-likelihood gain, in nats, of white noise added after a filter."""
 LINE_BLOCKS: Final = 4096
@@ -81,10 +85,28 @@ CandidateFunction = Callable[[WhitenedAxis], list[Effect]]
 
 
 def propose_allan_terms(whitened: WhitenedAxis) -> list[Effect]:
-    """Propose the noise terms Q, N, B and K that the current hypothesis lacks."""
+    """Propose the noise terms Q, N, B and K that the current hypothesis lacks.
+
+    Quantization noise is not proposed beside a low-pass filter if the spectrum falls. Q would only correct the shape of
+    the filter.
+    """
     small = initial_effect_size(whitened.axis)
     every = (QuantizationNoise(Q=small), AngleRandomWalk(N=small), BiasInstability(B=small), RateRandomWalk(K=small))
-    return [effect for effect in every if type(effect) not in whitened.effect_types]
+    known = whitened.effect_types
+    if BandwidthLimit in known and not _spectrum_rises(whitened.fit):
+        known = known | {QuantizationNoise}
+    return [effect for effect in every if type(effect) not in known]
+
+
+def _spectrum_rises(fit: AxisFit) -> bool:
+    """Return True if the noise density at the highest frequencies exceeds the density in the middle of the spectrum."""
+    bins, power = fit.axis.bins, fit.whittle.residual
+    high, middle = (
+        float(power[inside].sum() / max(float(bins.count[inside].sum()), 1.0))
+        for lo, hi in (HIGHEST_FREQUENCIES, MIDDLE_FREQUENCIES)
+        for inside in [(bins.f_hz > lo * bins.rate_hz) & (bins.f_hz < hi * bins.rate_hz)]
+    )
+    return high > middle
 
 
 def propose_correlated_noise(whitened: WhitenedAxis) -> list[Effect]:

@@ -27,7 +27,6 @@ from monitor.reconcile.diagnostics.null_distribution import AxisNull
 from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.hypothesis_fit import (
-    RESIZE_PENALTY_NATS,
     Hypothesis,
     find_maximum_by_golden_section,
     fit_with_fewest_changes,
@@ -61,6 +60,8 @@ MAX_LOG_BANDWIDTH_CHANGE: Final = 1.0
 MIN_HALF_SHARE: Final = 0.2
 """Smallest share of the gain that each half of the recording must contribute, for all axes together and for each
 axis."""
+MIN_AXIS_GAIN_NATS: Final = PENALTY_NATS[CommonVibration.name]
+"""Smallest log-likelihood gain of each axis beyond two, in nats. Each axis needs the evidence for a name of its own."""
 MAX_LOSS_SHARE: Final = 0.2
 """Largest increase of the significant gains of all diagnostics, relative to the gain of the correlations."""
 MAX_SAME_BANDWIDTH_RATIO: Final = 4.0
@@ -101,7 +102,7 @@ class _Vibration:
     @property
     def penalty_nats(self) -> float:
         """Smallest gain of the correlations of a true vibration."""
-        axes_penalty = RESIZE_PENALTY_NATS * max(int(np.count_nonzero(self.gains)) - 2, 0)
+        axes_penalty = MIN_AXIS_GAIN_NATS * max(int(np.count_nonzero(self.gains)) - 2, 0)
         frequency_penalty = 0.0 if self.shape[0] is None else FREQUENCY_PENALTY_NATS
         return PENALTY_NATS[CommonVibration.name] + axes_penalty + frequency_penalty
 
@@ -207,7 +208,7 @@ def _without_weak_axes(joint: "_JointFit", spectra: CrossSpectra, halves: Sequen
     """Leave out the axes on which the vibration explains too little, as long as more than two axes remain.
 
     The gain of an axis comes from its correlations with the other axes and from its spectrum. This gain and the gain
-    of the correlations alone must exceed ``RESIZE_PENALTY_NATS``, and each half of the recording must contribute to the
+    of the correlations alone must exceed ``MIN_AXIS_GAIN_NATS``, and each half of the recording must contribute to the
     gain from the correlations.
 
     Parameters
@@ -223,7 +224,7 @@ def _without_weak_axes(joint: "_JointFit", spectra: CrossSpectra, halves: Sequen
         axes = np.flatnonzero(joint.vibration.gains).tolist()
         gains = [_gain_of_axis(joint, spectra, halves, at) for at in axes]
         least = int(np.argmin(gains))
-        if gains[least] > RESIZE_PENALTY_NATS:
+        if gains[least] > MIN_AXIS_GAIN_NATS:
             break
         joint = _without_axis(joint, spectra, axes[least])
     return joint
@@ -392,7 +393,7 @@ def fit_correlations(spectra: CrossSpectra, shape: Shape) -> _Vibration:
         if active.size <= 2:
             return _Vibration(shape, gains / scale, whole)
         rest = [spectra.gain_nats(unit, gains / scale * (np.arange(scale.size) != at)) for at in active]
-        if whole - max(rest) > RESIZE_PENALTY_NATS:
+        if whole - max(rest) > MIN_AXIS_GAIN_NATS:
             return _Vibration(shape, gains / scale, whole)
         gains[active[int(np.argmax(rest))]] = 0.0
 
