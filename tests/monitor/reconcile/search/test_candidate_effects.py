@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from drivers.data_types import AXES
 from monitor.noise.effects import (
     EFFECTS,
     BandwidthLimit,
@@ -73,6 +74,17 @@ def test_missing_noise_terms_are_proposed():
     assert set(list_candidates(propose.propose_allan_terms, axis(draw_noise()), TERMS)) == {"quantization_noise"}
     model = (QuantizationNoise(Q=1e-8), *TERMS)
     assert list_candidates(propose.propose_allan_terms, axis(draw_noise()), model) == {}
+
+
+@pytest.mark.parametrize(("q_relative", "proposed"), [(0.0, False), (0.3, False), (0.8, True)])
+def test_quantization_noise_beside_a_low_pass_filter_is_proposed_only_if_the_spectrum_rises(q_relative, proposed):
+    rng = np.random.default_rng(2)
+    low_pass = BandwidthLimit(cutoff=0.2 * RATE_HZ, order=1)
+    filtered = NoiseModel({"gz": (WHITE, low_pass)}).simulate(n, RATE_HZ, 2)[:, AXES.index("gz")]
+    increments = np.diff(rng.standard_normal(n + 1))
+    y = filtered + 0.3 * white(n, rng) + q_relative * N * RATE_HZ**0.5 * increments
+    found = list_candidates(propose.propose_allan_terms, axis(y), (WHITE, WALK, low_pass))
+    assert ("quantization_noise" in found) == proposed
 
 
 @pytest.mark.parametrize("correlation_s", [0.05, 0.5, 5.0])
