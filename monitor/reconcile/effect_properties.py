@@ -60,6 +60,7 @@ EFFECT_PROPERTIES: Final = {
     "pulse_train": EffectProperties(23.0 + 7.0, "lines", "series", ("height",), identity="period", tolerance=0.005),
     "bias_curve": EffectProperties(9.5, "level", "series", ("slope", "curvature", "logarithmic"), ("time_constant",)),
     "variance_modulation": EffectProperties(18.0, "variance", identity="period", tolerance=0.05),
+    "wandering_variance": EffectProperties(11.0, "variance"),
     "power_law": EffectProperties(9.5 + 2.0, "psd", "noise", ("density",), ("exponent",), "exponent", 0.1),
 }
 """Properties of each effect, by name.

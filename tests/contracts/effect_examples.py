@@ -79,6 +79,7 @@ EXAMPLES = {
         expected_series=lambda x, t, c: x + 0.3 * t - 0.02 * t**2 + 0.7 * np.log(1.0 + t / 8.0),
     ),
     "variance_modulation": Example({"depth": 0.7, "period": 3.0}, {AXIS: (WHITE,)}),
+    "wandering_variance": Example({"deviation": 0.7, "correlation_time": 0.05}, {AXIS: (WHITE,)}),
     "pulse_train": Example({"height": -0.7, "period": 0.14, "width": 0.04}),
     "temperature_hysteresis": Example(
         {"height": 0.7, "reversal": 0.6},

@@ -24,6 +24,7 @@ from monitor.noise.effects.disturbances.pulse_train import PulseTrain as PulseTr
 from monitor.noise.effects.disturbances.random_telegraph import RandomTelegraph as RandomTelegraph
 from monitor.noise.effects.disturbances.variance_modulation import VarianceModulation as VarianceModulation
 from monitor.noise.effects.disturbances.wandering_line import WanderingLine as WanderingLine
+from monitor.noise.effects.disturbances.wandering_variance import WanderingVariance as WanderingVariance
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk as AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability as BiasInstability
 from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated as ExponentiallyCorrelated

@@ -26,6 +26,7 @@ from monitor.noise.effects import (
     TemperatureBias,
     TemperatureLag,
     TurnOnTransient,
+    WanderingVariance,
 )
 from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 from monitor.reconcile.effect_properties import SERIES_SIZE_PARAMETERS
@@ -204,10 +205,10 @@ class Axis:
         self._bases.clear()
 
     def white_noise_gain_over_time(self, effects: Sequence[Effect]) -> Floats:
-        """Return the gain of the white noise over time, shape (n,)."""
+        """Return the known gain of the white noise over time, shape (n,). A random gain is one on average."""
         gain = np.ones(self.n)
         for effect in effects:
-            if isinstance(effect, WhiteNoiseGain):
+            if isinstance(effect, WhiteNoiseGain) and not isinstance(effect, WanderingVariance):
                 started = effect.start_gain(self.rate_hz, np.random.default_rng(0))
                 gain *= started.compute_gain(self.regressors.first_sample, self.n)
         return gain

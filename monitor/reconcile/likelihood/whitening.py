@@ -12,7 +12,7 @@ from scipy.fft import next_fast_len, rfft
 
 from drivers.data_types import Floats, Ints
 from monitor.noise.effect import Effect, WhiteNoiseGain
-from monitor.noise.effects import HeavyTails
+from monitor.noise.effects import HeavyTails, WanderingVariance
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.outlier_fit import OutlierFit, convert_student_to_gaussian, fit_outliers
 from monitor.reconcile.likelihood.periodic_pulse_search import HarmonicSeries, Pulses, find_harmonic_series, fit_pulses
@@ -21,6 +21,11 @@ from monitor.reconcile.likelihood.variance_change_tests import (
     VarianceChangeGains,
     compare_variance_change_forms,
     find_spectrogram_change,
+)
+from monitor.reconcile.likelihood.wandering_variance_fit import (
+    FittedWanderingVariance,
+    estimate_wandering_std,
+    fit_wandering_variance,
 )
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 
@@ -87,8 +92,13 @@ class WhitenedAxis:
         return compare_variance_change_forms(self.flat_series, 1.0 / self.axis.rate_hz)
 
     @cached_property
+    def wandering_variance(self) -> FittedWanderingVariance | None:
+        """Fit of a random variation of the variance to the flattened series, or None if the recording is too short."""
+        return fit_wandering_variance(self.flat_series, 1.0 / self.axis.rate_hz)
+
+    @cached_property
     def unexplained_spectrogram_change(self) -> SpectrogramChange:
-        """Largest change of power in the spectrogram that noise steps and heavy tails of the model do not explain."""
+        """Largest change of power in the spectrogram that the model does not explain."""
         return find_spectrogram_change(_with_constant_gaussian_noise(self.series, self.fit), 1.0 / self.axis.rate_hz)
 
     @cached_property
@@ -135,9 +145,13 @@ def _flattened_series(fit: AxisFit, whitened: Floats) -> Floats:
 
 
 def _with_constant_gaussian_noise(whitened: Floats, fit: AxisFit) -> Floats:
-    """Remove the noise steps and the heavy tails of the model from a whitened series, shape (n,)."""
+    """Remove the variance changes and the heavy tails of the model from a whitened series, shape (n,)."""
     series = whitened / relative_noise_std_over_time(fit)
     for effect in fit.effects:
+        if isinstance(effect, WanderingVariance):
+            series = series / estimate_wandering_std(
+                series, 1.0 / fit.axis.rate_hz, effect.deviation, effect.correlation_time
+            )
         if isinstance(effect, HeavyTails):
             series = convert_student_to_gaussian(series, effect.nu)
     return np.asarray(series)

@@ -24,6 +24,7 @@ from monitor.noise.effects import (
     Sinusoidal,
     VarianceModulation,
     WanderingLine,
+    WanderingVariance,
 )
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
@@ -45,6 +46,7 @@ SAMPLE_EFFECTS: Final = (
     HeavyTails,
     VarianceModulation,
     WanderingLine,
+    WanderingVariance,
 )
 """Effects that do not change the Whittle likelihood. They are validated by the gap of the diagnostic."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"

@@ -4,7 +4,7 @@ The **score** of a trial is the gain in log-likelihood less the penalties. ``gen
 in this order:
 
 1. Quantization, clipping and repeated samples.
-2. Outliers, heavy tails, and steps or periodic variations of the noise level.
+2. Outliers, heavy tails, and steps, periodic or random variations of the noise level.
 3. Deterministic effects, with the gain over the best slow noise. Slow noise can resemble a deterministic effect.
 4. Noise effects and a common factor for all noise effects of the model.
 
@@ -18,7 +18,8 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc
 
-from monitor.noise.effect import AxisLeak, Effect, WhiteNoiseGain
+from drivers.data_types import Floats
+from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
     ExponentiallyCorrelated,
@@ -34,6 +35,7 @@ from monitor.noise.effects import (
     ScaleFactor,
     Sinusoidal,
     VarianceModulation,
+    WanderingVariance,
 )
 from monitor.noise.effects.disturbances.heavy_tails import DEGREES_OF_FREEDOM
 from monitor.reconcile.diagnostics.whiteness_tests import STEP_MARGIN_FRACTION
@@ -49,6 +51,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
 )
 from monitor.reconcile.likelihood.outlier_fit import convert_student_to_gaussian, student_misfit_z
 from monitor.reconcile.likelihood.variance_change_tests import compare_variance_change_forms, gains_in_frequency_bands
+from monitor.reconcile.likelihood.wandering_variance_fit import FittedWanderingVariance, estimate_wandering_std
 from monitor.reconcile.likelihood.whitening import MIN_NOISE_GAIN, WhitenedAxis
 from monitor.reconcile.preparation.value_artifacts import ValueWithInterval
 from monitor.reconcile.result import ParameterInterval
@@ -141,7 +144,8 @@ def generate_trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Ite
     """
     yield _value_trials(whitened)
     samples = _outlier_trial(hypothesis, whitened) + _heavy_tails_trial(whitened)
-    samples = _best_first(samples + _noise_step_trial(whitened) + _variance_modulation_trial(whitened))
+    samples += _noise_step_trial(whitened) + _variance_modulation_trial(whitened) + _wandering_variance_trial(whitened)
+    samples = _best_first(samples)
     # short pulses have heavy tails and a periodic variance too, and are tried with the noise effects
     pulses = [_noise_trial(hypothesis, effect) for effect in propose_pulse_trains(whitened)] if samples else []
     yield [] if any(one.score > samples[0].score for one in pulses) else samples
@@ -246,10 +250,10 @@ def _variance_modulation_trial(whitened: WhitenedAxis) -> list[Trial]:
     changes, found = whitened.variance_changes, whitened.variance_changes.periodic
     if AngleRandomWalk not in whitened.effect_types or VarianceModulation in whitened.effect_types:
         return []
-    if found.gain <= max(changes.step.gain, changes.trend_gain, changes.slow_variation_gain, _band_gain(whitened)):
+    if found.gain <= max(changes.step.gain, changes.trend_gain, _random_variation_gain(whitened), _band_gain(whitened)):
         return []
     effect = VarianceModulation(depth=found.depth.value, period=found.period.value, phase=found.phase)
-    if not _changes_all_frequencies(whitened, effect):
+    if not _changes_all_frequencies(whitened, whitened.axis.white_noise_gain_over_time((effect,))):
         return []
     intervals = {
         "depth": _scaled_bounds(found.depth),
@@ -257,6 +261,42 @@ def _variance_modulation_trial(whitened: WhitenedAxis) -> list[Trial]:
         "phase": ParameterInterval(found.phase),
     }
     return [_penalised_trial(effect, found.gain, intervals)]
+
+
+def _wandering_variance_trial(whitened: WhitenedAxis) -> list[Trial]:
+    """Try a random variation of the variance, unless another cause is as likely or the logarithms are not Gaussian.
+
+    Bursts and switches of the noise level have logarithms with heavy tails.
+    """
+    found, known = whitened.wandering_variance, whitened.effect_types
+    if found is None or AngleRandomWalk not in known or WanderingVariance in known or found.misfit_z >= MAX_OUTLIER_Z:
+        return []
+    penalty = PENALTY_NATS["wandering_variance"]
+    if found.gain <= max(_regular_variation_gain(whitened, found), _band_gain(whitened)) + ALTERNATIVE_MARGIN_NATS:
+        return []
+    deviation, time_s = found.deviation.value, found.correlation_time.value
+    std = estimate_wandering_std(whitened.flat_series, 1.0 / whitened.axis.rate_hz, deviation, time_s)
+    if found.gain_over_heavy_tails <= penalty or not _changes_all_frequencies(whitened, std):
+        return []
+    intervals = {
+        "deviation": _scaled_bounds(found.deviation),
+        "correlation_time": _scaled_bounds(found.correlation_time),
+    }
+    return [_penalised_trial(WanderingVariance(deviation=deviation, correlation_time=time_s), found.gain, intervals)]
+
+
+def _regular_variation_gain(whitened: WhitenedAxis, found: FittedWanderingVariance) -> float:
+    """Return the largest gain, in nats, of a step, a trend and a periodic variation of ln σ²."""
+    changes, rate_hz, n = whitened.variance_changes, whitened.axis.rate_hz, whitened.axis.n
+    return max(
+        found.regression_gain(lambda k: (k[None] >= changes.step.time.value * rate_hz).astype(np.float64)),
+        found.regression_gain(lambda k: np.stack([k / n, (k / n) ** 2])),
+        found.regression_gain(
+            lambda k: np.stack(
+                [turn(2.0 * np.pi * k / (rate_hz * changes.periodic.period.value)) for turn in (np.cos, np.sin)]
+            )
+        ),
+    )
 
 
 def _heavy_tails_trial(whitened: WhitenedAxis) -> list[Trial]:
@@ -284,21 +324,36 @@ def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
     inside = STEP_MARGIN_FRACTION * length_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
     if AngleRandomWalk not in whitened.effect_types or not inside:
         return []
-    if step.gain <= max(changes.largest_gain_other_than_step, _band_gain(whitened)) - ALTERNATIVE_MARGIN_NATS:
+    others = changes.trend_gain, changes.periodic.gain, _random_variation_gain(whitened), _band_gain(whitened)
+    if step.gain <= max(others) - ALTERNATIVE_MARGIN_NATS:
         return []
     effect = NoiseStep(time=step.time.value, ratio=step.ratio.value)
-    if not _changes_all_frequencies(whitened, effect):
+    if not _changes_all_frequencies(whitened, whitened.axis.white_noise_gain_over_time((effect,))):
         return []
     intervals = {"time": _scaled_bounds(step.time), "ratio": _scaled_bounds(step.ratio)}
     return [_penalised_trial(effect, step.gain, intervals)]
 
 
-def _changes_all_frequencies(whitened: WhitenedAxis, effect: WhiteNoiseGain) -> bool:
+def _random_variation_gain(whitened: WhitenedAxis) -> float:
+    """Return the gain of a free variance at low frequencies, in nats, or 0 if a regular variation is more likely."""
+    found = whitened.wandering_variance
+    is_regular = found is not None and found.gain < _regular_variation_gain(whitened, found)
+    return 0.0 if is_regular else whitened.variance_changes.slow_variation_gain
+
+
+def _changes_all_frequencies(whitened: WhitenedAxis, std: Floats) -> bool:
     """Return True if the variance changes at most frequencies, and not only in one frequency band.
 
     A resonance whose frequency or strength varies changes the variance in one band.
+
+    Parameters
+    ----------
+    whitened : WhitenedAxis
+        Whitened axis.
+    std : ndarray of float64, shape (n,)
+        Relative standard deviation over time.
     """
-    variance = np.maximum(whitened.axis.white_noise_gain_over_time((effect,)), MIN_NOISE_GAIN) ** 2
+    variance = np.maximum(std, MIN_NOISE_GAIN) ** 2
     gains = gains_in_frequency_bands(whitened.flat_series, variance / variance.mean(), FREQUENCY_BANDS)
     return bool(gains.max() < MAX_BAND_SHARE * gains.sum() + BAND_MARGIN_NATS)
 

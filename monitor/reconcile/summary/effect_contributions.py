@@ -38,6 +38,7 @@ from monitor.noise.effects import (
     Saturation,
     VarianceModulation,
     WanderingLine,
+    WanderingVariance,
 )
 from monitor.noise.spectrum import allan_variance_of_density
 from monitor.reconcile.diagnostics.whiteness_tests import fitted_variance_gain_nats
@@ -59,7 +60,15 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 """Diagnostics that detect the same difference, by the name of the group."""
 JUMP_PROCESSES: Final = (PoissonSteps, RandomTelegraph)
 """Effects that have the same spectrum as Gaussian noise."""
-EFFECTS_OUTSIDE_SPECTRUM: Final = (Outliers, HeavyTails, NoiseStep, VarianceModulation, WanderingLine, *JUMP_PROCESSES)
+EFFECTS_OUTSIDE_SPECTRUM: Final = (
+    Outliers,
+    HeavyTails,
+    NoiseStep,
+    VarianceModulation,
+    WanderingVariance,
+    WanderingLine,
+    *JUMP_PROCESSES,
+)
 """Effects that are not fully visible in the likelihood of the spectrum."""
 SATURATED_BANDS: Final = 64
 """Number of frequency bands with a separately fitted power, equally wide on a logarithmic scale."""

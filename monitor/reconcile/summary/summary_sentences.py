@@ -38,6 +38,7 @@ EFFECT_PHRASES: Final = {
     "resolution": "quantization steps",
     "sample_hold": "repeated samples",
     "sinusoidal": "line",
+    "wandering_variance": "random variation of the noise level",
 }
 """Phrase for each effect whose name cannot be used as a phrase."""
 GROUP_PHRASES: Final = {

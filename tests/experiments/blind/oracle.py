@@ -10,6 +10,7 @@ What the gain is of,
   that is timed no better than jumps are spaced gains nothing and costs nothing;
 - a wandering line: the path of its phase is unknown too. It is worth the gain of the true line, less two nats for each
   stretch over which the phase can be extrapolated: κ^(−2/3) for a frequency that walks by κ = s√(2/T) in Hz/√s;
+- a wandering variance: the logarithms of block variances, filtered by Kalman's filter with the true parameters;
 - outliers, noise steps and heavy tails: the samples whitened by 1/√S, then a two-Gaussian mixture, two variances, or
   Student's t;
 - what is exact (a grid, repeats, clipping) gains without bound: ``inf``;
@@ -26,7 +27,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 from scipy.fft import dct, rfft
 
 from tests.experiments.blind.processes import Floats, modulated
@@ -89,7 +90,7 @@ class Observer:
             return self._path()
         if name == "wandering_line":
             return self._wandering()
-        if name in ("outliers", "noise_step", "heavy_tails", "variance_modulation"):
+        if name in ("outliers", "noise_step", "heavy_tails", "variance_modulation", "wandering_variance"):
             return self._samples()
         return self._gaussian([*self.baseline, self.effect])
 
@@ -175,6 +176,8 @@ class Observer:
         if self.effect.name == "variance_modulation":
             power = np.maximum(modulated(self.world.clock(), **self.effect.parameters), 1e-3)
             return float(np.sum(0.5 * w**2 * (1.0 - 1.0 / power) - 0.5 * np.log(power)))
+        if self.effect.name == "wandering_variance":
+            return self._log_variances(w)
         if self.effect.name == "heavy_tails":
             nu = self.effect.parameters["nu"]
             student = stats.t(nu, scale=np.sqrt(1.0 - 2.0 / nu))
@@ -183,6 +186,22 @@ class Observer:
         s2 = 1.0 + (self.effect.parameters["scale"] / self.world.noise(self.effect.axis)) ** 2
         mixed = np.logaddexp(np.log1p(-share) - 0.5 * w**2, np.log(share) - 0.5 * np.log(s2) - 0.5 * w**2 / s2)
         return float(np.sum(mixed + 0.5 * w**2))
+
+    def _log_variances(self, w: Floats) -> float:
+        """Of the logarithms of the variances of blocks: a Kalman filter against a constant."""
+        size = max(32, self.n // 4096)
+        logs = np.log(np.mean(w[: w.size // size * size].reshape(-1, size) ** 2, axis=1))
+        logs -= logs.mean()
+        error = float(special.polygamma(1, 0.5 * size))
+        spread = self.effect.parameters["deviation"] ** 2
+        decay = float(np.exp(-size / (self.rate * self.effect.parameters["correlation_time"])))
+        gain, state, variance = 0.5 * float(np.sum(np.log(error) + logs**2 / error)), 0.0, spread
+        for log in logs.tolist():
+            total = variance + error
+            gain -= 0.5 * (np.log(total) + (log - state) ** 2 / total)
+            state, variance = decay * (state + variance / total * (log - state)), variance * error / total
+            variance = decay**2 * variance + (1.0 - decay**2) * spread
+        return float(gain)
 
     def _resonance(self) -> float:
         """The best resonance in place of a line."""

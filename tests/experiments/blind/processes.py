@@ -232,6 +232,14 @@ def modulated(clock: Clock, depth: float, period: float, phase: float) -> Floats
     return np.asarray(1.0 + depth * np.imag(np.exp(1j * (2.0 * np.pi * clock.t_s / period + phase))))
 
 
+def wandering_gain(clock: Clock, rng: np.random.Generator, deviation: float, correlation_time: float) -> Floats:
+    """[n] in front of Gaussian samples: the logarithm of the variance is a Gauss–Markov process."""
+    decay = np.exp(-1.0 / (clock.rate_hz * correlation_time))
+    drive = deviation * np.sqrt(1.0 - decay**2) * rng.standard_normal(clock.n)
+    drive[0] = deviation * rng.standard_normal()
+    return np.asarray(np.exp(0.5 * lfilter([1.0], [1.0, -decay], drive) - 0.25 * deviation**2))
+
+
 SOURCES: Final[dict[str, Callable[..., Floats]]] = {
     function.__name__: function
     for function in (

@@ -34,7 +34,7 @@ import numpy as np  # noqa: E402
 from monitor.noise.effect import Source  # noqa: E402
 from monitor.noise.model import NoiseModel  # noqa: E402
 from monitor.noise.model_loading import load_model  # noqa: E402
-from tests.experiments.blind.processes import SOURCES, TRANSFORMS, Clock, Floats, generator, modulated  # noqa: E402
+from tests.experiments.blind.processes import SOURCES, TRANSFORMS, Clock, Floats, generator, modulated, wandering_gain  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,7 @@ HIDDEN: Final[dict[str, Sizes]] = {
     "bias_curve": _curve,
     "noise_step": _noise_step,
     "variance_modulation": _modulation,
+    "wandering_variance": lambda s, n, rate_hz: {"deviation": 0.7, "correlation_time": 0.02 * n / rate_hz},
     "bandwidth_limit": lambda s, n, rate_hz: {"cutoff": 0.15 * rate_hz, "order": 2},
     "sample_hold": lambda s, n, rate_hz: {"fraction": 0.03},
     "scale_factor": lambda s, n, rate_hz: {"factor": 1.3},
@@ -236,6 +237,8 @@ def apply_effect(
     mean = np.convolve(np.pad(values, MEAN_SAMPLES // 2, "reflect"), np.full(MEAN_SAMPLES, 1.0 / MEAN_SAMPLES), "valid")
     if name == "noise_step":
         level = np.where(clock.t_s >= parameters["time"], parameters["ratio"], 1.0)
+    elif name == "wandering_variance":
+        level = wandering_gain(clock, rng, **parameters)
     else:
         level = np.sqrt(modulated(clock, **parameters))
     return mean + level * (values - mean)

@@ -116,6 +116,10 @@ def _breath(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]
     return {"period": log_uniform(rng, 5.0, world.seconds / 6.0), "phase": uniform(rng, 0.0, 2.0 * np.pi)}
 
 
+def _restless(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
+    return {"correlation_time": log_uniform(rng, 200.0 / world.rate_hz, world.seconds / 20.0)}
+
+
 def _transient(rng: np.random.Generator, world: World, axis: str) -> dict[str, Any]:
     return {"time_constant": log_uniform(rng, world.seconds / 60.0, world.seconds / 6.0)}
 
@@ -207,6 +211,7 @@ RECIPES: Final[Mapping[str, Recipe]] = {
     "pulse_train": Recipe(_pulses, "height", _noise(0.1)),
     "noise_step": Recipe(_moment, "ratio", lambda world, axis: 0.02),
     "variance_modulation": Recipe(_breath, "depth", lambda world, axis: 0.02),
+    "wandering_variance": Recipe(_restless, "deviation", lambda world, axis: 0.05),
     "heavy_tails": Recipe(_nothing, "nu", lambda world, axis: 10.0, fixed=_tails),
     "g_sensitivity": Recipe(
         _from_accelerometer, "coefficient", lambda world, axis: 1e-4, "shaking source", gyros_only=True

@@ -247,6 +247,7 @@ def test_vocabulary_is_complete() -> None:
         *processes.TRANSFORMS,
         "noise_step",
         "variance_modulation",
+        "wandering_variance",
         "heavy_tails",
         "g_sensitivity",
         "cross_axis",

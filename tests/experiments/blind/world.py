@@ -22,6 +22,7 @@ from tests.experiments.blind.processes import (
     generator,
     heavy_tails,
     modulated,
+    wandering_gain,
     white,
 )
 
@@ -161,6 +162,8 @@ class World:
                 level = level * np.where(clock.t_s >= effect.parameters["time"], effect.parameters["ratio"], 1.0)
             elif effect.name == "variance_modulation":
                 level = level * np.sqrt(modulated(clock, **effect.parameters))
+            elif effect.name == "wandering_variance":
+                level = level * wandering_gain(clock, generator(self.seed, axis, effect.name), **effect.parameters)
             elif effect.name == "heavy_tails":
                 level = level * heavy_tails(clock, generator(self.seed, axis, effect.name), **effect.parameters)
         for unnamed in self.foreign_effects:

@@ -251,6 +251,18 @@ def _check_variance_period(recording: CheckedRecording, axis: str, p: Parameters
     return Check(power > 12.0, f"periodogram of the logarithm of the variance: {power:.1f} times its mean")
 
 
+def _check_variance_correlation(recording: CheckedRecording, axis: str, p: Parameters) -> Check:
+    blocks = int(min(recording.values[axis].size // 32, 3.0 * recording.duration_s / p["correlation_time"]))
+    logs = _block_log_deviation(recording, axis, max(blocks, 16))
+    logs = np.clip(logs, *np.quantile(logs, [0.02, 0.98]))
+    logs = logs - logs.mean()
+    correlation = float(logs[1:] @ logs[:-1] / (logs @ logs))
+    return Check(
+        correlation * logs.size**0.5 > MIN_Z,
+        f"correlation {correlation:.2f} of the noise of {logs.size} adjacent blocks",
+    )
+
+
 def _check_tails(recording: CheckedRecording, axis: str, p: Parameters) -> Check:
     x = signal.detrend(recording.values[axis])
     spread = 1.4826 * float(np.median(np.abs(x - np.median(x))))
@@ -392,6 +404,7 @@ CHECKS: Final[dict[str, CheckFunction]] = {
     "bias_step": _check_step,
     "noise_step": _check_noise_step,
     "variance_modulation": _check_variance_period,
+    "wandering_variance": _check_variance_correlation,
     "outliers": _check_tails,
     "heavy_tails": _check_tails,
     "temperature_bias": _check_temperature,

@@ -18,6 +18,7 @@ from monitor.noise.effects import (
     Sinusoidal,
     TemperatureBias,
     TemperatureHysteresis,
+    WanderingVariance,
 )
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.effect_roles import build_unit_regressors
@@ -135,6 +136,26 @@ def test_change_of_the_noise_level_is_a_noise_step():
     assert isinstance(step, NoiseStep)
     assert step.time == pytest.approx(150.0, abs=2.0)
     assert step.ratio == pytest.approx(1.5, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_noise_level_is_a_wandering_variance(seed):
+    hidden = WanderingVariance(deviation=0.5, correlation_time=5.0)
+    gain = hidden.start_gain(RATE_HZ, np.random.default_rng([seed, 1])).compute_gain(0, n)
+    rng = np.random.default_rng([seed, 2])
+    found = search_axis(white(n, rng) * gain + walk(n, rng))
+    assert list_added(found) == ["wandering_variance"]
+    effect = found.hypothesis.effects[-1]
+    assert effect.deviation == pytest.approx(hidden.deviation, rel=0.3)
+    assert max(one.gain for one in found.final.findings.values()) < 20.0
+
+
+def test_noise_level_of_the_model_may_vary_in_another_way():
+    gain = WanderingVariance(deviation=0.5, correlation_time=5.0)
+    series = gain.start_gain(RATE_HZ, np.random.default_rng(8)).compute_gain(0, n)
+    rng = np.random.default_rng(9)
+    found = search_axis(white(n, rng) * series + walk(n, rng), (*MODEL, gain))
+    assert not any(one.trials[0].effect for one in found.rounds)
 
 
 def test_periodic_noise_level_is_a_variance_modulation():
