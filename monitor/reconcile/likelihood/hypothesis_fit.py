@@ -13,10 +13,17 @@ import numpy as np
 
 from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
-from monitor.noise.effects import CommonVibration, ExponentiallyCorrelated, PulseTrain, VarianceModulation
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    CommonVibration,
+    ExponentiallyCorrelated,
+    PulseTrain,
+    VarianceModulation,
+    WanderingVariance,
+)
 from monitor.reconcile.effect_properties import SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
-from monitor.reconcile.likelihood.effect_roles import effect_size, is_noise_effect
+from monitor.reconcile.likelihood.effect_roles import effect_size, is_noise_effect, with_effect_size
 from monitor.reconcile.likelihood.periodic_pulse_search import find_pulse_delay
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.result import ParameterInterval
@@ -31,6 +38,10 @@ GOLDEN: Final = 0.6180339887498949
 SHAPE_ITERATIONS: Final = 12
 MAX_LOG_HALF_WIDTH: Final = 3.0
 """Largest half width of an interval that is symmetric on a logarithmic scale."""
+
+
+MAX_MEAN_DEVIATIONS: Final = 3.0
+"""Largest change of the mean of a random variance, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +94,8 @@ class Hypothesis:
 def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
     """Fit the deterministic effects of a noise model and keep the sizes of the noise effects.
 
-    The sizes of deterministic effects, the delays of pulses and the phases of modulations differ between recordings.
+    The sizes of deterministic effects, the delays of pulses, the phases of modulations and the mean of a random variance
+    differ between recordings.
 
     Parameters
     ----------
@@ -92,7 +104,7 @@ def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    model = _with_fitted_timing(axis, model)
+    model = _with_fitted_mean_variance(axis, _with_fitted_timing(axis, model))
     return Hypothesis(model, axis.fit(model, noise_effect_indices(model)))
 
 
@@ -120,6 +132,38 @@ def _with_fitted_timing(axis: Axis, model: Effects) -> Effects:
         return replace(effect, phase=float(np.angle(1j * product) % (2.0 * np.pi)))
 
     return tuple(fit_timing(effect) for effect in model)
+
+
+def _with_fitted_mean_variance(axis: Axis, model: Effects) -> Effects:
+    """Return the effects with the angle random walk of this recording, if the variance varies randomly.
+
+    The logarithm of the variance has the standard deviation s and the correlation time T. Over a long recording, the
+    mean of the logarithm has the standard deviation s √(2T/length). The change is at most ``MAX_MEAN_DEVIATIONS`` times
+    this value.
+    """
+    spread = max(
+        (
+            one.deviation * min(1.0, (2.0 * one.correlation_time / axis.length_s) ** 0.5)
+            for one in model
+            if isinstance(one, WanderingVariance)
+        ),
+        default=0.0,
+    )
+    whites = frozenset(
+        at for at, one in enumerate(model) if isinstance(one, AngleRandomWalk) and effect_size(one) > 0.0
+    )
+    if spread == 0.0 or not whites:
+        return model
+    fitted = axis.fit(model, noise_effect_indices(model) - whites).effects
+    limit = 0.5 * MAX_MEAN_DEVIATIONS * spread
+
+    def within_limit(at: int) -> Effect:
+        ratio = max(effect_size(fitted[at]) / effect_size(model[at]), 1e-9)
+        return with_effect_size(
+            model[at], effect_size(model[at]) * float(np.exp(np.clip(np.log(ratio), -limit, limit)))
+        )
+
+    return tuple(within_limit(at) if at in whites else one for at, one in enumerate(model))
 
 
 def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects) -> Hypothesis:

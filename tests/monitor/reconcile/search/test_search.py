@@ -150,12 +150,15 @@ def test_random_noise_level_is_a_wandering_variance(seed):
     assert max(one.gain for one in found.final.findings.values()) < 20.0
 
 
-def test_noise_level_of_the_model_may_vary_in_another_way():
-    gain = WanderingVariance(deviation=0.5, correlation_time=5.0)
-    series = gain.start_gain(RATE_HZ, np.random.default_rng(8)).compute_gain(0, n)
-    rng = np.random.default_rng(9)
-    found = search_axis(white(n, rng) * series + walk(n, rng), (*MODEL, gain))
-    assert not any(one.trials[0].effect for one in found.rounds)
+@pytest.mark.parametrize("seed", range(4))
+def test_random_noise_level_of_the_model_may_take_another_course(seed):
+    hidden = WanderingVariance(deviation=0.5, correlation_time=5.0)
+    gain = hidden.start_gain(RATE_HZ, np.random.default_rng([seed, 1])).compute_gain(0, n)
+    rng = np.random.default_rng([seed, 2])
+    found = search_axis(white(n, rng) * gain + walk(n, rng), (*MODEL, hidden))
+    assert found.rounds == ()
+    louder = search_axis(1.5 * (white(n, rng) * gain + walk(n, rng)), (*MODEL, hidden))
+    assert louder.rounds
 
 
 def test_periodic_noise_level_is_a_variance_modulation():
