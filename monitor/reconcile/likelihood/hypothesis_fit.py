@@ -94,8 +94,8 @@ class Hypothesis:
 def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
     """Fit the deterministic effects of a noise model and keep the sizes of the noise effects.
 
-    The sizes of deterministic effects, the delays of pulses, the phases of modulations and the mean of a random variance
-    differ between recordings.
+    The sizes of deterministic effects, the delays of pulses, the phases of modulations and the mean of a random
+    variance differ between recordings.
 
     Parameters
     ----------
@@ -149,19 +149,16 @@ def _with_fitted_mean_variance(axis: Axis, model: Effects) -> Effects:
         ),
         default=0.0,
     )
-    whites = frozenset(
-        at for at, one in enumerate(model) if isinstance(one, AngleRandomWalk) and effect_size(one) > 0.0
-    )
+    sizes = {at: effect_size(one) for at, one in enumerate(model) if isinstance(one, AngleRandomWalk)}
+    whites = frozenset(at for at, size in sizes.items() if size > 0.0)
     if spread == 0.0 or not whites:
         return model
     fitted = axis.fit(model, noise_effect_indices(model) - whites).effects
     limit = 0.5 * MAX_MEAN_DEVIATIONS * spread
 
     def within_limit(at: int) -> Effect:
-        ratio = max(effect_size(fitted[at]) / effect_size(model[at]), 1e-9)
-        return with_effect_size(
-            model[at], effect_size(model[at]) * float(np.exp(np.clip(np.log(ratio), -limit, limit)))
-        )
+        log_ratio = log(max(effect_size(fitted[at]) / sizes[at], 1e-9))
+        return with_effect_size(model[at], sizes[at] * exp(min(max(log_ratio, -limit), limit)))
 
     return tuple(within_limit(at) if at in whites else one for at, one in enumerate(model))
 
